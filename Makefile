@@ -1,0 +1,68 @@
+# Every target sets up what it needs; the second time that costs nothing. Paths stay relative and
+# tools run as `python -m`, so a checkout whose path holds spaces works.
+
+# The first Python that is new enough; `make PYTHON=/path/to/python3.12 test` overrides.
+PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 python; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' >/dev/null 2>&1 && echo $$p && break; done)
+PY = .venv/bin/python
+PIP_FLAGS = --disable-pip-version-check -q
+
+.PHONY: help demo test lint format docs bench peers clean
+.NOTPARALLEL:
+
+help:
+	@echo "make demo    run the demonstration; pictures go to out/"
+	@echo "make test    run the tests, doctests and examples included"
+	@echo "make lint    ruff, formatting, mypy"
+	@echo "make format  let ruff mend formatting and import order"
+	@echo "make docs    run every snippet of README, docs and docstrings"
+	@echo "make bench   time bayesmc beside hand-written code (and peers, after 'make peers')"
+	@echo "make peers   install the packages that the benchmarks compare with, in .venv-peers"
+	@echo "make clean   remove what the other targets made"
+
+demo: .venv/.extras-plot
+	$(PY) -m examples.demo
+
+test: .venv/.extras-plot,test
+	$(PY) -m pytest -q
+
+lint: .venv/.extras-dev
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+
+format: .venv/.extras-dev
+	$(PY) -m ruff check --fix-only -q .
+	$(PY) -m ruff format .
+
+docs: .venv/.extras-plot,test
+	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
+
+bench: .venv/.extras-plot,test
+	$(PY) -m benchmarks
+
+peers: .venv-peers/.installed
+
+clean:
+	rm -rf .venv .venv-peers out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+# One stamp per set of extras, so that `make demo` waits for no test tools.
+.venv/.extras-%: pyproject.toml .venv/.created
+	@echo "installing bayesmc[$*] into .venv ..."
+	@$(PY) -m pip install $(PIP_FLAGS) -e ".[$*]"
+	@touch "$@"
+
+.venv/.created:
+	@test -n "$(PYTHON)" || { \
+		echo "bayesmc needs Python >= 3.11 and none was found; install one, or name it: make PYTHON=/path/to/python3.12 ..." >&2; \
+		exit 1; }
+	@"$(PYTHON)" -c 'import sys; sys.exit(sys.version_info < (3, 11) and \
+		"bayesmc needs Python >= 3.11, but $(PYTHON) is " + sys.version.split()[0])'
+	@"$(PYTHON)" -m venv --clear .venv || { \
+		echo "could not make .venv; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
+	@touch "$@"
+
+.venv-peers/.installed: benchmarks/peers/requirements.txt .venv/.created
+	$(PY) -m venv --clear .venv-peers
+	.venv-peers/bin/python -m pip install $(PIP_FLAGS) -r benchmarks/peers/requirements.txt
+	@touch "$@"

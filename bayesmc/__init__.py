@@ -1,0 +1,33 @@
+"""bayesmc: declare a hybrid Bayes net in plain NumPy, and ask it.
+
+A conditional density is a function whose argument names are its parents and which returns a
+distribution. See ``bayesmc.BayesNet`` and ``bayesmc.infer``.
+"""
+
+from bayesmc import errors
+from bayesmc.auto import Explanation, explain, infer
+from bayesmc.distributions import (
+    Bernoulli,
+    Beta,
+    Binomial,
+    Categorical,
+    Density,
+    Dirichlet,
+    DiscreteUniform,
+    Distribution,
+    Exponential,
+    Gamma,
+    Mixture,
+    MvNormal,
+    Normal,
+    Poisson,
+    StudentT,
+    Uniform,
+)
+from bayesmc.engines.exact import Exact
+from bayesmc.engines.weighting import LikelihoodWeighting
+from bayesmc.network import BayesNet
+from bayesmc.plates import PlateArray, stack
+from bayesmc.results import Marginal, Posterior, Summary
+
+__version__ = "0.1.0"

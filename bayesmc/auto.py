@@ -1,0 +1,190 @@
+"""The way in: ``infer`` poses a problem and runs an engine on it; ``explain`` says which and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from bayesmc.engines.exact import Exact
+from bayesmc.engines.weighting import LikelihoodWeighting
+from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.network import BayesNet, Problem, pose
+from bayesmc.randomness import seed_sequence
+from bayesmc.results import Posterior
+
+#: bytes up to which an exact answer counts as cheap
+_CHEAP = 256 * 2**20
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """Which engine answers a question, and why.
+
+    Attributes
+    ----------
+    engine : object
+        The engine that would run.
+    reasons : tuple of str
+    refused : dict
+        Engine name -> why it was not taken.
+    nodes : dict
+        Node -> what the engine does to it.
+    """
+
+    engine: Any
+    reasons: tuple[str, ...]
+    refused: dict[str, str] = field(default_factory=dict)
+    nodes: dict[str, str] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        lines = [f"engine: {self.engine!r}", *(f"  because {r}" for r in self.reasons)]
+        lines += [f"not {name}: {why}" for name, why in self.refused.items()]
+        shown = list(self.nodes.items())
+        width = max((len(n) for n, _ in shown), default=0)
+        lines += [f"  {name.ljust(width)}  {what}" for name, what in shown[:40]]
+        if len(shown) > 40:
+            lines.append(f"  ... and {len(shown) - 40} more nodes")
+        return "\n".join(lines)
+
+
+def infer(
+    net: BayesNet,
+    evidence: Mapping[str, Any] | None = None,
+    *,
+    inputs: Mapping[str, Any] | None = None,
+    engine: Any = None,
+    rng: Any = None,
+    progress: bool | None = None,
+    keep: str | Sequence[str] = "draws",
+    resume: Posterior | None = None,
+) -> Posterior:
+    """The posterior of a net given evidence.
+
+    Parameters
+    ----------
+    net : BayesNet
+    evidence : dict, optional
+        Node name -> value, an array over the node's plates, or a state label. A masked entry, NaN in a
+        plated node, or None is unobserved.
+    inputs : dict, optional
+        Values of the net's input nodes.
+    engine : optional
+        ``Exact()``, ``LikelihoodWeighting(draws)``, ...; None chooses (see ``explain``).
+    rng : seed, SeedSequence, Generator or None
+        The same seed gives the same result.
+    progress : bool, optional
+        Show a bar for what takes over a second; None: on a terminal.
+    keep : "draws", "summaries" or a list of node names
+        What to hold: all draws; means, variances and probabilities alone, in constant memory; or the
+        draws of some nodes.
+    resume : Posterior, optional
+        An earlier posterior of the same question whose draws are continued.
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    ModelError, EvidenceError, UnsupportedError
+        With the node's name, the fault and the fix.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("rain", bmc.Bernoulli(0.2), states=("no", "yes"))
+    >>> net.table("wet", ["rain"], [[0.9, 0.1], [0.1, 0.9]], states=("no", "yes"))
+    >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
+    [0.3077, 0.6923]
+    """
+    problem = pose(net, evidence, inputs)
+    _check_keep(keep, problem)
+    chosen = _choose(problem)[0] if engine is None else _checked(engine)
+    reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
+    if reason is not None:
+        raise UnsupportedError(_with_alternative(reason, chosen, problem))
+    return chosen.run(problem, seed_sequence(rng), keep, progress, resume)
+
+
+def explain(
+    net: BayesNet,
+    evidence: Mapping[str, Any] | None = None,
+    engine: Any = None,
+    *,
+    inputs: Mapping[str, Any] | None = None,
+) -> Explanation:
+    """Which engine would answer, why, what it does to each node, and why anything better was refused.
+
+    It prints the explanation and returns it.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.2))
+    >>> _ = bmc.explain(net)
+    engine: Exact(max_bytes=2147483648.0)
+      because all hidden nodes are finite: induced width 0, about 48 bytes
+      a  eliminated
+    """
+    problem = pose(net, evidence, inputs)
+    if engine is None:
+        chosen, reasons, refused = _choose(problem)
+    else:
+        chosen, reasons, refused = _checked(engine), ("it was asked for",), {}
+        why = chosen.refusal(problem)
+        if why is not None:
+            refused = {type(chosen).__name__: why}
+            reasons = ("it was asked for, but it cannot answer",)
+    explanation = Explanation(chosen, tuple(reasons), refused, chosen.describe(problem))
+    print(explanation)
+    return explanation
+
+
+def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
+    """Exact where cheap, otherwise likelihood weighting."""
+    exact = Exact(max_bytes=_CHEAP)
+    why_not = exact.refusal(problem)
+    if why_not is None:
+        cost = exact.cost(problem)
+        width, size = cost.induced_width, cost.bytes
+        return (
+            Exact(),
+            (f"all hidden nodes are finite: induced width {width}, about {size:.3g} bytes",),
+            {},
+        )
+    weighting = LikelihoodWeighting()
+    why = weighting.refusal(problem)
+    if why is not None:
+        raise UnsupportedError(f"infer: no engine can answer. {why_not}. {why}")
+    return weighting, ("every hidden node can be sampled given its parents",), {"Exact": why_not}
+
+
+def _checked(engine: Any) -> Any:
+    if isinstance(engine, type):
+        raise TypeError(f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()")
+    if not (hasattr(engine, "run") and hasattr(engine, "refusal")):
+        raise TypeError(f"engine={engine!r} is not an engine; use Exact(), LikelihoodWeighting(draws), ...")
+    return engine
+
+
+def _with_alternative(reason: str, engine: Any, problem: Problem) -> str:
+    try:
+        other = _choose(problem)[0]
+    except UnsupportedError:
+        return reason
+    if type(other) is type(engine):
+        return reason
+    return f"{reason}; {type(other).__name__}() can answer this"
+
+
+def _check_keep(keep: Any, problem: Problem) -> None:
+    if isinstance(keep, str):
+        if keep not in ("draws", "summaries"):
+            raise ValueError(f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names')
+        return
+    for name in keep:
+        if name not in problem.model.nodes:
+            raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node")

@@ -1,0 +1,256 @@
+"""What a distribution is: parameters with a batch shape, and the few things engines ask of it.
+
+Shapes are said once here: a sample has shape ``sample_shape + batch_shape + event_shape`` and a
+log probability the broadcast of the value's and the distribution's batch. A family supplies
+``_sample``, ``_log_prob``, ``mean``, ``var`` and ``support``; it knows nothing of nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc.distributions.support import Support
+from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
+from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
+
+_mark_invalid: ContextVar[bool] = ContextVar("mark_invalid", default=False)
+
+
+class Distribution:
+    """A batch of probability distributions of one family.
+
+    Attributes
+    ----------
+    batch_shape, event_shape : tuple of int
+        ``log_prob`` has the batch shape; one draw has ``batch_shape + event_shape``.
+    is_discrete : bool
+        Whether the values are isolated points.
+    """
+
+    is_discrete: ClassVar[bool] = False
+    #: parameter name -> number of axes that one parameter value has (0 for a scalar)
+    parameter_ndim: ClassVar[dict[str, int]] = {}
+
+    event_shape: Shape = ()
+    batch_shape: Shape = ()
+    #: batch elements with parameters out of range (only while these are marked), else None
+    invalid: np.ndarray | None = None
+    problem: ParameterError | None = None
+
+    def sample(self, rng: Any = None, sample_shape: int | Shape = ()) -> np.ndarray:
+        """Independent draws, shape ``sample_shape + batch_shape + event_shape``.
+
+        Parameters
+        ----------
+        rng : seed, Generator or None
+        sample_shape : int or tuple of int
+        """
+        shape = as_shape(sample_shape) + self.batch_shape
+        return self._sample(np.random.default_rng(rng), shape)
+
+    def sample_to(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        """Draws of shape ``shape + event_shape``, where the batch broadcasts to ``shape``.
+
+        Every element is an independent draw, also along axes that the parameters do not have.
+        """
+        if not broadcasts_to(self.batch_shape, shape):
+            raise ShapeError(f"batch shape {self.batch_shape} does not broadcast to {shape}")
+        return self._sample(rng, shape)
+
+    def log_prob(self, x: Any) -> np.ndarray:
+        """Log density (or log probability) at ``x``: minus infinity outside the support.
+
+        ``x`` has shape ``(..., *event_shape)``; the result broadcasts ``...`` and the batch.
+        """
+        # Outside the support a density takes logarithms of zero and worse: that is no accident.
+        with np.errstate(all="ignore"):
+            return self._log_prob(np.asarray(x))
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean, shape ``batch_shape + event_shape``."""
+        raise UnsupportedError(f"{type(self).__name__} has no closed mean; average draws instead")
+
+    @property
+    def var(self) -> np.ndarray:
+        """Variance of each component, shape ``batch_shape + event_shape``."""
+        raise UnsupportedError(f"{type(self).__name__} has no closed variance; use draws instead")
+
+    @property
+    def support(self) -> Support:
+        """Where the mass lies."""
+        raise NotImplementedError
+
+    def cdf(self, x: Any) -> np.ndarray:
+        """Probability of a value at most ``x``."""
+        raise UnsupportedError(f"{type(self).__name__} has no closed cdf")
+
+    def ppf(self, q: Any) -> np.ndarray:
+        """Quantile: the smallest value whose cdf reaches ``q``."""
+        raise UnsupportedError(f"{type(self).__name__} has no closed ppf")
+
+    @property
+    def probs_table(self) -> np.ndarray | None:
+        """Probabilities of ``support.values``: ``batch_shape + (size,)``; None if infinite."""
+        values = self.support.values
+        if values is None or self.event_shape:
+            return None
+        points = values.reshape((-1,) + (1,) * len(self.batch_shape))
+        return np.moveaxis(np.exp(self.log_prob(points)), 0, -1)
+
+    def parameters(self) -> list[tuple[np.ndarray, int]]:
+        """Each parameter with the number of its trailing axes that are not batch.
+
+        Two distributions of one family with equal parameters are equal; ``validate`` relies on it.
+        """
+        return [(np.asarray(getattr(self, key)), n) for key, n in self.parameter_ndim.items()]
+
+    def __repr__(self) -> str:
+        return (
+            f"{type(self).__name__}(batch_shape={self.batch_shape}, event_shape={self.event_shape})"
+        )
+
+    # ---- what a family supplies -------------------------------------------------------------
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        """New writable draws, shape ``shape + event_shape``; the batch broadcasts to ``shape``."""
+        raise NotImplementedError
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    # ---- what a family's constructor calls --------------------------------------------------
+
+    @property
+    def _family(self) -> str:
+        """The name in messages."""
+        return type(self).__name__
+
+    def _set_batch(self, *shapes: Shape) -> None:
+        try:
+            self.batch_shape = broadcast_shapes(*shapes)
+        except ValueError:
+            raise ShapeError(
+                f"{type(self).__name__}: parameter shapes "
+                f"{', '.join(map(str, shapes))} do not broadcast together"
+            ) from None
+
+    def _check(
+        self, name: str, value: np.ndarray, ok: Any, fallback: Any, requirement: str
+    ) -> np.ndarray:
+        """``value`` where ``ok``; otherwise raise, or mark the element and use ``fallback``.
+
+        ``ok`` has the parameter's batch shape, ``value`` that and the parameter's own axes.
+        Call it after ``_set_batch``.
+        """
+        if ok.all():
+            return value
+        index = first_index(~ok)
+        self._reject(name, value[index], ~ok, requirement)
+        extra = value.ndim - ok.ndim
+        return np.where(ok.reshape(ok.shape + (1,) * extra), value, fallback)
+
+    def _reject(self, name: str, value: Any, bad: Any, requirement: str) -> None:
+        """Raise for the first ``bad`` element, whose parameter is ``value``; or mark them all."""
+        index = first_index(bad)
+        error = ParameterError(
+            f"{self._family}: {name} must be {requirement}; got {_short(value)}{_at(index)}",
+            index,
+        )
+        if not _mark_invalid.get():
+            raise error
+        bad = np.broadcast_to(bad, self.batch_shape)
+        self.invalid = bad if self.invalid is None else self.invalid | bad
+        self.problem = self.problem or error
+
+    def _finite(self, name: str, value: np.ndarray) -> np.ndarray:
+        """A scalar parameter that must be finite."""
+        return self._check(name, value, np.isfinite(value), 0.0, "finite")
+
+    def _positive(self, name: str, value: np.ndarray) -> np.ndarray:
+        """A scalar parameter that must be positive and finite."""
+        ok = (value > 0) & (value < np.inf)
+        return self._check(name, value, ok, 1.0, "positive and finite")
+
+    def _unit(self, name: str, value: np.ndarray) -> np.ndarray:
+        """A scalar parameter that must be a probability."""
+        return self._check(name, value, (value >= 0) & (value <= 1), 0.5, "between 0 and 1")
+
+    def _adopt(self, part: Distribution, mask: Any = None) -> None:
+        """Take over the marks of a ``part`` of this distribution (``mask`` in our batch)."""
+        if part.invalid is None:
+            return
+        bad = np.broadcast_to(part.invalid if mask is None else mask, self.batch_shape)
+        self.invalid = bad if self.invalid is None else self.invalid | bad
+        self.problem = self.problem or part.problem
+
+
+@contextmanager
+def marking_invalid() -> Iterator[None]:
+    """Within it, bad parameters are marked on the distribution instead of raised.
+
+    Engines evaluate nodes at configurations that may have probability zero, where a function may
+    rightly return nonsense; they look at ``invalid`` and raise only where the configuration counts.
+    """
+    token = _mark_invalid.set(True)
+    try:
+        yield
+    finally:
+        _mark_invalid.reset(token)
+
+
+def as_float(value: Any) -> np.ndarray:
+    """A parameter as a float array; what cannot become one raises with its own message."""
+    return np.asarray(value, dtype=float)
+
+
+def as_quantile(q: Any) -> np.ndarray:
+    """Probabilities as floats, NaN where they are none."""
+    q = np.asarray(q, dtype=float)
+    return np.where((q >= 0) & (q <= 1), q, np.nan)
+
+
+def as_whole(value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A parameter as int64, and where it is a whole number (elsewhere it reads 0)."""
+    value = np.asarray(value)
+    if value.dtype.kind in "iub":
+        return value.astype(np.int64, copy=False), np.ones(value.shape, dtype=bool)
+    value = np.asarray(value, dtype=float)
+    ok = np.isfinite(value) & (value == np.floor(value)) & (np.abs(value) < 2.0**62)
+    return np.where(ok, value, 0.0).astype(np.int64), ok
+
+
+def draw_to(
+    draw: Callable[[Shape], np.ndarray], batch: Shape, shape: Shape, event_shape: Shape
+) -> np.ndarray:
+    """Draws of shape ``shape + event_shape`` from a sampler that only knows leading sample axes.
+
+    ``draw(sample_shape)`` returns ``sample_shape + batch + event_shape``. Axes along which the
+    batch has size one are drawn as further sample axes and moved into place, so that every
+    element is independent.
+    """
+    lead = len(shape) - len(batch)
+    inner = [i for i, n in enumerate(batch) if n == 1 and shape[lead + i] != 1]
+    draws = draw(shape[:lead] + tuple(shape[lead + i] for i in inner))
+    if not inner:
+        return draws
+    first_batch = lead + len(inner)
+    # each expanded batch axis (size one) makes way for its sample axis
+    axes = list(range(lead))
+    axes += [lead + inner.index(i) if i in inner else first_batch + i for i in range(len(batch))]
+    axes += range(first_batch + len(batch), draws.ndim)
+    dropped = tuple(first_batch + i for i in inner)
+    return draws.transpose(axes + list(dropped)).reshape(shape + event_shape)
+
+
+def _short(value: Any) -> str:
+    return np.array2string(np.asarray(value), precision=6, threshold=8)
+
+
+def _at(index: Shape) -> str:
+    return f" at index {index if len(index) > 1 else index[0]}" if index else ""

@@ -1,0 +1,296 @@
+"""Mixtures: one of K component distributions, chosen by a categorical weight.
+
+The components are one distribution whose last batch axis counts them, or a list of distributions of
+any families.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.base import Distribution, as_float, as_quantile
+from bayesmc.distributions.categorical import Categorical
+from bayesmc.distributions.discrete import whole_ppf
+from bayesmc.distributions.support import Support
+from bayesmc.errors import ShapeError, UnsupportedError
+from bayesmc.shapes import Shape, broadcast_shapes
+
+_AT_ONCE = 1 << 22  # component draws held at a time
+
+
+class Mixture(Distribution):
+    """Mixture distribution ``sum_k weights[..., k] * component_k``.
+
+    Parameters
+    ----------
+    weights : array_like, shape (..., K)
+        Mixing probabilities; a row off one by at most 1e-6 is renormalised.
+    components : Distribution or sequence of Distribution
+        One distribution whose last batch axis has length K, or K distributions with one event
+        shape, all discrete or all continuous.
+
+    Raises
+    ------
+    ParameterError
+        ``weights`` has a negative entry or a row that does not sum to one.
+    ShapeError
+        The number of weights and of components differ, or event shapes do.
+    UnsupportedError
+        Discrete and continuous components, or supports that have no common kind.
+
+    References
+    ----------
+    Murphy, Probabilistic Machine Learning: An Introduction, 2022, section 3.5.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> mixture = bmc.Mixture([0.5, 0.5], bmc.Normal([-1.0, 1.0], 1.0))
+    >>> float(mixture.log_prob(0.0).round(4)), float(mixture.mean), float(mixture.var)
+    (-1.4189, 0.0, 2.0)
+    """
+
+    def __init__(self, weights: Any, components: Distribution | Sequence[Distribution]) -> None:
+        weights = as_float(weights)
+        if weights.ndim < 1:
+            raise ShapeError("Mixture: weights must have shape (..., K); got a scalar")
+        self._parts = _parts(components)
+        if weights.shape[-1] != self._parts.count:
+            raise ShapeError(
+                f"Mixture: {weights.shape[-1]} weights for {self._parts.count} components"
+            )
+        self.components = components
+        self.event_shape = self._parts.event_shape
+        self.is_discrete = self._parts.support.is_discrete  # type: ignore[misc]
+        self._set_batch(weights.shape[:-1], self._parts.batch)
+        self._choice = _Weights(weights)
+        self._adopt(self._choice)
+        for part, mask in self._parts.marked():
+            self._adopt(part, mask)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Mixing probabilities, shape ``(..., K)``."""
+        return self._choice.probs
+
+    def parameters(self) -> list[tuple[np.ndarray, int]]:
+        return [(self.weights, 1), *self._parts.parameters()]
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        choice = self._choice.sample_to(rng, shape)
+        return self._parts.sample(rng, choice)
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        weights = self.weights
+        terms = self._parts.evaluate("log_prob", x)
+        # a component without weight counts for nothing, whatever its density
+        terms = np.where(weights > 0, terms + np.log(weights), -np.inf)
+        # reducing a contiguous leading axis is several times faster than a short last one
+        terms = np.array(np.moveaxis(terms, -1, 0), order="C")
+        peak = terms.max(axis=0)
+        peak = np.where(np.isfinite(peak), peak, 0.0)
+        terms -= peak
+        return np.log(np.exp(terms, out=terms).sum(axis=0)) + peak
+
+    @property
+    def mean(self) -> np.ndarray:
+        return self._average(self._parts.moments("mean"))
+
+    @property
+    def var(self) -> np.ndarray:
+        means = self._parts.moments("mean")
+        axis = -1 - len(self.event_shape)
+        with np.errstate(invalid="ignore"):
+            spread = (means - np.expand_dims(self._average(means), axis)) ** 2
+        return self._average(self._parts.moments("var") + spread)
+
+    @property
+    def support(self) -> Support:
+        return self._parts.support
+
+    def cdf(self, x: Any) -> np.ndarray:
+        return self._weigh(self._parts.evaluate("cdf", np.asarray(x)))
+
+    def ppf(self, q: Any) -> np.ndarray:
+        """Quantile by bisection between the least and the greatest quantile of the components."""
+        q = as_quantile(q)
+        quantiles = self._parts.evaluate("ppf", q)
+        used = self.weights > 0
+        low = np.where(used, quantiles, np.inf).min(axis=-1)
+        high = np.where(used, quantiles, -np.inf).max(axis=-1)
+        low, high = (np.where(np.isnan(q), np.nan, bound) for bound in (low, high))
+        if self.is_discrete:
+            inner = np.where((q > 0) & (q < 1), q, np.nan)
+            start, stop = (np.where(np.isnan(inner), 0.0, bound) for bound in (low, high))
+            return np.where(
+                q == 0, low, np.where(q == 1, high, whole_ppf(self.cdf, inner, start, stop))
+            )
+        return _bisect(self.cdf, q, low, high)
+
+    def _average(self, values: np.ndarray) -> np.ndarray:
+        """Weighted sum of ``(..., K, *event)`` over the components, in full batch shape."""
+        extra = len(self.event_shape)
+        weights = self.weights.reshape(self.weights.shape + (1,) * extra)
+        with np.errstate(invalid="ignore"):
+            terms = np.where(weights > 0, weights * values, 0.0)
+        total = terms.sum(axis=-1 - extra)
+        return np.broadcast_to(total, self.batch_shape + self.event_shape)
+
+    def _weigh(self, values: np.ndarray) -> np.ndarray:
+        return np.where(self.weights > 0, self.weights * values, 0.0).sum(axis=-1)
+
+
+class _Weights(Categorical):
+    """The choice of a component, whose faults are the mixture's."""
+
+    _family = "Mixture"
+    _probs_name = "weights"
+
+
+class _Stacked:
+    """Components as one distribution whose last batch axis counts them."""
+
+    def __init__(self, part: Distribution) -> None:
+        if not part.batch_shape:
+            raise ShapeError(
+                f"Mixture: {type(part).__name__} has batch shape (); its last batch axis must "
+                "count the components (parameters of shape (..., K)), or pass a list"
+            )
+        self.part = part
+        self.count = part.batch_shape[-1]
+        self.batch = part.batch_shape[:-1]
+        self.event_shape = part.event_shape
+
+    @property
+    def support(self) -> Support:
+        support = self.part.support
+        if support.is_constant:
+            return support
+        low = np.broadcast_to(support.low, self.part.batch_shape).min(axis=-1)
+        high = np.broadcast_to(support.high, self.part.batch_shape).max(axis=-1)
+        return Support(support.kind, low, high, support.open_low, support.open_high)
+
+    def marked(self) -> list[tuple[Distribution, Any]]:
+        invalid = self.part.invalid
+        return [] if invalid is None else [(self.part, invalid.any(axis=-1))]
+
+    def parameters(self) -> list[tuple[np.ndarray, int]]:
+        # a parameter that all components share has no component axis of its own
+        return [
+            (value.reshape((1,) * (n + 1 - value.ndim) + value.shape), n + 1)
+            for value, n in self.part.parameters()
+        ]
+
+    def evaluate(self, method: str, x: np.ndarray) -> np.ndarray:
+        at = np.expand_dims(x, x.ndim - len(self.event_shape) if method == "log_prob" else x.ndim)
+        return getattr(self.part, method)(at)
+
+    def moments(self, name: str) -> np.ndarray:
+        return np.broadcast_to(getattr(self.part, name), self.part.batch_shape + self.event_shape)
+
+    def sample(self, rng: np.random.Generator, choice: np.ndarray) -> np.ndarray:
+        draws_per_item = self.count * max(1, int(np.prod(self.event_shape)))
+        lead = choice.ndim - len(self.batch)
+        if lead and len(choice) > 1 and choice.size * draws_per_item > _AT_ONCE:
+            # all K are drawn and one is kept, so what is held at a time is bounded
+            step = max(1, len(choice) * _AT_ONCE // (choice.size * draws_per_item))
+            blocks = [self.sample(rng, choice[i : i + step]) for i in range(0, len(choice), step)]
+            return np.concatenate(blocks)
+        draws = self.part.sample_to(rng, (*choice.shape, self.count))
+        index = choice.reshape(choice.shape + (1,) * (1 + len(self.event_shape)))
+        return np.take_along_axis(draws, index, axis=choice.ndim).squeeze(axis=choice.ndim)
+
+
+class _Listed:
+    """Components as a list of distributions of any families."""
+
+    def __init__(self, parts: Sequence[Distribution]) -> None:
+        parts = tuple(parts)
+        if not parts or not all(isinstance(part, Distribution) for part in parts):
+            raise ShapeError(
+                "Mixture: components must be a Distribution or a list of Distributions"
+            )
+        if len({part.event_shape for part in parts}) > 1:
+            shapes = ", ".join(str(part.event_shape) for part in parts)
+            raise ShapeError(f"Mixture: components have different event shapes: {shapes}")
+        self.parts = parts
+        self.count = len(parts)
+        self.event_shape = parts[0].event_shape
+        self.batch = broadcast_shapes(*(part.batch_shape for part in parts))
+
+    @property
+    def support(self) -> Support:
+        supports = [part.support for part in self.parts]
+        first = supports[0]
+        if all(support == first for support in supports):
+            return first
+        return _hull(supports)
+
+    def marked(self) -> list[tuple[Distribution, Any]]:
+        return [(part, None) for part in self.parts]
+
+    def parameters(self) -> list[tuple[np.ndarray, int]]:
+        return [pair for part in self.parts for pair in part.parameters()]
+
+    def evaluate(self, method: str, x: np.ndarray) -> np.ndarray:
+        values = [np.asarray(getattr(part, method)(x), dtype=float) for part in self.parts]
+        return np.stack(np.broadcast_arrays(*values), axis=-1)
+
+    def moments(self, name: str) -> np.ndarray:
+        shape = self.batch + self.event_shape
+        values = [np.broadcast_to(getattr(part, name), shape) for part in self.parts]
+        return np.stack(values, axis=len(self.batch))
+
+    def sample(self, rng: np.random.Generator, choice: np.ndarray) -> np.ndarray:
+        draws = self.parts[0].sample_to(rng, choice.shape)
+        for k, part in enumerate(self.parts[1:], start=1):
+            chosen = (choice == k).reshape(choice.shape + (1,) * len(self.event_shape))
+            draws = np.where(chosen, part.sample_to(rng, choice.shape), draws)
+        return draws
+
+
+def _parts(components: Distribution | Sequence[Distribution]) -> _Stacked | _Listed:
+    if isinstance(components, Distribution):
+        return _Stacked(components)
+    return _Listed(components)
+
+
+def _hull(supports: Sequence[Support]) -> Support:
+    """The smallest support of one kind that holds all."""
+    kinds = {support.kind for support in supports}
+    if kinds <= {"real", "interval"} and "real" in kinds:
+        return next(support for support in supports if support.kind == "real")
+    if len(kinds) > 1:
+        raise UnsupportedError(
+            f"Mixture: components with supports {', '.join(sorted(kinds))} cannot be mixed"
+        )
+    first = supports[0]
+    if first.kind not in ("interval", "integers"):
+        return first
+    low, high = first.low, first.high
+    for support in supports[1:]:
+        low, high = np.minimum(low, support.low), np.maximum(high, support.high)
+    open_low = all(support.open_low for support in supports)
+    open_high = all(support.open_high for support in supports)
+    return Support(first.kind, low, high, open_low, open_high)
+
+
+def _bisect(
+    cdf: Callable[[np.ndarray], np.ndarray], q: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Where ``cdf`` crosses ``q`` between ``low`` and ``high``, to the last bit."""
+    answer = np.where(q == 1, high, low)
+    active = np.isfinite(low) & np.isfinite(high)
+    low, high = np.where(active, low, 0.0), np.where(active, high, 0.0)
+    for _ in range(2200):  # at most: halving an interval of doubles ends well before
+        middle = low + 0.5 * (high - low)
+        done = (middle <= low) | (middle >= high)
+        if done.all():
+            break
+        short = cdf(middle) < q
+        low, high = np.where(short & ~done, middle, low), np.where(short | done, high, middle)
+    # at q = 0 or 1 the bounds are the answer and may be infinite
+    return np.where(active, high, answer)

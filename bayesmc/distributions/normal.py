@@ -1,0 +1,78 @@
+"""The normal distribution of one number; vectors are in ``mvnormal``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.support import Support, real
+from bayesmc.shapes import Shape
+
+_HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
+
+
+class Normal(Distribution):
+    """Normal (Gaussian) distribution, ``exp(-((x - loc) / scale)**2 / 2)`` normalised.
+
+    Parameters
+    ----------
+    loc : array_like
+        Mean, any shape.
+    scale : array_like
+        Standard deviation, positive; broadcasts with ``loc``.
+
+    Raises
+    ------
+    ParameterError
+        ``loc`` not finite, or ``scale`` not positive and finite.
+
+    References
+    ----------
+    Johnson, Kotz and Balakrishnan, Continuous Univariate Distributions I, ch. 13.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> float(bmc.Normal(0.0, 2.0).log_prob(0.0).round(4))
+    -1.6121
+    """
+
+    parameter_ndim = {"loc": 0, "scale": 0}
+
+    def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
+        loc, scale = as_float(loc), as_float(scale)
+        self._set_batch(loc.shape, scale.shape)
+        self.loc = self._finite("loc", loc)
+        self.scale = self._positive("scale", scale)
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        draws = np.asarray(rng.standard_normal(shape))
+        draws *= self.scale
+        draws += self.loc
+        return draws
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        z = (x - self.loc) / self.scale
+        return -0.5 * z * z - _HALF_LOG_2PI - np.log(self.scale)
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.broadcast_to(self.loc, self.batch_shape)
+
+    @property
+    def var(self) -> np.ndarray:
+        return np.broadcast_to(self.scale**2, self.batch_shape)
+
+    @property
+    def support(self) -> Support:
+        return real
+
+    def cdf(self, x: Any) -> np.ndarray:
+        with np.errstate(over="ignore"):
+            return special.ndtr((np.asarray(x) - self.loc) / self.scale)
+
+    def ppf(self, q: Any) -> np.ndarray:
+        return self.loc + self.scale * special.ndtri(np.asarray(q))

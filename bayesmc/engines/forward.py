@@ -1,0 +1,263 @@
+"""Fast steps of the forward pass for finite nodes, and the loop over chunks that all forward engines share.
+
+A finite node whose parents are finite is a table: its draws are integer codes picked by comparing
+random bits with cumulative rows, its density a row of logs. Chunks are small enough for their arrays to
+stay in cache; each draws from its own random stream, so results do not depend on how work is cut.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import ParameterError
+from bayesmc.network import CompiledNode, Model, Observed, Problem
+from bayesmc.network.align import Aligner
+from bayesmc.network.forward import Pass, Step, run, step_for, steps_for
+from bayesmc.progress import Progress
+from bayesmc.randomness import stream
+from bayesmc.structure import Table, constants_of, tabulate
+
+#: draws per chunk of a net whose largest node is a scalar
+CHUNK = 8192
+#: array elements per node and chunk that larger nodes are cut to
+_CHUNK_ELEMENTS = 1 << 20
+_BITS = 31
+
+
+def forward_chunks(
+    problem: Problem,
+    draws: int,
+    seed: np.random.SeedSequence,
+    progress: Progress,
+    first: int = 0,
+) -> Iterator[Pass]:
+    """Passes that together make ``draws`` draws; chunk ``k`` uses random stream ``first + k``."""
+    model = problem.model
+    steps = fast_steps(model, problem.observed, problem.inputs)
+    size = chunk_size(model)
+    with marking_invalid(), np.errstate(all="ignore"):
+        for number, start in enumerate(range(0, draws, size)):
+            count = min(size, draws - start)
+            state = Pass(stream(seed, first + number), (count,), dict(problem.inputs))
+            yield run(steps, state)
+            progress.advance(count)
+
+
+def chunk_size(model: Model) -> int:
+    """Draws per chunk, so that one node's values stay near the size of the cache."""
+    largest = max((int(np.prod(n.value_shape, dtype=int)) for n in model.nodes.values()), default=1)
+    return max(1, min(CHUNK, _CHUNK_ELEMENTS // max(largest, 1)))
+
+
+def fast_steps(
+    model: Model, observed: Mapping[str, Observed], inputs: Mapping[str, np.ndarray]
+) -> list[Step]:
+    """One step per node: from a table where there is one, else by the node's function."""
+    constants = constants_of(model, inputs)
+    steps: list[Step] = []
+    for node in model.nodes.values():
+        step = _table_step(model, node, observed.get(node.name), constants)
+        steps.append(step if step is not None else step_for(model, node, observed))
+    plain = steps_for(model, observed)
+    return steps + plain[len(model.nodes) :]
+
+
+def _table_step(
+    model: Model, node: CompiledNode, seen: Observed | None, constants: Mapping[str, np.ndarray]
+) -> Step | None:
+    distinct = len(set(node.parents)) == len(node.parents)
+    if node.table is not None and distinct and not any(p in constants for p in node.parents):
+        return TableCompute(node)
+    if seen is not None and seen.mask is not None:
+        return None
+    limit = 1 << 20 if node.declaration.probs is None else 1 << 26
+    table = tabulate(model, node, constants, limit)
+    if table is None:
+        return None
+    if seen is None:
+        return TableDraw(node, table)
+    return TableWeigh(node, table, seen)
+
+
+class RowIndex:
+    """Row of a table for every draw and plate element, from the positions of the parents."""
+
+    def __init__(self, node: CompiledNode, parents: tuple[str, ...], lead: tuple[int, ...]) -> None:
+        cards = lead[: len(parents)]
+        links = dict(node.links)
+        self.parents: list[tuple[str, Aligner, int]] = []
+        rows = 1
+        for parent, card in zip(parents, cards, strict=True):
+            self.parents.append((parent, links[parent], card))
+            rows *= card
+        plates = lead[len(parents) :]
+        self.offset: np.ndarray | None = None
+        if int(np.prod(plates, dtype=int)) > 1:
+            self.offset = np.arange(int(np.prod(plates, dtype=int))).reshape(plates)
+            rows *= self.offset.size
+        self.rows = rows
+        self.dtype = np.min_scalar_type(max(rows - 1, 1))
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> Any:
+        """Integer array that broadcasts to batch and plates (a plain 0 for a single row)."""
+        index: Any = None
+        for parent, link, card in self.parents:
+            codes = link.place(values[parent])
+            if index is None:
+                index = codes
+            else:  # the first product is widened once, so that no code overflows
+                index = np.multiply(index, card, dtype=self.dtype, casting="unsafe") + codes
+        if self.offset is not None:
+            plates = self.offset.size
+            index = self.offset if index is None else index.astype(np.intp) * plates + self.offset
+        return 0 if index is None else index
+
+
+class TableDraw:
+    """Sample a finite node: count the cumulative probabilities that random bits exceed.
+
+    Bits and thresholds are 31-bit integers: 5e-10 fine, cheaper than floats, and states of probability
+    zero have no width at all. Few states are compared one by one, many by binary search.
+    """
+
+    def __init__(self, node: CompiledNode, table: Table) -> None:
+        self.name = node.name
+        self.node = node
+        lead = table.probs.shape[:-1]
+        self.index = RowIndex(node, table.parents, lead)
+        self.dtype = node.domain.dtype  # type: ignore[union-attr]
+        self.guard = _Guard(node, table)
+        probs = table.probs.reshape(-1, table.probs.shape[-1])
+        self.states = probs.shape[1]
+        edges = _thresholds(probs)
+        self.search = self.states > 5
+        if self.search:
+            self.width = 1 << int(np.ceil(np.log2(self.states)))
+            padded = np.full((len(probs), self.width), 1 << _BITS, dtype=np.uint32)
+            padded[:, : self.states - 1] = edges
+            self.edges = [padded.ravel()]
+        else:
+            self.edges = [np.ascontiguousarray(edges[:, k]) for k in range(self.states - 1)]
+
+    def __call__(self, state: Pass) -> None:
+        index = self.index(state.values)
+        self.guard.check(index, state)
+        shape = state.batch + self.node.plate_shape
+        bits = _random_bits(state.rng, shape)
+        codes = self._search(index, bits) if self.search else self._compare(index, bits)
+        codes.flags.writeable = False
+        state.values[self.name] = codes
+
+    def _compare(self, index: Any, bits: np.ndarray) -> np.ndarray:
+        if not self.edges:
+            return np.zeros(bits.shape, dtype=self.dtype)
+        codes = (bits >= self.edges[0].take(index)).view(np.uint8)
+        for edge in self.edges[1:]:
+            codes += (bits >= edge.take(index)).view(np.uint8)
+        return codes
+
+    def _search(self, index: Any, bits: np.ndarray) -> np.ndarray:
+        """Branchless binary search in each draw's row; the row's last edge is never exceeded."""
+        edges = self.edges[0]
+        start = np.broadcast_to(np.asarray(index, dtype=np.intp) * self.width, bits.shape)
+        at = start.copy()
+        step = self.width // 2
+        while step:
+            at += step * (bits >= edges.take(at + (step - 1)))
+            step //= 2
+        return (at - start).astype(self.dtype)
+
+
+class TableWeigh:
+    """Weight by a finite observed node: one gather of log probabilities."""
+
+    def __init__(self, node: CompiledNode, table: Table, seen: Observed) -> None:
+        self.node = node
+        self.name = node.name
+        self.seen = seen
+        self.plates = len(node.plates)
+        self.index = RowIndex(node, table.parents, table.probs.shape[:-1])
+        self.guard = _Guard(node, table)
+        with np.errstate(divide="ignore"):
+            logs = np.log(table.probs.reshape(-1, table.probs.shape[-1]))
+        self.states = logs.shape[1]
+        # without plates one column will do; with them the state differs from element to element
+        self.logs = np.ascontiguousarray(logs[:, int(seen.value)]) if not self.plates else logs.ravel()
+
+    def __call__(self, state: Pass) -> None:
+        index = self.index(state.values)
+        self.guard.check(index, state)
+        if not self.plates:
+            state.weigh(self.logs.take(index))
+        else:
+            rows = np.asarray(index, dtype=np.intp) * self.states + self.seen.value
+            logs = self.logs.take(rows)
+            lead = logs.shape[: max(logs.ndim - self.plates, 0)]
+            full = np.broadcast_to(logs, lead + self.node.plate_shape)
+            state.weigh(full.sum(axis=tuple(range(-self.plates, 0))))
+        state.values[self.name] = self.seen.value
+
+
+class TableCompute:
+    """A deterministic node of finite parents: one gather."""
+
+    def __init__(self, node: CompiledNode) -> None:
+        assert node.table is not None
+        self.node = node
+        self.index = RowIndex(node, node.parents, node.table.shape)
+        self.codes = np.ascontiguousarray(node.table).ravel()
+
+    def __call__(self, state: Pass) -> None:
+        node = self.node
+        from_table = self.codes.take(self.index(state.values))
+        lead = from_table.shape[: from_table.ndim - len(node.plates)]
+        if from_table.shape != lead + node.plate_shape:
+            from_table = np.broadcast_to(from_table, lead + node.plate_shape)
+        from_table.flags.writeable = False
+        state.values[node.name] = from_table
+
+
+class _Guard:
+    """Refuses configurations with bad parameters when a draw of positive weight reaches one."""
+
+    def __init__(self, node: CompiledNode, table: Table) -> None:
+        self.node = node
+        self.invalid = None if table.invalid is None else table.invalid.ravel()
+
+    def check(self, index: Any, state: Pass) -> None:
+        if self.invalid is None:
+            return
+        bad = self.invalid.take(index)
+        alive = np.asarray(state.log_weight) > -np.inf
+        while alive.ndim < np.ndim(bad):
+            alive = alive[..., None]
+        if (bad & alive).any():
+            raise ParameterError(
+                f"node {self.node.name!r}: the function gives bad parameters at a configuration of its "
+                "parents that has positive probability; check it there"
+            )
+
+
+def _thresholds(probs: np.ndarray) -> np.ndarray:
+    """Cumulative rows as integers of ``_BITS`` bits, shape (rows, states - 1)."""
+    cumulative = np.cumsum(probs, axis=1)
+    cumulative /= cumulative[:, -1:]
+    edges = np.rint(cumulative * float(1 << _BITS)).astype(np.uint32)
+    last = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
+    edges[np.arange(probs.shape[1]) >= last[:, None]] = 1 << _BITS
+    return edges[:, :-1]
+
+
+def _random_bits(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:
+    """Independent uniform integers below ``2**_BITS``."""
+    count = 1
+    for n in shape:
+        count *= n
+    words = rng.bit_generator.random_raw((count + 1) // 2).view(np.uint32)[:count]
+    words >>= np.uint32(32 - _BITS)
+    return words.reshape(shape)
+

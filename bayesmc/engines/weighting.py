@@ -1,0 +1,224 @@
+"""Likelihood weighting: the forward pass, with evidence as weights."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc import diagnostics
+from bayesmc.engines.forward import chunk_size, forward_chunks
+from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.network import BayesNet, Model, Problem, pose
+from bayesmc.network.forward import refuse_unsampled
+from bayesmc.progress import Progress
+from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
+
+
+@dataclass(frozen=True)
+class LikelihoodWeighting:
+    """Draw every hidden node given its parents and weight by the density of what is observed.
+
+    It runs on any net that can be sampled forwards, and gives ``log_marginal_likelihood`` without bias
+    (of the likelihood itself). Its error grows with the surprise of the evidence: ``weight_ess`` tells
+    how many equally weighted draws the answer is worth, ``pareto_k`` whether even that can be trusted.
+
+    Parameters
+    ----------
+    draws : int
+
+    References
+    ----------
+    Fung and Chang (1990); Shachter and Peot (1990); Koller and Friedman (2009), sec. 12.3.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.5))
+    >>> net.add("x", lambda a: bmc.Normal(2.0 * a, 1.0))
+    >>> posterior = bmc.infer(net, {"x": 1.0}, engine=bmc.LikelihoodWeighting(20_000), rng=0)
+    >>> bool(abs(posterior.probability(lambda a: a == 1) - 0.5) < 0.02)
+    True
+    """
+
+    draws: int = 10_000
+
+    def __post_init__(self) -> None:
+        if isinstance(self.draws, bool) or not isinstance(self.draws, (int, np.integer)) or self.draws < 1:
+            raise ValueError(f"LikelihoodWeighting(draws={self.draws!r}): give a positive number of draws")
+
+    def unsupported(
+        self,
+        net: BayesNet,
+        evidence: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> str | None:
+        """Why this engine cannot answer, or None."""
+        return self.refusal(pose(net, evidence, inputs))
+
+    def refusal(self, problem: Problem) -> str | None:
+        """Why this engine cannot answer a posed problem, or None."""
+        return refuse_unsampled(problem.model, problem.observed, "LikelihoodWeighting")
+
+    def describe(self, problem: Problem) -> dict[str, str]:
+        """What the engine does to each node."""
+        return {name: _treatment(problem, name) for name in problem.model.nodes}
+
+    def run(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any = "draws",
+        progress: bool | None = None,
+        resume: Posterior | None = None,
+    ) -> Posterior:
+        """Answer a posed problem; ``infer`` is the way in."""
+        names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
+        weighted = bool(problem.observed or problem.model.potentials)
+        with Progress(self.draws, "likelihood weighting", progress) as bar:
+            before = 0 if not isinstance(resume, DrawsPosterior) else resume._shape[1]
+            first = -(-before // chunk_size(problem.model))
+            chunks = forward_chunks(problem, self.draws, seed, bar, first)
+            if isinstance(keep, str) and keep == "summaries":
+                if resume is not None:
+                    raise UnsupportedError('infer: resume= continues draws; give keep="draws"')
+                return self._summaries(problem, chunks, names, weighted)
+            kept = names if isinstance(keep, str) else tuple(keep)
+            return self._draws(problem, chunks, kept, weighted, resume)
+
+    def _summaries(self, problem: Problem, chunks: Any, names: Any, weighted: bool) -> SumsPosterior:
+        sums = Sums(problem.model, names)
+        for chunk in chunks:
+            sums.add(chunk.values, chunk.log_weight, chunk.batch[0])
+        _refuse_zero(sums.top, self.draws)
+        posterior = SumsPosterior(problem, self, sums, weighted)
+        _set_evidence(posterior, sums.top + float(np.log(sums.weight[0])), self.draws, weighted)
+        return posterior
+
+    def _draws(
+        self, problem: Problem, chunks: Any, names: Any, weighted: bool, resume: Posterior | None
+    ) -> DrawsPosterior:
+        stored: dict[str, np.ndarray] = {}
+        log_weights = np.zeros((1, self.draws))
+        start = 0
+        for chunk in chunks:
+            stop = start + chunk.batch[0]
+            log_weights[0, start:stop] = chunk.log_weight
+            for name in names:
+                _keep(stored, name, chunk.values[name], problem.model, self.draws, start, stop)
+            start = stop
+        if resume is not None:
+            stored, log_weights = _joined(resume, stored, log_weights, problem)
+        total = log_weights.shape[1]
+        _refuse_zero(float(log_weights.max()), total)
+        for array in stored.values():
+            array.flags.writeable = False
+        log_weights.flags.writeable = False
+        posterior = DrawsPosterior(
+            problem,
+            self,
+            stored,
+            (1, total),
+            log_weights if weighted else None,
+            independent=True,
+        )
+        _set_evidence(posterior, float(diagnostics.log_sum_exp(log_weights)), total, weighted)
+        return posterior
+
+
+def _keep(
+    stored: dict[str, np.ndarray],
+    name: str,
+    value: np.ndarray,
+    model: Model,
+    draws: int,
+    start: int,
+    stop: int,
+) -> None:
+    """Put a chunk's values in place; values without a batch axis are the same for all draws."""
+    trailing = len(model[name].value_shape)
+    if value.ndim == trailing:
+        stored.setdefault(name, np.array(value)[None, None])
+        return
+    if name not in stored:
+        stored[name] = np.empty((1, draws, *value.shape[1:]), dtype=value.dtype)
+    stored[name][0, start:stop] = value
+
+
+def _joined(
+    old: Posterior, stored: dict[str, np.ndarray], log_weights: np.ndarray, problem: Problem
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """Earlier draws of the same question and the new ones, end to end."""
+    if not isinstance(old, DrawsPosterior) or set(old._stored) != set(stored):
+        raise UnsupportedError(
+            'infer: resume= takes an earlier posterior of the same net, evidence and keep="draws"'
+        )
+    before = old._shape[1]
+    joined = {}
+    for name, new in stored.items():
+        if new.shape[1] == 1 and old._stored[name].shape[1] == 1 and before > 1:
+            if not np.array_equal(new, old._stored[name]):
+                raise UnsupportedError(f"infer: resume= has other evidence on {name!r}")
+            joined[name] = new
+        else:
+            full = (1, log_weights.shape[1], *problem.model[name].value_shape)
+            joined[name] = np.concatenate(
+                [
+                    np.broadcast_to(old._stored[name], (1, before, *full[2:])),
+                    np.broadcast_to(new, full),
+                ],
+                axis=1,
+            )
+    earlier = np.zeros((1, before)) if old.log_weights is None else old.log_weights
+    return joined, np.concatenate([earlier, log_weights], axis=1)
+
+
+def _refuse_zero(top: float, draws: int) -> None:
+    if top == -np.inf:
+        raise ZeroProbabilityError(
+            f"LikelihoodWeighting: none of {draws} draws is compatible with the evidence, so its "
+            "probability is zero or far too small for this engine; check the evidence, or use Exact()"
+        )
+
+
+def _set_evidence(posterior: Any, log_total: float, draws: int, weighted: bool) -> None:
+    """Log evidence with its error by the delta method, and a warning where it rests on too little."""
+    posterior.log_marginal_likelihood = log_total - float(np.log(draws)) if weighted else 0.0
+    posterior.log_marginal_likelihood_mcse = 0.0
+    if not weighted:
+        return
+    ess = posterior.weight_ess
+    posterior.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
+    remedy = "use more draws, or Exact() where explain(net, evidence) says it can"
+    if ess < diagnostics.MIN_WEIGHT_ESS:
+        warnings.warn(
+            f"likelihood weighting: the {draws} draws are worth only {ess:.1f} equally weighted ones "
+            f"(weight_ess); answers and their error bars are unreliable: {remedy}",
+            LowEssWarning,
+            stacklevel=5,
+        )
+    elif ess < 0.5 * draws and posterior.pareto_k > diagnostics.MAX_PARETO_K:
+        warnings.warn(
+            f"likelihood weighting: the weights have a heavy tail (Pareto k = {posterior.pareto_k:.2f}, "
+            f"above {diagnostics.MAX_PARETO_K}); answers converge slowly: {remedy}",
+            LowEssWarning,
+            stacklevel=5,
+        )
+
+
+def _treatment(problem: Problem, name: str) -> str:
+    node = problem.model[name]
+    if node.kind in ("input", "fixed"):
+        return "given"
+    slow = ", element by element (vectorize=True): slow" if node.declaration.vectorize else ""
+    if not node.is_stochastic:
+        return "computed from its parents" + slow
+    seen = problem.observed.get(name)
+    if seen is None:
+        return "sampled given its parents" + slow
+    return "weights the draws" + (" (missing elements sampled)" if seen.mask is not None else "") + slow
+

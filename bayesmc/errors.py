@@ -1,0 +1,124 @@
+"""Every error and warning bayesmc raises, so that callers can catch them by type.
+
+A message says the call, the fault and the fix, with the node's name. This room knows nothing of
+models or engines: it only names what can go wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+
+class BayesmcError(Exception):
+    """Base of every error raised on purpose by bayesmc."""
+
+
+class ModelError(BayesmcError, ValueError):
+    """The net as declared is wrong."""
+
+
+class DuplicateNodeError(ModelError):
+    """A name was declared twice without ``replace=True``."""
+
+
+class UnknownNodeError(ModelError, KeyError):
+    """A name that the net does not have."""
+
+    def __str__(self) -> str:  # KeyError would show the repr of the message
+        return str(self.args[0]) if self.args else ""
+
+
+class CycleError(ModelError):
+    """The parents form a directed cycle; ``path`` lists its names, first repeated at the end."""
+
+    def __init__(self, message: str, path: Sequence[str] = ()) -> None:
+        super().__init__(message)
+        self.path = tuple(path)
+
+
+class PlateError(ModelError):
+    """A plate that is unknown, has no known size, or is used ungathered."""
+
+
+class ShapeError(ModelError):
+    """A value or a distribution whose shape does not fit the node's batch, plates and event."""
+
+
+class BroadcastError(ModelError):
+    """A function that does not act element by element over batch axes or a shared plate."""
+
+
+class StateError(ModelError):
+    """A label that is not among a node's states."""
+
+
+class ParameterError(BayesmcError, ValueError):
+    """A distribution's parameter is out of range.
+
+    Attributes
+    ----------
+    index : tuple of int
+        First offending position in the parameter's batch shape.
+    """
+
+    def __init__(self, message: str, index: tuple[int, ...] = ()) -> None:
+        super().__init__(message)
+        self.index = index
+
+
+class DensityError(BayesmcError, ValueError):
+    """A log density came out NaN or plus infinity."""
+
+
+class EvidenceError(BayesmcError, ValueError):
+    """Evidence or inputs that the net cannot take."""
+
+
+class ZeroProbabilityError(EvidenceError):
+    """The evidence has probability zero under the net."""
+
+
+class UnsupportedError(BayesmcError, NotImplementedError):
+    """The engine, distribution or posterior cannot answer this; the message names what can."""
+
+
+class BudgetError(UnsupportedError):
+    """An exact answer would cost more memory than allowed; ``bytes`` is the estimate."""
+
+    def __init__(self, message: str, bytes: int = 0) -> None:  # noqa: A002 - the unit is the name
+        super().__init__(message)
+        self.bytes = bytes
+
+
+class FileFormatError(BayesmcError, ValueError):
+    """A file that does not read as its format; carries ``path`` and ``line`` (from 1)."""
+
+    def __init__(self, message: str, path: Any = None, line: int | None = None) -> None:
+        where = "" if path is None else f"{path}:{line}: " if line is not None else f"{path}: "
+        super().__init__(where + message)
+        self.path = path
+        self.line = line
+
+
+class MissingExtraError(BayesmcError, ImportError):
+    """An optional dependency is not installed; the message says which extra brings it."""
+
+
+class BayesmcWarning(UserWarning):
+    """Base of every warning issued by bayesmc."""
+
+
+class LowEssWarning(BayesmcWarning):
+    """Importance weights rest on too few draws for the answer to be trusted."""
+
+
+class SlowModelWarning(BayesmcWarning):
+    """The model runs, but in a way that costs much more time than needed."""
+
+
+def missing_extra(package: str, extra: str) -> MissingExtraError:
+    """The error for an absent optional ``package`` that ``bayesmc[extra]`` installs."""
+    return MissingExtraError(
+        f"{package} is not installed; it comes with the extra: pip install 'bayesmc[{extra}]'"
+    )

@@ -1,0 +1,29 @@
+"""Exact inference over discrete factors: tables, elimination orders and clique trees.
+
+This package knows variables, cardinalities and arrays; nets, labels and evidence by name belong to
+the layers above.
+"""
+
+from __future__ import annotations
+
+from .calibrated import Calibrated
+from .cliquetree import BoundTree, CliqueTree
+from .elimination import HEURISTICS, Elimination, elimination_order
+from .factor import Factor, sum_product
+from .structure import TreeCost
+from .tables import FactorLike, LogTable, factor_from_log
+
+__all__ = [
+    "HEURISTICS",
+    "BoundTree",
+    "Calibrated",
+    "CliqueTree",
+    "Elimination",
+    "Factor",
+    "FactorLike",
+    "LogTable",
+    "TreeCost",
+    "elimination_order",
+    "factor_from_log",
+    "sum_product",
+]

@@ -1,0 +1,289 @@
+"""Exact inference in a product of discrete factors: a clique tree, prepared once and asked often.
+
+`CliqueTree` is the plan (structure and cost), `BoundTree` the plan with tables, and `Calibrated`
+(in `bayesmc.factors.calibrated`) the answer for one evidence. It knows nothing of nets: variables
+are hashables with cardinalities, factors are arrays.
+
+Notes
+-----
+Hugin propagation on the clique tree of a greedy triangulation: Lauritzen and Spiegelhalter (1988);
+Jensen, Lauritzen and Olesen (1990); Koller and Friedman (2009), chapter 10.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from functools import cached_property
+
+import numpy as np
+
+from ..errors import EvidenceError, ShapeError
+from .calibrated import Calibrated, Context
+from .elimination import Elimination, elimination_order
+from .program import Program, compile_program
+from .propagation import Mask, Potentials, collect, distribute, total_log_scale
+from .semiring import LINEAR, LOG
+from .structure import TreeCost, build_cliques, tree_cost
+from .tables import FactorLike, Given, Placement, add_logs, check_factor, multiply_linear
+
+_SLICE_ABOVE = 30_000  # entries; below, compiling shapes for an evidence costs more than it saves
+_PROGRAMS_KEPT = 8
+
+
+class CliqueTree:
+    """The plan for exact inference in a product of factors with fixed scopes.
+
+    Parameters
+    ----------
+    cardinalities : mapping of hashable to int, or sequence of int
+        The number of states of each variable; with a sequence the variables are ``0..n-1``.
+    scopes : iterable of sequences of variables
+        The scope of each factor, in the order of its axes. Scopes may repeat, and may be empty.
+    elimination : Elimination, optional
+        In positions of ``cardinalities``; by default the best that `elimination_order` finds.
+
+    Attributes
+    ----------
+    variables : tuple of hashable
+    cardinalities : tuple of int
+    scopes : tuple of tuple of variables
+    cost : TreeCost
+        Known before any table is allocated.
+
+    Examples
+    --------
+    Rain wets the grass; the grass is wet.
+
+    >>> tree = CliqueTree({"rain": 2, "wet": 2}, [("rain",), ("rain", "wet")])
+    >>> tables = [np.array([0.8, 0.2]), np.array([[0.9, 0.1], [0.1, 0.9]])]
+    >>> answer = tree.calibrate(tables, {"wet": 1})
+    >>> answer.marginal("rain").round(4), round(float(np.exp(answer.log_z)), 4)
+    (array([0.3077, 0.6923]), 0.26)
+    """
+
+    def __init__(
+        self,
+        cardinalities: Mapping[Hashable, int] | Sequence[int],
+        scopes: Iterable[Sequence[Hashable]],
+        elimination: Elimination | None = None,
+    ) -> None:
+        named = cardinalities if isinstance(cardinalities, Mapping) else None
+        self.variables: tuple[Hashable, ...] = (
+            tuple(range(len(cardinalities))) if named is None else tuple(named)
+        )
+        self.cardinalities: tuple[int, ...] = tuple(
+            int(n) for n in (cardinalities if named is None else named.values())
+        )
+        self.scopes = tuple(tuple(scope) for scope in scopes)
+        self.index = {v: k for k, v in enumerate(self.variables)}
+        self._check()
+        self._scopes = [tuple(self.index[v] for v in scope) for scope in self.scopes]
+        if elimination is None:
+            elimination = elimination_order(self.cardinalities, self._scopes)
+        self.cliques = build_cliques(elimination)
+        self.cost: TreeCost = tree_cost(self.cliques, self.cardinalities)
+        self._position = {v: k for k, v in enumerate(elimination.order)}
+        self.home = {v: k for k, c in enumerate(self.cliques) for v in c.residual}
+        self._programs: dict[frozenset[int], Program] = {}
+
+    def bind(self, factors: Sequence[FactorLike]) -> BoundTree:
+        """The tree with the factors' tables, one per scope, to be asked under any evidence.
+
+        Raises
+        ------
+        ShapeError
+            If there is not one table per scope, or a table does not have its scope's shape.
+        DensityError
+            If an entry is negative, NaN or infinite.
+        """
+        placements = self._placements
+        if len(factors) != len(placements):
+            raise ShapeError(
+                f"CliqueTree.bind: {len(factors)} factors for {len(placements)} scopes; give one "
+                "table per scope"
+            )
+        given = [
+            check_factor(factor, placement, k)
+            for k, (factor, placement) in enumerate(zip(factors, placements, strict=True))
+        ]
+        return BoundTree(self, given)
+
+    def calibrate(
+        self, factors: Sequence[FactorLike], evidence: Mapping[Hashable, int] | None = None
+    ) -> Calibrated:
+        """Both passes for these tables and this evidence; see `BoundTree.calibrate`."""
+        return self.bind(factors).calibrate(evidence)
+
+    def program(self, sliced: frozenset[int] = frozenset()) -> Program:
+        """The shapes for evidence that slices these variables; the last few are kept."""
+        found = self._programs.get(sliced)
+        if found is None:
+            unsliced = self.program() if sliced else None
+            found = compile_program(self.cliques, self.cardinalities, sliced, unsliced)
+            if len(self._programs) >= _PROGRAMS_KEPT:
+                for old in list(self._programs)[1:]:  # the first, without evidence, stays
+                    self._programs.pop(old, None)
+            self._programs[sliced] = found
+        return found
+
+    @cached_property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """The full shape of each clique's table."""
+        return tuple(tuple(self.cardinalities[v] for v in c.variables) for c in self.cliques)
+
+    @cached_property
+    def containing(self) -> tuple[tuple[int, ...], ...]:
+        """For each variable the cliques that hold it."""
+        found: list[list[int]] = [[] for _ in self.variables]
+        for k, clique in enumerate(self.cliques):
+            for v in clique.variables:
+                found[v].append(k)
+        return tuple(map(tuple, found))
+
+    @cached_property
+    def mask_shapes(self) -> tuple[tuple[int, int, int], ...]:
+        """For each variable its home clique's table seen as (before, states, after)."""
+        found = []
+        for v in range(len(self.variables)):
+            shape = self.shapes[self.home[v]]
+            axis = self.cliques[self.home[v]].variables.index(v)
+            found.append((math.prod(shape[:axis]), shape[axis], math.prod(shape[axis + 1 :])))
+        return tuple(found)
+
+    @cached_property
+    def _placements(self) -> list[Placement]:
+        found = []
+        for scope in self._scopes:
+            own = tuple(self.cardinalities[v] for v in scope)
+            if not scope:
+                found.append(Placement(-1, (), (), own))
+                continue
+            # The clique made by eliminating the scope's first variable holds all the others.
+            clique = self.home[min(scope, key=self._position.__getitem__)]
+            order = self.cliques[clique].variables
+            axes = tuple(sorted(range(len(scope)), key=lambda a: order.index(scope[a])))  # noqa: B023
+            shape = tuple(self.cardinalities[v] if v in scope else 1 for v in order)
+            found.append(Placement(clique, axes, shape, own))
+        return found
+
+    def _check(self) -> None:
+        for v, n in zip(self.variables, self.cardinalities, strict=True):
+            if n < 1:
+                raise ValueError(f"CliqueTree: variable {v!r} has {n} states; it needs at least 1")
+        for scope in self.scopes:
+            unknown = [v for v in scope if v not in self.index]
+            if unknown or len(set(scope)) != len(scope):
+                raise ValueError(
+                    f"CliqueTree: the scope {scope} must name known variables, each once"
+                    + (f"; unknown: {unknown}" if unknown else "")
+                )
+
+
+class BoundTree:
+    """A clique tree with tables; made by `CliqueTree.bind`, asked by `calibrate`.
+
+    Cliques below which nothing is observed keep their messages between calls, so that new evidence
+    costs the collect pass only from the observed variables to the root.
+    """
+
+    def __init__(self, tree: CliqueTree, given: Sequence[Given]) -> None:
+        self.tree = tree
+        self._given = tuple(given)
+
+    @cached_property
+    def _linear(self) -> tuple[Potentials, float] | None:
+        tree = self.tree
+        found = multiply_linear(tree.shapes, tree._placements, self._given)
+        return None if found is None else (Potentials(found[0], LINEAR), found[1])
+
+    @cached_property
+    def _log(self) -> tuple[Potentials, float]:
+        tree = self.tree
+        tables, log_scale = add_logs(tree.shapes, tree._placements, self._given)
+        return Potentials(tables, LOG), log_scale
+
+    def calibrate(
+        self, evidence: Mapping[Hashable, int] | None = None, *, log_domain: bool = False
+    ) -> Calibrated:
+        """The distribution given that variables are in these states.
+
+        Runs in ordinary arithmetic; where that underflows, again with logarithms, so that the
+        answer is right either way. Evidence of probability zero gives ``log_z == -inf``.
+
+        Parameters
+        ----------
+        evidence : mapping of variable to int, optional
+            Positions of states, from 0.
+        log_domain : bool
+            Use logarithms from the start.
+
+        Raises
+        ------
+        EvidenceError
+            If a variable is unknown, or a state out of range.
+        """
+        tree = self.tree
+        states = _evidence_states(tree, evidence or {})
+        sliced = tree.cost.total_entries > _SLICE_ABOVE
+        program = tree.program(frozenset(states) if sliced else frozenset())
+        if not log_domain and self._linear is not None:
+            try:
+                with np.errstate(under="raise", over="raise"):
+                    return self._run(*self._linear, program, states)
+            except FloatingPointError:
+                pass  # something underflowed that later evidence might have needed
+        with np.errstate(all="ignore"):
+            return self._run(*self._log, program, states)
+
+    def _run(
+        self, potentials: Potentials, log_scale: float, program: Program, states: dict[int, int]
+    ) -> Calibrated:
+        tree = self.tree
+        changed, masks = _entered(tree, program, states)
+        slices = states if program.sliced else {}
+        context = Context(tree, program, potentials.semiring, states)
+        collected = None
+        if log_scale > -math.inf:
+            collected = collect(tree.cliques, program, potentials, changed, slices, masks)
+        if collected is None:
+            return Calibrated(context, -math.inf, None, (), np.zeros(0))
+        # An underflow here only loses parts of beliefs that are below 1e-308 of the whole.
+        with np.errstate(under="ignore"):
+            ratios, flat = distribute(tree.cliques, program, collected, potentials.semiring)
+        log_z = log_scale + total_log_scale(collected)
+        return Calibrated(context, log_z, collected, ratios, flat)
+
+
+def _evidence_states(tree: CliqueTree, evidence: Mapping[Hashable, int]) -> dict[int, int]:
+    states = {}
+    for variable, state in evidence.items():
+        k = tree.index.get(variable)
+        if k is None:
+            raise EvidenceError(f"BoundTree.calibrate: unknown variable {variable!r} in evidence")
+        if not 0 <= state < tree.cardinalities[k]:
+            raise EvidenceError(
+                f"BoundTree.calibrate: state {state} of {variable!r} is out of range; it has "
+                f"states 0..{tree.cardinalities[k] - 1}"
+            )
+        states[k] = int(state)
+    return states
+
+
+def _entered(
+    tree: CliqueTree, program: Program, states: Mapping[int, int]
+) -> tuple[set[int], dict[int, list[Mask]]]:
+    """The cliques whose tables evidence changes, with all above them, and what is masked where."""
+    changed: set[int] = set()
+    masks: dict[int, list[Mask]] = {}
+    for v, state in states.items():
+        if program.sliced:
+            touched: Sequence[int] = tree.containing[v]
+        else:
+            touched = (tree.home[v],)
+            masks.setdefault(touched[0], []).append((*tree.mask_shapes[v], state))
+        for k in touched:
+            while k >= 0 and k not in changed:
+                changed.add(k)
+                k = tree.cliques[k].parent
+    return changed, masks

@@ -1,0 +1,491 @@
+"""Reading and writing the Bayesian Interchange Format (BIF) as plain records.
+
+Text becomes a list of `BifNode` and back. This room knows the file format only: it builds no
+network and checks no cycle; `bayesmc.io` turns the records into nets.
+
+The grammar is that of the "Interchange Format for Bayesian Networks" (UAI, 1998), as the bnlearn
+repository and JavaBayes write it, comments and ``property`` lines included.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+import re
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from ..errors import FileFormatError
+
+ROW_TOLERANCE = 1e-6
+"""Rows whose sum differs from 1 by at most this are rounding, and are renormalised."""
+
+
+@dataclass(frozen=True, eq=False)
+class BifNode:
+    """One variable of a BIF file with its conditional probability table.
+
+    Attributes
+    ----------
+    name : str
+    states : tuple of str
+        In file order.
+    parents : tuple of str
+        In the order of the ``probability`` block.
+    probs : ndarray, shape (card(parent_1), ..., card(parent_n), card(name))
+        Read-only; every row sums to 1.
+    properties : tuple of str
+        The texts of the variable's ``property`` lines.
+    """
+
+    name: str
+    states: tuple[str, ...]
+    parents: tuple[str, ...]
+    probs: np.ndarray
+    properties: tuple[str, ...] = ()
+
+
+def parse_bif(text: str, path: Any = None) -> list[BifNode]:
+    """The variables of a BIF file, in the order in which the file declares them.
+
+    Rows ``(states of the parents) numbers;`` may come in any order; ``default numbers;`` fills the
+    rows not given. A ``table`` with parents lists its numbers with the child slowest and the last
+    parent fastest, as the format's definition does. Rows whose sum is off by at most 1e-6 are
+    renormalised.
+
+    Parameters
+    ----------
+    text : str
+        The file's content.
+    path : str or path-like, optional
+        Named in errors; nothing is opened.
+
+    Raises
+    ------
+    FileFormatError
+        With the line (from 1), for anything that does not read as BIF: unknown or repeated names,
+        states, rows or blocks, missing rows, a wrong number of entries, an entry that is not a
+        probability, a row that does not sum to 1, or a file that ends in the middle of a block.
+
+    Examples
+    --------
+    >>> text = '''network tiny { }
+    ... variable age { type discrete [ 2 ] { <5, 5-12 }; }
+    ... variable ill { type discrete [ 2 ] { yes, no }; }
+    ... probability ( age ) { table 0.4, 0.6; }
+    ... probability ( ill | age ) { (5-12) 0.1, 0.9; (<5) 0.3, 0.7; }'''
+    >>> age, ill = parse_bif(text)
+    >>> age.states, ill.parents
+    (('<5', '5-12'), ('age',))
+    >>> ill.probs[age.states.index("<5")]
+    array([0.3, 0.7])
+    """
+    return _Reader(text, path).nodes()
+
+
+def format_bif(nodes: Iterable[BifNode], name: str = "unknown") -> str:
+    """The text of a BIF file; `parse_bif` of it gives equal names, states and tables.
+
+    Names that would not read back as one word are quoted. Numbers are written with the digits
+    that identify the float.
+
+    Raises
+    ------
+    ValueError
+        If a name holds a double quote or a line break, for which the format has no spelling.
+
+    Examples
+    --------
+    >>> print(format_bif([BifNode("coin", ("heads", "tails"), (), np.array([0.5, 0.5]))]))
+    network unknown {
+    }
+    variable coin {
+      type discrete [ 2 ] { heads, tails };
+    }
+    probability ( coin ) {
+      table 0.5, 0.5;
+    }
+    <BLANKLINE>
+    """
+    nodes = list(nodes)
+    states = {node.name: node.states for node in nodes}
+    lines = [f"network {_spell(name)} {{", "}"]
+    for node in nodes:
+        listed = ", ".join(map(_spell, node.states))
+        lines += [
+            f"variable {_spell(node.name)} {{",
+            f"  type discrete [ {len(node.states)} ] {{ {listed} }};",
+            *(f"  property {text};" for text in node.properties),
+            "}",
+        ]
+    for node in nodes:
+        lines += _probability_block(node, states)
+    return "\n".join(lines) + "\n"
+
+
+def read_text(path: str | PathLike[str]) -> str:
+    """The content of a text file, decompressed where its first bytes say gzip.
+
+    Raises
+    ------
+    FileFormatError
+        If the file is not UTF-8 text, or its gzip stream is damaged.
+    OSError
+        If it cannot be opened.
+    """
+    data = Path(path).read_bytes()
+    try:
+        if data[:2] == b"\x1f\x8b":
+            data = gzip.decompress(data)
+        return data.decode("utf-8-sig")
+    except (OSError, EOFError, ValueError, zlib.error) as error:
+        raise FileFormatError(f"not readable as (gzipped) UTF-8 text: {error}", path) from error
+
+
+# A word ends at white space, at the format's punctuation, or where a comment starts.
+_WORD = r'(?:[^\s{}()\[\];,|"/]|/(?![/*]))+'
+_NAME = rf'(?:"([^"\n]*)"|({_WORD}))'
+_COMMENT_OR_QUOTED = re.compile(r'"[^"\n]*"|//[^\n]*|/\*.*?\*/', re.S)
+_NAMES = re.compile(rf"[\s,|]*{_NAME}")
+_TOKEN = re.compile(rf"{_NAME}|[{{}}()\[\];,|]")
+_GAP = re.compile(r"\s*")
+_HEAD = re.compile(rf"{_NAME}\s*")
+_TO_CLOSING_BRACE = re.compile(r'(?:[^"{}]+|"[^"\n]*")*\}')
+_NETWORK_HEAD = re.compile(rf"(?:{_NAME})?[^{{}}]*\{{")
+_PROPERTY = re.compile(r'((?:"[^"\n]*"|[^";])*);')
+_TYPE = re.compile(r'discrete\s*\[\s*(\d+)\s*\]\s*\{((?:"[^"\n]*"|[^"{};])*)\}\s*;')
+_SCOPE = re.compile(r'\(((?:"[^"\n]*"|[^"(){};])*)\)\s*\{')
+_ROW = re.compile(r'\(((?:"[^"\n]*"|[^"();])*)\)([^;{}()"]*);')
+_NUMBERS = re.compile(r'([^;{}()"]*);')
+
+
+@dataclass
+class _Variable:
+    """A variable block, before its probability block is known."""
+
+    at: int
+    states: tuple[str, ...]
+    codes: Mapping[str, int]
+    properties: tuple[str, ...]
+
+
+class _Reader:
+    """A cursor over the text; offsets are kept so that an error can name its line."""
+
+    def __init__(self, text: str, path: Any) -> None:
+        self.path = path
+        self.at = 0
+        # Comments become blanks of the same length, so that offsets and lines stay true.
+        self.text = _COMMENT_OR_QUOTED.sub(_blank_comment, text)
+        self.variables: dict[str, _Variable] = {}
+        self.tables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
+
+    def nodes(self) -> list[BifNode]:
+        blocks: list[int] = []  # probability blocks wait: they may precede their variables
+        while (keyword := self.keyword("")) is not None:
+            at = self.at
+            if keyword == "network":
+                self.skip_network(at)
+            elif keyword == "variable":
+                self.read_variable(at)
+            elif keyword == "probability":
+                blocks.append(at)
+                self.skip_block(at, "probability")
+            else:
+                self.fail(f"expected 'network', 'variable' or 'probability', found {keyword!r}")
+        for at in blocks:
+            self.at = at
+            self.read_probability(at)
+        return [self.node(name, variable) for name, variable in self.variables.items()]
+
+    def node(self, name: str, variable: _Variable) -> BifNode:
+        if name not in self.tables:
+            self.fail(f"variable {name!r} has no probability block; add one", variable.at)
+        parents, probs = self.tables[name]
+        probs.flags.writeable = False
+        return BifNode(name, variable.states, parents, probs, variable.properties)
+
+    def skip_network(self, at: int) -> None:
+        match = _NETWORK_HEAD.match(self.text, self.at)
+        if match is None:
+            self.fail("the network block does not open with '{'", at)
+        self.at = match.end()
+        while (keyword := self.keyword("the network block")) != "}":
+            if keyword != "property":
+                self.fail(f"expected 'property' or '}}' in the network block, found {keyword!r}")
+            self.property_text()
+
+    def skip_block(self, at: int, what: str) -> None:
+        match = _SCOPE.match(self.text, self.at)
+        if match is None:
+            self.fail(f"expected '( child | parents ) {{' after '{what}'", at)
+        self.at = match.end()
+        end = _TO_CLOSING_BRACE.match(self.text, self.at)
+        if end is None:
+            self.fail(f"this {what} block is not closed by '}}'; the file looks truncated", at)
+        self.at = end.end()
+
+    def read_variable(self, at: int) -> None:
+        name = self.name_before_brace(at)
+        if name in self.variables:
+            self.fail(f"variable {name!r} is declared twice", at)
+        states: tuple[str, ...] | None = None
+        properties = []
+        inside = f"the block of variable {name!r}"
+        while (keyword := self.keyword(inside)) != "}":
+            if keyword == "property":
+                properties.append(self.property_text())
+            elif keyword == "type" and states is None:
+                states = self.read_states(name)
+            else:
+                self.fail(f"expected one 'type', 'property' or '}}' in {inside}, found {keyword!r}")
+        if states is None:
+            self.fail(f"variable {name!r} has no 'type discrete [ n ] {{ ... }};'", at)
+        codes = {state: code for code, state in enumerate(states)}
+        self.variables[name] = _Variable(at, states, codes, tuple(properties))
+
+    def read_states(self, name: str) -> tuple[str, ...]:
+        match = _TYPE.match(self.text, self.at)
+        if match is None:
+            self.fail(f"variable {name!r}: expected 'discrete [ n ] {{ states }};' after 'type'")
+        states = self.names(match[2], match.start(2))
+        if len(states) != int(match[1]) or not states:
+            self.fail(
+                f"variable {name!r} announces {match[1]} states and lists {len(states)}: "
+                f"{', '.join(states)} (a state that holds a space needs double quotes)"
+            )
+        if len(set(states)) != len(states):
+            self.fail(f"variable {name!r} lists a state twice: {', '.join(states)}")
+        self.at = match.end()
+        return states
+
+    def read_probability(self, at: int) -> None:
+        scope = _SCOPE.match(self.text, self.at)
+        assert scope is not None  # the first pass matched it here
+        child, *parents = self.names(scope[1], scope.start(1)) or ("",)
+        for name in (child, *parents):
+            if name not in self.variables:
+                self.fail(f"probability of {child!r}: {name!r} is not a declared variable", at)
+        if len({child, *parents}) != 1 + len(parents):
+            self.fail(f"probability of {child!r}: a variable is listed twice in its scope", at)
+        if child in self.tables:
+            self.fail(f"variable {child!r} has a second probability block", at)
+        self.at = scope.end()
+        self.tables[child] = (tuple(parents), self.read_table(child, parents, at))
+
+    def read_table(self, child: str, parents: list[str], at: int) -> np.ndarray:
+        """The rows of one block; ``self.at`` is after its opening brace."""
+        shape = [len(self.variables[p].states) for p in parents]
+        shape.append(len(self.variables[child].states))
+        size, count = shape[-1], math.prod(shape[:-1])
+        codes = [self.variables[p].codes for p in parents]
+        rows: dict[int, list[float]] = {}
+        where: dict[int, int] = {}
+        default: list[float] | None = None
+        default_at = table_at = None
+        while True:
+            self.at = start = _after_gap(self.text, self.at)
+            row = _ROW.match(self.text, start)
+            if row is not None:
+                index = self.row_index(row[1], row.start(1), child, parents, codes)
+                if index in rows:
+                    self.fail(f"probability of {child!r}: row ({row[1].strip()}) is given twice")
+                rows[index] = self.numbers(row[2], row.start(2), size, child)
+                where[index] = start
+                self.at = row.end()
+                continue
+            if self.text.startswith("(", start):
+                self.fail(f"probability of {child!r}: expected '(states) numbers;'")
+            keyword = self.keyword(f"the probability block of {child!r}")
+            if keyword == "}":
+                break
+            if keyword == "property":
+                self.property_text()
+                continue
+            match = _NUMBERS.match(self.text, self.at)
+            if keyword == "table" and match and table_at is None:
+                flat = self.numbers(match[1], match.start(1), size * count, child)
+                table_at = start
+            elif keyword == "default" and match and default is None:
+                default = self.numbers(match[1], match.start(1), size, child)
+                default_at = start
+            else:
+                self.fail(
+                    f"probability of {child!r}: expected '(states) numbers;', one 'table numbers;' "
+                    f"or one 'default numbers;', found {keyword!r}", start
+                )
+            self.at = match.end()
+        if table_at is not None:
+            if rows or default is not None:
+                self.fail(f"probability of {child!r} mixes 'table' with rows", table_at)
+            table = np.array(flat).reshape(size, count).T.copy()
+            lines = [table_at] * count
+        else:
+            missing = [k for k in range(count) if k not in rows] if len(rows) < count else []
+            if missing and default is None:
+                states = np.unravel_index(missing[0], shape[:-1]) if parents else ()
+                named = [self.variables[p].states[k] for p, k in zip(parents, states, strict=True)]
+                self.fail(
+                    f"probability of {child!r}: {len(missing)} of {count} rows are missing, first "
+                    f"({', '.join(named)}); give them, or a 'default' row", at
+                )
+            for k in missing:
+                rows[k], where[k] = default, default_at  # type: ignore[assignment]
+            table = np.array([rows[k] for k in range(count)])
+            lines = [where[k] for k in range(count)]
+        self.normalise(table, lines, child)
+        return table.reshape(shape)
+
+    def row_index(
+        self, text: str, at: int, child: str, parents: list[str], codes: list[Mapping[str, int]]
+    ) -> int:
+        names = self.names(text, at)
+        if len(names) != len(parents):
+            self.fail(
+                f"probability of {child!r}: row ({text.strip()}) names {len(names)} states for "
+                f"{len(parents)} parents ({', '.join(parents)})"
+            )
+        index = 0
+        for name, parent, code in zip(names, parents, codes, strict=True):
+            if name not in code:
+                self.fail(
+                    f"probability of {child!r}: {name!r} is not a state of its parent {parent!r} "
+                    f"({', '.join(code)})"
+                )
+            index = index * len(code) + code[name]
+        return index
+
+    def numbers(self, text: str, at: int, count: int, child: str) -> list[float]:
+        words = text.replace(",", " ").split()
+        try:
+            values = list(map(float, words))
+        except ValueError:
+            values = []
+        if not values or "_" in text:  # float() would take 0_5 for 5
+            for k, word in enumerate(words):
+                if not _is_number(word):
+                    where = at + _word_offset(text, k)
+                    self.fail(f"probability of {child!r}: {word!r} is not a number", where)
+        if len(values) != count:
+            self.fail(f"probability of {child!r}: expected {count} numbers, found {len(values)}")
+        # Written so that NaN fails; sums of allowed entries are judged in `normalise`.
+        if not (min(values) >= 0.0 and max(values) <= 1.0 + ROW_TOLERANCE and sum(values) < math.inf):
+            for k, value in enumerate(values):
+                if not 0.0 <= value <= 1.0 + ROW_TOLERANCE:
+                    where = at + _word_offset(text, k)
+                    self.fail(f"probability of {child!r}: {words[k]} is not a probability", where)
+        return values
+
+    def normalise(self, table: np.ndarray, lines: list[int], child: str) -> None:
+        """Divide the rows that are off by rounding; refuse those that are off by more."""
+        sums = table.sum(axis=1)
+        off = np.abs(sums - 1.0)
+        worst = int(np.argmax(off))
+        if off[worst] > ROW_TOLERANCE * (1 + 1e-9):  # 0.999999 differs from 1 by 1.00000000003e-6
+            self.fail(
+                f"probability of {child!r}: a row sums to {sums[worst]:.9g}, not 1 (differences up "
+                f"to {ROW_TOLERANCE:g} are taken for rounding)", lines[worst]
+            )
+        rounded = off > 1e-12  # dividing exact rows as well would change their last digit
+        table[rounded] /= sums[rounded, None]
+
+    def names(self, text: str, at: int) -> tuple[str, ...]:
+        if '"' not in text:  # the common case, by string methods: five times faster
+            return tuple(text.replace(",", " ").replace("|", " ").split())
+        found, end = [], 0
+        while (match := _NAMES.match(text, end)) is not None:
+            found.append(match[1] if match[1] is not None else match[2])
+            end = match.end()
+        if text[end:].strip(" \t\r\n,|"):
+            self.fail(f"cannot read the names in ({text.strip()})", at + end)
+        return tuple(found)
+
+    def keyword(self, inside: str) -> str | None:
+        """The next word or punctuation mark; at the end of the text, None outside any block."""
+        self.at = start = _after_gap(self.text, self.at)
+        if start == len(self.text):
+            if not inside:
+                return None
+            self.fail(f"the file ends inside {inside}; it looks truncated")
+        match = _TOKEN.match(self.text, start)
+        if match is None:
+            self.fail(f"cannot read {self.text[start : start + 20]!r}")
+        if self.text[start] not in "{}()[];,|":
+            self.at = _after_gap(self.text, match.end())
+        elif match[0] == "}" and inside:
+            self.at = match.end()
+        return match[0]
+
+    def name_before_brace(self, at: int) -> str:
+        match = _HEAD.match(self.text, self.at)
+        if match is None or not self.text.startswith("{", match.end()):
+            self.fail("expected 'variable name {'", at)
+        self.at = match.end() + 1
+        return match[1] if match[1] is not None else match[2]
+
+    def property_text(self) -> str:
+        match = _PROPERTY.match(self.text, self.at)
+        if match is None:
+            self.fail("this property is not closed by ';'")
+        self.at = match.end()
+        return match[1].strip()
+
+    def fail(self, message: str, at: int | None = None) -> NoReturn:
+        at = self.at if at is None else at
+        raise FileFormatError(message, self.path, self.text.count("\n", 0, at) + 1)
+
+
+def _after_gap(text: str, at: int) -> int:
+    match = _GAP.match(text, at)
+    return match.end() if match else at
+
+
+def _blank_comment(match: re.Match[str]) -> str:
+    found = match[0]
+    if found[0] == '"':
+        return found
+    return re.sub(r"[^\n]", " ", found)
+
+
+def _word_offset(text: str, index: int) -> int:
+    """Where the word number ``index`` of a list of numbers starts."""
+    return list(re.finditer(r"[^\s,]+", text))[index].start()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return "_" not in word
+
+
+def _spell(name: str) -> str:
+    if re.fullmatch(_WORD, name):
+        return name
+    if '"' in name or "\n" in name or "\r" in name:
+        raise ValueError(f"format_bif: BIF has no spelling for the name {name!r}; rename it")
+    return f'"{name}"'
+
+
+def _probability_block(node: BifNode, states: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    if not node.parents:
+        yield f"probability ( {_spell(node.name)} ) {{"
+        yield f"  table {_row_text(node.probs)};"
+    else:
+        parents = ", ".join(map(_spell, node.parents))
+        yield f"probability ( {_spell(node.name)} | {parents} ) {{"
+        for index in np.ndindex(node.probs.shape[:-1]):
+            names = (states[p][k] for p, k in zip(node.parents, index, strict=True))
+            yield f"  ({', '.join(map(_spell, names))}) {_row_text(node.probs[index])};"
+    yield "}"
+
+
+def _row_text(row: np.ndarray) -> str:
+    return ", ".join(map(repr, row.tolist()))

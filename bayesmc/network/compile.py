@@ -1,0 +1,365 @@
+"""From declarations to a ``Model``: call every function once on reachable values and note what it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Density, Distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.support import Support
+from bayesmc.errors import (
+    BayesmcError,
+    BroadcastError,
+    DensityError,
+    ModelError,
+    PlateError,
+    ShapeError,
+)
+from bayesmc.network.align import Aligner
+from bayesmc.network.domain import Domain, domain_with_states, states_domain
+from bayesmc.network.model import (
+    CompiledNode,
+    Model,
+    arguments_of,
+    call,
+    deterministic_fit,
+    fit,
+    invalid_error,
+    lookup,
+)
+from bayesmc.network.node import Declaration, Potential
+from bayesmc.shapes import Shape, broadcasts_to, read_only, unused_sizes
+
+#: configurations of finite parents up to which a deterministic node is tabulated
+_DETERMINISTIC_TABLE = 4096
+
+def compile_model(
+    name: str | None,
+    declarations: Mapping[str, Declaration],
+    potentials: Mapping[str, Potential],
+    sizes: Mapping[str, int],
+    labels: Mapping[str, tuple[Any, ...]],
+    inputs: Mapping[str, np.ndarray],
+    order: Sequence[str],
+) -> Model:
+    """Call every node once on reachable values of its parents and note what it is."""
+    events = [n for d in declarations.values() for n in d.event_shape]
+    shape = tuple(unused_sizes([*sizes.values(), *events], 2))[::-1]
+    nodes: dict[str, CompiledNode] = {}
+    model = Model(name, nodes, {}, dict(sizes), dict(labels), {}, shape)
+    rng = np.random.default_rng(20)
+    with marking_invalid(), np.errstate(all="ignore"):
+        for count, key in enumerate(order):
+            declaration = declarations[key]
+            links = _links(declaration.parents, declaration, nodes)
+            plates = tuple(sizes[p] for p in declaration.plates)
+            node, value = _discover(declaration, links, plates, model.probe, shape, count, rng, inputs)
+            nodes[key] = node
+            model.probe[key] = value
+    for key, potential in potentials.items():
+        what = Declaration(key, "function", potential.parents, potential.plates)
+        model.potentials[key] = (potential, _links(potential.parents, what, nodes))
+    return model
+
+
+def _links(
+    parents: Sequence[str], child: Declaration, nodes: Mapping[str, CompiledNode]
+) -> tuple[tuple[str, Aligner], ...]:
+    table = child.source == "table"
+    return tuple(
+        (
+            p,
+            Aligner(
+                child.plates,
+                nodes[p].plates,
+                len(nodes[p].event_shape),
+                nodes[p].domain,
+                positions=table,
+            ),
+        )
+        for p in parents
+    )
+
+
+def _discover(
+    declaration: Declaration,
+    links: tuple[tuple[str, Aligner], ...],
+    plates: Shape,
+    probe: Mapping[str, np.ndarray],
+    shape: Shape,
+    count: int,
+    rng: np.random.Generator,
+    inputs: Mapping[str, np.ndarray],
+) -> tuple[CompiledNode, np.ndarray]:
+    """The compiled node, and reachable values of it for its children to be tried on."""
+    if declaration.source == "input":
+        value = inputs.get(declaration.name)
+        if value is None:
+            value = 1.0 + rng.random(plates + declaration.event_shape)
+        node = CompiledNode(declaration, links, plates, declaration.event_shape, False, False)
+        return node, read_only(value)
+    if declaration.source == "fixed":
+        assert declaration.value is not None
+        discrete = declaration.domain is not None
+        node = CompiledNode(
+            declaration, links, plates, declaration.event_shape, discrete, False, declaration.domain
+        )
+        return node, declaration.value
+    if declaration.source == "table":
+        _check_table_parents(declaration, links, probe)
+    arguments, batch = arguments_of(links, probe)
+    result = _call_batched(declaration, links, probe, shape, batch + plates)
+    if isinstance(result, Distribution):
+        return _discover_stochastic(declaration, links, plates, result, batch, shape, count, rng)
+    return _discover_deterministic(declaration, links, plates, result, batch, probe, shape)
+
+
+def _call_batched(
+    declaration: Declaration,
+    links: tuple[tuple[str, Aligner], ...],
+    probe: Mapping[str, np.ndarray],
+    shape: Shape,
+    lead: Shape,
+) -> Any:
+    """Call on the whole probe; if that fails but one entry works, the function does not broadcast."""
+    arguments, _ = arguments_of(links, probe)
+    try:
+        return call(declaration, arguments, lead)
+    except BayesmcError as error:
+        if not links or declaration.source == "table":
+            raise
+        try:
+            one, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
+            call(declaration, one, lead[len(lead) - len(declaration.plates) :])
+        except BayesmcError as alone:
+            raise alone from alone.__cause__
+        raise BroadcastError(
+            f"node {declaration.name!r} works on one value at a time but not on arrays of them: "
+            f"{str(error).removeprefix(f'node {declaration.name!r}: ')}; write it with NumPy "
+            "(np.where for if, axis=-1 for components), or declare vectorize=True (slow)"
+        ) from error
+
+
+def _discover_stochastic(
+    declaration: Declaration,
+    links: tuple[tuple[str, Aligner], ...],
+    plates: Shape,
+    dist: Distribution,
+    batch: Shape,
+    shape: Shape,
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[CompiledNode, np.ndarray]:
+    fit(declaration, dist, batch, plates)
+    support = dist.support
+    domain = None
+    constant = np.size(support.low) == 1 and np.size(support.high) == 1
+    if support.size is not None and constant and not dist.event_shape:
+        try:
+            domain = domain_with_states(
+                support.size, int(np.asarray(support.low).flat[0]), declaration.states
+            )
+        except ModelError as error:
+            raise ModelError(f"node {declaration.name!r}: {error}") from None
+    elif declaration.states is not None:
+        raise ModelError(
+            f"node {declaration.name!r}: states= need a distribution with finitely many values that "
+            f"do not depend on the parents; {type(dist).__name__} is on {support.describe()}"
+        )
+    node = CompiledNode(
+        declaration,
+        links,
+        plates,
+        dist.event_shape,
+        bool(dist.is_discrete),
+        True,
+        domain,
+        support if constant else None,
+        unsampled=isinstance(dist, Density) and not dist.can_sample,
+    )
+    error = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
+    if error is not None:
+        raise error
+    lead = _probe_batch(bool(links), domain is not None, batch, shape, count)
+    value = _reachable(node, dist, lead, count, rng)
+    return node, read_only(value)
+
+
+def _probe_batch(
+    has_parents: bool, is_finite: bool, batch: Shape, shape: Shape, count: int
+) -> Shape:
+    """Batch shapes that differ from node to node but broadcast, each a true joint draw per entry.
+
+    Finite roots always vary, so that all their states are tried.
+    """
+    q, p = shape
+    if not has_parents:
+        choices = [(q, p), (p,)] if is_finite else [(q, p), (p,), (), (q, 1)]
+        return choices[count % len(choices)]
+    return shape if count % 3 == 2 else batch
+
+
+def _reachable(
+    node: CompiledNode, dist: Distribution, batch: Shape, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Distinct values of positive density: states in turn for finite nodes, draws for all others."""
+    lead = batch + node.plate_shape
+    if node.domain is not None:
+        table = dist.probs_table
+        assert table is not None
+        possible = np.broadcast_to(table > 0, (*lead, node.domain.size))
+        rank = np.cumsum(possible, axis=-1)
+        turn = (np.arange(int(np.prod(lead, dtype=int))).reshape(lead) + count) % np.maximum(
+            rank[..., -1], 1
+        )
+        return np.argmax(rank > turn[..., None], axis=-1).astype(node.domain.dtype)
+    try:
+        return np.asarray(dist.sample_to(rng, lead))
+    except BayesmcError:
+        return _point_in(dist.support, lead + dist.event_shape, rng)
+
+
+def _point_in(support: Support, shape: Shape, rng: np.random.Generator) -> np.ndarray:
+    """Some points of a support, for densities that cannot be sampled from."""
+    u = 0.2 + 0.6 * rng.random(shape)
+    if support.kind == "simplex":
+        return u / u.sum(axis=-1, keepdims=True)
+    if support.kind not in ("interval", "integers"):
+        return u
+    low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
+    both = np.isfinite(low) & np.isfinite(high)
+    with np.errstate(invalid="ignore"):
+        value = np.where(both, low + u * (high - low), np.where(np.isfinite(low), low + u, high - u))
+    value = np.where(np.isfinite(value), value, u)
+    return np.broadcast_to(np.floor(value) if support.is_discrete else value, shape)
+
+
+def _discover_deterministic(
+    declaration: Declaration,
+    links: tuple[tuple[str, Aligner], ...],
+    plates: Shape,
+    result: np.ndarray,
+    batch: Shape,
+    probe: Mapping[str, np.ndarray],
+    shape: Shape,
+) -> tuple[CompiledNode, np.ndarray]:
+    """Event shape from one unbatched call; a table where all parents are finite."""
+    single, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
+    one = call(declaration, single, plates)
+    event = one.shape[len(plates) :]
+    full = batch + plates + event
+    value = deterministic_fit(declaration, result, batch, plates, full)
+    if value.dtype.kind == "f" and np.isnan(value).any():
+        raise DensityError(f"node {declaration.name!r}: the function returns NaN on reachable values")
+    integral = value.dtype.kind in "biu"
+    node = CompiledNode(declaration, links, plates, event, integral, False)
+    if declaration.states is not None and event:
+        raise ModelError(f"node {declaration.name!r}: states= need scalar values")
+    tabulated = _tabulate_deterministic(node)
+    if tabulated is None:
+        if declaration.states is not None:
+            raise ModelError(
+                f"node {declaration.name!r}: states= on a deterministic node need finite parents"
+            )
+        return node, value
+    return tabulated, lookup(tabulated, probe)
+
+
+def _tabulate_deterministic(node: CompiledNode) -> CompiledNode | None:
+    """``node`` with the table of its positions over all configurations of its parents, if small."""
+    domains = [link.domain for _, link in node.links]
+    if node.event_shape or not node.links or node.has_foreign_parents or None in domains:
+        return None
+    cards = tuple(d.size for d in domains if d is not None)
+    if np.prod(cards, dtype=float) * max(np.prod(node.plate_shape), 1) > _DETERMINISTIC_TABLE:
+        return None
+    values = configurations(node.links, cards)
+    try:
+        arguments, batch = arguments_of(node.links, values)
+        result = call(node.declaration, arguments, batch + node.plate_shape)
+    except BayesmcError:
+        return None  # some configuration, perhaps an impossible one, cannot be evaluated
+    full = np.broadcast_to(result, cards + node.plate_shape)
+    if full.dtype.kind == "f" and not np.isfinite(full).all():
+        return None
+    unique, positions = np.unique(full, return_inverse=True)
+    positions = positions.reshape(full.shape)
+    declared = node.declaration.states
+    if declared is not None:
+        size = int(unique.max()) + 1
+        if unique.dtype.kind not in "biu" or unique.min() < 0 or size > len(declared):
+            raise ModelError(
+                f"node {node.name!r}: with states= a deterministic node returns positions "
+                f"0..{len(declared) - 1}, not {unique[:6].tolist()}"
+            )
+        domain, positions = states_domain(declared), full
+    else:
+        unique.flags.writeable = False
+        domain = Domain(len(unique), values=unique)
+    return CompiledNode(
+        node.declaration,
+        node.links,
+        node.plate_shape,
+        (),
+        node.is_discrete,
+        False,
+        domain,
+        None,
+        positions.astype(domain.dtype),
+    )
+
+
+def configurations(
+    links: Sequence[tuple[str, Aligner]], cards: Sequence[int]
+) -> dict[str, np.ndarray]:
+    """Every joint configuration of finite parents: parent i varies along batch axis i.
+
+    Plated parents hold the same state in all their elements.
+    """
+    values: dict[str, np.ndarray] = {}
+    for axis, ((parent, link), card) in enumerate(zip(links, cards, strict=True)):
+        if parent in values:
+            continue
+        shape = (1,) * axis + (card,) + (1,) * (len(cards) - 1 - axis + link.trailing)
+        values[parent] = np.arange(card).reshape(shape)
+    return values
+
+
+def entry(
+    links: Sequence[tuple[str, Aligner]],
+    probe: Mapping[str, np.ndarray],
+    shape: Shape,
+    index: Shape,
+) -> dict[str, np.ndarray]:
+    """The parents' values at one entry of the probe's broadcast batch, without batch axes."""
+    picked = {}
+    for parent, link in links:
+        value = probe[parent]
+        batch = link.batch_shape(value)
+        own = index[len(shape) - len(batch) :]
+        at = tuple(i if n > 1 else 0 for i, n in zip(own, batch, strict=True))
+        picked[parent] = value[(*at, Ellipsis)]  # an array still, also without axes
+    return picked
+
+
+def _check_table_parents(
+    declaration: Declaration,
+    links: tuple[tuple[str, Aligner], ...],
+    probe: Mapping[str, np.ndarray],
+) -> None:
+    assert declaration.probs is not None
+    for (parent, link), card in zip(links, declaration.probs.shape[:-1], strict=True):
+        if link.foreign:
+            raise PlateError(
+                f"node {declaration.name!r}: the table's parent {parent!r} is in plates "
+                f"{link.foreign}, which the table lacks; add them to plates="
+            )
+        top = int(np.max(probe[parent], initial=0))
+        if probe[parent].dtype.kind not in "biu" or top >= card:
+            raise ShapeError(
+                f"node {declaration.name!r}: the table has {card} rows for parent {parent!r}, "
+                "which has other values"
+            )

@@ -1,0 +1,257 @@
+"""Evidence and inputs: from what a user passes to stored values, with every fault named.
+
+A masked entry, NaN in a plated node or None is unobserved. Labels, shapes, supports and missing
+entries are settled here once, so that engines never look at user values.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.network.model import CompiledNode, Model
+from bayesmc.network.node import Declaration
+from bayesmc.shapes import Shape, first_index
+
+
+@dataclass(frozen=True, eq=False)
+class Observed:
+    """What is known of one node.
+
+    Attributes
+    ----------
+    value : ndarray
+        Stored values, shape ``(*plates, *event)``; unobserved elements hold a filler.
+    mask : ndarray of bool or None
+        Observed plate elements; None where all are.
+    """
+
+    value: np.ndarray
+    mask: np.ndarray | None = None
+
+
+def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str, Observed]:
+    """Check and store evidence; nodes given as None are left out."""
+    if evidence is not None and not isinstance(evidence, Mapping):
+        raise EvidenceError(
+            f"evidence is a {type(evidence).__name__}; give a dict from node name to value"
+        )
+    observed = {}
+    for name, value in (evidence or {}).items():
+        node = model.nodes.get(name)
+        if node is None:
+            raise EvidenceError(f"evidence on {name!r}, which the net does not have{_close(name, model)}")
+        if not node.is_stochastic:
+            raise EvidenceError(
+                f"evidence on {name!r}, which is {_ARTICLE[node.kind]} node and takes none; "
+                "observe a stochastic node, or give it a narrow distribution"
+            )
+        if value is None:
+            continue
+        found = _observe(node, value)
+        if found is not None:
+            observed[name] = found
+    return observed
+
+
+def read_inputs(
+    declarations: Mapping[str, Declaration], sizes: Mapping[str, int], inputs: Mapping[str, Any] | None
+) -> dict[str, np.ndarray]:
+    """Check the values of input nodes; all that are declared must be given."""
+    given = dict(inputs or {})
+    wanted = {n: d for n, d in declarations.items() if d.source == "input"}
+    for name in given:
+        if name not in wanted:
+            raise EvidenceError(
+                f"inputs= gives {name!r}, which is not a declared input; the inputs are {list(wanted)}"
+            )
+    read = {}
+    for name, declaration in wanted.items():
+        if name not in given:
+            raise EvidenceError(f"input {name!r} has no value; pass inputs={{{name!r}: value}}")
+        value = np.array(given[name])
+        if value.dtype.kind not in "biuf":
+            raise EvidenceError(f"input {name!r} has dtype {value.dtype}; give numbers")
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            at = first_index(~np.isfinite(value))
+            raise EvidenceError(f"input {name!r} is {value[at]} at index {at}; inputs must be finite")
+        shape = tuple(sizes[p] for p in declaration.plates) + declaration.event_shape
+        if value.shape != shape:
+            raise EvidenceError(
+                f"input {name!r} has shape {value.shape}, but its plates {declaration.plates} and "
+                f"event_shape {declaration.event_shape} make {shape}"
+            )
+        value.flags.writeable = False
+        read[name] = value
+    return read
+
+
+def plate_sizes(
+    plates: Mapping[str, int | None],
+    declarations: Mapping[str, Declaration],
+    *data: Mapping[str, Any] | None,
+) -> dict[str, int | None]:
+    """Sizes of all plates: declared ones, else read off the leading axes of the data."""
+    sizes = dict(plates)
+    source: dict[str, str] = {}
+    fixed = {n: d.value for n, d in declarations.items() if d.value is not None}
+    for values in (fixed, *data):
+        for name, value in (values or {}).items():
+            declaration = declarations.get(name)
+            if declaration is None or value is None or not declaration.plates:
+                continue
+            shape = value.shape if isinstance(value, np.ndarray) else _shape(value)
+            if len(shape) < len(declaration.plates):
+                continue  # said with the node's full shape when the value is read
+            for plate, size in zip(declaration.plates, shape, strict=False):
+                if sizes[plate] is None:
+                    sizes[plate], source[plate] = size, name
+                elif sizes[plate] != size and plate in source:
+                    raise PlateError(
+                        f"plate {plate!r} has size {sizes[plate]} in the data of {source[plate]!r} but "
+                        f"{size} in that of {name!r}"
+                    )
+    return sizes
+
+
+def store(node: CompiledNode, value: Any) -> np.ndarray:
+    """Complete user values (any batch axes in front) as stored values; faults name the node."""
+    try:
+        if node.domain is not None:
+            stored = node.domain.encode(value)
+        else:
+            stored = np.array(value)
+            if stored.dtype.kind not in "biuf":
+                raise EvidenceError(f"values of dtype {stored.dtype}; give numbers")
+            if not node.is_discrete:
+                stored = stored.astype(float, copy=False)
+    except EvidenceError as error:
+        raise EvidenceError(f"node {node.name!r}: {error}") from None
+    trailing = len(node.value_shape)
+    if stored.shape[stored.ndim - trailing :] != node.value_shape or stored.ndim < trailing:
+        raise EvidenceError(_shape_message(node, stored.shape))
+    stored.flags.writeable = False
+    return stored
+
+
+def _observe(node: CompiledNode, value: Any) -> Observed | None:
+    array, missing = _missing(node, value)
+    if array.shape != node.value_shape:
+        raise EvidenceError(_shape_message(node, array.shape))
+    event = tuple(range(len(node.plate_shape), array.ndim))
+    some = missing.any(axis=event) if event else missing
+    every = missing.all(axis=event) if event else missing
+    if (some & ~every).any():
+        raise EvidenceError(
+            f"evidence on {node.name!r}: some components of one vector are missing, which is not "
+            "supported; split the vector into nodes of its parts, or leave the whole vector out"
+        )
+    if every.all() and array.size:
+        return None
+    filler = array[first_index(~missing)] if array.size else 0
+    filled = np.where(missing, filler, array) if missing.any() else array
+    stored = store(node, filled)
+    observed = ~every
+    _check_support(node, stored, observed)
+    return Observed(stored, None if observed.all() else observed)
+
+
+def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The value as an array and which entries are missing; a lone NaN is refused."""
+    masked = np.ma.getmaskarray(value) if isinstance(value, np.ma.MaskedArray) else None
+    data = value.data if isinstance(value, np.ma.MaskedArray) else value
+    if node.domain is not None and node.domain.labels is not None:
+        if hasattr(data, "labels") and hasattr(data, "codes"):
+            data = data.labels
+        array = np.array(data, dtype=object)
+        flat = [v is None or (isinstance(v, float) and v != v) for v in array.ravel().tolist()]
+        missing = np.array(flat, dtype=bool).reshape(array.shape)
+    else:
+        array = np.asarray(data)
+        if array.dtype == object:
+            try:
+                array = np.array(data, dtype=float)
+            except (TypeError, ValueError):
+                raise EvidenceError(
+                    f"evidence on {node.name!r}: {_peek(data)} is not a number"
+                ) from None
+        if array.dtype.kind not in "biuf":
+            raise EvidenceError(
+                f"evidence on {node.name!r}: {_peek(data)} is not among its values "
+                f"({_allowed(node)})"
+            )
+        missing = np.isnan(array) if array.dtype.kind == "f" else np.zeros(array.shape, dtype=bool)
+    if missing.any() and not node.plates:
+        raise EvidenceError(
+            f"evidence on {node.name!r} is {_peek(data)}, which means nothing for a node without "
+            "plates; leave it out (or give None) if it is unobserved"
+        )
+    return array, missing if masked is None else missing | masked
+
+
+def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray) -> None:
+    event = tuple(range(len(node.plate_shape), stored.ndim))
+    if stored.dtype.kind == "f":
+        finite = np.isfinite(stored)
+        bad = ~(finite.all(axis=event) if event else finite) & observed
+        if bad.any():
+            at = first_index(bad)
+            raise EvidenceError(f"evidence on {node.name!r} is {stored[at]}{_at(at)}; it must be finite")
+    if node.domain is not None or node.support is None:
+        return
+    if node.support.event_ndim not in (0, len(node.event_shape)):
+        return
+    outside = ~np.asarray(node.support.contains(stored)) & observed
+    if outside.any():
+        at = first_index(outside)
+        raise EvidenceError(
+            f"evidence on {node.name!r} is {stored[at]}{_at(at)}, outside its support "
+            f"({node.support.describe()})"
+        )
+
+
+def _allowed(node: CompiledNode) -> str:
+    if node.domain is not None:
+        return node.domain._allowed()
+    return node.support.describe() if node.support is not None else "numbers"
+
+
+def _shape_message(node: CompiledNode, shape: Shape) -> str:
+    plates = ", ".join(f"{p}={n}" for p, n in zip(node.plates, node.plate_shape, strict=True))
+    return (
+        f"evidence on {node.name!r} has shape {shape}, but the node's plates ({plates or 'none'}) and "
+        f"event shape {node.event_shape} make {node.value_shape}"
+    )
+
+
+def _shape(value: Any) -> Shape:
+    try:
+        return np.shape(value)
+    except ValueError:
+        return ()
+
+
+def _peek(value: Any) -> str:
+    array = np.asarray(value, dtype=object)
+    return repr(array.item()) if array.size == 1 else repr(array.ravel()[:3].tolist())[:-1] + ", ...]"
+
+
+def _at(index: Shape) -> str:
+    return f" at index {index if len(index) > 1 else index[0]}" if index else ""
+
+
+def _close(name: str, model: Model) -> str:
+    near = difflib.get_close_matches(str(name), model.nodes, n=1)
+    return f" (did you mean {near[0]!r}?)" if near else f"; its nodes are {_some(list(model.nodes))}"
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(names[:12]) + (", ..." if len(names) > 12 else "")
+
+
+_ARTICLE = {"deterministic": "a deterministic", "input": "an input", "fixed": "a fixed (do)"}

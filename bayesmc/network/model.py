@@ -1,0 +1,346 @@
+"""The compiled net: nodes in topological order, with everything engines need to evaluate them.
+
+``Model`` is frozen. It is made from declarations and plate sizes by calling every function once on
+values drawn from its ancestors, which tells event shapes, supports and finite domains; the same draws
+serve ``validate``. Values it takes and gives are *stored values*: positions for finite discrete nodes,
+the values themselves for all others, shape ``(*batch, *plates, *event)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Categorical, Distribution, as_distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.support import Support
+from bayesmc.errors import (
+    BayesmcError,
+    BroadcastError,
+    DensityError,
+    ModelError,
+    ParameterError,
+    PlateError,
+    ShapeError,
+)
+from bayesmc.network.align import Aligner
+from bayesmc.network.domain import Domain, domain_with_states, states_domain
+from bayesmc.network.elementwise import call_elementwise
+from bayesmc.network.node import Declaration, Node, Potential
+from bayesmc.plates import Gathered, PlateArray
+from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, read_only, unused_sizes
+
+#: configurations of finite parents up to which a deterministic node is tabulated
+_DETERMINISTIC_TABLE = 4096
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledNode:
+    """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
+    ``unsampled`` says that its density has no sampler."""
+
+    declaration: Declaration
+    links: tuple[tuple[str, Aligner], ...]
+    plate_shape: Shape
+    event_shape: Shape = ()
+    is_discrete: bool = False
+    is_stochastic: bool = True
+    domain: Domain | None = None
+    support: Support | None = None
+    table: np.ndarray | None = None
+    unsampled: bool = False
+
+    @property
+    def name(self) -> str:
+        return self.declaration.name
+
+    @property
+    def parents(self) -> tuple[str, ...]:
+        return self.declaration.parents
+
+    @property
+    def plates(self) -> tuple[str, ...]:
+        return self.declaration.plates
+
+    @property
+    def value_shape(self) -> Shape:
+        """Shape of one value, plates included."""
+        return self.plate_shape + self.event_shape
+
+    @property
+    def kind(self) -> str:
+        source = self.declaration.source
+        if source in ("input", "fixed"):
+            return source
+        return "stochastic" if self.is_stochastic else "deterministic"
+
+    @property
+    def has_foreign_parents(self) -> bool:
+        return any(link.foreign for _, link in self.links)
+
+    def record(self) -> Node:
+        """The public, frozen view."""
+        states = self.domain.states if self.domain is not None and self.is_discrete else None
+        return Node(
+            self.name, self.parents, self.plates, self.event_shape, states, self.is_discrete, self.kind
+        )
+
+    def decode(self, stored: np.ndarray) -> np.ndarray:
+        """Stored values as user values."""
+        return self.domain.decode(stored) if self.domain is not None else stored
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A net compiled for given plate sizes.
+
+    Attributes
+    ----------
+    nodes : dict
+        Name -> ``CompiledNode``, parents before children.
+    potentials : dict
+        Name -> (potential, links).
+    sizes : dict
+        Plate -> size.
+    labels : dict
+        Plate -> labels, where given.
+    probe : dict
+        Name -> one batch of jointly reachable stored values, with batch shapes that differ but broadcast.
+    """
+
+    name: str | None
+    nodes: dict[str, CompiledNode]
+    potentials: dict[str, tuple[Potential, tuple[tuple[str, Aligner], ...]]]
+    sizes: dict[str, int]
+    labels: dict[str, tuple[Any, ...]] = field(default_factory=dict)
+    probe: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
+    probe_shape: Shape = ()
+
+    def __getitem__(self, name: str) -> CompiledNode:
+        return self.nodes[name]
+
+    def without_functions(self) -> Model:
+        """The same model for results that are stored: it describes nodes but evaluates none."""
+        nodes = {
+            name: replace(node, declaration=replace(node.declaration, function=None))
+            for name, node in self.nodes.items()
+        }
+        return replace(self, nodes=nodes, potentials={}, probe={})
+
+    def evaluate(self, name: str, values: Mapping[str, np.ndarray]) -> tuple[Any, Shape]:
+        """What node ``name`` is given its parents' stored values, and the batch shape of those.
+
+        Returns a ``Distribution`` whose batch broadcasts to ``batch + plates``, or for a deterministic
+        node its stored values, shape ``(*batch, *plates, *event)``.
+        """
+        node = self.nodes[name]
+        if node.declaration.value is not None:
+            return node.declaration.value, ()
+        arguments, batch = arguments_of(node.links, values)
+        if node.table is not None:
+            return lookup(node, values), batch
+        result = call(node.declaration, arguments, batch + node.plate_shape)
+        if isinstance(result, Distribution):
+            fit(node.declaration, result, batch, node.plate_shape)
+            return result, batch
+        shape = batch + node.plate_shape + node.event_shape
+        return deterministic_fit(node.declaration, result, batch, node.plate_shape, shape), batch
+
+    def log_density(
+        self, name: str, distribution: Distribution, stored: np.ndarray
+    ) -> np.ndarray:
+        """Log density of stored values, shape the broadcast of batch and plates; NaN never passes."""
+        node = self.nodes[name]
+        value = node.domain.to_support(stored) if node.domain is not None else stored
+        with np.errstate(all="ignore"):
+            result = distribution.log_prob(value)
+        if result.max(initial=-np.inf) < np.inf:  # false for NaN, too
+            return result
+        bad = ~(result < np.inf)
+        if distribution.invalid is not None:
+            bad = bad & ~distribution.invalid
+            result = np.where(distribution.invalid, -np.inf, result)
+        if bad.any():
+            found = np.broadcast_to(result, bad.shape)[bad].flat[0]
+            raise DensityError(
+                f"node {name!r}: the log density of {distribution!r} is {found}; a log density must "
+                "be below infinity and not NaN (check the function at the edges of its support)"
+            )
+        return result
+
+    def potential(
+        self, name: str, values: Mapping[str, np.ndarray], total: bool = True
+    ) -> np.ndarray:
+        """Log factor ``name``, shape the batch: summed over its plates, unless ``total`` is false."""
+        potential, links = self.potentials[name]
+        arguments, batch = arguments_of(links, values)
+        plates = tuple(self.sizes[p] for p in potential.plates)
+        what = Declaration(f"potential {name}", "function", function=potential.function)
+        result = np.asarray(call(what, arguments, batch + plates, wants_array=True), dtype=float)
+        if not broadcasts_to(result.shape, batch + plates):
+            raise ShapeError(
+                f"potential {name!r} returns shape {result.shape}, which does not fit "
+                f"{batch + plates}; reduce foreign plates with .sum(plate) or name plates="
+            )
+        if not (result < np.inf).all():
+            raise DensityError(f"potential {name!r} is NaN or infinite; a log factor must be finite")
+        full = np.broadcast_to(result, batch + plates)
+        if not (plates and total):
+            return full
+        return full.sum(axis=tuple(range(len(batch), full.ndim)))
+
+    def sample_stored(
+        self, name: str, distribution: Distribution, rng: np.random.Generator, batch: Shape
+    ) -> np.ndarray:
+        """Stored draws of node ``name``, shape ``(*batch, *plates, *event)``, frozen."""
+        node = self.nodes[name]
+        try:
+            draws = distribution.sample_to(rng, batch + node.plate_shape)
+        except BayesmcError as error:
+            raise type(error)(f"node {name!r}: {error}") from error
+        if node.domain is not None:
+            draws = node.domain.from_support(draws)
+        draws.flags.writeable = False
+        return draws
+
+
+def arguments_of(
+    links: Sequence[tuple[str, Aligner]], values: Mapping[str, np.ndarray]
+) -> tuple[list[Any], Shape]:
+    """Arguments for a function and the broadcast of its parents' batch shapes."""
+    arguments = []
+    batch: Shape = ()
+    for parent, link in links:
+        value = values[parent]
+        batch = broadcast_shapes(batch, link.batch_shape(value))
+        arguments.append(link(value))
+    return arguments, batch
+
+
+def call(
+    declaration: Declaration, arguments: Sequence[Any], lead: Shape, wants_array: bool = False
+) -> Any:
+    """Call a node's function; what goes wrong inside names the node.
+
+    Returns a ``Distribution``, or an array for a deterministic node.
+    """
+    name = declaration.name
+    if declaration.probs is not None:
+        return _table_rows(declaration, arguments)
+    assert declaration.function is not None
+    try:
+        if declaration.vectorize:
+            result: Any = call_elementwise(declaration.function, arguments, lead)
+        else:
+            result = declaration.function(*arguments)
+        if isinstance(result, Distribution):
+            if wants_array:
+                raise ModelError("a potential returns a log factor, not a distribution")
+            return result
+        wrapped = as_distribution(result)
+        if wrapped is not None:
+            return wrapped
+        if result is None:
+            raise ModelError("the function returns None; return a distribution or an array")
+        if isinstance(result, PlateArray):
+            raise result._ungathered()
+        array = np.asarray(result)
+        if array.dtype == object:
+            raise ModelError(
+                f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "
+                "a frozen scipy.stats one), or an array of numbers for a deterministic node"
+            )
+        return array
+    except BayesmcError as error:
+        raise _renamed(error, f"node {name!r}: {error}") from error
+    except Exception as error:
+        raise BroadcastError(f"node {name!r}: {_explain(error, arguments)}") from error
+
+
+def fit(declaration: Declaration, dist: Distribution, batch: Shape, plates: Shape) -> None:
+    """Refuse a distribution whose batch goes beyond the batch of the parents and the plates."""
+    if not broadcasts_to(dist.batch_shape, batch + plates):
+        names = declaration.plates
+        where = f"plates {names} of sizes {plates}" if names else "no plates"
+        raise ShapeError(
+            f"node {declaration.name!r}: {type(dist).__name__} has batch shape {dist.batch_shape}, "
+            f"which does not fit {batch + plates} (batch {batch} of the parents, {where}); "
+            "declare the axes that are elements with plates=, the components of a vector on the last "
+            "axis with a vector distribution"
+        )
+
+
+def lookup(node: CompiledNode, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Stored values of a tabulated deterministic node."""
+    assert node.table is not None
+    index = tuple(link.place(values[parent]).astype(np.intp) for parent, link in node.links)
+    plates = node.plate_shape
+    if node.table.ndim > len(index):
+        index = (*index, *np.ix_(*(np.arange(n) for n in plates)))
+    result = node.table[index] if index else node.table
+    return read_only(np.asarray(result))
+
+
+def invalid_error(
+    node: CompiledNode, dist: Distribution, counts: np.ndarray, batch: Shape
+) -> ParameterError | None:
+    """The error for bad parameters at configurations that count, or None.
+
+    ``counts`` (shape ``batch``) tells which batch elements have positive probability.
+    """
+    if dist.invalid is None:
+        return None
+    full = np.broadcast_to(dist.invalid, batch + node.plate_shape)
+    lead = np.asarray(counts).reshape(np.shape(counts) + (1,) * len(node.plate_shape))
+    bad = full & lead
+    if not bad.any():
+        return None
+    index = tuple(int(i) for i in np.argwhere(bad)[0])
+    element = index[len(batch) :]
+    at = f" (plate element {element if len(element) > 1 else element[0]})" if element else ""
+    return ParameterError(f"node {node.name!r}{at}: {dist.problem}", index)
+
+
+def deterministic_fit(
+    declaration: Declaration, result: Any, batch: Shape, plates: Shape, shape: Shape
+) -> np.ndarray:
+    array = np.asarray(result)
+    if isinstance(result, Distribution) or not broadcasts_to(array.shape, shape):
+        raise ShapeError(
+            f"node {declaration.name!r}: the function returns shape {array.shape}, which does not fit "
+            f"{shape} (batch {batch} of the parents, plates {declaration.plates} of sizes {plates}); "
+            "declare the axes that are elements with plates="
+        )
+    return read_only(np.broadcast_to(array, shape))
+
+
+def _table_rows(declaration: Declaration, arguments: Sequence[Any]) -> Distribution:
+    """The rows of a conditional probability table that the parents' positions pick."""
+    probs = declaration.probs
+    assert probs is not None
+    if not arguments:
+        return Categorical(probs)
+    rows: Any = 0
+    for card, positions in zip(probs.shape[:-1], arguments, strict=True):
+        rows = rows * card + positions.astype(np.intp)
+    return Categorical(Gathered(probs.reshape(-1, probs.shape[-1]), rows))
+
+
+def _renamed(error: BayesmcError, message: str) -> BayesmcError:
+    """The same kind of error, carrying the same facts, with another message."""
+    copy = type(error).__new__(type(error))
+    copy.__dict__.update(error.__dict__)
+    copy.args = (message,)
+    return copy
+
+
+def _explain(error: Exception, arguments: Sequence[Any]) -> str:
+    if isinstance(error, ValueError) and "read-only" in str(error):
+        return "the function changes a parent in place; parents are read-only, so make a new array"
+    shapes = ", ".join(
+        str(a.array.shape if isinstance(a, PlateArray) else np.shape(a)) for a in arguments
+    )
+    return f"{type(error).__name__}: {error} (arguments of shapes {shapes or 'none'})"

@@ -1,0 +1,653 @@
+"""``BayesNet``: where a user declares nodes. It keeps declarations; ``Model`` evaluates them.
+
+It wraps a networkx graph (``net.graph``) and is not one, and it knows no engine.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution, as_distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import (
+    DuplicateNodeError,
+    EvidenceError,
+    ModelError,
+    ParameterError,
+    PlateError,
+    UnknownNodeError,
+    UnsupportedError,
+)
+from bayesmc.network import forward
+from bayesmc.network.compile import compile_model
+from bayesmc.network.evidence import plate_sizes, read_inputs, store
+from bayesmc.network.model import Model, invalid_error
+from bayesmc.network.node import Declaration, Node, Potential, bind
+from bayesmc.network.ordering import topological_order
+from bayesmc.network.validate import validate_model
+from bayesmc.randomness import seed_sequence, stream
+from bayesmc.shapes import as_shape, first_index, owned, unused_sizes
+
+if TYPE_CHECKING:
+    import networkx
+
+Parents = Sequence[str] | Mapping[str, str] | None
+#: bytes of inputs up to which a compiled model is kept for the next call with the same inputs
+_KEEP_INPUTS = 1 << 20
+
+
+class BayesNet:
+    """A hybrid Bayes net: nodes whose conditional densities are plain functions of their parents.
+
+    Parameters
+    ----------
+    name : str, optional
+    plates : dict, optional
+        Plate name -> size, a sequence of labels, or None (read from the data).
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet("sprinkler")
+    >>> @net.node
+    ... def rain():
+    ...     return bmc.Bernoulli(0.2)
+    >>> @net.node
+    ... def wet(rain):
+    ...     return bmc.Bernoulli(0.1 + 0.8 * rain)
+    >>> posterior = bmc.infer(net, {"wet": 1}, engine=bmc.Exact())
+    >>> posterior.probabilities("rain").round(4).tolist()
+    [0.3077, 0.6923]
+
+    References
+    ----------
+    Koller and Friedman, Probabilistic Graphical Models (2009), ch. 3 and 6 (plates).
+    """
+
+    def __init__(
+        self, name: str | None = None, plates: Mapping[str, int | Sequence[Any] | None] | None = None
+    ) -> None:
+        self.name = name
+        self._declarations: dict[str, Declaration] = {}
+        self._potentials: dict[str, Potential] = {}
+        self._sizes: dict[str, int | None] = {}
+        self._labels: dict[str, tuple[Any, ...]] = {}
+        for plate, size in (plates or {}).items():
+            self._sizes[plate] = _plate_size(plate, size)
+            if size is not None and not isinstance(size, (int, np.integer)):
+                self._labels[plate] = tuple(size)
+        self._models: dict[Any, Model] = {}
+        self._valid = False
+
+    # ---- declaring --------------------------------------------------------------------------
+
+    def node(
+        self,
+        function: Callable[..., Any] | None = None,
+        *,
+        plates: str | Sequence[str] = (),
+        states: Sequence[Any] | None = None,
+        name: str | None = None,
+        parents: Parents = None,
+        vectorize: bool = False,
+        replace: bool = False,
+    ) -> Any:
+        """Declare a node by its conditional density, as a decorator; returns the function unchanged.
+
+        The function's name is the node's name and its arguments are the parents; arguments with
+        defaults are not parents. It returns a distribution, or an array (a deterministic node).
+
+        Parameters
+        ----------
+        plates : str or sequence of str
+            Plates the node is repeated over.
+        states : sequence, optional
+            Labels or numbers for the values of a finite distribution, in the order of its support.
+        name : str, optional
+            Node name, if not the function's.
+        parents : list or dict, optional
+            Node names in the order of the arguments, or argument name -> node name.
+        vectorize : bool
+            Call a function that does not broadcast once per element: slow.
+        replace : bool
+            Allow a name that is declared already.
+
+        Raises
+        ------
+        DuplicateNodeError, PlateError, ModelError
+        """
+
+        def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+            own = name if name is not None else f.__name__
+            if own == "<lambda>":
+                raise ModelError("a lambda has no name to give the node; use name= or net.add")
+            self._declare_function(own, f, parents, plates, states, vectorize, replace)
+            return f
+
+        return declare if function is None else declare(function)
+
+    def add(
+        self,
+        name: str,
+        cpd: Any,
+        parents: Parents = None,
+        plates: str | Sequence[str] = (),
+        states: Sequence[Any] | None = None,
+        *,
+        vectorize: bool = False,
+        replace: bool = False,
+    ) -> None:
+        """Declare a node by a distribution, a function or a table (the programmatic form of ``node``).
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet()
+        >>> net.add("a", bmc.Bernoulli(0.3))
+        >>> net.add("b", lambda a: bmc.Normal(a, 1.0))
+        >>> net.add("c", [[0.9, 0.1], [0.2, 0.8]], parents=["a"], states=("low", "high"))
+        >>> net["c"].parents
+        ('a',)
+        """
+        dist = cpd if isinstance(cpd, Distribution) else as_distribution(cpd)
+        if dist is not None:
+            if parents:
+                raise ModelError(
+                    f"node {name!r}: a distribution has no arguments for parents={parents!r}; pass a "
+                    "function of them that returns it"
+                )
+            self._declare_function(name, _Constant(dist), (), plates, states, False, replace)
+        elif callable(cpd):
+            self._declare_function(name, cpd, parents, plates, states, vectorize, replace)
+        else:
+            if isinstance(parents, Mapping):
+                raise ModelError(f"node {name!r}: a table lists its parents in the order of its axes")
+            self.table(name, parents or (), cpd, states, plates=plates, replace=replace)
+
+    def table(
+        self,
+        name: str,
+        parents: Sequence[str] = (),
+        probs: Any = None,
+        states: Sequence[Any] | None = None,
+        *,
+        plates: str | Sequence[str] = (),
+        replace: bool = False,
+    ) -> None:
+        """Declare a discrete node by its conditional probability table.
+
+        Parameters
+        ----------
+        parents : sequence of str
+            Discrete parents, in the order of the table's axes.
+        probs : array_like, shape (card(parent_1), ..., card(parent_n), card(name))
+            Every row sums to 1 (to 1e-6).
+        states : sequence, optional
+            Labels of the node's own values.
+
+        Raises
+        ------
+        ParameterError
+            A row that is not a probability vector, with its index.
+        """
+        if probs is None:
+            raise ModelError(f"node {name!r}: table() needs probs=")
+        if isinstance(parents, str):
+            raise ModelError(f"node {name!r}: parents={parents!r} is one string; give a list of names")
+        table = np.array(probs, dtype=float)
+        if table.ndim != len(parents) + 1:
+            raise ModelError(
+                f"node {name!r}: probs has {table.ndim} axes, but {len(parents)} parents and the node "
+                f"itself make {len(parents) + 1}"
+            )
+        if states is not None and len(states) != table.shape[-1]:
+            raise ModelError(
+                f"node {name!r}: states= has {len(states)} entries but the table's last axis {table.shape[-1]}"
+            )
+        table = _checked_rows(name, table)
+        self._declare(
+            Declaration(
+                name,
+                "table",
+                tuple(parents),
+                self._node_plates(name, plates),
+                None if states is None else tuple(states),
+                probs=table,
+            ),
+            replace,
+        )
+
+    def input(self, name: str, plates: str | Sequence[str] = (), event_shape: Any = ()) -> None:
+        """Declare a known value, passed as ``inputs=`` to ``infer``, ``sample``, ``log_prob``."""
+        plates = self._node_plates(name, plates)
+        self._declare(Declaration(name, "input", (), plates, event_shape=as_shape(event_shape)), False)
+
+    def potential(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        parents: Parents = None,
+        plates: str | Sequence[str] = (),
+    ) -> None:
+        """Add a log factor on named nodes: the joint density is multiplied by ``exp(function(...))``.
+
+        Without ``plates`` the function sees plated nodes as foreign and reduces them (``x.sum("point")``);
+        with them it acts element by element and the elements are summed.
+        """
+        names, bound = bind(name, function, parents)
+        if name in self._declarations or name in self._potentials:
+            raise DuplicateNodeError(f"potential {name!r}: the name is declared already")
+        self._potentials[name] = Potential(name, names, bound, self._node_plates(name, plates))
+        self._changed()
+
+    def do(self, mapping: Mapping[str, Any] | None = None, /, **values: Any) -> BayesNet:
+        """A new net with those nodes cut from their parents and fixed (Pearl's intervention).
+
+        Raises
+        ------
+        UnknownNodeError, EvidenceError
+            A node the net lacks, or a value outside its support or shape.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet()
+        >>> net.add("a", bmc.Bernoulli(0.3))
+        >>> net.add("b", lambda a: bmc.Normal(2.0 * a, 1.0))
+        >>> float(net.do(a=1).log_prob({"b": 2.0}).round(4))
+        -0.9189
+        """
+        chosen = {**(mapping or {}), **values}
+        for name in chosen:
+            if name not in self._declarations:
+                raise UnknownNodeError(f"do({name}=...): {self._unknown(name)}")
+        sizes = plate_sizes(self._sizes, self._declarations, chosen)
+        model = self._probe_model(sizes)
+        copy = self.copy()
+        for name, value in chosen.items():
+            node = model[name]
+            if node.kind == "input":
+                raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")
+            stored = store(node, value)
+            inside = node.support is None or node.domain is not None
+            if not (inside or bool(np.all(node.support.contains(stored)))):
+                raise EvidenceError(
+                    f"do({name}=...): {value!r} is outside the support ({node.support.describe()})"
+                )
+            if stored.shape != node.value_shape:
+                raise EvidenceError(f"do({name}=...): shape {stored.shape}, not {node.value_shape}")
+            if stored.dtype.kind == "f" and not np.isfinite(stored).all():
+                raise EvidenceError(f"do({name}=...): {value!r} is not finite")
+            copy._declarations[name] = Declaration(
+                name,
+                "fixed",
+                (),
+                node.plates,
+                node.declaration.states,
+                event_shape=node.event_shape,
+                value=owned(stored),
+                domain=node.domain,
+            )
+        copy._changed()
+        return copy
+
+    def copy(self) -> BayesNet:
+        """An independent net with the same declarations."""
+        other = BayesNet(self.name)
+        other._declarations = dict(self._declarations)
+        other._potentials = dict(self._potentials)
+        other._sizes = dict(self._sizes)
+        other._labels = dict(self._labels)
+        return other
+
+    def snapshot(self) -> BayesNet:
+        """A copy that shares what is compiled already; what holds it never sees later declarations."""
+        other = self.copy()
+        other._models, other._valid = self._models, self._valid
+        return other
+
+    # ---- asking -----------------------------------------------------------------------------
+
+    def __getitem__(self, name: str) -> Node:
+        if name not in self._declarations:
+            raise UnknownNodeError(self._unknown(name))
+        return self._probe_model(self._sizes)[name].record()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._declarations
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._declarations)
+
+    def __len__(self) -> int:
+        return len(self._declarations)
+
+    def __repr__(self) -> str:
+        return f"BayesNet({self.name!r}, {len(self)} nodes)"
+
+    @property
+    def plates(self) -> dict[str, int | None]:
+        """Plate name -> size (None where it is read from the data)."""
+        return dict(self._sizes)
+
+    @property
+    def graph(self) -> networkx.DiGraph:
+        """A networkx copy of the DAG, with ``plates`` and ``source`` on every node."""
+        import networkx
+
+        graph = networkx.DiGraph(name=self.name or "")
+        for name, declaration in self._declarations.items():
+            graph.add_node(name, plates=declaration.plates, source=declaration.source)
+        for name, declaration in self._declarations.items():
+            self._known_parents(name, declaration.parents)
+            graph.add_edges_from((parent, name) for parent in declaration.parents)
+        return graph
+
+    def validate(self, inputs: Mapping[str, Any] | None = None) -> None:
+        """Check the whole net: parents, plates, cycles, shapes, and that functions broadcast.
+
+        Runs by itself on first use. Functions are evaluated on batch shapes (), (p,) and (q, p); each
+        entry must equal the unbatched call, two equal calls must agree, and perturbing one element of a
+        shared plate must move only that element.
+
+        Raises
+        ------
+        ModelError
+            Or one of its kinds, with the node's name, the fault and the fix.
+        """
+        if inputs is not None:
+            self.model(inputs=inputs)
+            return
+        model = self._probe_model(self._sizes)
+        if not self._valid:
+            validate_model(model)
+            self._valid = True
+
+    def log_prob(
+        self, values: Mapping[str, Any], *, inputs: Mapping[str, Any] | None = None
+    ) -> np.ndarray:
+        """Joint log density of complete values, summed over nodes and plates; shape: their batch.
+
+        Parameters
+        ----------
+        values : dict
+            Stochastic node -> array ``(*batch, *plates, *event)`` or labels. Deterministic nodes may be
+            left out; where one is given and differs from its function, the result is minus infinity.
+        """
+        trimmed = {n: self._unbatched(n, v) for n, v in values.items() if n in self._declarations}
+        model = self.model(trimmed, inputs)
+        unknown = [n for n in values if n not in model.nodes]
+        if unknown:
+            raise EvidenceError(f"log_prob: {self._unknown(unknown[0])}")
+        stored: dict[str, np.ndarray] = {**read_inputs(self._declarations, model.sizes, inputs)}
+        total: Any = np.zeros(())
+        with marking_invalid(), np.errstate(all="ignore"):
+            for name, node in model.nodes.items():
+                if node.kind == "input":
+                    continue
+                if not node.is_stochastic and name not in values:
+                    stored[name], _ = model.evaluate(name, stored)
+                    continue
+                if name not in values:
+                    raise EvidenceError(f"log_prob: node {name!r} has no value; give all stochastic nodes")
+                value = store(node, values[name])
+                total = total + self._one_log_prob(model, name, value, stored, total)
+                stored[name] = value
+            for name in model.potentials:
+                total = total + model.potential(name, stored)
+        return total
+
+    def sample(
+        self,
+        draws: int = 1,
+        rng: Any = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        plates: Mapping[str, int] | None = None,
+    ) -> dict[str, np.ndarray]:
+        """Ancestral sampling: every node drawn given its parents, in topological order.
+
+        Parameters
+        ----------
+        draws : int
+        rng : seed, SeedSequence, Generator or None
+        inputs : dict, optional
+            Values of input nodes.
+        plates : dict, optional
+            Sizes of plates that are otherwise read from data.
+
+        Returns
+        -------
+        dict of ndarray
+            Name -> ``(draws, *plates, *event)``; labelled states compare with their labels.
+
+        References
+        ----------
+        Bishop, Pattern Recognition and Machine Learning (2006), sec. 8.1.2.
+        """
+        if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 0:
+            raise ValueError(f"sample(draws={draws!r}): draws is a number of draws, 0 or more")
+        model = self.model(None, inputs, plates)
+        if model.potentials:
+            raise UnsupportedError(
+                f"sample: the potential {next(iter(model.potentials))!r} reweights the joint density, "
+                "which ancestral sampling cannot follow; use infer with LikelihoodWeighting and resample"
+            )
+        refusal = forward.refuse_unsampled(model, {}, "sample")
+        if refusal:
+            raise UnsupportedError(refusal)
+        start = forward.Pass(
+            stream(seed_sequence(rng), 0),
+            (int(draws),),
+            dict(read_inputs(self._declarations, model.sizes, inputs)),
+        )
+        with marking_invalid(), np.errstate(all="ignore"):
+            values = forward.run(forward.steps_for(model, {}), start).values
+        return {
+            name: _full(node.decode(values[name]), (int(draws), *node.value_shape))
+            for name, node in model.nodes.items()
+        }
+
+    def model(
+        self,
+        evidence: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, Any] | None = None,
+        plates: Mapping[str, int] | None = None,
+    ) -> Model:
+        """The validated snapshot that engines run on, with plate sizes settled by the data."""
+        for plate in plates or {}:
+            if plate not in self._sizes:
+                raise PlateError(f"plates= gives {plate!r}; the net's plates are {list(self._sizes)}")
+        sizes = plate_sizes({**self._sizes, **(plates or {})}, self._declarations, evidence, inputs)
+        open_plates = [p for p, n in sizes.items() if n is None and self._uses(p)]
+        if open_plates:
+            raise PlateError(
+                f"the size of plate {open_plates[0]!r} is not known; observe a node in it, or declare "
+                f"plates={{{open_plates[0]!r}: size}}"
+            )
+        settled = {p: n if n is not None else 0 for p, n in sizes.items()}
+        given = read_inputs(self._declarations, settled, inputs)
+        model = self._compile(settled, given)
+        if not self._valid:
+            validate_model(model)
+            self._valid = True
+        return model
+
+    # ---- private ----------------------------------------------------------------------------
+
+    def _declare_function(
+        self,
+        name: str,
+        function: Callable[..., Any],
+        parents: Parents,
+        plates: str | Sequence[str],
+        states: Sequence[Any] | None,
+        vectorize: bool,
+        replace_: bool,
+    ) -> None:
+        names, bound = bind(name, function, parents)
+        labels = None if states is None else tuple(states)
+        own = self._node_plates(name, plates)
+        self._declare(
+            Declaration(name, "function", names, own, labels, bound, vectorize), replace_
+        )
+
+    def _declare(self, declaration: Declaration, replace_: bool) -> None:
+        name = declaration.name
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"a node's name is a non-empty string, not {name!r}")
+        if (name in self._declarations and not replace_) or name in self._potentials:
+            raise DuplicateNodeError(
+                f"node {name!r} is declared already; choose another name or pass replace=True"
+            )
+        self._declarations[name] = declaration
+        self._changed()
+
+    def _changed(self) -> None:
+        self._models = {}
+        self._valid = False
+
+    def _node_plates(self, name: str, plates: str | Sequence[str]) -> tuple[str, ...]:
+        names = (plates,) if isinstance(plates, str) else tuple(plates)
+        for plate in names:
+            if plate not in self._sizes:
+                raise PlateError(
+                    f"node {name!r} is in plate {plate!r}, which the net does not have (its plates: "
+                    f"{list(self._sizes) or 'none'}); declare BayesNet(plates={{{plate!r}: size}})"
+                )
+        if len(set(names)) != len(names):
+            raise PlateError(f"node {name!r}: plates={names} names a plate twice")
+        return names
+
+    def _known_parents(self, name: str, parents: Sequence[str], what: str = "node") -> None:
+        for parent in parents:
+            if parent not in self._declarations:
+                raise UnknownNodeError(
+                    f"{what} {name!r} has the parent {parent!r}: {self._unknown(parent)}. Declare it, give "
+                    "the argument a default if it is no parent, or name the parents with parents="
+                )
+
+    def _unknown(self, name: str) -> str:
+        near = difflib.get_close_matches(str(name), self._declarations, n=1)
+        hint = f" (did you mean {near[0]!r}?)" if near else ""
+        return f"the net has no node {name!r}{hint}"
+
+    def _uses(self, plate: str) -> bool:
+        return any(plate in d.plates for d in self._declarations.values())
+
+    def _probe_model(self, sizes: Mapping[str, int | None]) -> Model:
+        """A compiled model when nobody has given data: open plates and inputs get stand-ins."""
+        open_ = [p for p, n in sizes.items() if n is None]
+        stand_in = unused_sizes([n for n in sizes.values() if n is not None], len(open_) + 2)[2:]
+        settled = {p: n for p, n in sizes.items() if n is not None}
+        settled.update(zip(open_, stand_in, strict=True))
+        try:
+            return self._compile(settled, {})
+        except ModelError:
+            zeros = {
+                n: owned(np.zeros(tuple(settled[p] for p in d.plates) + d.event_shape, dtype=int))
+                for n, d in self._declarations.items()
+                if d.source == "input"
+            }
+            if not zeros:
+                raise
+            return self._compile(settled, zeros)
+
+    def _compile(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Model:
+        small = sum(v.nbytes for v in inputs.values()) <= _KEEP_INPUTS
+        key = (tuple(sizes.items()), tuple((n, v.tobytes()) for n, v in inputs.items() if small))
+        model = self._models.get(key) if small else None
+        if model is None:
+            parents = {n: d.parents for n, d in self._declarations.items()}
+            for name, above in parents.items():
+                self._known_parents(name, above)
+            for name, potential in self._potentials.items():
+                self._known_parents(name, potential.parents, "potential")
+            order = topological_order(parents)
+            model = compile_model(
+                self.name, self._declarations, self._potentials, sizes, self._labels, inputs, order
+            )
+            if small:
+                self._models[key] = model
+        return model
+
+    def _unbatched(self, name: str, value: Any) -> Any:
+        """A stand-in with the value's plate axes in front, for reading plate sizes off it."""
+        declaration = self._declarations[name]
+        if not declaration.plates or all(self._sizes[p] is not None for p in declaration.plates):
+            return None
+        event = len(self._probe_model(self._sizes)[name].event_shape)
+        shape = np.shape(value)
+        lead = len(shape) - event - len(declaration.plates)
+        return np.empty(shape[lead:], dtype=bool) if lead >= 0 else None
+
+    @staticmethod
+    def _one_log_prob(
+        model: Model, name: str, value: np.ndarray, stored: Mapping[str, np.ndarray], total: Any
+    ) -> np.ndarray:
+        """Log density of one node's values given its parents', summed over its plates."""
+        node = model[name]
+        result, batch = model.evaluate(name, stored)
+        axes = tuple(range(-len(node.plates), 0))
+        if not isinstance(result, Distribution):
+            own = tuple(range(-len(node.value_shape), 0))
+            return np.where((result == value).all(axis=own), 0.0, -np.inf)
+        if result.invalid is not None:
+            counts = np.broadcast_to(np.asarray(total) > -np.inf, np.broadcast_shapes(np.shape(total), batch))
+            error = invalid_error(node, result, counts, counts.shape)
+            if error is not None:
+                raise error
+        density = model.log_density(name, result, value)
+        if axes:
+            lead = density.shape[: max(density.ndim - len(axes), 0)]
+            density = np.broadcast_to(density, lead + node.plate_shape).sum(axis=axes)
+        return density
+
+
+class _Constant:
+    """A function of no parents that returns one distribution."""
+
+    def __init__(self, distribution: Distribution) -> None:
+        self.distribution = distribution
+
+    def __call__(self) -> Distribution:
+        return self.distribution
+
+
+def _plate_size(plate: str, size: Any) -> int | None:
+    if not isinstance(plate, str):
+        raise PlateError(f"a plate's name is a string, not {plate!r}")
+    if size is None:
+        return None
+    if isinstance(size, str):
+        raise PlateError(f"plate {plate!r}: {size!r} is one string; give a size or a list of labels")
+    count = int(size) if isinstance(size, (int, np.integer)) else len(size)
+    if count < 0:
+        raise PlateError(f"plate {plate!r}: size {count} is negative")
+    return count
+
+
+def _checked_rows(name: str, table: np.ndarray) -> np.ndarray:
+    """Rows renormalised where they are off by rounding; worse ones raise with their index."""
+    from_one = np.abs(table.sum(axis=-1) - 1)
+    bad = ~((table >= 0).all(axis=-1) & (from_one <= 1e-6))
+    if bad.any():
+        at = first_index(bad)
+        raise ParameterError(
+            f"node {name!r}: the row at parents' index {at} is {table[at]}, which is not a probability "
+            f"vector (sum {table[at].sum():.6g}); every row of a table sums to 1",
+            at,
+        )
+    table = table / table.sum(axis=-1, keepdims=True)
+    table.flags.writeable = False
+    return table
+
+
+def _full(value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The user's own writable array of the full shape."""
+    return value.copy() if value.shape == shape else np.array(np.broadcast_to(value, shape, subok=True), subok=True)
+

@@ -1,0 +1,162 @@
+"""Declarations: what a user wrote about one node, before anything is evaluated."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import ModelError
+from bayesmc.network.domain import Domain
+from bayesmc.shapes import Shape
+
+
+@dataclass(frozen=True)
+class Node:
+    """One node of a net, as ``net[name]`` shows it.
+
+    Attributes
+    ----------
+    name : str
+    parents : tuple of str
+        Names of the parents, in the order of the function's arguments.
+    plates : tuple of str
+    event_shape : tuple of int
+        Shape of one value; ``()`` for a scalar.
+    states : tuple or None
+        Values of a finite discrete node in the order of its support; None for others.
+    is_discrete : bool
+    kind : str
+        ``"stochastic"``, ``"deterministic"``, ``"input"`` or ``"fixed"`` (by ``do``).
+    """
+
+    name: str
+    parents: tuple[str, ...]
+    plates: tuple[str, ...]
+    event_shape: Shape
+    states: tuple[Any, ...] | None
+    is_discrete: bool
+    kind: str = "stochastic"
+
+
+@dataclass(frozen=True, eq=False)
+class Declaration:
+    """What was declared under one name.
+
+    ``source`` is "function", "table", "input" or "fixed"; ``function`` takes the parents in order.
+    """
+
+    name: str
+    source: str
+    parents: tuple[str, ...] = ()
+    plates: tuple[str, ...] = ()
+    states: tuple[Any, ...] | None = None
+    function: Callable[..., Any] | None = None
+    vectorize: bool = False
+    probs: np.ndarray | None = None
+    event_shape: Shape = ()
+    value: np.ndarray | None = None
+    domain: Domain | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Potential:
+    """An extra log factor on named nodes."""
+
+    name: str
+    parents: tuple[str, ...]
+    function: Callable[..., Any]
+    plates: tuple[str, ...] = field(default=())
+
+
+def bind(
+    name: str,
+    function: Callable[..., Any],
+    parents: Sequence[str] | Mapping[str, str] | None,
+) -> tuple[tuple[str, ...], Callable[..., Any]]:
+    """Parents of ``function`` in call order, and the function taking them positionally."""
+    if isinstance(parents, str):
+        raise ModelError(f"node {name!r}: parents={parents!r} is one string; give a list of names")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        if parents is None or isinstance(parents, Mapping):
+            raise ModelError(
+                f"node {name!r}: the arguments of {function!r} cannot be read; list parents="
+            ) from None
+        return tuple(parents), function
+    positional, keyword, starred = _arguments(name, signature)
+    if isinstance(parents, Mapping):
+        unknown = set(parents) - set(positional) - set(keyword) - _defaults(signature)
+        if unknown:
+            raise ModelError(
+                f"node {name!r}: parents= maps {sorted(unknown)}, which the function has no "
+                f"argument for; its arguments are {positional + keyword}"
+            )
+        extra = [a for a in parents if a not in positional and a not in keyword]
+        names = tuple(parents.get(a, a) for a in positional + keyword) + tuple(
+            parents[a] for a in extra
+        )
+        return names, _with_keywords(function, len(positional), keyword + extra)
+    if parents is not None:
+        names = tuple(parents)
+        _check_count(name, names, signature, positional, keyword, starred)
+        return names, _with_keywords(function, len(names) - len(keyword), keyword)
+    if starred:
+        raise ModelError(f"node {name!r}: *{starred} needs parents= to say which nodes they are")
+    return tuple(positional + keyword), _with_keywords(function, len(positional), keyword)
+
+
+def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:
+    """Names of positional and of keyword-only arguments without default, and of ``*args``."""
+    positional, keyword, starred = [], [], ""
+    for argument in signature.parameters.values():
+        if argument.kind is argument.VAR_KEYWORD:
+            raise ModelError(
+                f"node {name!r}: **{argument.name} is refused, since argument names are the parents; "
+                "name the parents, or list them with parents="
+            )
+        if argument.kind is argument.VAR_POSITIONAL:
+            starred = argument.name
+        elif argument.default is argument.empty:
+            (keyword if argument.kind is argument.KEYWORD_ONLY else positional).append(argument.name)
+    return positional, keyword, starred
+
+
+def _defaults(signature: inspect.Signature) -> set[str]:
+    return {a.name for a in signature.parameters.values() if a.default is not a.empty}
+
+
+def _check_count(
+    name: str,
+    names: tuple[str, ...],
+    signature: inspect.Signature,
+    positional: list[str],
+    keyword: list[str],
+    starred: str,
+) -> None:
+    needed = len(positional) + len(keyword)
+    room = needed + len(_defaults(signature))
+    if len(names) < needed or (len(names) > room and not starred):
+        raise ModelError(
+            f"node {name!r}: parents= lists {len(names)} names, but the function takes "
+            f"{needed} arguments ({', '.join(positional + keyword)})"
+        )
+
+
+def _with_keywords(
+    function: Callable[..., Any], positional: int, keyword: list[str]
+) -> Callable[..., Any]:
+    """``function`` with its keyword-only arguments taken by position, after the others."""
+    if not keyword:
+        return function
+
+    def call(*values: Any) -> Any:
+        return function(
+            *values[:positional], **dict(zip(keyword, values[positional:], strict=True))
+        )
+
+    return call

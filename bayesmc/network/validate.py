@@ -1,0 +1,188 @@
+"""The checks that a net keeps the array rules: element by element, no random numbers, no mixing.
+
+Every function is evaluated on batch shapes (), (p,) and (q, p), with p and q unlike each other and every
+plate and event size, on parents whose batch shapes differ but broadcast and whose values are reachable.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError, BroadcastError, ModelError
+from bayesmc.network.compile import entry
+from bayesmc.network.model import CompiledNode, Model, arguments_of, call
+from bayesmc.shapes import Shape
+
+_RTOL = 1e-7
+
+
+def validate_model(model: Model) -> None:
+    """Raise on the first node whose function breaks a rule.
+
+    Raises
+    ------
+    ModelError, BroadcastError
+        With the node's name, the entry or plate element, and what to write instead.
+    """
+    with marking_invalid(), np.errstate(all="ignore"):
+        for node in model.nodes.values():
+            if node.declaration.source == "function":
+                _check_node(model, node)
+
+
+def _check_node(model: Model, node: CompiledNode) -> None:
+    arguments, batch = arguments_of(node.links, model.probe)
+    lead = batch + node.plate_shape
+    whole = _signature(node, arguments, lead)
+    again = _signature(node, arguments, lead)
+    if not _same(whole, again):
+        raise ModelError(
+            f"node {node.name!r}: two calls with the same parents differ; a conditional density must "
+            "not draw random numbers or change state (randomness belongs in a parent node)"
+        )
+    if not node.links:
+        return
+    _check_entries(model, node, whole, batch)
+    _check_mixing(model, node)
+
+
+def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: Shape) -> None:
+    """Each entry of a batched call must equal the unbatched call."""
+    shape = model.probe_shape
+    offset = len(shape) - len(batch)
+    for index in np.ndindex(batch):
+        full = (0,) * offset + index
+        arguments, _ = arguments_of(node.links, entry(node.links, model.probe, shape, full))
+        alone = _signature(node, arguments, node.plate_shape)
+        if whole.family != alone.family or not all(
+            _close(a[index], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
+        ):
+            raise BroadcastError(_broadcast_message(node, index, whole, alone))
+    if len(batch) < 2:
+        return
+    row = {p: _row(model.probe[p], link.batch_shape(model.probe[p])) for p, link in node.links}
+    arguments, short = arguments_of(node.links, row)
+    one = _signature(node, arguments, short + node.plate_shape)
+    for a, b in zip(whole.arrays, one.arrays, strict=True):
+        if not _close(a[0], b):
+            raise BroadcastError(_broadcast_message(node, (0,), whole, one))
+
+
+def _row(value: np.ndarray, batch: Shape) -> np.ndarray:
+    """The first row of a value with two batch axes; others as they are."""
+    return value[0] if len(batch) == 2 else value
+
+
+def _check_mixing(model: Model, node: CompiledNode) -> None:
+    """Perturbing one element of a shared plate must move only that element."""
+    shape = model.probe_shape
+    base = entry(node.links, model.probe, shape, (0,) * len(shape))
+    other = entry(node.links, model.probe, shape, tuple(n - 1 for n in shape))
+    before: _Signature | None = None
+    for axis, plate in enumerate(node.plates):
+        sharing = [p for p in dict.fromkeys(node.parents) if plate in model.nodes[p].plates]
+        size = node.plate_shape[axis]
+        if size < 2 or not sharing:
+            continue
+        if before is None:
+            before = _signature(node, arguments_of(node.links, base)[0], node.plate_shape)
+        for element in (0, size - 1):
+            moved = dict(base)
+            for parent in sharing:
+                moved[parent] = _perturbed(
+                    model.nodes[parent], base[parent], other[parent], plate, element
+                )
+            try:
+                after = _signature(node, arguments_of(node.links, moved)[0], node.plate_shape)
+            except BayesmcError:
+                continue  # the perturbed values may not be reachable
+            rest = (slice(None),) * axis + (np.arange(size) != element,)
+            for a, b in zip(before.arrays, after.arrays, strict=True):
+                if not _close(a[rest], b[rest]):
+                    raise BroadcastError(
+                        f"node {node.name!r}: changing element {element} of {sharing} along plate "
+                        f"{plate!r} moves other elements too; a function acts element by element on a "
+                        "shared plate. To mix elements (a mean, a cumulative sum), use an unplated "
+                        "deterministic node that reads the whole plate"
+                    )
+
+
+def _perturbed(
+    parent: CompiledNode, value: np.ndarray, other: np.ndarray, plate: str, element: int
+) -> np.ndarray:
+    """``value`` with one element along ``plate`` changed, to a reachable one where there is one."""
+    at = (slice(None),) * parent.plates.index(plate) + (element,)
+    moved = np.array(value)
+    moved[at] = np.array(other)[at]
+    if np.array_equal(moved, value):
+        if parent.domain is not None:
+            moved[at] = (moved[at] + 1) % parent.domain.size
+        elif moved.dtype.kind == "f":
+            moved[at] = moved[at] * 1.1 + 0.1
+    return moved
+
+
+class _Signature:
+    """What a call returned, as arrays of shape ``lead + own axes`` that can be compared."""
+
+    __slots__ = ("arrays", "family")
+
+    def __init__(self, family: str, arrays: list[np.ndarray]) -> None:
+        self.family = family
+        self.arrays = arrays
+
+
+def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
+    result = call(node.declaration, arguments, lead)
+    if isinstance(result, Distribution):
+        parts = result.parameters()
+        family = type(result).__name__
+    else:
+        parts = [(result, len(node.event_shape))]
+        family = "array"
+    arrays = []
+    for array, own in parts:
+        array = np.asarray(array)
+        tail = array.shape[array.ndim - own :] if own else ()
+        try:
+            arrays.append(np.broadcast_to(array, lead + tail))
+        except ValueError:
+            raise BroadcastError(
+                f"node {node.name!r}: a parameter of shape {array.shape} does not fit the batch and "
+                f"plates {lead}; write the function so that it broadcasts"
+            ) from None
+    return _Signature(family, arrays)
+
+
+def _same(a: _Signature, b: _Signature) -> bool:
+    return a.family == b.family and all(map(_close, a.arrays, b.arrays))
+
+
+def _close(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal up to rounding (vectorised and scalar loops may differ in the last digits)."""
+    if a.shape != b.shape:
+        return False
+    if (a == b).all():
+        return True
+    if a.dtype.kind != "f":
+        return False
+    scale = np.maximum(np.abs(a), np.abs(b))
+    near = np.abs(a - b) <= _RTOL * np.where(np.isfinite(scale), scale, 0.0) + 1e-12
+    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
+
+
+def _broadcast_message(
+    node: CompiledNode, index: Shape, whole: _Signature, alone: _Signature
+) -> str:
+    return (
+        f"node {node.name!r} does not broadcast: entry {index} of a call on a batch differs from the "
+        f"call on that entry alone ({whole.family} against {alone.family} with other parameters); "
+        "every operation must act on the last axes or element by element (axis=-1, np.where for if, "
+        "components as v[..., k]), or declare vectorize=True (slow)"
+    )
+
+

@@ -1,0 +1,39 @@
+"""Random streams: the same seed gives the same result, however the work is cut.
+
+Every unit of work draws from its own child of one ``SeedSequence``. What a user passes is never
+spawned from, so a seed sequence can be used twice and give the same draws twice.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+def seed_sequence(rng: Any = None) -> np.random.SeedSequence:
+    """A private seed sequence from what SPEC 7 allows: a seed, a SeedSequence, a Generator or None.
+
+    A ``Generator`` is drawn from (so the next call with it differs); a ``SeedSequence`` is copied.
+    """
+    if isinstance(rng, np.random.SeedSequence):
+        return np.random.SeedSequence(
+            rng.entropy, spawn_key=(*rng.spawn_key, 0xB1), pool_size=rng.pool_size
+        )
+    if isinstance(rng, (np.random.Generator, np.random.RandomState)):
+        draw = rng.integers if isinstance(rng, np.random.Generator) else rng.randint
+        return np.random.SeedSequence([int(n) for n in draw(0, 2**31 - 1, size=8)])
+    if isinstance(rng, np.random.BitGenerator):
+        return seed_sequence(np.random.Generator(rng))
+    return np.random.SeedSequence(rng)
+
+
+def stream(seed: np.random.SeedSequence, *key: int) -> np.random.Generator:
+    """The generator of one unit of work, named by integers (its chunk, its chain, ...).
+
+    SFC64 is the fastest of NumPy's generators; its period does not depend on the key.
+    """
+    child = np.random.SeedSequence(
+        seed.entropy, spawn_key=(*seed.spawn_key, *key), pool_size=seed.pool_size
+    )
+    return np.random.Generator(np.random.SFC64(child))

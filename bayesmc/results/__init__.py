@@ -1,0 +1,18 @@
+"""Results: posteriors that answer the same queries whatever made them."""
+
+from bayesmc.results.draws import DrawsPosterior
+from bayesmc.results.exact import ExactPosterior
+from bayesmc.results.marginal import Marginal
+from bayesmc.results.posterior import Posterior
+from bayesmc.results.sums import Sums, SumsPosterior
+from bayesmc.results.table import Summary
+
+__all__ = [
+    "DrawsPosterior",
+    "ExactPosterior",
+    "Marginal",
+    "Posterior",
+    "Summary",
+    "Sums",
+    "SumsPosterior",
+]

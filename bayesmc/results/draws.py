@@ -1,0 +1,320 @@
+"""A posterior held as draws, weighted or not, shape ``(chain, draw, *plates, *event)``.
+
+Weights are never dropped: every query here is weighted where the draws are. Predictive draws rerun the
+net's own forward pass from the posterior draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc import diagnostics
+from bayesmc.distributions import marking_invalid
+from bayesmc.errors import UnknownNodeError, UnsupportedError, missing_extra
+from bayesmc.network import Problem, read_inputs
+from bayesmc.network import forward
+from bayesmc.randomness import seed_sequence, stream
+from bayesmc.resampling import systematic
+from bayesmc.results.marginal import Marginal
+from bayesmc.results.posterior import Plates, Posterior
+from bayesmc.results.query import Query
+
+
+class DrawsPosterior(Posterior):
+    """Queries answered from draws.
+
+    Parameters
+    ----------
+    stored : dict
+        Node -> stored values, leading axes (chain, draw), either of which may have size 1 for constants.
+    log_weights : ndarray, shape (chain, draw), optional
+    independent : bool
+        Draws are independent of each other (no chain to diagnose).
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        engine: Any,
+        stored: Mapping[str, np.ndarray],
+        shape: tuple[int, int],
+        log_weights: np.ndarray | None = None,
+        independent: bool = False,
+    ) -> None:
+        super().__init__(problem, engine)
+        self._stored = dict(stored)
+        self._shape = shape
+        self._independent = independent
+        self.log_weights = log_weights
+        if log_weights is not None:
+            self.weights = diagnostics.normalised(log_weights)
+            self.weights.flags.writeable = False
+            self.weight_ess = diagnostics.weight_ess(log_weights)
+
+    @property
+    def pareto_k(self) -> float | None:  # type: ignore[override]
+        """Tail shape of the weights (above 0.7 they cannot be trusted); None where uniform."""
+        if self.log_weights is None:
+            return None
+        flat = self.log_weights.ravel()
+        return diagnostics.pareto_k(flat[np.isfinite(flat)], flat.size)
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        node = self._node(name)
+        values = np.broadcast_to(self._of(name), self._shape + node.value_shape)
+        return node.decode(values).copy()
+
+    # ---- moments -----------------------------------------------------------------------------
+
+    def mean(self, name: str) -> np.ndarray:
+        return self._average(self._values(name, "mean"))
+
+    def var(self, name: str) -> np.ndarray:
+        values = self._values(name, "var")
+        return self._average((values - self._average(values)) ** 2)
+
+    def cov(self, *names: str) -> np.ndarray:
+        blocks = [self._full(name, "cov").reshape(*self._shape, -1) for name in names]
+        flat = np.concatenate(blocks, axis=-1)
+        flat = (flat - self._average(flat)).reshape(-1, flat.shape[-1])
+        weights = np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
+        matrix = (flat * weights[:, None]).T @ flat
+        return matrix[0, 0] if matrix.size == 1 else matrix
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        values = self._full(name, "quantile")
+        flat = values.reshape((-1, *values.shape[2:]))
+        if self.weights is None:
+            return np.quantile(flat, q, axis=0)
+        return np.quantile(flat, q, axis=0, weights=self.weights.ravel(), method="inverted_cdf")
+
+    def probabilities(self, *names: str) -> np.ndarray:
+        if not names:
+            raise UnknownNodeError("probabilities(): name at least one node")
+        nodes = [self._finite(name) for name in names]
+        plates = tuple(dict.fromkeys(p for node in nodes for p in node.plates))
+        sizes = tuple(self.model.sizes[p] for p in plates)
+        code: Any = 0
+        for name, node in zip(names, nodes, strict=True):
+            assert node.domain is not None
+            order = [node.plates.index(p) for p in plates if p in node.plates]
+            values = self._of(name).transpose(0, 1, *(2 + i for i in order))
+            shape = [self.model.sizes[p] if p in node.plates else 1 for p in plates]
+            code = code * node.domain.size + values.reshape(values.shape[:2] + tuple(shape)).astype(np.intp)
+        cards = tuple(node.domain.size for node in nodes if node.domain is not None)
+        total = int(np.prod(cards))
+        flat = np.broadcast_to(code, self._shape + sizes).reshape(int(np.prod(self._shape)), -1)
+        weights = None if self.weights is None else self.weights.ravel()
+        table = np.stack(
+            [np.bincount(column, weights=weights, minlength=total) for column in flat.T]
+        ).astype(float)
+        if weights is None:
+            table /= len(flat)
+        return table.reshape(sizes + cards)
+
+    # ---- functions ---------------------------------------------------------------------------
+
+    def expectation(
+        self,
+        function: Callable[..., Any] | str,
+        plates: Plates = (),
+        names: Mapping[str, str] | None = None,
+    ) -> np.ndarray:
+        return self._average(self._evaluate(function, plates, names))
+
+    def probability(
+        self,
+        function: Callable[..., Any],
+        plates: Plates = (),
+        names: Mapping[str, str] | None = None,
+    ) -> np.ndarray:
+        values = self._evaluate(function, plates, names)
+        if values.dtype.kind != "b":
+            raise UnsupportedError(
+                f"probability: the function returns {values.dtype} values, not booleans; use expectation"
+            )
+        return self._average(values.astype(float))
+
+    def mcse(self, what: Any) -> np.ndarray:
+        values = self._scalars(what)
+        if self.weights is not None:
+            return diagnostics.weighted_mcse(values, self.weights)
+        if self._independent:
+            return values.std(axis=(0, 1), ddof=1) / np.sqrt(np.prod(self._shape))
+        return diagnostics.chain_statistic("mcse", values)
+
+    def ess(self, what: Any) -> np.ndarray:
+        values = self._scalars(what)
+        if self.weights is not None:
+            return diagnostics.weighted_ess(values, self.weights)
+        if self._independent:
+            return np.full(values.shape[2:], float(np.prod(self._shape)))
+        return diagnostics.chain_statistic("ess", values)
+
+    def rhat(self, what: Any) -> np.ndarray:
+        values = self._scalars(what)
+        if self.weights is not None or self._independent:
+            return np.full(values.shape[2:], np.nan)
+        return diagnostics.chain_statistic("rhat", values)
+
+    # ---- distributions -----------------------------------------------------------------------
+
+    def marginal(self, name: str, index: Any = ()) -> Marginal:
+        node = self._node(name)
+        if node.domain is not None and not node.event_shape:
+            values = np.arange(node.domain.size) if node.domain.labels else node.domain.numbers
+            picked = self.probabilities(name)[index if isinstance(index, tuple) else (index,)]
+            return Marginal(name, np.asarray(values), picked, node.domain.states)
+        draws = self._full(name, "marginal")
+        flat = draws.reshape((-1, *draws.shape[2:]))
+        flat = flat[(slice(None), *(index if isinstance(index, tuple) else (index,)))]
+        weights = np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
+        return Marginal(name, flat, weights)
+
+    def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
+        count = int(np.prod(self._shape)) if draws is None else int(draws)
+        generator = stream(seed_sequence(rng), 0)
+        total = int(np.prod(self._shape))
+        weights = np.full(total, 1 / total) if self.weights is None else self.weights.ravel()
+        picked = generator.permutation(systematic(weights, count, generator))
+        chain, draw = np.divmod(picked, self._shape[1])
+        stored = {
+            name: values
+            if values.shape[:2] == (1, 1)
+            else values[chain if values.shape[0] > 1 else 0, draw if values.shape[1] > 1 else 0][None]
+            for name, values in self._stored.items()
+        }
+        # duplicates of few heavy draws are not independent, so their error is the chain's business
+        return DrawsPosterior(
+            self._live("resample"), self.engine, stored, (1, count), independent=self.weights is None
+        )
+
+    def predict(
+        self,
+        names: str | Sequence[str],
+        inputs: Mapping[str, Any] | None = None,
+        plates: Mapping[str, int] | None = None,
+        rng: Any = None,
+        draws: int | None = None,
+    ) -> DrawsPosterior:
+        problem = self._live("predict")
+        wanted = (names,) if isinstance(names, str) else tuple(names)
+        for name in wanted:
+            if not self._node(name).is_stochastic and self._node(name).kind != "deterministic":
+                raise UnsupportedError(f"predict({name!r}): {self._node(name).kind} nodes are not drawn")
+        seed = seed_sequence(rng)
+        source = self if self.weights is None else self.resample(draws, stream(seed, 1))
+        return source._predict(problem, wanted, inputs, plates or {}, stream(seed, 0))
+
+    def _predict(
+        self,
+        problem: Problem,
+        wanted: tuple[str, ...],
+        inputs: Mapping[str, Any] | None,
+        plates: Mapping[str, int],
+        rng: np.random.Generator,
+    ) -> DrawsPosterior:
+        sizes = {**self.model.sizes, **plates}
+        given = problem.inputs if inputs is None else inputs
+        model = problem.net.model(None, given, sizes)
+        known = read_inputs({n: c.declaration for n, c in model.nodes.items()}, sizes, given)
+        values: dict[str, np.ndarray] = {}
+        anew: set[str] = set()
+        steps: list[forward.Step] = []
+        for name, node in model.nodes.items():
+            if node.kind == "input":
+                values[name] = known[name]
+                changed = inputs is not None or any(p in plates for p in node.plates)
+                anew |= {name} if changed else set()
+            elif name in wanted or any(p in plates for p in node.plates):
+                anew.add(name)
+                steps.append(forward.step_for(model, node, {}))
+            elif not node.is_stochastic and anew & set(node.parents):
+                anew.add(name)
+                steps.append(forward.step_for(model, node, {}))
+            else:
+                values[name] = self._of(name)
+        refused = forward.refuse_unsampled(
+            model, {n: problem.observed.get(n) for n in model.nodes if n not in anew}, "predict"  # type: ignore[misc]
+        )
+        if refused:
+            raise UnsupportedError(refused)
+        with marking_invalid(), np.errstate(all="ignore"):
+            drawn = forward.run(steps, forward.Pass(rng, self._shape, values)).values
+        stored = {n: _chained(drawn[n], len(model[n].value_shape)) for n in drawn}
+        new = Problem(problem.net, model, {}, dict(known))
+        return DrawsPosterior(new, self.engine, stored, self._shape, independent=self._independent)
+
+    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
+        if self.weights is not None and resample is None:
+            raise UnsupportedError(
+                "to_datatree: these draws are weighted and ArviZ would drop the weights; pass "
+                "resample=draws for equally weighted ones"
+            )
+        if resample is not None:
+            return self.resample(resample, rng).to_datatree()
+        try:
+            import arviz_base
+        except ImportError:
+            raise missing_extra("arviz-base", "arviz") from None
+        free = [n for n in self.names if self._is_free(n)]
+        groups = {"posterior": {n: np.asarray(self[n]) for n in free}}
+        seen = {n: self.model[n].decode(o.value) for n, o in self._live("to_datatree").observed.items()}
+        if seen:
+            groups["observed_data"] = {n: np.asarray(v) for n, v in seen.items()}
+        dims = {n: [*self.model[n].plates, *self._event_dims(n)] for n in [*free, *seen]}
+        coords = {p: list(self.model.labels.get(p, range(n))) for p, n in self.model.sizes.items()}
+        return arviz_base.from_dict(groups, dims=dims, coords=coords)
+
+    # ---- private -----------------------------------------------------------------------------
+
+    def _event_dims(self, name: str) -> list[str]:
+        return [f"{name}_dim_{i}" for i in range(len(self.model[name].event_shape))]
+
+    def _of(self, name: str) -> np.ndarray:
+        if name not in self._stored:
+            self._node(name)
+            raise UnsupportedError(
+                f"{name!r} was not kept (keep= lists {sorted(self._stored)}); add it to keep="
+            )
+        return self._stored[name]
+
+    def _values(self, name: str, what: str) -> np.ndarray:
+        """Numeric values, whose batch axes may have size 1 for constants."""
+        node = self._numeric(name, what)
+        return np.asarray(node.decode(self._of(name)))
+
+    def _full(self, name: str, what: str) -> np.ndarray:
+        values = self._values(name, what)
+        return np.broadcast_to(values, self._shape + values.shape[2:])
+
+    def _average(self, values: np.ndarray) -> np.ndarray:
+        if values.shape[:2] == (1, 1):
+            return np.asarray(values[0, 0], dtype=float)
+        return np.asarray(diagnostics.weighted_mean(values, self.weights))
+
+    def _evaluate(self, function: Any, plates: Plates, names: Mapping[str, str] | None) -> np.ndarray:
+        query = Query(self.model, function, plates, names)
+        stored = {
+            n: np.broadcast_to(self._of(n), self._shape + self.model[n].value_shape) for n in query.nodes
+        }
+        return query(stored, self._shape)
+
+    def _scalars(self, what: Any) -> np.ndarray:
+        """Values of a node or function; a labelled node gives the indicators of its states."""
+        if callable(what):
+            return self._evaluate(what, (), None).astype(float)
+        node = self._node(what)
+        if node.domain is not None and node.domain.labels is not None:
+            codes = np.broadcast_to(self._of(what), self._shape + node.value_shape)
+            return (codes[..., None] == np.arange(node.domain.size)).astype(float)
+        return self._full(what, "mean").astype(float)
+
+
+def _chained(values: np.ndarray, trailing: int) -> np.ndarray:
+    """Values with exactly two batch axes."""
+    missing = 2 - (values.ndim - trailing)
+    return values.reshape((1,) * missing + values.shape) if missing > 0 else values

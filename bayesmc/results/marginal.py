@@ -1,0 +1,92 @@
+"""``Marginal``: one node's distribution, from weighted draws, as histogram, kernel density or table."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import UnsupportedError
+
+
+@dataclass(frozen=True, eq=False)
+class Marginal:
+    """The marginal distribution of one node (each plate element and component by itself).
+
+    Attributes
+    ----------
+    name : str
+    values : ndarray, shape (draws, *plates, *event)
+        Draws, or the node's possible values where it is answered from a table.
+    weights : ndarray, shape (draws,) or (*plates, states)
+        Weights that sum to 1.
+    states : tuple or None
+        For a finite discrete node.
+    """
+
+    name: str
+    values: np.ndarray
+    weights: np.ndarray
+    states: tuple[Any, ...] | None = None
+
+    @property
+    def probabilities(self) -> np.ndarray:
+        """Probabilities of the states, shape ``(*plates, states)``."""
+        if self.states is None:
+            raise UnsupportedError(f"marginal({self.name!r}): a continuous node has no table of states")
+        return self.weights
+
+    def histogram(self, bins: Any = 40, range: Any = None, density: bool = True) -> tuple[Any, Any]:  # noqa: A002
+        """Weighted histogram of a scalar node: ``(heights, edges)`` as ``np.histogram`` gives them."""
+        values = self._scalar("histogram")
+        return np.histogram(values, bins=bins, range=range, weights=self.weights, density=density)
+
+    def density(self, points: Any, bandwidth: str | float = "scott") -> np.ndarray:
+        """Kernel density estimate at ``points``, Gaussian kernels on weighted draws.
+
+        Parameters
+        ----------
+        points : array_like
+        bandwidth : "scott", "silverman" or float
+            A rule with the weights' effective sample size, or the kernel's standard deviation.
+
+        References
+        ----------
+        Scott, Multivariate Density Estimation (1992), sec. 6.5; Silverman (1986), eq. 3.31.
+        """
+        values = self._scalar("density")
+        points = np.asarray(points, dtype=float)
+        h = self._bandwidth(values, bandwidth)
+        flat = points.ravel()
+        total = np.zeros(flat.shape)
+        step = max(1, 2_000_000 // max(len(flat), 1))
+        for start in range(0, len(values), step):
+            z = (flat[:, None] - values[None, start : start + step]) / h
+            total += np.exp(-0.5 * z * z) @ self.weights[start : start + step]
+        return (total / (h * np.sqrt(2 * np.pi))).reshape(points.shape)
+
+    def _scalar(self, what: str) -> np.ndarray:
+        if self.states is not None:
+            raise UnsupportedError(f"marginal({self.name!r}).{what}: use .probabilities of a discrete node")
+        if self.values.ndim != 1:
+            raise UnsupportedError(
+                f"marginal({self.name!r}).{what}: the node has shape {self.values.shape[1:]}; ask for one "
+                f"scalar with marginal({self.name!r}, index)"
+            )
+        return self.values
+
+    def _bandwidth(self, values: np.ndarray, rule: str | float) -> float:
+        if not isinstance(rule, str):
+            if not rule > 0:
+                raise ValueError(f"bandwidth={rule!r} must be positive")
+            return float(rule)
+        ess = 1.0 / np.sum(self.weights**2)
+        mean = self.weights @ values
+        spread = np.sqrt(self.weights @ (values - mean) ** 2)
+        spread = spread or max(abs(mean), 1.0) * 1e-3
+        if rule == "scott":
+            return float(spread * ess ** (-1 / 5))
+        if rule == "silverman":
+            return float(spread * (0.75 * ess) ** (-1 / 5))
+        raise ValueError(f"bandwidth={rule!r} is not 'scott', 'silverman' or a number")

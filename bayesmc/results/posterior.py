@@ -1,0 +1,260 @@
+"""``Posterior``: the answers to a question, the same queries whatever engine made it.
+
+What is common stands here: names, numbers of states, tables of figures, the snapshot. How an answer
+comes about (from draws, from sums, from exact tables) is each subclass's own affair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.network import CompiledNode, Problem
+from bayesmc.results.marginal import Marginal
+from bayesmc.results.table import Summary
+
+Plates = str | Sequence[str]
+_QUANTILES = (0.05, 0.5, 0.95)
+
+
+class Posterior:
+    """Answers about the nodes of a net given evidence.
+
+    Attributes
+    ----------
+    engine : object
+        The engine's options.
+    log_marginal_likelihood : float or None
+        Log probability (density) of the evidence.
+    log_marginal_likelihood_mcse : float or None
+        Its Monte Carlo standard error; 0 where exact.
+    """
+
+    log_marginal_likelihood: float | None = None
+    log_marginal_likelihood_mcse: float | None = None
+    #: importance weights normalised to sum to 1, shape (chain, draw); None where uniform or exact
+    weights: np.ndarray | None = None
+    log_weights: np.ndarray | None = None
+    weight_ess: float | None = None
+    pareto_k: float | None = None
+
+    def __init__(self, problem: Problem, engine: Any) -> None:
+        self.problem: Problem | None = problem
+        self.model = problem.model
+        self.engine = engine
+        self._observed = frozenset(n for n, o in problem.observed.items() if o.mask is None)
+
+    # ---- what every subclass answers ---------------------------------------------------------
+
+    def mean(self, name: str) -> np.ndarray:
+        """Posterior mean, shape ``(*plates, *event)``; labels have none."""
+        raise NotImplementedError
+
+    def var(self, name: str) -> np.ndarray:
+        """Posterior variance of every scalar, shape ``(*plates, *event)``."""
+        raise NotImplementedError
+
+    def std(self, name: str) -> np.ndarray:
+        """Posterior standard deviation, shape ``(*plates, *event)``."""
+        return np.sqrt(self.var(name))
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Covariance matrix of all scalars of the named nodes, in order; of one scalar, its variance."""
+        raise self._cannot("cov")
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Posterior quantiles, shape ``(*q.shape, *plates, *event)``."""
+        raise self._cannot("quantile")
+
+    def probabilities(self, *names: str) -> np.ndarray:
+        """Probabilities of the states: ``(*plates, states)``, or the joint table of several nodes."""
+        raise self._cannot("probabilities")
+
+    def expectation(
+        self,
+        function: Callable[..., Any] | str,
+        plates: Plates = (),
+        names: Mapping[str, str] | None = None,
+    ) -> np.ndarray:
+        """Posterior expectation of a function whose arguments name nodes.
+
+        Parameters
+        ----------
+        function : callable
+            Receives ``(*batch, *plates, *event)`` of each node and keeps the batch axes.
+        plates : str or sequence of str
+            Hand the function what a node in these plates would receive.
+        names : dict, optional
+            Argument -> node, where a node's name is no identifier.
+        """
+        raise self._cannot("expectation")
+
+    def probability(
+        self,
+        function: Callable[..., Any],
+        plates: Plates = (),
+        names: Mapping[str, str] | None = None,
+    ) -> np.ndarray:
+        """Posterior probability of an event: a function of named nodes that returns booleans."""
+
+        raise self._cannot("probability")
+
+    def marginal(self, name: str, index: Any = ()) -> Marginal:
+        """The marginal of a node (or of one scalar of it): histogram, kernel density, table."""
+        raise self._cannot("marginal")
+
+    def resample(self, draws: int | None = None, rng: Any = None) -> Posterior:
+        """A posterior of equally weighted draws."""
+        raise self._cannot("resample")
+
+    def mcse(self, what: Any) -> np.ndarray:
+        """Monte Carlo standard error of the mean of a node (of each state's probability, for labels)
+        or of the expectation of a function."""
+        raise self._cannot("mcse")
+
+    def ess(self, what: Any) -> np.ndarray:
+        """Effective number of independent draws behind the mean of a node or function."""
+        raise self._cannot("ess")
+
+    def rhat(self, what: Any) -> np.ndarray:
+        """Split R-hat across chains (NaN where draws are independent)."""
+        raise self._cannot("rhat")
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Raw draws, shape ``(chain, draw, *plates, *event)``: unweighted, also where weights matter."""
+        raise self._cannot("raw draws")
+
+    def predict(
+        self,
+        names: str | Sequence[str],
+        inputs: Mapping[str, Any] | None = None,
+        plates: Mapping[str, int] | None = None,
+        rng: Any = None,
+        draws: int | None = None,
+    ) -> Posterior:
+        """Posterior predictive: ``names`` drawn anew given the posterior draws of everything else."""
+        raise self._cannot("predict")
+
+    def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
+        """The draws as an ArviZ ``DataTree`` (extra ``arviz``)."""
+        raise self._cannot("to_datatree")
+
+    # ---- shared ------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that can be asked about."""
+        return tuple(n for n, c in self.model.nodes.items() if c.kind != "input")
+
+    def summary(self, names: Sequence[str] | None = None) -> Summary:
+        """Mean, sd, quantiles, Monte Carlo error, ESS and R-hat per scalar; probabilities per label.
+
+        By default the nodes that are not wholly observed.
+        """
+        chosen = list(names) if names is not None else [n for n in self.names if self._is_free(n)]
+        labels: list[str] = []
+        parts: dict[str, list[np.ndarray]] = {}
+        for name in chosen:
+            node = self._node(name)
+            for key, values in self._figures(name).items():
+                parts.setdefault(key, []).append(np.asarray(values, dtype=float).ravel())
+            labels.extend(self._row_names(node))
+        columns = {key: np.concatenate(values) for key, values in parts.items()}
+        return Summary(tuple(labels), columns, self._title())
+
+    def _figures(self, name: str) -> dict[str, np.ndarray]:
+        """Columns of the summary for one node, each of the node's shape (and states, for labels)."""
+        node = self._node(name)
+        if _is_labelled(node):
+            p = self.probabilities(name)
+            nan = np.full(p.shape, np.nan)
+            columns = {"mean": p, "sd": np.sqrt(p * (1 - p))}
+            columns.update({f"{100 * q:g}%": nan for q in _QUANTILES})
+        else:
+            columns = {"mean": self.mean(name), "sd": self.std(name)}
+            columns.update(self._quantile_columns(name))
+        columns["mcse"] = self.mcse(name)
+        columns["ess"] = np.broadcast_to(self.ess(name), columns["mean"].shape)
+        columns["rhat"] = np.broadcast_to(self.rhat(name), columns["mean"].shape)
+        return columns
+
+    def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
+        values = self.quantile(name, list(_QUANTILES))
+        return {f"{100 * q:g}%": v for q, v in zip(_QUANTILES, values, strict=True)}
+
+    def _title(self) -> str:
+        return type(self.engine).__name__
+
+    def _row_names(self, node: CompiledNode) -> list[str]:
+        axes = [
+            [str(x) for x in self.model.labels.get(p, range(n))]
+            for p, n in zip(node.plates, node.plate_shape, strict=True)
+        ]
+        axes += [[str(i) for i in range(n)] for n in node.event_shape]
+        if _is_labelled(node):
+            assert node.domain is not None
+            axes.append([str(s) for s in node.domain.states])
+        shape = tuple(len(a) for a in axes)
+        return [
+            node.name + (f"[{', '.join(a[i] for a, i in zip(axes, at, strict=True))}]" if at else "")
+            for at in np.ndindex(shape)
+        ]
+
+    def _node(self, name: str) -> CompiledNode:
+        node = self.model.nodes.get(name) if isinstance(name, str) else None
+        if node is None:
+            raise UnknownNodeError(
+                f"posterior: no node {name!r}; its nodes are {', '.join(list(self.model.nodes)[:12])}"
+            )
+        return node
+
+    def _numeric(self, name: str, what: str) -> CompiledNode:
+        node = self._node(name)
+        if _is_labelled(node):
+            assert node.domain is not None
+            raise UnsupportedError(
+                f"{what}({name!r}): the states {node.domain.states} are labels and have no {what}; use "
+                f"probabilities({name!r})"
+            )
+        return node
+
+    def _finite(self, name: str) -> CompiledNode:
+        node = self._node(name)
+        if node.domain is None:
+            raise UnsupportedError(
+                f"probabilities({name!r}): the node has no finite set of states; use "
+                f"probability(lambda {name}: ...), mean or quantile"
+            )
+        return node
+
+    def _is_free(self, name: str) -> bool:
+        return self.model.nodes[name].kind != "fixed" and name not in self._observed
+
+    def _live(self, what: str) -> Problem:
+        if self.problem is None:
+            raise UnsupportedError(
+                f"{what}: this posterior was unpickled, and pickles carry no functions; call infer again"
+            )
+        return self.problem
+
+    def _cannot(self, what: str) -> UnsupportedError:
+        return UnsupportedError(
+            f"{what}: {type(self).__name__} cannot answer this; {self._remedy()}"
+        )
+
+    def _remedy(self) -> str:
+        return "draw from it with resample(draws)"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without the model's functions."""
+        return {**self.__dict__, "problem": None, "model": self.model.without_functions()}
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"
+
+
+def _is_labelled(node: CompiledNode) -> bool:
+    return node.domain is not None and node.domain.labels is not None

@@ -1,0 +1,75 @@
+"""``Summary``: a table of one row per scalar that prints well without a data-frame library."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import UnknownNodeError
+
+
+@dataclass(frozen=True, eq=False)
+class Summary:
+    """Rows of figures, one per scalar.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Row names such as ``"mean[0]"`` or ``"rain[yes]"``.
+    columns : dict
+        Column name -> array, one entry per row.
+    title : str
+    """
+
+    names: tuple[str, ...]
+    columns: dict[str, np.ndarray]
+    title: str = ""
+
+    def __getitem__(self, key: str) -> Any:
+        """A column as an array, or a row as a dict."""
+        if key in self.columns:
+            return self.columns[key]
+        if key in self.names:
+            row = self.names.index(key)
+            return {column: float(values[row]) for column, values in self.columns.items()}
+        raise UnknownNodeError(f"summary: no row or column {key!r}; columns are {list(self.columns)}")
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def to_dict(self) -> dict[str, dict[str, float]]:
+        """Row name -> {column: figure}."""
+        return {name: self[name] for name in self.names}
+
+    def __str__(self) -> str:
+        shown = list(range(len(self.names)))
+        if len(shown) > 60:
+            shown = [*shown[:30], *shown[-30:]]
+        head = ["", *self.columns]
+        rows = [[self.names[i], *(_figure(v[i]) for v in self.columns.values())] for i in shown]
+        if len(self.names) > 60:
+            rows.insert(30, ["..."] + [""] * len(self.columns))
+        widths = [max(len(r[c]) for r in [head, *rows]) for c in range(len(head))]
+        lines = [
+            "  ".join(
+                [row[0].ljust(widths[0]), *(t.rjust(w) for t, w in zip(row[1:], widths[1:], strict=True))]
+            ).rstrip()
+            for row in [head, *rows]
+        ]
+        return "\n".join([self.title, *lines] if self.title else lines)
+
+    __repr__ = __str__
+
+
+def _figure(value: float) -> str:
+    if np.isnan(value):
+        return "-"
+    if value and (abs(value) >= 1e6 or abs(value) < 1e-4):
+        return f"{value:.3g}"
+    return f"{value:.0f}" if abs(value) >= 1e4 else f"{value:.4g}"

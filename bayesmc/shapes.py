@@ -1,0 +1,76 @@
+"""Arithmetic of shapes: a value is an array of shape ``(*batch, *plates, *event)``.
+
+Batch axes (draws, chains, particles, candidate values) always lead, plates follow, event axes come
+last; batch shapes of different values may differ but broadcast. This room knows arrays only, not nodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+Shape = tuple[int, ...]
+
+
+def as_shape(shape: int | Iterable[int]) -> Shape:
+    """``shape`` as a tuple of ints; a bare int is one axis."""
+    if isinstance(shape, tuple):
+        return shape
+    if isinstance(shape, (int, np.integer)):
+        return (int(shape),)
+    return tuple(int(n) for n in shape)
+
+
+def broadcast_shapes(*shapes: Shape) -> Shape:
+    """NumPy's broadcast of shapes, with the common cases (one shape, equal, empty) made cheap."""
+    first: Shape = ()
+    for shape in shapes:
+        if shape == first or not shape:
+            continue
+        if not first:
+            first = shape
+            continue
+        return np.broadcast_shapes(*shapes)
+    return first
+
+
+def read_only(value: np.ndarray) -> np.ndarray:
+    """A view of ``value`` that refuses to be written to (the array itself when it already does)."""
+    if not value.flags.writeable:
+        return value
+    view = value.view()
+    view.flags.writeable = False
+    return view
+
+
+def owned(value: Any, dtype: Any = None) -> np.ndarray:
+    """A private read-only copy of ``value``, so that nobody's array is shared or mutated."""
+    array = np.array(value, dtype=dtype)
+    array.flags.writeable = False
+    return array
+
+
+def broadcasts_to(shape: Shape, target: Shape) -> bool:
+    """Whether ``shape`` broadcasts to exactly ``target``, never beyond it."""
+    if len(shape) > len(target):
+        return False
+    return all(
+        a == b or a == 1 for a, b in zip(reversed(shape), reversed(target), strict=False)
+    )
+
+
+def unused_sizes(taken: Iterable[int], count: int) -> Sequence[int]:
+    """The ``count`` smallest sizes from 2 that differ from each other and from all ``taken``."""
+    used, sizes, candidate = set(taken), [], 2
+    while len(sizes) < count:
+        if candidate not in used:
+            sizes.append(candidate)
+        candidate += 1
+    return sizes
+
+
+def first_index(mask: np.ndarray) -> Shape:
+    """Index of the first True in ``mask``, in C order."""
+    return tuple(int(i) for i in np.unravel_index(int(np.argmax(mask)), mask.shape))

@@ -1,0 +1,141 @@
+"""Labelled states: integer codes that compare with labels.
+
+A node declared with ``states=("yes", "no")`` reaches functions and queries as a ``StateArray`` of
+positions 0, 1, ... for which ``== "yes"`` means what it says and an unknown label raises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import StateError
+
+
+class StateArray(np.ndarray):
+    """Integer codes whose ``==`` and ``!=`` accept labels; arithmetic gives plain integers.
+
+    Parameters
+    ----------
+    codes : array_like of int
+        Positions in ``states``.
+    states : sequence
+        The labels, in the order of the support.
+
+    Examples
+    --------
+    >>> from bayesmc.states import StateArray
+    >>> x = StateArray([0, 1, 1], ("yes", "no"))
+    >>> x == "no", x + 1
+    (array([False,  True,  True]), array([1, 2, 2]))
+    >>> x
+    StateArray(['yes', 'no', 'no'])
+    """
+
+    states: tuple[Any, ...]
+
+    def __new__(cls, codes: Any, states: Sequence[Any]) -> StateArray:
+        array = np.asarray(codes).view(cls)
+        array.states = tuple(states)
+        return array
+
+    def __array_finalize__(self, obj: Any) -> None:
+        self.states = getattr(obj, "states", ())
+
+    @property
+    def codes(self) -> np.ndarray:
+        """The positions as a plain array."""
+        return self.view(np.ndarray)
+
+    @property
+    def labels(self) -> np.ndarray:
+        """The labels, same shape."""
+        return label_array(self.states)[self.codes]
+
+    def isin(self, labels: Sequence[Any]) -> np.ndarray:
+        """Whether each element is one of ``labels``."""
+        return np.isin(self.codes, [label_code(self.states, label) for label in labels])
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if ufunc in (np.equal, np.not_equal) and method == "__call__":
+            inputs = _comparable(*inputs)
+        plain = [x.codes if isinstance(x, StateArray) else x for x in inputs]
+        return getattr(ufunc, method)(*plain, **kwargs)
+
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        if func is np.isin and isinstance(args[0], StateArray):
+            return args[0].isin(np.atleast_1d(np.asarray(args[1], dtype=object)).ravel(), **kwargs)
+        return super().__array_function__(func, types, args, kwargs)
+
+    def __getitem__(self, key: Any) -> Any:
+        item = super().__getitem__(key)
+        return item if isinstance(item, StateArray) else StateArray(item, self.states)
+
+    def __iter__(self) -> Any:
+        return (self[i] for i in range(len(self)))
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        if self.ndim:
+            raise TypeError("unhashable: an array of states")
+        return hash(self.states[int(self.codes)])
+
+    def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> np.ndarray:  # type: ignore[override]
+        return self.codes.astype(dtype, *args, **kwargs)
+
+    def tolist(self) -> Any:
+        """The labels as (nested) lists."""
+        return self.labels.tolist() if self.ndim else self.states[int(self.codes)]
+
+    def __repr__(self) -> str:
+        return f"StateArray({np.array2string(self.labels, separator=', ', threshold=20)})"
+
+    def __str__(self) -> str:
+        return str(self.labels) if self.ndim else str(self.states[int(self.codes)])
+
+    def __format__(self, spec: str) -> str:
+        return format(str(self), spec)
+
+    def __reduce__(self) -> Any:
+        return StateArray, (self.codes.copy(), self.states)
+
+
+def label_array(states: Sequence[Any]) -> np.ndarray:
+    """The labels as an array (of strings where all are strings, else of objects)."""
+    if all(isinstance(s, str) for s in states):
+        return np.array(states)
+    labels = np.empty(len(states), dtype=object)
+    labels[:] = list(states)
+    return labels
+
+
+def label_code(states: Sequence[Any], label: Any) -> int:
+    """Position of ``label`` among ``states``; an unknown one raises with the allowed labels."""
+    if isinstance(label, np.generic):
+        label = label.item()
+    for code, state in enumerate(states):
+        if type(state) is type(label) and state == label:
+            return code
+    if not isinstance(label, str):
+        for code, state in enumerate(states):
+            if not isinstance(state, str) and state == label:
+                return code
+    raise StateError(f"{label!r} is not a state; the states are {', '.join(map(repr, states))}")
+
+
+def _comparable(a: Any, b: Any) -> tuple[Any, Any]:
+    """Both sides as codes over the same states."""
+    if isinstance(a, StateArray) and isinstance(b, StateArray):
+        if a.states == b.states:
+            return a, b
+        shared = {s: i for i, s in enumerate(a.states)}
+        return a.codes, np.array([shared.get(s, -1) for s in b.states])[b.codes]
+    if isinstance(b, StateArray):
+        other, codes = _comparable(b, a)
+        return codes, other
+    plain = np.asarray(b, dtype=object) if isinstance(b, (str, list, tuple)) else np.asarray(b)
+    if plain.dtype.kind in "US" or plain.dtype == object:
+        codes = [label_code(a.states, label) for label in plain.ravel().tolist()]
+        return a, np.array(codes, dtype=int).reshape(plain.shape)
+    return a, b

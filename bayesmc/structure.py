@@ -1,0 +1,356 @@
+"""Structure read off a net: tables of finite nodes, and the net as discrete variables and factors.
+
+Functions of discrete parents are evaluated once on all configurations. Deterministic nodes without a
+finite domain are passed through: what depends on them depends on the finite nodes above.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.factors import FactorLike, LogTable
+from bayesmc.network import CompiledNode, Model, Observed
+from bayesmc.shapes import Shape
+
+#: table entries up to which a function is evaluated on all configurations of its parents
+TABLE_ENTRIES = 1 << 24
+
+#: one element of a finite node
+Variable = tuple[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """A finite node's probabilities over all configurations of its finite parents.
+
+    Attributes
+    ----------
+    parents : tuple of str
+        Parents that vary, in axis order (fixed nodes and inputs are constants).
+    probs : ndarray, shape (*cards, *plates or ones, states)
+    invalid : ndarray of bool or None, shape (*cards, *plates or ones)
+        Configurations at which the function gives bad parameters.
+    """
+
+    parents: tuple[str, ...]
+    probs: np.ndarray
+    invalid: np.ndarray | None = None
+
+
+def tabulate(
+    model: Model, node: CompiledNode, constants: Mapping[str, np.ndarray], limit: int = TABLE_ENTRIES
+) -> Table | None:
+    """The table of a finite node whose parents are finite and in its own plates; None if there is none.
+
+    ``constants`` are the stored values of inputs and fixed nodes.
+    """
+    if not node.is_stochastic or node.domain is None or node.has_foreign_parents:
+        return None
+    varying = tuple(dict.fromkeys(p for p in node.parents if p not in constants))
+    if any(model[p].domain is None for p in varying):
+        return None
+    cards = tuple(model[p].domain.size for p in varying)  # type: ignore[union-attr]
+    if float(np.prod(cards, dtype=float)) * node.domain.size * np.prod(node.plate_shape) > limit:
+        return None
+    values = dict(constants)
+    for axis, (parent, card) in enumerate(zip(varying, cards, strict=True)):
+        values[parent] = _along(axis, card, len(cards), model[parent].plate_shape)
+    with marking_invalid(), np.errstate(all="ignore"):
+        dist, _ = model.evaluate(node.name, values)
+        probs = dist.probs_table
+    ones = (1,) * len(node.plates)
+    lead = probs.shape[:-1]
+    full = np.broadcast_to(probs, np.broadcast_shapes(lead, cards + ones) + probs.shape[-1:])
+    invalid = None
+    if dist.invalid is not None and dist.invalid.any():
+        invalid = np.broadcast_to(dist.invalid, full.shape[:-1])
+    return Table(varying, full, invalid)
+
+
+def constants_of(model: Model, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Stored values that never vary: inputs and nodes fixed by ``do``."""
+    fixed = {
+        name: node.declaration.value
+        for name, node in model.nodes.items()
+        if node.declaration.value is not None
+    }
+    return {**inputs, **fixed}
+
+
+@dataclass(frozen=True, eq=False)
+class FactorSource:
+    """How one node or potential becomes factors: over which variables, at which plate elements.
+
+    ``alone`` are finite nodes whose element follows the factor's own; ``whole`` are those all of whose
+    elements matter (foreign plates), one axis each.
+    """
+
+    name: str
+    plates: tuple[str, ...]
+    alone: tuple[str, ...]
+    whole: tuple[str, ...]
+    is_potential: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteNet:
+    """A net as discrete variables and factors, the tables of its static part filled in.
+
+    Attributes
+    ----------
+    cards : dict
+        Variable -> number of states.
+    scopes : list of tuple
+        Scope of every factor: first the static ones, then those of continuous evidence.
+    static : list of FactorLike
+        Tables that do not depend on the evidence.
+    evidence_sources : list of FactorSource
+    invalid : list of (name, element, scope, mask)
+        Configurations with bad parameters, to be refused if they turn out to be possible.
+    """
+
+    model: Model
+    constants: dict[str, np.ndarray]
+    cards: dict[Variable, int]
+    scopes: list[tuple[Variable, ...]] = field(default_factory=list)
+    static: list[FactorLike] = field(default_factory=list)
+    evidence_sources: list[FactorSource] = field(default_factory=list)
+    invalid: list[tuple[str, int, tuple[Variable, ...], np.ndarray]] = field(default_factory=list)
+
+    def evidence_factors(self, observed: Mapping[str, Observed]) -> list[FactorLike]:
+        """Log likelihoods of continuous evidence, in the order of their scopes."""
+        factors: list[FactorLike] = []
+        for source in self.evidence_sources:
+            log_density, _ = _log_density(self, source, observed)
+            factors.extend(LogTable(log_density[at]) for at in _elements(self.model, source, log_density))
+        return factors
+
+
+def why_not_discrete(model: Model, observed: Mapping[str, Observed]) -> str | None:
+    """Why a net with this evidence is no discrete net, or None."""
+    for name, node in model.nodes.items():
+        if not node.is_stochastic or node.domain is not None:
+            continue
+        seen = observed.get(name)
+        if seen is None or seen.mask is not None:
+            partly = "is only partly observed and " if seen is not None else ""
+            what = (
+                f"has infinitely many values ({node.support.describe()})"
+                if node.is_discrete and node.support is not None
+                else "has values that depend on its parents"
+                if node.is_discrete
+                else "is continuous"
+            )
+            return f"node {name!r} {partly}{what}"
+    return None
+
+
+def discrete_net(
+    model: Model, observed: Mapping[str, Observed], inputs: Mapping[str, np.ndarray]
+) -> DiscreteNet:
+    """Variables, scopes and static tables of a net whose hidden nodes are all finite.
+
+    Raises
+    ------
+    BudgetError
+        A function has too many configurations to be tabulated.
+    """
+    cards = {
+        (name, element): node.domain.size
+        for name, node in model.nodes.items()
+        if node.domain is not None and node.kind != "fixed"
+        for element in range(int(np.prod(node.plate_shape, dtype=int)))
+    }
+    net = DiscreteNet(model, constants_of(model, inputs), cards)
+    later = []
+    for name, node in model.nodes.items():
+        if node.kind in ("input", "fixed") or (node.domain is None and not node.is_stochastic):
+            continue
+        source = _source(model, name, node.parents, node.plates)
+        if node.domain is None:
+            later.append(source)
+        else:
+            _add_static(net, source, node)
+    for name, (potential, _) in model.potentials.items():
+        source = _source(model, name, potential.parents, potential.plates, is_potential=True)
+        later.append(source)
+    for source in later:
+        _check_size(net, source, 1)
+        net.evidence_sources.append(source)
+        for element in np.ndindex(_plate_shape(model, source)):
+            net.scopes.append(_scope(model, source, element))
+    return net
+
+
+def configure(
+    net: DiscreteNet, alone: Sequence[str], whole: Sequence[str], names: Sequence[str]
+) -> tuple[dict[str, np.ndarray], Shape]:
+    """Stored values of ``names`` and what they need, over all configurations of the variables.
+
+    Axis k of the batch runs over the k-th of: nodes ``alone`` (one axis each, all plate elements alike),
+    then every element of the nodes ``whole``.
+    """
+    model = net.model
+    sizes = [model[n].domain.size for n in alone]  # type: ignore[union-attr]
+    for name in whole:
+        node = model[name]
+        sizes += [node.domain.size] * int(np.prod(node.plate_shape, dtype=int))  # type: ignore[union-attr]
+    values = dict(net.constants)
+    for axis, name in enumerate(alone):
+        values[name] = _along(axis, sizes[axis], len(sizes), model[name].plate_shape)
+    axis = len(alone)
+    for name in whole:
+        node = model[name]
+        count = int(np.prod(node.plate_shape, dtype=int))
+        batch = (1,) * axis + tuple(sizes[axis : axis + count]) + (1,) * (len(sizes) - axis - count)
+        value = np.empty((*batch, count), dtype=np.intp)
+        for element in range(count):
+            value[..., element] = _along(axis + element, sizes[axis + element], len(sizes), ())
+        values[name] = value.reshape(batch + node.plate_shape)
+        axis += count
+    needed = _between(model, names, values)
+    for name in model.nodes:
+        if name in needed:
+            values[name], _ = model.evaluate(name, values)
+    return values, tuple(sizes)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _along(axis: int, card: int, ndim: int, plates: Shape) -> np.ndarray:
+    """All positions along one batch axis, the same in every plate element."""
+    shape = (1,) * axis + (card,) + (1,) * (ndim - 1 - axis)
+    values = np.arange(card).reshape(shape + (1,) * len(plates))
+    return np.broadcast_to(values, shape + plates)
+
+
+def _source(
+    model: Model,
+    name: str,
+    parents: Sequence[str],
+    plates: tuple[str, ...],
+    is_potential: bool = False,
+) -> FactorSource:
+    """The finite nodes a factor depends on, through deterministic nodes without a domain."""
+    found: dict[str, bool] = {}
+
+    def visit(above: Sequence[str], own: tuple[str, ...], whole: bool) -> None:
+        for parent in above:
+            node = model[parent]
+            if node.kind in ("input", "fixed"):
+                continue
+            foreign = whole or any(p not in own for p in node.plates)
+            if node.domain is not None:
+                found[parent] = found.get(parent, False) or foreign
+            elif not node.is_stochastic:
+                visit(node.parents, node.plates, foreign)
+            else:
+                raise UnsupportedError(
+                    f"{name!r} depends on {parent!r}, which has no finite set of values"
+                )
+
+    visit(parents, plates, False)
+    alone = tuple(p for p, is_whole in found.items() if not is_whole)
+    whole_nodes = tuple(p for p, is_whole in found.items() if is_whole)
+    return FactorSource(name, plates, alone, whole_nodes, is_potential)
+
+
+def _plate_shape(model: Model, source: FactorSource) -> Shape:
+    return tuple(model.sizes[p] for p in source.plates)
+
+
+def _scope(model: Model, source: FactorSource, element: Shape) -> tuple[Variable, ...]:
+    scope: list[Variable] = []
+    for name in source.alone:
+        node = model[name]
+        own = tuple(element[source.plates.index(p)] for p in node.plates)
+        flat = int(np.ravel_multi_index(own, node.plate_shape)) if own else 0
+        scope.append((name, flat))
+    for name in source.whole:
+        scope += [(name, e) for e in range(int(np.prod(model[name].plate_shape, dtype=int)))]
+    return tuple(scope)
+
+
+def _check_size(net: DiscreteNet, source: FactorSource, states: int) -> None:
+    element = (0,) * len(source.plates)
+    entries = float(np.prod([net.cards[v] for v in _scope(net.model, source, element)], dtype=float))
+    entries *= states * float(np.prod(_plate_shape(net.model, source), dtype=float))
+    if entries > TABLE_ENTRIES:
+        what = "potential" if source.is_potential else "node"
+        raise BudgetError(
+            f"{what} {source.name!r} depends on {len(source.alone)} nodes and all elements of "
+            f"{list(source.whole)}: {entries:.3g} configurations to tabulate, above {TABLE_ENTRIES:.3g}",
+            int(min(8 * entries, 2**62)),
+        )
+
+
+def _add_static(net: DiscreteNet, source: FactorSource, node: CompiledNode) -> None:
+    assert node.domain is not None
+    _check_size(net, source, node.domain.size)
+    with marking_invalid(), np.errstate(all="ignore"):
+        values, cards = configure(net, source.alone, source.whole, _parents_of(net.model, source))
+        result, _ = net.model.evaluate(node.name, values)
+        if isinstance(result, Distribution):
+            probs = result.probs_table
+            invalid = result.invalid
+        else:
+            probs = np.asarray(result)[..., None] == np.arange(node.domain.size)
+            invalid = None
+    shape = cards + node.plate_shape
+    table = np.broadcast_to(probs, (*shape, node.domain.size)).astype(float, copy=False)
+    masks = None if invalid is None else np.broadcast_to(invalid, shape)
+    for flat, element in enumerate(np.ndindex(node.plate_shape)):
+        at = (slice(None),) * len(cards) + element
+        scope = _scope(net.model, source, element)
+        net.scopes.append((*scope, (node.name, flat)))
+        net.static.append(np.ascontiguousarray(table[at]))
+        if masks is not None and masks[at].any():
+            net.invalid.append((node.name, flat, scope, masks[at]))
+
+
+def _log_density(
+    net: DiscreteNet, source: FactorSource, observed: Mapping[str, Observed]
+) -> tuple[np.ndarray, Any]:
+    """Log likelihood of one continuous observed node, shape ``(*cards, *plates)``."""
+    model = net.model
+    with marking_invalid(), np.errstate(all="ignore"):
+        values, cards = configure(net, source.alone, source.whole, _parents_of(model, source))
+        shape = cards + _plate_shape(model, source)
+        if source.is_potential:
+            potential, _ = model.potentials[source.name]
+            return np.broadcast_to(model.potential(source.name, values, total=False), shape), None
+        dist, _ = model.evaluate(source.name, values)
+        density = model.log_density(source.name, dist, observed[source.name].value)
+    return np.broadcast_to(density, shape), dist.invalid
+
+
+def _elements(model: Model, source: FactorSource, table: np.ndarray) -> list[tuple[Any, ...]]:
+    plates = _plate_shape(model, source)
+    lead = table.ndim - len(plates)
+    return [(slice(None),) * lead + element for element in np.ndindex(plates)]
+
+
+def _parents_of(model: Model, source: FactorSource) -> tuple[str, ...]:
+    if source.is_potential:
+        return model.potentials[source.name][0].parents
+    return model[source.name].parents
+
+
+def _between(model: Model, names: Sequence[str], known: Mapping[str, Any]) -> set[str]:
+    """Deterministic nodes to compute on the way from known values to ``names``."""
+    needed: set[str] = set()
+    todo = [n for n in names if n not in known]
+    while todo:
+        name = todo.pop()
+        if name not in needed:
+            needed.add(name)
+            todo += [p for p in model[name].parents if p not in known]
+    return needed

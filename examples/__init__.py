@@ -1,0 +1,1 @@
+"""Nets on real numbers, run by ``make demo`` (``python -m examples.demo``)."""

@@ -1,0 +1,69 @@
+"""What every test file shares: the reference data, and a Hypothesis profile without chance.
+
+Tests that hold bayesmc against published numbers take the fixture ``reference_data`` (a path),
+which marks them ``reference``; where the data is absent they are skipped, and the run's last lines
+say how many, so that a green run without data is not mistaken for a checked one.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parents[1]
+ABSENT = "reference data absent"
+
+hypothesis.settings.register_profile(
+    "bayesmc", derandomize=True, deadline=None, print_blob=True, database=None
+)
+hypothesis.settings.load_profile("bayesmc")
+
+
+def data_root() -> Path:
+    """Where the reference data is looked for: ``BAYESMC_DATA``, else beside the checkout."""
+    named = os.environ.get("BAYESMC_DATA")
+    return Path(named) if named else REPOSITORY.parent / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def reference_data() -> Path:
+    """Path of the reference data; a test that asks for it is skipped where there is none."""
+    root = data_root()
+    if not root.is_dir():
+        pytest.skip(f"{ABSENT}: {root} is not a folder (set BAYESMC_DATA)")
+    return root
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        if "reference_data" in getattr(item, "fixturenames", ()):
+            item.add_marker("reference")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    ran, without_data, otherwise = _reference_counts(terminalreporter.stats)
+    line = f"reference tests: {ran} ran, {without_data} skipped for want of data"
+    if otherwise:
+        line += f", {otherwise} skipped for other reasons"
+    terminalreporter.write_line(line, yellow=without_data > 0)
+
+
+def _reference_counts(stats: dict[str, list]) -> tuple[int, int, int]:
+    ran: set[str] = set()
+    skipped: dict[str, str] = {}
+    for reports in stats.values():
+        for report in reports:
+            if "reference" not in getattr(report, "keywords", ()):
+                continue
+            if report.skipped:
+                skipped[report.nodeid] = str(report.longrepr)
+            elif report.when == "call" or report.failed:
+                ran.add(report.nodeid)
+    # Without the folder no reference test can have another reason that matters.
+    absent = not data_root().is_dir()
+    without_data = sum(absent or ABSENT in reason for reason in skipped.values())
+    return len(ran), without_data, len(skipped) - without_data

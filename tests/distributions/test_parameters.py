@@ -1,0 +1,163 @@
+"""Parameters out of range: the message, the first offending index, and marking instead of raising."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesmc.distributions as d
+from bayesmc.errors import ParameterError, ShapeError
+
+NAN, INF = np.nan, np.inf
+NOT_PD = np.array([[1.0, 2.0], [2.0, 1.0]])
+
+#: a call with exactly one fault, its index, and words of its message
+FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
+    (lambda: d.Normal(0.0, -1.0), (), "Normal: scale must be positive and finite; got -1."),
+    (lambda: d.Normal(0.0, [1.0, 0.0]), (1,), "scale must be positive and finite; got 0. at index 1"),
+    (lambda: d.Normal([[0, 1], [NAN, 2]], 1.0), (1, 0), r"loc must be finite; got nan at index (1, 0)"),
+    (lambda: d.Normal(0.0, INF), (), "scale must be positive"),
+    (lambda: d.StudentT([3.0, -3.0], 0.0, 1.0), (1,), "StudentT: df must be positive"),
+    (lambda: d.StudentT(3.0, 0.0, NAN), (), "scale must be positive"),
+    (lambda: d.Uniform([0.0, 2.0], 2.0), (1,), "Uniform: high must be finite and above low; got 2."),
+    (lambda: d.Uniform(0.0, NAN), (), "high must be finite and above low"),
+    (lambda: d.Uniform(-INF, 0.0), (), "low must be finite"),
+    (lambda: d.Beta([1.0, 0.0], 1.0), (1,), "Beta: concentration1 must be positive"),
+    (lambda: d.Beta(1.0, NAN), (), "concentration0 must be positive"),
+    (lambda: d.Gamma(1.0, [[1.0, -2.0]]), (0, 1), "Gamma: rate must be positive"),
+    (lambda: d.Exponential(INF), (), "Exponential: rate must be positive and finite; got inf"),
+    (lambda: d.Dirichlet([[1.0, 1.0], [1.0, 0.0]]), (1,), "Dirichlet: concentration must be positive"),
+    (lambda: d.Bernoulli([0.5, 1.5]), (1,), "Bernoulli: probs must be between 0 and 1; got 1.5 at"),
+    (lambda: d.Bernoulli(logits=[0.0, NAN]), (1,), "logits must be a number"),
+    (lambda: d.Binomial(2.5, 0.5), (), "Binomial: total_count must be a nonnegative whole number; got 2.5"),
+    (lambda: d.Binomial([3, -1], 0.5), (1,), "total_count must be a nonnegative whole number; got -1"),
+    (lambda: d.Binomial(3, [0.5, NAN]), (1,), "Binomial: probs must be between 0 and 1"),
+    (lambda: d.Poisson([1.0, -1.0]), (1,), "Poisson: rate must be nonnegative and finite"),
+    (lambda: d.DiscreteUniform(0.5, 3), (), "DiscreteUniform: low must be a whole number; got 0.5"),
+    (lambda: d.DiscreteUniform(0, [3, NAN]), (1,), "high must be a whole number"),
+    (lambda: d.DiscreteUniform([0, 4], 3), (1,), "high must be at least low; got 3 at index 1"),
+    (
+        lambda: d.Categorical([[0.5, 0.5], [0.5, 0.4]]),
+        (1,),
+        "Categorical: probs must be nonnegative and sum to 1 within 1e-06 (this row sums to 0.9); "
+        "got [0.5 0.4] at index 1",
+    ),
+    (lambda: d.Categorical([1.5, -0.5]), (), "nonnegative and sum to 1"),
+    (lambda: d.Categorical([[[0.5, 0.5], [NAN, 0.5]]]), (0, 1), "at index (0, 1)"),
+    (lambda: d.Categorical(logits=[[0.0, 0.0], [-INF, -INF]]), (1,), "logits must be below infinity"),
+    (lambda: d.Categorical(logits=[0.0, INF]), (), "logits must be below infinity"),
+    (lambda: d.MvNormal([0.0, NAN], np.eye(2)), (), "MvNormal: loc must be finite"),
+    (
+        lambda: d.MvNormal(np.zeros(2), [np.eye(2), np.eye(2), NOT_PD]),
+        (2,),
+        "MvNormal: cov must be symmetric positive definite",
+    ),
+    (lambda: d.MvNormal(np.zeros(2), [[1.0, 0.5], [0.0, 1.0]]), (), "symmetric positive definite"),
+    (lambda: d.MvNormal(np.zeros(2), [[NAN, 0.0], [0.0, 1.0]]), (), "symmetric positive definite"),
+    (lambda: d.MvNormal(np.zeros(2), scale_tril=[[1.0, 0.5], [0.0, 1.0]]), (), "lower triangular"),
+    (lambda: d.MvNormal(np.zeros(2), scale_tril=-np.eye(2)), (), "positive diagonal"),
+    (lambda: d.MvNormal(np.zeros(2), scale_diag=[[1.0, 1.0], [1.0, 0.0]]), (1,), "scale_diag must be"),
+    (lambda: d.Mixture([0.5, 0.6], d.Normal([0, 1], 1)), (), "Mixture: weights must be nonnegative and"),
+    (
+        lambda: d.as_distribution(stats.norm(0.0, [1.0, -1.0])),
+        (1,),
+        "scipy.stats.norm: parameters must be in SciPy's range; got [ 0. -1.] at index 1",
+    ),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("call", "index", "message"), FAULTS, ids=lambda v: str(v)[:50])
+def test_the_first_fault_is_named(call: Callable, index: tuple[int, ...], message: str) -> None:
+    with pytest.raises(ParameterError) as caught:
+        call()
+    assert message in str(caught.value)
+    assert caught.value.index == index
+
+
+@pytest.mark.parametrize(("call", "index", "message"), FAULTS, ids=lambda v: str(v)[:50])
+def test_a_marked_fault_leaves_the_rest_usable(
+    call: Callable, index: tuple[int, ...], message: str
+) -> None:
+    with d.marking_invalid():
+        if not index and message.startswith("scipy"):
+            return
+        dist = call()
+    assert dist.invalid.shape == dist.batch_shape
+    assert dist.invalid[index]
+    assert dist.invalid.sum() == 1
+    assert message in str(dist.problem)
+    assert dist.problem.index == index
+    draws = dist.sample(0, 50)
+    assert draws.shape == (50, *dist.batch_shape, *dist.event_shape)
+    good = ~dist.invalid
+    assert np.isfinite(dist.log_prob(draws)[:, good]).all()
+
+
+def test_marks_do_not_leak_out_of_the_block() -> None:
+    with d.marking_invalid():
+        assert d.Normal(0.0, -1.0).invalid is not None
+    with pytest.raises(ParameterError):
+        d.Normal(0.0, -1.0)
+
+
+def test_valid_elements_are_untouched_by_a_marked_one() -> None:
+    with d.marking_invalid():
+        dist = d.Normal([0.0, 1.0, 2.0], [1.0, -1.0, 3.0])
+        table = d.Categorical([[0.2, 0.8], [0.7, 0.7]])
+    np.testing.assert_array_equal(dist.log_prob(0.5)[[0, 2]], d.Normal([0.0, 2.0], [1.0, 3.0]).log_prob(0.5))
+    np.testing.assert_array_equal(table.probs[0], [0.2, 0.8])
+
+
+def test_several_faults_are_all_marked() -> None:
+    with d.marking_invalid():
+        dist = d.Gamma([1.0, -1.0, 1.0], [1.0, 1.0, 0.0])
+    assert dist.invalid.tolist() == [False, True, True]
+    assert "concentration" in str(dist.problem)  # the first one found
+
+
+def test_a_mixture_adopts_the_marks_of_its_parts() -> None:
+    with d.marking_invalid():
+        stacked = d.Mixture([0.5, 0.5], d.Normal(0.0, [[1.0, 1.0], [1.0, -1.0]]))
+        listed = d.Mixture([0.5, 0.5], [d.Normal(0.0, [1.0, -1.0]), d.Normal(0.0, 1.0)])
+    assert stacked.invalid.tolist() == listed.invalid.tolist() == [False, True]
+    assert "scale" in str(stacked.problem)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: d.Normal(np.zeros(2), np.ones(3)), r"\(2,\), \(3,\) do not broadcast"),
+        (lambda: d.MvNormal(0.0, np.eye(2)), "loc must have shape"),
+        (lambda: d.MvNormal(np.zeros(3), np.eye(2)), "loc must have shape"),
+        (lambda: d.MvNormal(np.zeros(2), np.ones((2, 3))), "loc must have shape"),
+        (lambda: d.Dirichlet(1.0), r"shape \(..., K\)"),
+        (lambda: d.Categorical(0.5), r"shape \(..., K\)"),
+        (lambda: d.Categorical(np.zeros((2, 0))), "K at least 1"),
+        (lambda: d.Mixture([0.5, 0.5], d.Normal(0, 1)), "must count the components"),
+        (lambda: d.Mixture([0.5, 0.5], d.Normal([0, 1, 2], 1)), "2 weights for 3 components"),
+        (lambda: d.Mixture(1.0, d.Normal([0], 1)), "got a scalar"),
+        (lambda: d.Mixture([1.0], []), "list of Distributions"),
+        (lambda: d.Mixture([1.0], [3.0]), "list of Distributions"),
+    ],
+)
+def test_shapes_that_do_not_fit_are_refused(call: Callable, message: str) -> None:
+    with pytest.raises(ShapeError, match=message):
+        call()
+
+
+@pytest.mark.parametrize("family", [d.Bernoulli, d.Categorical])
+def test_probs_and_logits_exclude_each_other(family: type[d.Distribution]) -> None:
+    with pytest.raises(ParameterError, match="exactly one of probs and logits"):
+        family([0.5, 0.5], logits=[0.0, 0.0])
+    with pytest.raises(ParameterError, match="exactly one of probs and logits"):
+        family()
+
+
+def test_mvnormal_takes_exactly_one_scale() -> None:
+    with pytest.raises(ParameterError, match="exactly one of cov"):
+        d.MvNormal([0.0])
+    with pytest.raises(ParameterError, match="exactly one of cov"):
+        d.MvNormal([0.0], [[1.0]], scale_diag=[1.0])

@@ -1,0 +1,206 @@
+"""Draws against the distributions they claim to come from, at stated false-alarm rates.
+
+Seeds are fixed, so a test that passes keeps passing; each test's false-alarm rate is ``ALARM`` were the
+seed fresh. About 900 tests run here, so that a fresh run of the file would fail once in a thousand.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+import bayesmc.distributions as d
+from tests.distributions.families import FAMILIES, magnitudes, parameters_of
+
+ALARM = 1e-6
+DRAWS = 10_000
+FIXED = settings(derandomize=True, max_examples=30, deadline=None, database=None)
+
+
+def uniforms(dist: d.Distribution, draws: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Probability integral transform: uniform if the draws are right; atoms are spread at random."""
+    upper = dist.cdf(draws)
+    if isinstance(dist, d.Beta):
+        # near one, numbers are too far apart for a steep cdf: that mass is spread at random
+        edge = 1 - 1e-14
+        spread = 1 - rng.random(draws.shape) * (1 - dist.cdf(edge))
+        return np.where(draws > edge, spread, upper)
+    if not dist.is_discrete:
+        return upper
+    return upper - rng.random(draws.shape) * np.exp(dist.log_prob(draws))
+
+
+def p_value(dist: d.Distribution, draws: np.ndarray, rng: np.random.Generator) -> float:
+    """Least Kolmogorov-Smirnov p-value over the batch, times its size (Bonferroni)."""
+    u = uniforms(dist, draws, rng).reshape(len(draws), -1)
+    least = min(stats.kstest(u[:, k], "uniform").pvalue for k in range(u.shape[1]))
+    return least * u.shape[1]
+
+
+@pytest.mark.parametrize("name", sorted(FAMILIES))
+def test_draws_fit_over_parameters_and_batch_shapes(name: str) -> None:
+    @FIXED
+    @given(parameters_of(name), st.integers(0, 2**32 - 1))
+    def check(parameters: list[np.ndarray], seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        dist = FAMILIES[name].make(*parameters)
+        draws = dist.sample(rng, DRAWS)
+        assert draws.shape == (DRAWS, *dist.batch_shape)
+        assert not np.isnan(draws).any()
+        assert p_value(dist, draws, rng) > ALARM
+
+    check()
+
+
+MODERATE = [(name, values) for name, family in FAMILIES.items() for values in family.moderate]
+
+
+@pytest.mark.parametrize(("name", "values"), MODERATE)
+def test_mean_and_variance_of_draws_agree(name: str, values: tuple[float, ...]) -> None:
+    # The two means are normal to a good approximation at 10^5 draws of light-tailed families; the
+    # variance of (x - mean)^2 is estimated. 4.9 standard errors, two-sided: 10^-6 each.
+    dist = FAMILIES[name].make(*values)
+    x = dist.sample(7, 100_000).astype(float)
+    squares = (x - dist.mean) ** 2
+    for sample, expected in ((x, dist.mean), (squares, dist.var)):
+        error = sample.std() / np.sqrt(len(x))
+        assert abs(sample.mean() - expected) <= 4.9 * error + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("claimed", "drawn"),
+    [
+        (d.Normal(0.0, 1.0), d.Normal(0.0, 1.12)),
+        (d.StudentT(3.0, 0.0, 1.0), d.Normal(0.0, 1.0)),
+        (d.Gamma(2.0, 3.0), d.Gamma(2.0, 2.7)),
+        (d.Beta(2.0, 3.0), d.Beta(2.2, 3.0)),
+        (d.Bernoulli(0.30), d.Bernoulli(0.35)),
+        (d.Poisson(3.5), d.Poisson(3.8)),
+        (d.Binomial(12, 0.3), d.Poisson(3.6)),
+        (d.Categorical([0.2, 0.3, 0.5]), d.Categorical([0.25, 0.3, 0.45])),
+        (d.Mixture([0.5, 0.5], d.Normal([-2, 2], 1)), d.Normal(0.0, np.sqrt(5.0))),
+    ],
+    ids=repr,
+)
+def test_draws_of_another_distribution_are_seen(
+    claimed: d.Distribution, drawn: d.Distribution
+) -> None:
+    # negative control of the goodness-of-fit tests, at their own number of draws and alarm rate
+    rng = np.random.default_rng(0)
+    assert p_value(claimed, drawn.sample(rng, DRAWS), rng) < ALARM
+
+
+@FIXED
+@given(
+    st.lists(magnitudes(1e-6, 1.0), min_size=1, max_size=60),
+    st.sampled_from([(), (1,), (3,), (2, 1)]),
+    st.booleans(),
+    st.integers(0, 2**32 - 1),
+)
+def test_categorical_draws_fit(
+    weights: list[float], batch: tuple[int, ...], broadcast: bool, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    probs = np.array(weights) / np.sum(weights)
+    rows = np.broadcast_to(probs, (*batch, len(probs)))
+    dist = d.Categorical(rows if broadcast else rows.copy())
+    draws = dist.sample(rng, DRAWS)
+    assert draws.dtype == np.int64
+    assert p_value(dist, draws, rng) > ALARM
+    # states together, as Pearson's chi-square where its approximation holds
+    counts = np.bincount(draws.reshape(-1), minlength=len(probs))
+    expected = probs * draws.size
+    if len(probs) > 1 and expected.min() >= 50:
+        assert stats.chisquare(counts, expected * counts.sum() / expected.sum()).pvalue > ALARM
+
+
+@FIXED
+@given(st.integers(1, 4), st.sampled_from(["cov", "scale_tril", "scale_diag"]), st.integers(0, 999))
+def test_mvnormal_projections_fit(size: int, form: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = np.tril(rng.normal(size=(2, size, size))) + 3 * np.eye(size)
+    loc = 10 * rng.normal(size=(2, size))
+    if form == "scale_diag":
+        dist = d.MvNormal(loc, scale_diag=np.linalg.diagonal(root))
+    elif form == "scale_tril":
+        dist = d.MvNormal(loc, scale_tril=root)
+    else:
+        dist = d.MvNormal(loc, root @ np.matrix_transpose(root))
+    draws = dist.sample(rng, DRAWS)
+    direction = rng.normal(size=size)
+    variance = np.einsum("i,bij,j->b", direction, dist.cov, direction)
+    z = (draws - loc) @ direction / np.sqrt(variance)
+    distances = dist.squared_mahalanobis(draws)
+    for k in range(2):
+        assert stats.kstest(z[:, k], "norm").pvalue > ALARM
+        assert stats.kstest(distances[:, k], stats.chi2(size).cdf).pvalue > ALARM
+
+
+def test_mvnormal_with_a_wrong_correlation_is_seen() -> None:
+    # negative control of the projections
+    draws = d.MvNormal([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]]).sample(1, DRAWS)
+    claimed = d.MvNormal([0.0, 0.0], [[1.0, 0.3], [0.3, 1.0]])
+    assert stats.kstest(claimed.squared_mahalanobis(draws), stats.chi2(2).cdf).pvalue < ALARM
+
+
+@FIXED
+@given(st.lists(magnitudes(0.02, 1e3), min_size=2, max_size=5), st.integers(0, 999))
+def test_dirichlet_margins_fit(concentration: list[float], seed: int) -> None:
+    # every component, and the sum of the first two, are Beta
+    rng = np.random.default_rng(seed)
+    a = np.array([concentration, concentration[::-1]])
+    draws = d.Dirichlet(a).sample(rng, DRAWS)
+    np.testing.assert_allclose(draws.sum(axis=-1), 1.0, rtol=1e-12)
+    total = a.sum(axis=-1)
+    margins = [(draws[..., k], a[:, k]) for k in range(a.shape[1])]
+    if a.shape[1] > 2:
+        margins.append((draws[..., 0] + draws[..., 1], a[:, 0] + a[:, 1]))
+    for values, part in margins:
+        for row in range(2):
+            beta = d.Beta(part[row], total[row] - part[row])
+            # nothing below the smallest normal number can be drawn: its mass is an atom there
+            u = uniforms(beta, values[:, row], rng)
+            u = np.where(values[:, row] < 1e-300, rng.random(DRAWS) * beta.cdf(1e-300), u)
+            assert stats.kstest(u, "uniform").pvalue > ALARM
+
+
+@FIXED
+@given(st.lists(magnitudes(1e-3, 1.0), min_size=1, max_size=4), st.integers(0, 999))
+def test_mixture_draws_fit(weights: list[float], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    probs = np.array(weights) / np.sum(weights)
+    loc = 5 * rng.normal(size=(2, len(probs)))
+    stacked = d.Mixture(probs, d.Normal(loc, 1.0))
+    listed = d.Mixture(probs, [d.Normal(loc[:, k], 1.0) for k in range(len(probs))])
+    for dist in (stacked, listed):
+        assert p_value(dist, dist.sample(rng, DRAWS), rng) > ALARM
+    counts = d.Mixture(probs, d.Poisson(np.abs(loc)))
+    assert p_value(counts, counts.sample(rng, DRAWS), rng) > ALARM
+
+
+@pytest.mark.parametrize(
+    "dist",
+    [
+        d.Gamma([0.005, 0.02], 1.0),
+        d.Beta(0.01, [0.01, 5.0]),
+        d.Beta(2.0, [0.05, 0.3]),
+        d.Dirichlet([[0.01, 0.01, 0.01], [0.001, 0.5, 3.0]]),
+        d.StudentT([0.05, 0.3], 0.0, 1.0),
+        d.Exponential([1e-300, 1e300]),
+        d.Uniform(0.1, 0.1 + 1e-16 * 3),
+    ],
+    ids=repr,
+)
+def test_no_draw_has_density_zero_or_infinite(dist: d.Distribution) -> None:
+    draws = dist.sample(3, 20_000)
+    assert np.isfinite(dist.log_prob(draws)).all()
+    assert dist.support.contains(draws).all()
+
+
+def test_the_same_seed_gives_the_same_draws() -> None:
+    dist = d.Mixture([0.3, 0.7], d.Gamma([0.5, 3.0], 1.0))
+    np.testing.assert_array_equal(dist.sample(5, 100), dist.sample(5, 100))
+    assert (dist.sample(5, 100) != dist.sample(6, 100)).any()

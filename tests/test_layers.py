@@ -1,0 +1,230 @@
+"""Holds the layers of the package: imports point down only, heavy libraries load when first used.
+
+The modules are read, not run: every import statement is found in the syntax tree, those inside
+functions and under ``TYPE_CHECKING`` included; only a cycle within a room may be closed by an import
+for types. Planted violations show that each rule can fail.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parents[1] / "bayesmc"
+
+# Top to bottom. A package counts as one room; rooms on one line do not import each other.
+LAYERS = """
+robotics | plotting | io | testing
+auto
+pmcmc
+engines
+kernels
+dbn | structure | results
+network
+factors
+distributions
+resampling | gaussian | diagnostics | tracing | plates | states | randomness | progress
+errors | shapes
+"""
+DEPTH = {
+    room.strip(): depth
+    for depth, line in enumerate(LAYERS.strip().splitlines())
+    for room in line.split("|")
+}
+
+HEAVY = ("scipy.stats", "networkx", "arviz_stats", "arviz_base", "matplotlib", "hypothesis",
+         "tqdm", "numba", "PIL", "yaml", "pandas")  # fmt: skip
+
+
+def violations(sources: dict[str, str]) -> list[str]:
+    """What is wrong with modules given as dotted name -> source text; empty when all is well."""
+    found, graph = [], {}
+    for name, source in sources.items():
+        imports = list(_imports(name, source))
+        graph[name] = {target for target, _, _, only_types in imports if not only_types}
+        for target, line, in_function, only_types in imports:
+            where = f"{name}:{line}"
+            if target.split(".")[0] == "bayesmc":
+                found += _knots(name, target, where, in_function)
+            elif not in_function and not only_types and _is_heavy(target):
+                found.append(f"{where}: imports {target} at module level, not where it is used")
+        found += _rooms(name)
+    return found + _cycles(_between_modules(graph))
+
+
+def _knots(name: str, target: str, where: str, in_function: bool) -> Iterator[str]:
+    if in_function:
+        yield f"{where}: imports {target} inside a function"
+    here, there = _room(name), _room(target)
+    if here in ("", there) or here not in DEPTH:
+        return
+    if there == "":
+        yield f"{where}: imports the package itself, which stands above everything"
+    elif DEPTH.get(there, -1) <= DEPTH[here]:
+        yield f"{where}: {here} imports {there}, which does not stand below it"
+
+
+def _rooms(name: str) -> list[str]:
+    room = _room(name)
+    known = room == "" or room in DEPTH
+    return [] if known else [f"{name}: the room {room!r} has no place in LAYERS"]
+
+
+def _room(name: str) -> str:
+    """First part below the package: ``engines`` of ``bayesmc.engines.exact``; '' for itself."""
+    parts = name.split(".")
+    return parts[1] if len(parts) > 1 and parts[1] != "__init__" else ""
+
+
+def _is_heavy(target: str) -> bool:
+    return any(target == heavy or target.startswith(heavy + ".") for heavy in HEAVY)
+
+
+def _imports(name: str, source: str) -> Iterator[tuple[str, int, bool, bool]]:
+    """``(imported dotted name, line, inside a function, under TYPE_CHECKING)`` of every import."""
+
+    def walk(node: ast.AST, in_function: bool, only_types: bool) -> Iterator:
+        for child in ast.iter_child_nodes(node):
+            line = getattr(child, "lineno", 0)
+            for target in _targets(name, child):
+                yield target, line, in_function, only_types
+            inside = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            types = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
+            yield from walk(child, in_function or inside, only_types or types)
+
+    return walk(ast.parse(source), False, False)
+
+
+def _targets(name: str, node: ast.AST) -> Iterator[str]:
+    if isinstance(node, ast.Import):
+        yield from (alias.name for alias in node.names)
+    elif isinstance(node, ast.ImportFrom):
+        base = node.module or ""
+        if node.level:
+            package = name.removesuffix(".__init__").split(".")
+            climb = node.level - name.endswith(".__init__")
+            base = ".".join([*package[: len(package) - climb], *([base] if base else [])])
+        # `from bayesmc import network` names a module, `from scipy import stats` too
+        yield from (f"{base}.{alias.name}" for alias in node.names)
+    elif isinstance(node, ast.Call) and _called(node) in ("import_module", "__import__"):
+        # The lazy package namespace is the one place that may load bayesmc modules by name.
+        constant = node.args and isinstance(node.args[0], ast.Constant)
+        target = str(node.args[0].value) if constant else "bayesmc.<computed>"
+        lazy_namespace = name == "bayesmc.__init__"
+        if not lazy_namespace:
+            yield "bayesmc" + target if target.startswith(".") else target
+
+
+def _called(node: ast.Call) -> str:
+    function = node.func
+    return getattr(function, "attr", None) or getattr(function, "id", "")
+
+
+def _between_modules(graph: dict[str, set[str]]) -> dict[str, set[str]]:
+    """The graph with each target cut to the module that holds it, as far as it is one of ours."""
+    modules = {name.removesuffix(".__init__"): name for name in graph}
+
+    def module(target: str) -> str | None:
+        while target and target not in modules:
+            target = target.rpartition(".")[0]
+        return modules.get(target)
+
+    return {name: {module(t) for t in targets} - {None, name} for name, targets in graph.items()}
+
+
+def _cycles(graph: dict[str, set[str]]) -> list[str]:
+    """One line per module that imports itself through others, the package namespace apart."""
+    found, finished = [], {"bayesmc.__init__"}
+
+    def visit(name: str, path: list[str]) -> None:
+        if name in path:
+            found.append("cycle: " + " -> ".join([*path[path.index(name) :], name]))
+        elif name not in finished:
+            for target in sorted(graph[name]):
+                visit(target, [*path, name])
+            finished.add(name)
+
+    for name in sorted(graph):
+        visit(name, [])
+    return found
+
+
+def package_sources() -> dict[str, str]:
+    """Every module of the package: dotted name (``.__init__`` kept) -> source text."""
+    return {
+        ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts): path.read_text("utf-8")
+        for path in sorted(PACKAGE.rglob("*.py"))
+    }
+
+
+def test_imports_point_down() -> None:
+    assert violations(package_sources()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "source", "expected"),
+    [
+        ("network", "from bayesmc.engines.exact import Exact", "does not stand below"),
+        ("network", "from .engines import exact", "does not stand below"),
+        ("network", "from . import auto", "does not stand below"),
+        ("shapes", "import bayesmc.errors", "does not stand below"),
+        ("results", "if TYPE_CHECKING:\n    from bayesmc.dbn import X", "does not stand below"),
+        ("network", "import bayesmc as bmc", "the package itself"),
+        ("network", "def f():\n    from bayesmc.shapes import as_shape", "inside a function"),
+        ("network", "class A:\n  def f(self):\n    import bayesmc.shapes", "inside a function"),
+        ("auto", "m = importlib.import_module('.testing', 'bayesmc')", "does not stand below"),
+        ("network", "import networkx as nx", "at module level"),
+        ("network", "from scipy import stats", "at module level"),
+        ("network", "from scipy.stats import norm", "at module level"),
+        ("kernels", "try:\n  import numba.typed\nexcept ImportError:\n  pass", "at module level"),
+        ("helpers", "", "no place in LAYERS"),
+    ],
+)  # fmt: skip
+def test_planted_violation_is_found(name: str, source: str, expected: str) -> None:
+    found = violations({f"bayesmc.{name}": source})
+    assert len(found) == 1
+    assert expected in found[0]
+
+
+def test_planted_cycle_is_found() -> None:
+    sources = {
+        "bayesmc.engines.exact": "from bayesmc.engines.forward import f",
+        "bayesmc.engines.forward": "from .exact import g",
+    }
+    assert violations(sources) == [
+        "cycle: bayesmc.engines.exact -> bayesmc.engines.forward -> bayesmc.engines.exact"
+    ]
+
+
+def test_rightful_imports_pass() -> None:
+    sources = {
+        "bayesmc.__init__": "from bayesmc.auto import infer",
+        "bayesmc.engines.exact": (
+            "from __future__ import annotations\n"
+            "import numpy as np\nimport scipy.special\nfrom bayesmc.network import BayesNet\n"
+            "from .base import Engine\n"
+            "if TYPE_CHECKING:\n    import networkx\n"
+            "def f():\n    import networkx\n    from scipy import stats\n"
+        ),
+        "bayesmc.engines.base": "from ..errors import ModelError",
+        "bayesmc.network": "from bayesmc import errors, shapes",
+        "bayesmc.errors": "",
+        "bayesmc.auto": "",
+        "bayesmc.shapes": "",
+    }
+    assert violations(sources) == []
+
+
+def test_import_loads_nothing_heavy() -> None:
+    code = "import json, sys, bayesmc; print(json.dumps(sorted(sys.modules)))"
+    loaded = subprocess.run([sys.executable, "-c", code], cwd=PACKAGE.parent, text=True,
+                            capture_output=True, check=True)  # fmt: skip
+    modules = json.loads(loaded.stdout)
+    assert "bayesmc" in modules
+    assert [name for name in modules if _is_heavy(name)] == []

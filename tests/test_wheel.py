@@ -1,0 +1,105 @@
+"""The built wheel, installed into an empty environment, runs the README's example.
+
+This is what ``pip install`` gives a stranger: no checkout, no extras, no test tools. It needs a
+package index; without one it is skipped, except where ``CI`` is set.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from tests.snippets import REPOSITORY, snippets
+
+# pip's words for "no index answers", as against a requirement that does not exist there
+UNREACHABLE = ("connection", "timed out", "temporary failure", "name resolution", "network is")
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    _pip(sys.executable, "wheel", "--no-deps", "-w", str(folder), str(REPOSITORY))
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def stranger(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Python of an environment that holds the wheel and what it requires, nothing else."""
+    folder = tmp_path_factory.mktemp("stranger") / "env"
+    venv.create(folder, with_pip=True)
+    python = folder / "bin" / "python"
+    if not python.exists():
+        python = folder / "Scripts" / "python.exe"
+    _pip(str(python), "install", str(wheel))
+    return python
+
+
+def test_wheel_holds_the_package_only(wheel: Path) -> None:
+    names = zipfile.ZipFile(wheel).namelist()
+    assert "bayesmc/py.typed" in names
+    assert any(name.endswith("licenses/LICENSE") for name in names)
+    tops = {name.split("/")[0] for name in names}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"bayesmc"}
+    sources = REPOSITORY.glob("bayesmc/**/*.py")
+    modules = {path.relative_to(REPOSITORY).as_posix() for path in sources}
+    assert modules == {name for name in names if name.endswith(".py")}
+
+
+def test_readme_example_runs_from_the_wheel(stranger: Path, tmp_path: Path) -> None:
+    page = snippets((REPOSITORY / "README.md").read_text("utf-8"))
+    script = tmp_path / "readme.py"
+    script.write_text("\n".join(snippet.code for snippet in page), "utf-8")
+    ran = _run([str(stranger), "-W", "error", str(script)], tmp_path)
+    assert ran.returncode == 0, ran.stderr
+    assert ran.stdout.rstrip() == "".join(snippet.shown for snippet in page).rstrip()
+
+
+def test_the_wheel_is_what_ran(stranger: Path, tmp_path: Path) -> None:
+    code = (
+        "import bayesmc, importlib.metadata\n"
+        "print(bayesmc.__file__)\nprint(importlib.metadata.version('bayesmc'))"
+    )
+    ran = _run([str(stranger), "-c", code], tmp_path)
+    place, version = ran.stdout.split("\n")[:2]
+    assert str(REPOSITORY) not in place
+    assert "site-packages" in place
+    assert version == _project()["version"]
+
+
+def test_extras_are_absent_and_said_so(stranger: Path, tmp_path: Path) -> None:
+    code = (
+        "import bayesmc as bmc, bayesmc.plotting as p\n"
+        "net = bmc.BayesNet()\nnet.add('x', bmc.Normal(0.0, 1.0))\np.plot_dag(net)"
+    )
+    ran = _run([str(stranger), "-c", code], tmp_path)
+    assert ran.returncode != 0
+    assert "pip install 'bayesmc[plot]'" in ran.stderr.splitlines()[-1]
+
+
+def _project() -> dict:
+    import tomllib
+
+    return tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
+
+
+def _pip(python: str, *arguments: str) -> None:
+    command = [python, "-m", "pip", "--disable-pip-version-check", "-q", *arguments]
+    ran = _run(command, Path(python).parent)
+    if ran.returncode == 0:
+        return
+    unreachable = any(words in ran.stderr.lower() for words in UNREACHABLE)
+    if unreachable and not os.environ.get("CI"):
+        pytest.skip(f"no package index answers: {ran.stderr.strip().splitlines()[-1]}")
+    pytest.fail(f"{' '.join(command)}\n{ran.stderr}", pytrace=False)
+
+
+def _run(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
+    return subprocess.run(command, cwd=folder, env=kept, text=True, capture_output=True)
