@@ -4,7 +4,7 @@ A conditional density is a function whose argument names are its parents and whi
 distribution. See ``bayesmc.BayesNet`` and ``bayesmc.infer``.
 """
 
-from bayesmc import errors
+from bayesmc import errors, io
 from bayesmc.auto import Explanation, explain, infer
 from bayesmc.distributions import (
     Bernoulli,

@@ -142,8 +142,8 @@ class ScipyUnivariate(Distribution):
         return draws.astype(np.int64) if self.is_discrete else draws.astype(float, copy=False)
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        if not self.is_discrete:
-            return np.asarray(self.frozen.logpdf(x))
+        if not self.is_discrete:  # at infinity some of SciPy's formulas give NaN
+            return np.where(np.isinf(x), -np.inf, self.frozen.logpdf(x))
         whole = x == np.floor(x)
         return np.where(whole, self.frozen.logpmf(np.where(whole, x, 0)), -np.inf)
 
@@ -174,9 +174,13 @@ class ScipyUnivariate(Distribution):
         )
 
     def _replace_invalid(self, ok: np.ndarray) -> tuple[Any, Any]:
-        """Use a valid element's parameters for the invalid ones, or normals where there is none."""
+        """Give the invalid elements a valid one's parameters, so that the object can be used."""
         if not ok.any():
-            raise self.problem  # type: ignore[misc]
+            from scipy import stats
+
+            half = np.full(self.batch_shape, 0.5)
+            self.frozen = stats.bernoulli(half) if self.is_discrete else stats.norm(half)
+            return self.frozen.support()
         good = tuple(np.argwhere(ok)[0])
 
         def mend(value: Any) -> np.ndarray:
@@ -241,7 +245,7 @@ class ScipyVariable(Distribution):
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         if not self.is_discrete:
-            return np.asarray(self.variable.logpdf(x))
+            return np.where(np.isinf(x), -np.inf, self.variable.logpdf(x))
         return np.where(x == np.floor(x), self.variable.logpmf(x), -np.inf)
 
     @property
@@ -288,12 +292,17 @@ class ScipyMultivariate(Distribution):
         self.frozen = frozen
         self.is_discrete = hasattr(frozen, "logpmf")  # type: ignore[misc]
         self._log_density = frozen.logpmf if self.is_discrete else frozen.logpdf
-        draws = np.asarray(frozen.rvs(size=2, random_state=np.random.default_rng(0)))
-        self.event_shape = draws.shape[1:]
         # Wishart densities take matrices along the last axis, all others along the first
         self._last = type(frozen).__name__ in _POSITIVE_DEFINITE
-        if np.shape(self._at(draws)) != (2,):
-            raise UnsupportedError(f"{self._family}: only one distribution at a time, not a batch")
+        batch = f"{self._family}: only one distribution at a time, not a batch"
+        try:
+            draws = np.asarray(frozen.rvs(size=7, random_state=np.random.default_rng(0)))
+            self.event_shape = draws.shape[1:]
+            single = np.shape(self._at(draws)) == (7,)
+        except ValueError as error:  # seven draws do not broadcast with a batch
+            raise UnsupportedError(batch) from error
+        if not single:
+            raise UnsupportedError(batch)
         self._support = self._find_support()
 
     @property

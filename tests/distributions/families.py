@@ -28,9 +28,7 @@ def signed(high: float) -> st.SearchStrategy[float]:
     return st.builds(lambda s, m: s * m, st.sampled_from([-1.0, 0.0, 1.0]), magnitudes(1e-6, high))
 
 
-PROBABILITY = (
-    st.floats(0, 1) | magnitudes(1e-12, 1.0) | magnitudes(1e-12, 1.0).map(lambda v: 1 - v)
-)
+PROBABILITY = st.floats(0, 1) | magnitudes(1e-12, 1.0) | magnitudes(1e-12, 1.0).map(lambda v: 1 - v)
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,9 @@ def parameters_of(draw: st.DrawFn, name: str) -> list[np.ndarray]:
     for strategy in FAMILIES[name].parameters:
         shape = draw(shapes)
         size = int(np.prod(shape))
-        result.append(np.array(draw(st.lists(strategy, min_size=size, max_size=size))).reshape(shape))
+        result.append(
+            np.array(draw(st.lists(strategy, min_size=size, max_size=size))).reshape(shape)
+        )
     return result
 
 

@@ -103,7 +103,7 @@ MULTIVARIATE = {
 def test_multivariate_distributions_are_wrapped(name: str) -> None:
     frozen = MULTIVARIATE[name]
     dist = d.as_distribution(frozen)
-    one = np.asarray(frozen.rvs(random_state=0))
+    one = np.asarray(frozen.rvs(size=2, random_state=0))[0]
     assert dist.event_shape == one.shape
     draws = dist.sample_to(np.random.default_rng(0), (4, 5))
     assert draws.shape == (4, 5, *one.shape)

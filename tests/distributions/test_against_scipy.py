@@ -153,7 +153,9 @@ BOUNDARIES = [
 
 
 @pytest.mark.parametrize(("ours", "theirs", "x"), BOUNDARIES, ids=lambda v: str(v)[:40])
-def test_boundaries_equal_scipys(ours: d.Distribution, theirs: stats.rv_continuous, x: list) -> None:
+def test_boundaries_equal_scipys(
+    ours: d.Distribution, theirs: stats.rv_continuous, x: list
+) -> None:
     log_density = theirs.logpmf if ours.is_discrete else theirs.logpdf
     with np.errstate(all="ignore"):
         expected = log_density(np.array(x))
@@ -163,7 +165,9 @@ def test_boundaries_equal_scipys(ours: d.Distribution, theirs: stats.rv_continuo
 def test_outside_is_minus_infinity_where_scipy_gives_nan() -> None:
     assert d.Gamma(3.0, 1.0).log_prob(np.inf) == -np.inf
     assert d.Poisson(3.0).log_prob(np.inf) == -np.inf
-    assert (d.Dirichlet([2.0, 3.0]).log_prob([[0.5, 0.6], [-0.1, 1.1], [1.0, 0.0]]) == -np.inf).all()
+    assert (
+        d.Dirichlet([2.0, 3.0]).log_prob([[0.5, 0.6], [-0.1, 1.1], [1.0, 0.0]]) == -np.inf
+    ).all()
 
 
 DISCRETE = [
@@ -206,7 +210,9 @@ def test_nan_in_gives_nan_out(dist: d.Distribution) -> None:
 
 @pytest.mark.parametrize("dist", [*CONTINUOUS, *DISCRETE], ids=repr)
 def test_cdf_covers_the_whole_line(dist: d.Distribution) -> None:
-    assert dist.cdf(np.array([-np.inf, -1e300, -5.0])).max() <= 1e-3 + 0.2 * (dist.support.low == -np.inf)
+    assert dist.cdf(np.array([-np.inf, -1e300, -5.0])).max() <= 1e-3 + 0.2 * (
+        dist.support.low == -np.inf
+    )
     np.testing.assert_array_equal(dist.cdf(np.array([-np.inf, np.inf])).reshape(-1)[:2], [0.0, 1.0])
 
 

@@ -24,7 +24,9 @@ def test_the_batch_is_found_from_the_function() -> None:
     dist = d.Density(_log_laplace, _laplace)
     assert dist.batch_shape == (3,)
     assert not dist.is_discrete
-    np.testing.assert_array_equal(dist.log_prob([[0.5], [1.0]]), _log_laplace(np.array([[0.5], [1.0]])))
+    np.testing.assert_array_equal(
+        dist.log_prob([[0.5], [1.0]]), _log_laplace(np.array([[0.5], [1.0]]))
+    )
     draws = dist.sample(0, 20_000)
     # mean |x| is the scale, with a standard error of scale / sqrt(n): 6 of them
     assert (np.abs(np.abs(draws).mean(axis=0) / SCALES - 1) < 6 / np.sqrt(20_000)).all()

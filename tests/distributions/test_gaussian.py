@@ -86,7 +86,11 @@ def test_batches_equal_single_calls(size: int, batches: tuple, seed: int) -> Non
 def test_linear_map_is_the_textbook_formula() -> None:
     rng = np.random.default_rng(0)
     root = rng.normal(size=(5, 3, 3))
-    cov, mean, matrix = root @ np.matrix_transpose(root), rng.normal(size=3), rng.normal(size=(2, 3))
+    cov, mean, matrix = (
+        root @ np.matrix_transpose(root),
+        rng.normal(size=3),
+        rng.normal(size=(2, 3)),
+    )
     noise, offset = np.diag([0.1, 0.2]), np.array([1.0, -1.0])
     mapped_mean, mapped_cov = gaussian.linear_map(mean, cov, matrix, offset, noise)
     np.testing.assert_allclose(mapped_mean, matrix @ mean + offset, rtol=1e-14)

@@ -85,7 +85,9 @@ def test_discrete_quantiles_are_the_least_that_reach_q(q: float, seed: int) -> N
 
 def test_a_component_without_weight_counts_for_nothing() -> None:
     dist = d.Mixture([1.0, 0.0], [d.Normal(0.0, 1.0), d.Gamma(0.5, 1.0)])
-    assert dist.log_prob(0.0) == d.Normal(0.0, 1.0).log_prob(0.0)  # Gamma's density there is infinite
+    assert dist.log_prob(0.0) == d.Normal(0.0, 1.0).log_prob(
+        0.0
+    )  # Gamma's density there is infinite
     never = d.Mixture([1.0, 0.0], [d.Normal(0.0, 1.0), d.StudentT(0.5, 0.0, 1.0)])
     assert (never.mean, never.var) == (0.0, 1.0)
     assert d.Mixture([0.5, 0.5], [d.Normal(0.0, 1.0), d.Gamma(0.5, 1.0)]).log_prob(0.0) == np.inf

@@ -107,7 +107,9 @@ def test_valid_elements_are_untouched_by_a_marked_one() -> None:
     with d.marking_invalid():
         dist = d.Normal([0.0, 1.0, 2.0], [1.0, -1.0, 3.0])
         table = d.Categorical([[0.2, 0.8], [0.7, 0.7]])
-    np.testing.assert_array_equal(dist.log_prob(0.5)[[0, 2]], d.Normal([0.0, 2.0], [1.0, 3.0]).log_prob(0.5))
+    np.testing.assert_array_equal(
+        dist.log_prob(0.5)[[0, 2]], d.Normal([0.0, 2.0], [1.0, 3.0]).log_prob(0.5)
+    )
     np.testing.assert_array_equal(table.probs[0], [0.2, 0.8])
 
 
