@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,179 +18,182 @@ import numpy as np
 import bayesmc as bmc
 from examples import diagnosis, old_faithful
 
+SEED = 2024
+EXACT = "exact"
+
 
 @dataclass(frozen=True)
 class Row:
-    """One engine's answer to a question."""
+    """One engine's answers to a question, each with its Monte Carlo error."""
 
     engine: str
-    answer: str
-    error: str = ""
-    ess: str = ""
+    answers: tuple[float, ...] = ()
+    errors: tuple[float, ...] | str = ""
+    ess: float | None = None
     seconds: float | None = None
+    refusal: str = ""
 
 
-def main(arguments: list[str] | None = None) -> None:
+@dataclass(frozen=True)
+class Table:
+    """A question, what was asked for, and a row for each engine."""
+
+    question: str
+    asked: tuple[str, ...]
+    rows: tuple[Row, ...]
+    warned: tuple[str, ...] = ()
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Ask all questions, print the tables, write the pictures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--fast", action="store_true", help="few draws, for a smoke test")
     parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the pictures")
     options = parser.parse_args(arguments)
-    draws = 20_000 if options.fast else 1_000_000
+    for table in questions(20_000 if options.fast else 1_000_000):
+        print_table(table)
     options.out.mkdir(parents=True, exist_ok=True)
-
-    ask_diagnosis(draws)
-    ask_eruption(draws)
-    ask_all_eruptions(min(draws, 20_000))
-    ask_typical_wait(draws)
-    for path in draw_pictures(options.out, min(draws, 100_000)):
+    for path in draw_pictures(options.out, 20_000 if options.fast else 200_000):
         print(f"wrote {path}")
 
 
-def ask_diagnosis(draws: int) -> None:
-    """The chest clinic: which disease, before and after the X-ray."""
+def questions(draws: int) -> Iterator[Table]:
+    """Every question with the answers of every engine that takes it."""
+    yield which_disease(draws, "a smoker back from Asia, short of breath", diagnosis.AT_FIRST)
+    yield which_disease(draws, "the same, and the X-ray is positive", diagnosis.WITH_XRAY)
+    yield which_kind(draws)
+    yield how_long(draws)
+    yield which_kinds_all(draws // 50)
+    yield typical_wait(draws)
+
+
+def which_disease(draws: int, when: str, evidence: Mapping[str, str]) -> Table:
+    """The chest clinic: a discrete net."""
     net = diagnosis.chest_clinic()
-    for when, evidence in (
-        ("a smoker back from Asia, short of breath", diagnosis.AT_FIRST),
-        ("the same, and the X-ray is positive", diagnosis.WITH_XRAY),
-    ):
-        rows = []
-        for engine in (bmc.Exact(), bmc.LikelihoodWeighting(draws)):
-            posterior, seconds = timed(net, evidence, engine)
-            p = [posterior.probabilities(name)[1] for name in diagnosis.DISEASES]
-            errors = [posterior.mcse(name)[1] for name in diagnosis.DISEASES]
-            rows.append(row(posterior, numbers(p), errors, seconds))
-        rows.append(
-            counted(
-                net,
-                draws,
-                lambda values, evidence=evidence: np.all(
-                    [values[name] == state for name, state in evidence.items()], axis=0
-                ),
-                lambda kept: [kept[name] == "yes" for name in diagnosis.DISEASES],
-            )
-        )
-        print_table(f"P({', '.join(diagnosis.DISEASES)} | {when})", rows)
 
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [
+            (posterior.probabilities(name)[1], posterior.mcse(name)[1])
+            for name in diagnosis.DISEASES
+        ]
 
-def ask_eruption(draws: int) -> None:
-    """One eruption of Old Faithful: its kind, then its length, from what was timed."""
-    net = old_faithful.two_kinds(1)
-    evidence: dict[str, Any] = {"duration": [2.9], "waiting": [66.0]}
-    rows = []
-    for engine in (bmc.Exact(), bmc.LikelihoodWeighting(draws)):
-        posterior, seconds = timed(net, evidence, engine)
-        p = posterior.probabilities("kind")[0, 1]
-        rows.append(row(posterior, numbers([p]), posterior.mcse("kind")[0, 1:], seconds))
-    print_table("P(long | it lasted 2.9 min and the next came 66 min later)", rows)
-
-    evidence = {"waiting": [66.0]}
-    truth = old_faithful.kind_and_duration_given(66.0)
-    rows = [Row("closed form", numbers(truth))]
-    rows.append(Row("Exact", "refuses: the duration is continuous and not observed"))
-    if bmc.Exact().unsupported(net, evidence) is None:
-        raise AssertionError("Exact takes what the table says it refuses")
-    posterior, seconds = timed(net, evidence, bmc.LikelihoodWeighting(draws))
-    answers = [posterior.probabilities("kind")[0, 1], posterior.mean("duration")[0]]
-    errors = [posterior.mcse("kind")[0, 1], posterior.mcse("duration")[0]]
-    rows.append(row(posterior, numbers(answers), errors, seconds))
-    rows.append(
-        counted(
-            net,
-            draws,
-            # times are recorded to the minute
-            lambda values: np.abs(values["waiting"][:, 0] - 66.0) < 0.5,
-            lambda kept: [kept["kind"][:, 0] == "long", kept["duration"][:, 0]],
-        )
+    counted = count(
+        net,
+        draws,
+        lambda values: np.all([values[name] == evidence[name] for name in evidence], axis=0),
+        lambda kept: [kept[name] == "yes" for name in diagnosis.DISEASES],
     )
-    print_table("P(long), mean minutes it lasted | the next came 66 min later", rows)
+    rows = (
+        infer(net, evidence, bmc.Exact(), ask),
+        infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+        counted,
+    )
+    return Table(f"Which disease? {when}", diagnosis.DISEASES, rows)
 
 
-def ask_all_eruptions(draws: int) -> None:
+def which_kind(draws: int) -> Table:
+    """One eruption of Old Faithful: the kind is hidden, both times are measured."""
+    net = old_faithful.two_kinds(1)
+    evidence = {"duration": [2.9], "waiting": [66.0]}
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [(posterior.probabilities("kind")[0, 1], posterior.mcse("kind")[0, 1])]
+
+    rows = (
+        infer(net, evidence, bmc.Exact(), ask),
+        infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+    )
+    return Table("Old Faithful: it lasted 2.9 min, the next came 66 min later", ("long",), rows)
+
+
+def how_long(draws: int) -> Table:
+    """The same when nobody timed it: the duration is hidden, too, and elimination has to refuse."""
+    net = old_faithful.two_kinds(1)
+    evidence = {"waiting": [66.0]}
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [
+            (posterior.probabilities("kind")[0, 1], posterior.mcse("kind")[0, 1]),
+            (posterior.mean("duration")[0], posterior.mcse("duration")[0]),
+        ]
+
+    counted = count(
+        net,
+        draws,
+        # waiting times are recorded to the minute
+        lambda values: np.abs(values["waiting"][:, 0] - 66.0) < 0.5,
+        lambda kept: [kept["kind"][:, 0] == "long", kept["duration"][:, 0]],
+    )
+    rows = (
+        Row("closed form", old_faithful.kind_and_duration_given(66.0), EXACT),
+        infer(net, evidence, bmc.Exact(), ask),
+        infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+        counted,
+    )
+    question = "Old Faithful: nobody timed it, the next came 66 min later"
+    return Table(question, ("long", "mean minutes"), rows)
+
+
+def which_kinds_all(draws: int) -> Table:
     """All 272 eruptions at once: easy for elimination, hopeless for importance weights."""
     net = old_faithful.two_kinds()
     evidence = {"duration": old_faithful.DURATIONS, "waiting": old_faithful.WAITS}
-    rows = [Row("published fit", f"log P = {old_faithful.LOG_LIKELIHOOD:.3f}")]
-    warned: list[warnings.WarningMessage] = []
-    for engine in (bmc.Exact(), bmc.LikelihoodWeighting(draws)):
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            posterior, seconds = timed(net, evidence, engine)
-            long = posterior.probabilities("kind")[:, 1].sum()
-            answer = f"log P = {posterior.log_marginal_likelihood:.3f}, {long:.1f} long"
-            rows.append(row(posterior, answer, [posterior.log_marginal_likelihood_mcse], seconds))
-        warned += caught
-    print_table("The kinds of all 272 eruptions", rows)
-    for message in {str(warning.message) for warning in warned}:
-        print(f"  warned: {message}\n")
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [(posterior.log_marginal_likelihood, posterior.log_marginal_likelihood_mcse)]
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rows = (
+            Row("published fit", (old_faithful.LOG_LIKELIHOOD,), EXACT),
+            infer(net, evidence, bmc.Exact(), ask),
+            infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+        )
+    warned = tuple(dict.fromkeys(str(warning.message) for warning in caught))
+    return Table("Old Faithful: all 272 eruptions at once", ("log P(times)",), rows, warned)
 
 
-def ask_typical_wait(draws: int) -> None:
+def typical_wait(draws: int) -> Table:
     """An unknown mean, learnt from the first eight waits after long eruptions."""
+    net = old_faithful.typical_wait()
     evidence = {"wait": old_faithful.FIRST_LONG_WAITS}
-    mean, sd, log_p = old_faithful.typical_given(old_faithful.FIRST_LONG_WAITS)
-    rows = [Row("closed form", numbers([mean, sd, log_p]))]
-    posterior, seconds = timed(
-        old_faithful.typical_wait(), evidence, bmc.LikelihoodWeighting(draws)
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [
+            (posterior.mean("typical"), posterior.mcse("typical")),
+            (posterior.log_marginal_likelihood, posterior.log_marginal_likelihood_mcse),
+        ]
+
+    mean, _, log_p = old_faithful.typical_given(old_faithful.FIRST_LONG_WAITS)
+    rows = (
+        Row("closed form", (mean, log_p), EXACT),
+        infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
     )
-    answers = [
-        posterior.mean("typical"),
-        posterior.std("typical"),
-        posterior.log_marginal_likelihood,
-    ]
-    rows.append(row(posterior, numbers(answers), [posterior.mcse("typical")], seconds))
-    print_table("Typical wait after a long eruption: mean, sd, log P(data) | eight waits", rows)
+    question = "Old Faithful: the typical wait after a long eruption, from eight of them"
+    return Table(question, ("mean minutes", "log P(waits)"), rows)
 
 
-def draw_pictures(folder: Path, draws: int) -> list[Path]:
-    """Graphs with their plates, and marginals before and after the evidence."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    from bayesmc import plotting
-
-    clinic = diagnosis.chest_clinic()
-    before, after = (bmc.infer(clinic, e, engine=bmc.Exact()) for e in ({}, diagnosis.WITH_XRAY))
-    wait = old_faithful.typical_wait()
-    engine = bmc.LikelihoodWeighting(draws)
-    waits = {"wait": old_faithful.FIRST_LONG_WAITS}
-    guess, learnt = (bmc.infer(wait, e, engine=engine, rng=1) for e in ({}, waits))
-    pictures = {
-        "asia_graph": plotting.plot_dag(clinic, observed=diagnosis.WITH_XRAY),
-        "asia_prior_posterior": plotting.plot_prior_posterior(
-            before, after, [*diagnosis.DISEASES, "either"]
-        )[0],
-        "old_faithful_graph": plotting.plot_dag(
-            old_faithful.two_kinds(272), observed=["duration", "waiting"]
-        ),
-        "old_faithful_prior_posterior": plotting.plot_prior_posterior(guess, learnt, ["typical"])[
-            0
-        ],
-    }
-    paths = []
-    for name, ax in pictures.items():
-        paths.append(folder / f"{name}.png")
-        ax.figure.savefig(paths[-1], dpi=150)
-        matplotlib.pyplot.close(ax.figure)
-    return paths
-
-
-def timed(net: bmc.BayesNet, evidence: Mapping[str, Any], engine: Any) -> tuple[Any, float]:
-    """The posterior, and the seconds that it took; what takes long shows its progress."""
+def infer(
+    net: bmc.BayesNet,
+    evidence: Mapping[str, Any],
+    engine: Any,
+    ask: Callable[[Any], list[tuple[float, float]]],
+) -> Row:
+    """One engine's answers, or its refusal; what takes over a second shows its progress."""
+    name = type(engine).__name__
+    refusal = engine.unsupported(net, evidence)
+    if refusal is not None:
+        return Row(name, refusal=refusal)
     start = time.perf_counter()
-    posterior = bmc.infer(net, evidence, engine=engine, rng=2024, progress=True)
-    return posterior, time.perf_counter() - start
-
-
-def row(posterior: Any, answer: str, errors: Any, seconds: float) -> Row:
-    """A row for any engine; exact answers have no Monte Carlo error and no ESS."""
-    name = type(posterior.engine).__name__
+    posterior = bmc.infer(net, evidence, engine=engine, rng=SEED, progress=True)
+    answers, errors = zip(*ask(posterior), strict=True)
+    seconds = time.perf_counter() - start
     if posterior.weight_ess is None:
-        return Row(name, answer, "exact", "", seconds)
-    return Row(name, answer, numbers(errors, "{:.1g}"), f"{posterior.weight_ess:,.0f}", seconds)
+        return Row(name, answers, EXACT, seconds=seconds)
+    return Row(name, answers, errors, posterior.weight_ess, seconds)
 
 
-def counted(
+def count(
     net: bmc.BayesNet,
     draws: int,
     matches: Callable[[Mapping[str, Any]], np.ndarray],
@@ -198,37 +201,73 @@ def counted(
 ) -> Row:
     """Ancestral sampling: of the draws that match the evidence, the mean of what is asked."""
     start = time.perf_counter()
-    values = net.sample(draws, rng=2024)
+    values = net.sample(draws, rng=SEED)
     match = matches(values)
     kept = {name: value[match] for name, value in values.items()}
-    count = int(match.sum())
-    seconds = time.perf_counter() - start
-    if count < 2:
-        return Row("sample and count", f"{count} draws match", "", str(count), seconds)
     columns = [np.asarray(column, dtype=float) for column in asked(kept)]
-    errors = [column.std(ddof=1) / np.sqrt(count) for column in columns]
-    answer = numbers([column.mean() for column in columns])
-    return Row("sample and count", answer, numbers(errors, "{:.1g}"), f"{count:,}", seconds)
+    answers = tuple(column.mean() for column in columns)
+    errors = tuple(column.std() / np.sqrt(len(column)) for column in columns)
+    seconds = time.perf_counter() - start
+    return Row("sample and count", answers, errors, float(match.sum()), seconds)
 
 
-def numbers(values: Any, form: str = "{:.4f}") -> str:
-    """Several numbers in one cell."""
-    return "  ".join(form.format(float(value)) for value in values)
+def draw_pictures(folder: Path, draws: int) -> list[Path]:
+    """Graphs with their plates, and marginals before and after the evidence."""
+    import matplotlib
+
+    matplotlib.use("agg")  # write files; open no window
+    from matplotlib import pyplot
+
+    from bayesmc import plotting
+
+    clinic, times, wait = (
+        diagnosis.chest_clinic(), old_faithful.two_kinds(272), old_faithful.typical_wait()
+    )  # fmt: skip
+    healthy, ill = (bmc.infer(clinic, e, engine=bmc.Exact()) for e in ({}, diagnosis.WITH_XRAY))
+    engine = bmc.LikelihoodWeighting(draws)
+    waits = {"wait": old_faithful.FIRST_LONG_WAITS}
+    guess, learnt = (bmc.infer(wait, e, engine=engine, rng=SEED) for e in ({}, waits))
+    pictures = {
+        "chest_clinic": plotting.plot_dag(clinic, observed=diagnosis.WITH_XRAY),
+        "chest_clinic_marginals": plotting.plot_prior_posterior(healthy, ill)[0],
+        "old_faithful": plotting.plot_dag(times, observed=["duration", "waiting"]),
+        "old_faithful_marginals": plotting.plot_prior_posterior(guess, learnt)[0],
+    }
+    paths = []
+    for name, ax in pictures.items():
+        paths.append(folder / f"{name}.png")
+        ax.figure.savefig(paths[-1], dpi=150)
+        pyplot.close(ax.figure)
+    return paths
 
 
-def print_table(title: str, rows: list[Row]) -> None:
-    """A table with a line for each engine."""
-    cells = [["engine", "answer", "Monte Carlo error", "ESS", "seconds"]]
-    for r in rows:
-        seconds = "" if r.seconds is None else f"{r.seconds:.3f}"
-        cells.append([r.engine, r.answer, r.error, r.ess, seconds])
-    widths = [max(len(line[i]) for line in cells) for i in range(5)]
-    print(title)
+def print_table(table: Table) -> None:
+    """The question, and a line for each engine."""
+    cells = [["engine", ", ".join(table.asked), "Monte Carlo error", "ESS", "seconds"]]
+    for row in table.rows:
+        refused = f"refuses: {row.refusal}"
+        error = row.errors if isinstance(row.errors, str) else _numbers(row.errors, "{:.1g}")
+        cells.append([
+            row.engine,
+            refused if row.refusal else _numbers(row.answers, "{:.4f}"),
+            error,
+            "" if row.ess is None else f"{row.ess:,.0f}",
+            "" if row.seconds is None else f"{row.seconds:.3f}",
+        ])  # fmt: skip
+    shown = [line for line in cells if not line[1].startswith("refuses")]
+    widths = [max(len(line[i]) for line in shown) for i in range(5)]
+    print(table.question)
     for line in cells:
         left = [cell.ljust(width) for cell, width in zip(line[:3], widths, strict=False)]
         right = [cell.rjust(width) for cell, width in zip(line[3:], widths[3:], strict=True)]
-        print("  " + "  ".join(left + right).rstrip())
+        print(("  " + "  ".join(left + right)).rstrip())
+    for message in table.warned:
+        print(f"  warned: {message}")
     print()
+
+
+def _numbers(values: Sequence[float], form: str) -> str:
+    return "  ".join(form.format(float(value)) for value in values)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.snippets import REPOSITORY, run_page, snippets
+from tests.snippets import REPOSITORY, refresh, run_page, snippets
 
 PAGES = [REPOSITORY / "CONTRIBUTING.md", *sorted((REPOSITORY / "docs").glob("*.md"))]
 
@@ -65,3 +65,12 @@ def test_blocks_share_a_namespace(tmp_path: Path) -> None:
         "```python\nx = 1\n```\n\n```python\nprint(x)\n```\n\n```text\n1\n```\n", "utf-8"
     )
     assert run_page(path) == 2
+
+
+def test_refreshed_page_passes(tmp_path: Path) -> None:
+    path = tmp_path / "page.md"
+    block = "```python\nprint(%d)\n```\n\n```text\n```\n\n"
+    path.write_text(block % 1 + "```python\nx = 1\n```\n\n" + block % 2, "utf-8")
+    refresh(path)
+    assert path.read_text("utf-8").count("```text\n1\n```") == 1
+    assert run_page(path) == 3

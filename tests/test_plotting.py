@@ -250,7 +250,7 @@ def weighted(evidence: dict, draws: int = 20_000) -> bmc.Posterior:
 
 
 def test_bars_are_the_probabilities() -> None:
-    posterior = bmc.infer(weather(), {"level": 2.2}, engine=bmc.Exact())
+    posterior = bmc.infer(weather(), {"level": 2.2, "guests": 3}, engine=bmc.Exact())
     ax = plot_marginal(posterior, "rain")
     heights = [bar.get_height() for bar in ax.patches]
     np.testing.assert_allclose(heights, posterior.probabilities("rain"))

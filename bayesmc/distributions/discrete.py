@@ -83,6 +83,8 @@ class Bernoulli(_Odds):
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         one, zero = self._log_odds_parts()
+        if x.ndim == 0:  # one observed value for the whole batch needs no selection
+            return np.array(one if x == 1 else zero if x == 0 else np.full_like(one, -np.inf))
         return np.where(x == 1, one, np.where(x == 0, zero, -np.inf))
 
     @property
@@ -138,8 +140,8 @@ class Binomial(_Odds):
     Examples
     --------
     >>> import bayesmc as bmc
-    >>> float(bmc.Binomial(10, 0.5).log_prob(5).round(4))
-    -1.4019
+    >>> float(bmc.Binomial(10, 0.5).log_prob(5).round(3))
+    -1.402
     """
 
     is_discrete = True

@@ -7,6 +7,7 @@ stay in cache; each draws from its own random stream, so results do not depend o
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -25,7 +26,12 @@ from bayesmc.structure import Table, constants_of, tabulate
 CHUNK = 8192
 #: array elements per node and chunk that larger nodes are cut to
 _CHUNK_ELEMENTS = 1 << 20
+#: table entries up to which a function, or a declared table, is turned into a step
+_FUNCTION_ENTRIES = 1 << 20
+_TABLE_ENTRIES = 1 << 26
 _BITS = 31
+#: steps of nets without inputs, as long as their compiled models live
+_TABLES: weakref.WeakKeyDictionary[Model, dict[str, _Tabulated]] = weakref.WeakKeyDictionary()
 
 
 def forward_chunks(
@@ -58,29 +64,43 @@ def fast_steps(
 ) -> list[Step]:
     """One step per node: from a table where there is one, else by the node's function."""
     constants = constants_of(model, inputs)
+    kept: dict[str, _Tabulated] = {} if inputs else _TABLES.setdefault(model, {})
     steps: list[Step] = []
     for node in model.nodes.values():
-        step = _table_step(model, node, observed.get(node.name), constants)
+        seen = observed.get(node.name)
+        if node.name not in kept:
+            kept[node.name] = _Tabulated(model, node, constants)
+        step = kept[node.name].step(seen)
         steps.append(step if step is not None else step_for(model, node, observed))
     plain = steps_for(model, observed)
     return steps + plain[len(model.nodes) :]
 
 
-def _table_step(
-    model: Model, node: CompiledNode, seen: Observed | None, constants: Mapping[str, np.ndarray]
-) -> Step | None:
-    distinct = len(set(node.parents)) == len(node.parents)
-    if node.table is not None and distinct and not any(p in constants for p in node.parents):
-        return TableCompute(node)
-    if seen is not None and seen.mask is not None:
-        return None
-    limit = 1 << 20 if node.declaration.probs is None else 1 << 26
-    table = tabulate(model, node, constants, limit)
-    if table is None:
-        return None
-    if seen is None:
-        return TableDraw(node, table)
-    return TableWeigh(node, table, seen)
+class _Tabulated:
+    """What a node's table makes of it: steps that do not depend on the evidence, made once."""
+
+    def __init__(
+        self, model: Model, node: CompiledNode, constants: Mapping[str, np.ndarray]
+    ) -> None:
+        self.node = node
+        self.hidden: Step | None = None
+        self.table: Table | None = None
+        distinct = len(set(node.parents)) == len(node.parents)
+        if node.table is not None:
+            if distinct and not any(p in constants for p in node.parents):
+                self.hidden = TableCompute(node)
+            return
+        limit = _FUNCTION_ENTRIES if node.declaration.probs is None else _TABLE_ENTRIES
+        self.table = tabulate(model, node, constants, limit)
+        if self.table is not None:
+            self.hidden = TableDraw(node, self.table)
+
+    def step(self, seen: Observed | None) -> Step | None:
+        if seen is None:
+            return self.hidden
+        if self.table is None or seen.mask is not None:
+            return None
+        return TableWeigh(self.node, self.table, seen)
 
 
 class RowIndex:
@@ -155,6 +175,8 @@ class TableDraw:
     def _compare(self, index: Any, bits: np.ndarray) -> np.ndarray:
         if not self.edges:
             return np.zeros(bits.shape, dtype=self.dtype)
+        if isinstance(index, np.ndarray) and len(self.edges) > 1:
+            index = index.astype(np.intp)  # once, where every gather would
         codes = (bits >= self.edges[0].take(index)).view(np.uint8)
         for edge in self.edges[1:]:
             codes += (bits >= edge.take(index)).view(np.uint8)

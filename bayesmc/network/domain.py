@@ -85,7 +85,8 @@ class Domain:
         numbers = self.numbers
         assert numbers is not None
         positions = np.searchsorted(np.sort(numbers), array)
-        positions = np.argsort(numbers, kind="stable")[np.minimum(positions, self.size - 1)]
+        order = np.argsort(numbers, kind="stable")
+        positions = np.asarray(order[np.minimum(positions, self.size - 1)])
         wrong = numbers[positions] != array
         if np.any(wrong):
             raise EvidenceError(

@@ -16,12 +16,16 @@ from bayesmc.errors import UnsupportedError
 from bayesmc.network import Model, Problem
 from bayesmc.results.posterior import Posterior
 
+#: joint states up to which scalar finite nodes share one histogram, so that it stays in cache
+_GROUP_STATES = 2048
+
 
 class Sums:
-    """Running weighted sums over chunks of draws, mergeable and of constant size.
+    """Running weighted sums over chunks of draws, of constant size.
 
-    For each node two rows are kept, one weighted by ``w`` and one by ``w**2`` (for Monte Carlo errors):
-    counts of the states of finite nodes, and powers 0, 1, 2 of the centred values of all others.
+    Every figure is kept twice, weighted by ``w`` and by ``w**2`` (for Monte Carlo errors). Scalar finite
+    nodes are counted jointly in groups, one histogram for several nodes; plated ones state by state;
+    all others by the first two powers of their centred values.
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
@@ -30,76 +34,165 @@ class Sums:
         self.draws = 0
         self.top = -np.inf
         self.weight = np.zeros(2)
-        self.counts: dict[str, np.ndarray] = {}
-        self.powers: dict[str, np.ndarray] = {}
-        self.centre: dict[str, np.ndarray] = {}
-        self.tail = np.empty(0)
+        self.tail = _Tail()
+        self._groups: list[_Group] | None = None
+        self._states: dict[str, np.ndarray] = {}
+        self._powers: dict[str, np.ndarray] = {}
+        self._centre: dict[str, np.ndarray] = {}
+        self._constant: dict[str, np.ndarray] = {}
 
     def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
         """Take in one chunk of ``draws`` draws with their log weights (a scalar: all equal)."""
-        log_weight = np.broadcast_to(np.asarray(log_weight, dtype=float), (draws,))
-        weights = self._relative(log_weight, draws)
-        self.weight += weights.sum(axis=1)
+        weights = self._relative(np.asarray(log_weight, dtype=float), draws)
+        if self._groups is None:
+            self._groups = self._sort(values)
+        for group in self._groups:
+            group.add(values, weights)
+        for name in self._states:
+            self._add_states(name, values[name], weights)
+        for name in self._centre:
+            self._add_powers(name, values[name], weights)
+
+    def counts(self, name: str) -> np.ndarray:
+        """Weight of each state of a finite node by w and by w**2, shape ``(2, *plates, states)``."""
+        node = self.model[name]
+        assert node.domain is not None
+        if name in self._constant:
+            one_hot = np.eye(node.domain.size)[self._constant[name].astype(np.intp)]
+            return self.weight.reshape((2,) + (1,) * one_hot.ndim) * one_hot
+        if name in self._states:
+            return self._states[name].reshape((2, *node.plate_shape, node.domain.size))
+        return next(g for g in self._groups or () if name in g.names).counts(name)
+
+    def powers(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A centre and the sums of the first two powers around it, each ``(2, *plates, *event)``."""
+        shape = self.model[name].value_shape
+        if name in self._constant:
+            zero = np.zeros((2, *shape))
+            return self._constant[name].astype(float), zero, zero
+        first, second = self._powers[name].reshape((2, 2, *shape))
+        return self._centre[name].reshape(shape), first, second
+
+    def _sort(self, values: Mapping[str, np.ndarray]) -> list[_Group]:
+        """Decide from the first chunk how each node is summed."""
+        groups: list[_Group] = []
         for name in self.names:
-            node = self.model[name]
-            value = values[name]
-            batched = value.ndim > len(node.value_shape)
-            flat = value.reshape(draws, -1) if batched and value.shape[0] == draws else value.reshape(1, -1)
-            if node.domain is not None:
-                self._count(name, flat, node.domain.size, weights)
+            node, value = self.model[name], values[name]
+            size = int(np.prod(node.value_shape, dtype=int))
+            if value.ndim == len(node.value_shape):
+                self._constant[name] = value
+            elif node.domain is None:
+                self._centre[name] = _finite(value.reshape(-1, size).astype(float).mean(axis=0))
+                self._powers[name] = np.zeros((2, 2, size))
+            elif node.plates:
+                self._states[name] = np.zeros((2, size, node.domain.size))
+            elif groups and groups[-1].size * node.domain.size <= _GROUP_STATES:
+                groups[-1] = groups[-1].with_node(name, node.domain.size)
             else:
-                self._power(name, flat.astype(float, copy=False), weights)
+                groups.append(_Group((name,), (node.domain.size,)))
+        return groups
 
     def _relative(self, log_weight: np.ndarray, draws: int) -> np.ndarray:
         """Rows ``w`` and ``w**2`` relative to the largest weight so far; older sums are rescaled."""
-        highest = float(log_weight.max(initial=-np.inf))
+        highest = float(log_weight.max())
         if highest > self.top:
-            scale = np.exp(np.array([1.0, 2.0]) * (self.top - highest)) if self.draws else np.ones(2)
-            self.weight *= scale
-            for kept in (self.counts, self.powers):
-                for array in kept.values():
-                    array *= scale.reshape((2,) + (1,) * (array.ndim - 1))
+            if self.weight[0]:
+                self._rescale(np.exp(np.array([1.0, 2.0]) * (self.top - highest)))
             self.top = highest
         self.draws += draws
+        self.tail.add(log_weight, draws)
         weights = np.empty((2, draws))
-        top = self.top if np.isfinite(self.top) else 0.0
-        np.exp(log_weight - top, out=weights[0])
+        np.exp(log_weight - (self.top if self.top > -np.inf else 0.0), out=weights[0])
         np.multiply(weights[0], weights[0], out=weights[1])
-        self._keep_tail(log_weight)
+        self.weight += weights.sum(axis=1)
         return weights
 
-    def _keep_tail(self, log_weight: np.ndarray) -> None:
-        """The largest log weights, as many as the Pareto fit may need for the draws so far."""
-        if len(self.tail) and log_weight.max() == log_weight.min() == self.tail.min():
-            if len(self.tail) >= 5 * diagnostics.tail_length(self.draws):
-                return
-        size = 5 * diagnostics.tail_length(2 * self.draws)
-        merged = np.concatenate([self.tail, log_weight])
-        self.tail = np.partition(merged, -size)[-size:] if len(merged) > size else merged
+    def _rescale(self, scale: np.ndarray) -> None:
+        self.weight *= scale
+        for group in self._groups or ():
+            group.histogram *= scale[:, None]
+        for array in self._states.values():
+            array *= scale[:, None, None]
+        for array in self._powers.values():
+            array *= scale[None, :, None]
 
-    def _count(self, name: str, codes: np.ndarray, size: int, weights: np.ndarray) -> None:
-        table = self.counts.setdefault(name, np.zeros((2, codes.shape[1], size)))
-        if codes.shape[0] == 1:
-            total = weights.sum(axis=1)
-            table[:, np.arange(codes.shape[1]), codes[0]] += total[:, None]
-            return
-        rest = weights.sum(axis=1)[:, None]
-        for state in range(1, size):
-            indicator = codes if size == 2 else codes == state
-            mass = weights @ indicator.astype(float)
-            table[:, :, state] += mass
-            rest = rest - mass
-        table[:, :, 0] += np.maximum(rest, 0.0)
+    def _add_states(self, name: str, codes: np.ndarray, weights: np.ndarray) -> None:
+        table = self._states[name]
+        flat = codes.reshape(len(codes), -1)
+        for state in range(table.shape[2]):
+            table[:, :, state] += weights @ (flat == state).astype(float)
 
-    def _power(self, name: str, values: np.ndarray, weights: np.ndarray) -> None:
-        if name not in self.centre:
-            mean = weights[0] @ values / weights[0].sum() if len(values) > 1 and weights[0].any() else values.mean(0)
-            self.centre[name] = np.where(np.isfinite(mean), mean, 0.0)
-            self.powers[name] = np.zeros((2, 2, values.shape[1]))
-        centred = values - self.centre[name]
-        rows = weights if len(values) > 1 else weights.sum(axis=1, keepdims=True)
-        self.powers[name][:, 0] += rows @ centred
-        self.powers[name][:, 1] += rows @ (centred * centred)
+    def _add_powers(self, name: str, value: np.ndarray, weights: np.ndarray) -> None:
+        centred = value.reshape(len(value), -1) - self._centre[name]
+        if centred.shape[1] == 1:
+            centred = centred[:, 0]
+        first, second = self._powers[name]
+        first += (weights @ centred).reshape(first.shape)
+        np.multiply(centred, centred, out=centred)
+        second += (weights @ centred).reshape(first.shape)
+
+
+class _Group:
+    """Scalar finite nodes counted together, in one histogram over their joint states."""
+
+    def __init__(self, names: tuple[str, ...], cards: tuple[int, ...]) -> None:
+        self.names = names
+        self.cards = cards
+        self.size = int(np.prod(cards))
+        self.histogram = np.zeros((2, self.size))
+
+    def with_node(self, name: str, card: int) -> _Group:
+        return _Group((*self.names, name), (*self.cards, card))
+
+    def add(self, values: Mapping[str, np.ndarray], weights: np.ndarray) -> None:
+        code = values[self.names[0]].astype(np.uint16 if self.size <= 1 << 16 else np.intp)
+        for name, card in zip(self.names[1:], self.cards[1:], strict=True):
+            code *= card
+            code += values[name]
+        bins = code.astype(np.intp)
+        for row, weight in zip(self.histogram, weights, strict=True):
+            row += np.bincount(bins, weights=weight, minlength=self.size)
+
+    def counts(self, name: str) -> np.ndarray:
+        axis = self.names.index(name)
+        joint = self.histogram.reshape((2, *self.cards))
+        return joint.sum(axis=tuple(1 + k for k in range(len(self.cards)) if k != axis))
+
+
+class _Tail:
+    """The largest log weights, as many as the Pareto fit needs for the draws so far."""
+
+    def __init__(self) -> None:
+        self.draws = 0
+        self.kept = np.empty(0)
+        self._fresh: list[np.ndarray] = []
+        self._count = 0
+        self._floor = -np.inf
+
+    def add(self, log_weight: np.ndarray, draws: int) -> None:
+        self.draws += draws
+        if log_weight.ndim == 0:
+            return  # equal weights have no tail
+        above = log_weight[log_weight > self._floor] if self._floor > -np.inf else log_weight
+        if above.size:
+            self._fresh.append(above)
+            self._count += above.size
+        if self._count > 4 * max(self._needed(), len(self.kept)):
+            self.values()
+
+    def values(self) -> np.ndarray:
+        """The kept log weights, in no order."""
+        if self._fresh:
+            merged = np.concatenate([self.kept, *self._fresh])
+            size = self._needed()
+            self.kept = np.partition(merged, -size)[-size:] if len(merged) > size else merged
+            self._fresh, self._count = [], 0
+            # more draws lengthen the tail, so what falls below is dropped only with room to spare
+            self._floor = float(self.kept.min()) if len(merged) > size else -np.inf
+        return self.kept
+
+    def _needed(self) -> int:
+        return 5 * diagnostics.tail_length(4 * self.draws)
 
 
 class SumsPosterior(Posterior):
@@ -118,16 +211,16 @@ class SumsPosterior(Posterior):
         """Tail shape of the weights; None where uniform."""
         if not self._weighted:
             return None
-        tail = self._sums.tail
+        tail = self._sums.tail.values()
         return diagnostics.pareto_k(tail[np.isfinite(tail)], self._sums.draws)
 
     def mean(self, name: str) -> np.ndarray:
         node = self._numeric(name, "mean")
         if node.domain is not None:
-            return self._expected_state(name, 1)
+            return self.probabilities(name) @ np.asarray(node.domain.numbers, dtype=float)
         self._kept(name)
-        first = self._sums.powers[name][0, 0] / self._sums.weight[0]
-        return (self._sums.centre[name] + first).reshape(node.value_shape)
+        centre, first, _ = self._sums.powers(name)
+        return centre + first[0] / self._sums.weight[0]
 
     def var(self, name: str) -> np.ndarray:
         node = self._numeric(name, "var")
@@ -136,37 +229,35 @@ class SumsPosterior(Posterior):
             p = self.probabilities(name)
             return p @ numbers**2 - (p @ numbers) ** 2
         self._kept(name)
-        first, second = self._sums.powers[name][0] / self._sums.weight[0]
-        return np.maximum(second - first**2, 0.0).reshape(node.value_shape)
+        _, first, second = self._sums.powers(name)
+        total = self._sums.weight[0]
+        return np.maximum(second[0] / total - (first[0] / total) ** 2, 0.0)
 
     def probabilities(self, *names: str) -> np.ndarray:
         if len(names) != 1:
             raise self._cannot("probabilities of several nodes")
-        node = self._finite(names[0])
+        self._finite(names[0])
         self._kept(names[0])
-        assert node.domain is not None
-        table = self._sums.counts[names[0]][0] / self._sums.weight[0]
-        return table.reshape((*node.plate_shape, node.domain.size))
+        return self._sums.counts(names[0])[0] / self._sums.weight[0]
 
     def mcse(self, what: Any) -> np.ndarray:
         if not isinstance(what, str):
             raise self._cannot("mcse of a function")
         node = self._node(what)
         self._kept(what)
-        total = self._sums.weight[0]
+        total, squares = self._sums.weight
         if node.domain is None:
-            second = self._sums.powers[what][1]
-            mean = self._sums.powers[what][0, 0] / total
-            squares = second[1] - 2 * mean * second[0] + mean**2 * self._sums.weight[1]
-            return (np.sqrt(np.maximum(squares, 0.0)) / total).reshape(node.value_shape)
-        p = self._sums.counts[what][0] / total
-        heavy = self._sums.counts[what][1]
+            _, first, second = self._sums.powers(what)
+            mean = first[0] / total
+            spread = second[1] - 2 * mean * first[1] + mean**2 * squares
+            return np.sqrt(np.maximum(spread, 0.0)) / total
+        counts, heavy = self._sums.counts(what)
+        p = counts / total
         if node.domain.labels is not None:
-            squares = heavy * (1 - p) ** 2 + (self._sums.weight[1] - heavy) * p**2
-            return (np.sqrt(squares) / total).reshape((*node.plate_shape, node.domain.size))
+            return np.sqrt(heavy * (1 - p) ** 2 + (squares - heavy) * p**2) / total
         numbers = np.asarray(node.domain.numbers, dtype=float)
-        centred = numbers - (p @ numbers)[:, None]
-        return (np.sqrt((heavy * centred**2).sum(axis=-1)) / total).reshape(node.plate_shape)
+        centred = numbers - (p @ numbers)[..., None]
+        return np.sqrt((heavy * centred**2).sum(axis=-1)) / total
 
     def ess(self, what: Any) -> np.ndarray:
         if not isinstance(what, str):
@@ -183,10 +274,6 @@ class SumsPosterior(Posterior):
     def rhat(self, what: Any) -> np.ndarray:
         return np.full(np.shape(self.mcse(what)), np.nan)
 
-    def _expected_state(self, name: str, power: int) -> np.ndarray:
-        numbers = np.asarray(self.model[name].domain.numbers, dtype=float)  # type: ignore[union-attr]
-        return self.probabilities(name) @ numbers**power
-
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         return {}
 
@@ -200,3 +287,7 @@ class SumsPosterior(Posterior):
 
     def _remedy(self) -> str:
         return 'call infer with keep="draws"'
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, 0.0)

@@ -1,4 +1,4 @@
-"""Gaussian linear algebra: distances and linear maps, also where covariances are ill-conditioned."""
+"""Gaussian linear algebra: distances and linear maps, ill-conditioned covariances included."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Parameters out of range: the message, the first offending index, and marking instead of raising."""
+"""Parameters out of range: the message, the first offending index, and marking instead."""
 
 from __future__ import annotations
 
@@ -17,23 +17,47 @@ NOT_PD = np.array([[1.0, 2.0], [2.0, 1.0]])
 #: a call with exactly one fault, its index, and words of its message
 FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
     (lambda: d.Normal(0.0, -1.0), (), "Normal: scale must be positive and finite; got -1."),
-    (lambda: d.Normal(0.0, [1.0, 0.0]), (1,), "scale must be positive and finite; got 0. at index 1"),
-    (lambda: d.Normal([[0, 1], [NAN, 2]], 1.0), (1, 0), r"loc must be finite; got nan at index (1, 0)"),
+    (
+        lambda: d.Normal(0.0, [1.0, 0.0]),
+        (1,),
+        "scale must be positive and finite; got 0. at index 1",
+    ),
+    (
+        lambda: d.Normal([[0, 1], [NAN, 2]], 1.0),
+        (1, 0),
+        r"loc must be finite; got nan at index (1, 0)",
+    ),
     (lambda: d.Normal(0.0, INF), (), "scale must be positive"),
     (lambda: d.StudentT([3.0, -3.0], 0.0, 1.0), (1,), "StudentT: df must be positive"),
     (lambda: d.StudentT(3.0, 0.0, NAN), (), "scale must be positive"),
-    (lambda: d.Uniform([0.0, 2.0], 2.0), (1,), "Uniform: high must be finite and above low; got 2."),
+    (
+        lambda: d.Uniform([0.0, 2.0], 2.0),
+        (1,),
+        "Uniform: high must be finite and above low; got 2.",
+    ),
     (lambda: d.Uniform(0.0, NAN), (), "high must be finite and above low"),
     (lambda: d.Uniform(-INF, 0.0), (), "low must be finite"),
     (lambda: d.Beta([1.0, 0.0], 1.0), (1,), "Beta: concentration1 must be positive"),
     (lambda: d.Beta(1.0, NAN), (), "concentration0 must be positive"),
     (lambda: d.Gamma(1.0, [[1.0, -2.0]]), (0, 1), "Gamma: rate must be positive"),
     (lambda: d.Exponential(INF), (), "Exponential: rate must be positive and finite; got inf"),
-    (lambda: d.Dirichlet([[1.0, 1.0], [1.0, 0.0]]), (1,), "Dirichlet: concentration must be positive"),
+    (
+        lambda: d.Dirichlet([[1.0, 1.0], [1.0, 0.0]]),
+        (1,),
+        "Dirichlet: concentration must be positive",
+    ),
     (lambda: d.Bernoulli([0.5, 1.5]), (1,), "Bernoulli: probs must be between 0 and 1; got 1.5 at"),
     (lambda: d.Bernoulli(logits=[0.0, NAN]), (1,), "logits must be a number"),
-    (lambda: d.Binomial(2.5, 0.5), (), "Binomial: total_count must be a nonnegative whole number; got 2.5"),
-    (lambda: d.Binomial([3, -1], 0.5), (1,), "total_count must be a nonnegative whole number; got -1"),
+    (
+        lambda: d.Binomial(2.5, 0.5),
+        (),
+        "Binomial: total_count must be a nonnegative whole number; got 2.5",
+    ),
+    (
+        lambda: d.Binomial([3, -1], 0.5),
+        (1,),
+        "total_count must be a nonnegative whole number; got -1",
+    ),
     (lambda: d.Binomial(3, [0.5, NAN]), (1,), "Binomial: probs must be between 0 and 1"),
     (lambda: d.Poisson([1.0, -1.0]), (1,), "Poisson: rate must be nonnegative and finite"),
     (lambda: d.DiscreteUniform(0.5, 3), (), "DiscreteUniform: low must be a whole number; got 0.5"),
@@ -47,7 +71,11 @@ FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
     ),
     (lambda: d.Categorical([1.5, -0.5]), (), "nonnegative and sum to 1"),
     (lambda: d.Categorical([[[0.5, 0.5], [NAN, 0.5]]]), (0, 1), "at index (0, 1)"),
-    (lambda: d.Categorical(logits=[[0.0, 0.0], [-INF, -INF]]), (1,), "logits must be below infinity"),
+    (
+        lambda: d.Categorical(logits=[[0.0, 0.0], [-INF, -INF]]),
+        (1,),
+        "logits must be below infinity",
+    ),
     (lambda: d.Categorical(logits=[0.0, INF]), (), "logits must be below infinity"),
     (lambda: d.MvNormal([0.0, NAN], np.eye(2)), (), "MvNormal: loc must be finite"),
     (
@@ -59,14 +87,22 @@ FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
     (lambda: d.MvNormal(np.zeros(2), [[NAN, 0.0], [0.0, 1.0]]), (), "symmetric positive definite"),
     (lambda: d.MvNormal(np.zeros(2), scale_tril=[[1.0, 0.5], [0.0, 1.0]]), (), "lower triangular"),
     (lambda: d.MvNormal(np.zeros(2), scale_tril=-np.eye(2)), (), "positive diagonal"),
-    (lambda: d.MvNormal(np.zeros(2), scale_diag=[[1.0, 1.0], [1.0, 0.0]]), (1,), "scale_diag must be"),
-    (lambda: d.Mixture([0.5, 0.6], d.Normal([0, 1], 1)), (), "Mixture: weights must be nonnegative and"),
+    (
+        lambda: d.MvNormal(np.zeros(2), scale_diag=[[1.0, 1.0], [1.0, 0.0]]),
+        (1,),
+        "scale_diag must be",
+    ),
+    (
+        lambda: d.Mixture([0.5, 0.6], d.Normal([0, 1], 1)),
+        (),
+        "Mixture: weights must be nonnegative and",
+    ),
     (
         lambda: d.as_distribution(stats.norm(0.0, [1.0, -1.0])),
         (1,),
         "scipy.stats.norm: parameters must be in SciPy's range; got [ 0. -1.] at index 1",
     ),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("call", "index", "message"), FAULTS, ids=lambda v: str(v)[:50])

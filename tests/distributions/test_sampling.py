@@ -1,7 +1,7 @@
 """Draws against the distributions they claim to come from, at stated false-alarm rates.
 
-Seeds are fixed, so a test that passes keeps passing; each test's false-alarm rate is ``ALARM`` were the
-seed fresh. About 900 tests run here, so that a fresh run of the file would fail once in a thousand.
+Seeds are fixed, so a test that passes keeps passing; each test's false-alarm rate is ``ALARM`` were
+the seed fresh. About 900 tests run here, so that a fresh run would fail once in a thousand.
 """
 
 from __future__ import annotations
