@@ -110,6 +110,8 @@ class PlateArray(NDArrayOperatorsMixin):
         if not kept and not extra and self.event_ndim:
             return Gathered(table, rows)
         values = np.take(table, rows, axis=0)
+        if hasattr(table, "states"):  # labels survive, also where NumPy makes a bare scalar
+            values = type(table)(values, table.states)
         if not kept and not extra:
             return values
         return PlateArray(values, extra + names, self.own, self.event_ndim)
@@ -123,7 +125,8 @@ class PlateArray(NDArrayOperatorsMixin):
         """
         lead, sizes, event = self._split()
         start = len(lead)
-        joined = [self.plates.index(name) for name in extra if name in self.plates]
+        mine = [name for k, name in enumerate(self.plates) if k not in gathered]
+        joined = [self.plates.index(name) for name in extra if name in mine]
         order = (
             *range(start),
             *(start + k for k in joined),
@@ -131,7 +134,7 @@ class PlateArray(NDArrayOperatorsMixin):
             *(start + k for k in kept),
             *range(start + len(sizes), self.array.ndim),
         )
-        ones = tuple(sizes[self.plates.index(n)] if n in self.plates else 1 for n in extra)
+        ones = tuple(sizes[self.plates.index(n)] if n in mine else 1 for n in extra)
         lead = lead + ones
         rest = tuple(sizes[k] for k in kept) + event
         array = np.transpose(self.array, order) if order != tuple(range(len(order))) else self.array
@@ -301,9 +304,13 @@ class Gathered(NDArrayOperatorsMixin):
         if self._array is None:
             self._array = np.take(self.table, self.rows, axis=0)
             self._array.flags.writeable = False
-        return self._array if dtype is None else self._array.astype(dtype)
+        if dtype is not None and np.dtype(dtype) != self._array.dtype:
+            return self._array.astype(dtype)
+        return self._array.copy() if copy else self._array
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if any(isinstance(x, Gathered) for x in kwargs.get("out", ())):
+            raise ValueError("output array is read-only")
         plain = [np.asarray(x) if isinstance(x, Gathered) else x for x in inputs]
         return getattr(ufunc, method)(*plain, **kwargs)
 
@@ -392,6 +399,10 @@ def _expand(x: PlateArray, names: tuple[str, ...], event: int, core: int) -> np.
 def _as_index(key: Any, plate: str, size: int) -> PlateArray:
     """An index along ``plate`` as a PlateArray of positions, checked against the plate's size."""
     foreign = key if isinstance(key, PlateArray) else None
+    if foreign is not None and foreign.event_ndim:
+        raise IndexError(
+            f"plate {plate!r} is gathered by scalars, not by vectors; take a component with v[..., k]"
+        )
     array = np.asarray(foreign.array if foreign is not None else key)
     if array.dtype.kind not in "iu":
         raise IndexError(

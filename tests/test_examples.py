@@ -33,8 +33,8 @@ def test_demo_prints_tables_and_writes_pictures(
 def test_demo_engines_agree(tables: list[demo.Table]) -> None:
     """Every sampled figure lies within 4.5 of its Monte Carlo errors of the exact one.
 
-    The false-alarm rate of that is 7e-6 a figure, at a fixed seed; it carries over to weighted draws
-    where their effective number is large, which the table with one effective draw is not.
+    The false-alarm rate of that is 7e-6 a figure, at a fixed seed, where the effective number of
+    draws is large; the table with one effective draw is left out.
     """
     checked = 0
     for table in tables:

@@ -1,8 +1,8 @@
 """Holds the layers of the package: imports point down only, heavy libraries load when first used.
 
 The modules are read, not run: every import statement is found in the syntax tree, those inside
-functions and under ``TYPE_CHECKING`` included; only a cycle within a room may be closed by an import
-for types. Planted violations show that each rule can fail.
+functions and under ``TYPE_CHECKING`` included; only a cycle within a room may be closed by an
+import for types. Planted violations show that each rule can fail.
 """
 
 from __future__ import annotations

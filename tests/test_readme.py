@@ -26,6 +26,7 @@ def test_opens_with_the_two_commands() -> None:
 def test_named_make_targets_exist() -> None:
     makefile = (REPOSITORY / "Makefile").read_text("utf-8")
     targets = set(re.findall(r"^([a-z]+):", makefile, re.MULTILINE))
+    pattern = r"(?:^|`)make ([a-z]+)"
     pages = [README, REPOSITORY / "CONTRIBUTING.md", REPOSITORY / ".ci" / "run"]
-    named = {t for page in pages for t in re.findall(r"make ([a-z]+)", page.read_text("utf-8"))}
+    named = {t for page in pages for t in re.findall(pattern, page.read_text("utf-8"), re.M)}
     assert named <= targets

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -74,9 +74,7 @@ class Calibrated:
         """The normalised joint table of a clique's variables; sliced ones keep one state."""
         return self._named(self._belief(clique))
 
-    def joint(
-        self, variables: Sequence[Hashable], max_bytes: float = JOINT_BYTES
-    ) -> np.ndarray:
+    def joint(self, variables: Sequence[Hashable], max_bytes: float = JOINT_BYTES) -> np.ndarray:
         """The joint probabilities of any variables.
 
         Parameters
@@ -134,7 +132,9 @@ class Calibrated:
         self._possible("sample")
         tree, program = self._context.tree, self._context.program
         codes: dict[int, np.ndarray] = {
-            v: np.full(draws, self._context.states[v], np.min_scalar_type(tree.cardinalities[v] - 1))
+            v: np.full(
+                draws, self._context.states[v], np.min_scalar_type(tree.cardinalities[v] - 1)
+            )
             for v in program.sliced
         }
         for k, clique in enumerate(tree.cliques):
@@ -192,7 +192,9 @@ class Calibrated:
 
     def _named(self, factor: Factor) -> Factor:
         names = self._context.tree.variables
-        return Factor(tuple(names[v] for v in factor.scope), factor.values, factor.log_scale)
+        return Factor(
+            tuple(names[cast(int, v)] for v in factor.scope), factor.values, factor.log_scale
+        )
 
     def _joint_factor(self, free: Sequence[int], max_bytes: float) -> Factor:
         """The joint of unobserved variables: from one clique, or along the paths between them."""

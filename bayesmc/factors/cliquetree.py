@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
+from typing import cast
 
 import numpy as np
 
@@ -72,9 +73,8 @@ class CliqueTree:
         self.variables: tuple[Hashable, ...] = (
             tuple(range(len(cardinalities))) if named is None else tuple(named)
         )
-        self.cardinalities: tuple[int, ...] = tuple(
-            int(n) for n in (cardinalities if named is None else named.values())
-        )
+        sizes = list(cardinalities) if named is None else list(named.values())
+        self.cardinalities: tuple[int, ...] = tuple(int(cast(int, n)) for n in sizes)
         self.scopes = tuple(tuple(scope) for scope in scopes)
         self.index = {v: k for k, v in enumerate(self.variables)}
         self._check()

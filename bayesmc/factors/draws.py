@@ -10,9 +10,7 @@ import numpy as np
 _FEW_COLUMNS = 16
 
 
-def draw_columns(
-    weights: np.ndarray, rows: np.ndarray, rng: np.random.Generator
-) -> np.ndarray:
+def draw_columns(weights: np.ndarray, rows: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """For each draw a column of its row, with probability in proportion to the row's weights.
 
     Parameters

@@ -136,7 +136,7 @@ class _Graph:
         self.added = 0
 
     def eliminate(self, vertex: int) -> int:
-        """Join the neighbours of ``vertex`` and drop it; the mask of vertices whose counts moved."""
+        """Join the neighbours of ``vertex`` and drop it; the mask of those whose counts moved."""
         adjacency = self.adjacency
         neighbours = adjacency[vertex]
         moved = neighbours
@@ -190,7 +190,11 @@ def _greedy(
         if heuristic == "min-weight":
             return round(weight[v], 6), fill[v] if ties is None else noise[v], v
         # Rounding lets equal weights tie although they were summed in different orders.
-        return round(fill[v] * 2.0 ** min(weight[v] / 2, 500.0), 6), round(weight[v], 6) + noise[v], v
+        return (
+            round(fill[v] * 2.0 ** min(weight[v] / 2, 500.0), 6),
+            round(weight[v], 6) + noise[v],
+            v,
+        )
 
     heap = [key(v) for v in range(len(weights))]
     latest = list(heap)

@@ -110,8 +110,8 @@ def sum_product(
     if 8.0 * largest > max_bytes:
         raise BudgetError(
             f"sum_product over {len(keep)} variables: the largest intermediate table would take "
-            f"{8.0 * largest:.3g} bytes, above the {max_bytes:.3g} allowed; ask for fewer variables "
-            "at once, or raise the budget",
+            f"{8.0 * largest:.3g} bytes, above the {max_bytes:.3g} allowed; ask for fewer "
+            "variables at once, or raise the budget",
             int(8.0 * largest),
         )
     for variable in order:

@@ -91,8 +91,10 @@ def compile_program(
     place, end = {}, 0
     touched = [not sliced.isdisjoint(clique.variables) for clique in cliques]
     for k, clique in enumerate(cliques):
-        if unsliced is not None and not touched[k] and not (
-            clique.parent >= 0 and touched[clique.parent]
+        if (
+            unsliced is not None
+            and not touched[k]
+            and not (clique.parent >= 0 and touched[clique.parent])
         ):
             shapes.append(unsliced.cliques[k])
         else:

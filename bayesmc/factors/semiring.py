@@ -44,10 +44,10 @@ class Semiring(Protocol):
         """Leave the semiring."""
 
 
-class Linear:
+class Linear(Semiring):
     """Ordinary arithmetic; sums are matrix-vector products, several times faster than `sum`."""
 
-    multiply = np.multiply
+    multiply: np.ufunc = np.multiply
     zero = 0.0
 
     def row_sums(self, matrix: np.ndarray) -> np.ndarray:
@@ -80,10 +80,10 @@ class Linear:
         return values
 
 
-class Log:
+class Log(Semiring):
     """Arithmetic on logarithms: products are sums, sums are log-sum-exp."""
 
-    multiply = np.add
+    multiply: np.ufunc = np.add
     zero = -math.inf
 
     def row_sums(self, matrix: np.ndarray) -> np.ndarray:

@@ -14,10 +14,10 @@ import math
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -156,7 +156,8 @@ _NAMES = re.compile(rf"[\s,|]*{_NAME}")
 _TOKEN = re.compile(rf"{_NAME}|[{{}}()\[\];,|]")
 _GAP = re.compile(r"\s*")
 _HEAD = re.compile(rf"{_NAME}\s*")
-_TO_CLOSING_BRACE = re.compile(r'(?:[^"{}]+|"[^"\n]*")*\}')
+# Possessive, as backtracking into an unclosed block would take exponential time.
+_TO_CLOSING_BRACE = re.compile(r'(?:[^"{}]++|"[^"\n]*+")*+\}')
 _NETWORK_HEAD = re.compile(rf"(?:{_NAME})?[^{{}}]*\{{")
 _PROPERTY = re.compile(r'((?:"[^"\n]*"|[^";])*);')
 _TYPE = re.compile(r'discrete\s*\[\s*(\d+)\s*\]\s*\{((?:"[^"\n]*"|[^"{};])*)\}\s*;')
@@ -173,6 +174,22 @@ class _Variable:
     states: tuple[str, ...]
     codes: Mapping[str, int]
     properties: tuple[str, ...]
+
+
+class _Row(NamedTuple):
+    """The numbers of one row, and where it starts."""
+
+    at: int
+    numbers: list[float]
+
+
+@dataclass
+class _Entries:
+    """What one probability block gives."""
+
+    rows: dict[int, _Row] = field(default_factory=dict)
+    default: _Row | None = None
+    table: _Row | None = None
 
 
 class _Reader:
@@ -280,67 +297,76 @@ class _Reader:
         self.tables[child] = (tuple(parents), self.read_table(child, parents, at))
 
     def read_table(self, child: str, parents: list[str], at: int) -> np.ndarray:
-        """The rows of one block; ``self.at`` is after its opening brace."""
+        """The table of one block; ``self.at`` is after its opening brace."""
         shape = [len(self.variables[p].states) for p in parents]
         shape.append(len(self.variables[child].states))
         size, count = shape[-1], math.prod(shape[:-1])
+        entries = self.read_entries(child, parents, size, count)
+        if entries.table is not None:
+            if entries.rows or entries.default is not None:
+                self.fail(f"probability of {child!r} mixes 'table' with rows", entries.table.at)
+            table = np.array(entries.table.numbers).reshape(size, count).T.copy()
+            lines = [entries.table.at] * count
+        else:
+            rows = self.completed(entries, child, parents, shape[:-1], at)
+            table = np.array([row.numbers for row in rows])
+            lines = [row.at for row in rows]
+        self.normalise(table, lines, child)
+        return table.reshape(shape)
+
+    def read_entries(self, child: str, parents: list[str], size: int, count: int) -> _Entries:
+        """Everything up to the block's closing brace."""
         codes = [self.variables[p].codes for p in parents]
-        rows: dict[int, list[float]] = {}
-        where: dict[int, int] = {}
-        default: list[float] | None = None
-        default_at = table_at = None
+        found = _Entries()
         while True:
             self.at = start = _after_gap(self.text, self.at)
             row = _ROW.match(self.text, start)
             if row is not None:
                 index = self.row_index(row[1], row.start(1), child, parents, codes)
-                if index in rows:
+                if index in found.rows:
                     self.fail(f"probability of {child!r}: row ({row[1].strip()}) is given twice")
-                rows[index] = self.numbers(row[2], row.start(2), size, child)
-                where[index] = start
+                numbers = self.numbers(row[2], row.start(2), size, child)
+                found.rows[index] = _Row(start, numbers)
                 self.at = row.end()
                 continue
             if self.text.startswith("(", start):
                 self.fail(f"probability of {child!r}: expected '(states) numbers;'")
             keyword = self.keyword(f"the probability block of {child!r}")
             if keyword == "}":
-                break
+                return found
             if keyword == "property":
                 self.property_text()
                 continue
             match = _NUMBERS.match(self.text, self.at)
-            if keyword == "table" and match and table_at is None:
-                flat = self.numbers(match[1], match.start(1), size * count, child)
-                table_at = start
-            elif keyword == "default" and match and default is None:
-                default = self.numbers(match[1], match.start(1), size, child)
-                default_at = start
+            if keyword == "table" and match and found.table is None:
+                numbers = self.numbers(match[1], match.start(1), size * count, child)
+                found.table = _Row(start, numbers)
+            elif keyword == "default" and match and found.default is None:
+                numbers = self.numbers(match[1], match.start(1), size, child)
+                found.default = _Row(start, numbers)
             else:
                 self.fail(
                     f"probability of {child!r}: expected '(states) numbers;', one 'table numbers;' "
-                    f"or one 'default numbers;', found {keyword!r}", start
+                    f"or one 'default numbers;', found {keyword!r}",
+                    start,
                 )
             self.at = match.end()
-        if table_at is not None:
-            if rows or default is not None:
-                self.fail(f"probability of {child!r} mixes 'table' with rows", table_at)
-            table = np.array(flat).reshape(size, count).T.copy()
-            lines = [table_at] * count
-        else:
-            missing = [k for k in range(count) if k not in rows] if len(rows) < count else []
-            if missing and default is None:
-                states = np.unravel_index(missing[0], shape[:-1]) if parents else ()
-                named = [self.variables[p].states[k] for p, k in zip(parents, states, strict=True)]
-                self.fail(
-                    f"probability of {child!r}: {len(missing)} of {count} rows are missing, first "
-                    f"({', '.join(named)}); give them, or a 'default' row", at
-                )
-            for k in missing:
-                rows[k], where[k] = default, default_at  # type: ignore[assignment]
-            table = np.array([rows[k] for k in range(count)])
-            lines = [where[k] for k in range(count)]
-        self.normalise(table, lines, child)
-        return table.reshape(shape)
+
+    def completed(
+        self, entries: _Entries, child: str, parents: list[str], shape: list[int], at: int
+    ) -> list[_Row]:
+        """One row per configuration of the parents, the default where none is given."""
+        count = math.prod(shape)
+        if entries.default is None and len(entries.rows) < count:
+            first = next(k for k in range(count) if k not in entries.rows)
+            states = np.unravel_index(first, shape) if parents else ()
+            named = [self.variables[p].states[k] for p, k in zip(parents, states, strict=True)]
+            self.fail(
+                f"probability of {child!r}: {count - len(entries.rows)} of {count} rows are "
+                f"missing, first ({', '.join(named)}); give them, or a 'default' row",
+                at,
+            )
+        return [entries.rows.get(k, entries.default) for k in range(count)]  # type: ignore[misc]
 
     def row_index(
         self, text: str, at: int, child: str, parents: list[str], codes: list[Mapping[str, int]]
@@ -375,7 +401,9 @@ class _Reader:
         if len(values) != count:
             self.fail(f"probability of {child!r}: expected {count} numbers, found {len(values)}")
         # Written so that NaN fails; sums of allowed entries are judged in `normalise`.
-        if not (min(values) >= 0.0 and max(values) <= 1.0 + ROW_TOLERANCE and sum(values) < math.inf):
+        if not (
+            min(values) >= 0.0 and max(values) <= 1.0 + ROW_TOLERANCE and sum(values) < math.inf
+        ):
             for k, value in enumerate(values):
                 if not 0.0 <= value <= 1.0 + ROW_TOLERANCE:
                     where = at + _word_offset(text, k)
@@ -390,7 +418,8 @@ class _Reader:
         if off[worst] > ROW_TOLERANCE * (1 + 1e-9):  # 0.999999 differs from 1 by 1.00000000003e-6
             self.fail(
                 f"probability of {child!r}: a row sums to {sums[worst]:.9g}, not 1 (differences up "
-                f"to {ROW_TOLERANCE:g} are taken for rounding)", lines[worst]
+                f"to {ROW_TOLERANCE:g} are taken for rounding)",
+                lines[worst],
             )
         rounded = off > 1e-12  # dividing exact rows as well would change their last digit
         table[rounded] /= sums[rounded, None]

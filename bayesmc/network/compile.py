@@ -31,7 +31,7 @@ from bayesmc.network.model import (
     lookup,
 )
 from bayesmc.network.node import Declaration, Potential
-from bayesmc.shapes import Shape, broadcasts_to, read_only, unused_sizes
+from bayesmc.shapes import Shape, read_only, unused_sizes
 
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
@@ -56,6 +56,8 @@ def compile_model(
             declaration = declarations[key]
             links = _links(declaration.parents, declaration, nodes)
             plates = tuple(sizes[p] for p in declaration.plates)
+            if declaration.source == "table":
+                _check_table_parents(declaration, links, nodes)
             node, value = _discover(declaration, links, plates, model.probe, shape, count, rng, inputs)
             nodes[key] = node
             model.probe[key] = value
@@ -108,8 +110,6 @@ def _discover(
             declaration, links, plates, declaration.event_shape, discrete, False, declaration.domain
         )
         return node, declaration.value
-    if declaration.source == "table":
-        _check_table_parents(declaration, links, probe)
     arguments, batch = arguments_of(links, probe)
     result = _call_batched(declaration, links, probe, shape, batch + plates)
     if isinstance(result, Distribution):
@@ -127,13 +127,13 @@ def _call_batched(
     """Call on the whole probe; if that fails but one entry works, the function does not broadcast."""
     arguments, _ = arguments_of(links, probe)
     try:
-        return call(declaration, arguments, lead)
+        return call(declaration, arguments, lead, links)
     except BayesmcError as error:
         if not links or declaration.source == "table":
             raise
         try:
             one, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
-            call(declaration, one, lead[len(lead) - len(declaration.plates) :])
+            call(declaration, one, lead[len(lead) - len(declaration.plates) :], links)
         except BayesmcError as alone:
             raise alone from alone.__cause__
         raise BroadcastError(
@@ -183,23 +183,8 @@ def _discover_stochastic(
     error = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
     if error is not None:
         raise error
-    lead = _probe_batch(bool(links), domain is not None, batch, shape, count)
-    value = _reachable(node, dist, lead, count, rng)
+    value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
-
-
-def _probe_batch(
-    has_parents: bool, is_finite: bool, batch: Shape, shape: Shape, count: int
-) -> Shape:
-    """Batch shapes that differ from node to node but broadcast, each a true joint draw per entry.
-
-    Finite roots always vary, so that all their states are tried.
-    """
-    q, p = shape
-    if not has_parents:
-        choices = [(q, p), (p,)] if is_finite else [(q, p), (p,), (), (q, 1)]
-        return choices[count % len(choices)]
-    return shape if count % 3 == 2 else batch
 
 
 def _reachable(
@@ -248,7 +233,7 @@ def _discover_deterministic(
 ) -> tuple[CompiledNode, np.ndarray]:
     """Event shape from one unbatched call; a table where all parents are finite."""
     single, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
-    one = call(declaration, single, plates)
+    one = call(declaration, single, plates, links)
     event = one.shape[len(plates) :]
     full = batch + plates + event
     value = deterministic_fit(declaration, result, batch, plates, full)
@@ -279,7 +264,7 @@ def _tabulate_deterministic(node: CompiledNode) -> CompiledNode | None:
     values = configurations(node.links, cards)
     try:
         arguments, batch = arguments_of(node.links, values)
-        result = call(node.declaration, arguments, batch + node.plate_shape)
+        result = call(node.declaration, arguments, batch + node.plate_shape, node.links)
     except BayesmcError:
         return None  # some configuration, perhaps an impossible one, cannot be evaluated
     full = np.broadcast_to(result, cards + node.plate_shape)
@@ -348,7 +333,7 @@ def entry(
 def _check_table_parents(
     declaration: Declaration,
     links: tuple[tuple[str, Aligner], ...],
-    probe: Mapping[str, np.ndarray],
+    nodes: Mapping[str, CompiledNode],
 ) -> None:
     assert declaration.probs is not None
     for (parent, link), card in zip(links, declaration.probs.shape[:-1], strict=True):
@@ -357,9 +342,14 @@ def _check_table_parents(
                 f"node {declaration.name!r}: the table's parent {parent!r} is in plates "
                 f"{link.foreign}, which the table lacks; add them to plates="
             )
-        top = int(np.max(probe[parent], initial=0))
-        if probe[parent].dtype.kind not in "biu" or top >= card:
+        domain = nodes[parent].domain
+        if domain is None:
             raise ShapeError(
-                f"node {declaration.name!r}: the table has {card} rows for parent {parent!r}, "
-                "which has other values"
+                f"node {declaration.name!r}: the table's parent {parent!r} has no finite set of states; "
+                "use a function of it that returns a distribution"
+            )
+        if domain.size != card:
+            raise ShapeError(
+                f"node {declaration.name!r}: probs has {card} rows along the axis of parent {parent!r}, "
+                f"which has {domain.size} states"
             )

@@ -13,14 +13,16 @@ from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
 
 
-def call_elementwise(function: Callable[..., Any], arguments: Sequence[Any], lead: Shape) -> Any:
+def call_elementwise(
+    function: Callable[..., Any], arguments: Sequence[Any], event_ndims: Sequence[int], lead: Shape
+) -> Any:
     """``function`` called once per element of the batch and plates ``lead``, results put together.
 
     Events stay whole: a vector parent reaches the function as a vector.
     """
     results = []
     for index in np.ndindex(lead):
-        picked = [_pick(argument, index, len(lead)) for argument in arguments]
+        picked = [_pick(a, n, index) for a, n in zip(arguments, event_ndims, strict=True)]
         results.append(function(*picked))
     parts = [as_distribution(r) for r in results]
     if results and parts[0] is not None:
@@ -30,15 +32,15 @@ def call_elementwise(function: Callable[..., Any], arguments: Sequence[Any], lea
     return np.reshape(np.stack(values) if values else np.zeros(lead), lead + event)
 
 
-def _pick(argument: Any, index: Shape, ndim: int) -> Any:
+def _pick(argument: Any, event_ndim: int, index: Shape) -> Any:
     """The element of one argument; its lead is right-aligned with the index and may have size 1."""
     if isinstance(argument, PlateArray):
         lead = argument.array.ndim - len(argument.plates) - argument.event_ndim
         part = argument.array[_own(index, argument.array.shape[:lead])]
         return PlateArray(part, argument.plates, 0, argument.event_ndim)
     array = np.asanyarray(argument)
-    lead = min(array.ndim, ndim)
-    return array[_own(index, array.shape[:lead])]
+    lead = array.ndim - event_ndim
+    return array[(*_own(index, array.shape[:lead]), Ellipsis)]
 
 
 def _own(index: Shape, shape: Shape) -> Shape:
@@ -93,12 +95,19 @@ class Elementwise(Distribution):
         return Support(first.kind, low, high, first.open_low, first.open_high)
 
     def parameters(self) -> list[tuple[np.ndarray, int]]:
-        each = [p.parameters() for p in self.parts]
-        lead = self.batch_shape
-        return [
-            (np.reshape(np.stack([e[k][0] for e in each]), lead + each[0][k][0].shape), n)
-            for k, (_, n) in enumerate(each[0])
+        """One row per element: its family, and its parameters end to end."""
+        names = sorted({type(p).__name__ for p in self.parts})
+        rows = [
+            np.concatenate(
+                [[names.index(type(p).__name__)], *(np.ravel(a) for a, _ in p.parameters())]
+            )
+            for p in self.parts
         ]
+        width = max(len(row) for row in rows)
+        table = np.zeros((len(rows), width))
+        for row, values in zip(table, rows, strict=True):
+            row[: len(values)] = values
+        return [(table.reshape((*self.batch_shape, width)), 1)]
 
     def _each(self, what: str) -> np.ndarray:
         values = np.stack([getattr(p, what) for p in self.parts])

@@ -130,6 +130,8 @@ def store(node: CompiledNode, value: Any) -> np.ndarray:
                 raise EvidenceError(f"values of dtype {stored.dtype}; give numbers")
             if not node.is_discrete:
                 stored = stored.astype(float, copy=False)
+            elif stored.dtype.kind != "i" and (stored == np.floor(stored)).all():
+                stored = stored.astype(np.int64)
     except EvidenceError as error:
         raise EvidenceError(f"node {node.name!r}: {error}") from None
     trailing = len(node.value_shape)

@@ -142,7 +142,7 @@ class Model:
         arguments, batch = arguments_of(node.links, values)
         if node.table is not None:
             return lookup(node, values), batch
-        result = call(node.declaration, arguments, batch + node.plate_shape)
+        result = call(node.declaration, arguments, batch + node.plate_shape, node.links)
         if isinstance(result, Distribution):
             fit(node.declaration, result, batch, node.plate_shape)
             return result, batch
@@ -179,7 +179,7 @@ class Model:
         arguments, batch = arguments_of(links, values)
         plates = tuple(self.sizes[p] for p in potential.plates)
         what = Declaration(f"potential {name}", "function", function=potential.function)
-        result = np.asarray(call(what, arguments, batch + plates, wants_array=True), dtype=float)
+        result = np.asarray(call(what, arguments, batch + plates, links, wants_array=True), dtype=float)
         if not broadcasts_to(result.shape, batch + plates):
             raise ShapeError(
                 f"potential {name!r} returns shape {result.shape}, which does not fit "
@@ -221,7 +221,11 @@ def arguments_of(
 
 
 def call(
-    declaration: Declaration, arguments: Sequence[Any], lead: Shape, wants_array: bool = False
+    declaration: Declaration,
+    arguments: Sequence[Any],
+    lead: Shape,
+    links: Sequence[tuple[str, Aligner]],
+    wants_array: bool = False,
 ) -> Any:
     """Call a node's function; what goes wrong inside names the node.
 
@@ -233,7 +237,9 @@ def call(
     assert declaration.function is not None
     try:
         if declaration.vectorize:
-            result: Any = call_elementwise(declaration.function, arguments, lead)
+            result: Any = call_elementwise(
+                declaration.function, arguments, [link.event_ndim for _, link in links], lead
+            )
         else:
             result = declaration.function(*arguments)
         if isinstance(result, Distribution):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from bayesmc.errors import (
 from bayesmc.network import forward
 from bayesmc.network.compile import compile_model
 from bayesmc.network.evidence import plate_sizes, read_inputs, store
-from bayesmc.network.model import Model, invalid_error
+from bayesmc.network.model import CompiledNode, Model, invalid_error
 from bayesmc.network.node import Declaration, Node, Potential, bind
 from bayesmc.network.ordering import topological_order
 from bayesmc.network.validate import validate_model
@@ -122,9 +123,11 @@ class BayesNet:
         """
 
         def declare(f: Callable[..., Any]) -> Callable[..., Any]:
-            own = name if name is not None else f.__name__
+            own = name if name is not None else getattr(f, "__name__", "<lambda>")
             if own == "<lambda>":
-                raise ModelError("a lambda has no name to give the node; use name= or net.add")
+                raise ModelError(
+                    "this function has no name to give the node (a lambda or partial); use name= or net.add"
+                )
             self._declare_function(own, f, parents, plates, states, vectorize, replace)
             return f
 
@@ -215,7 +218,7 @@ class BayesNet:
                 "table",
                 tuple(parents),
                 self._node_plates(name, plates),
-                None if states is None else tuple(states),
+                None if states is None else _states(states),
                 probs=table,
             ),
             replace,
@@ -272,6 +275,7 @@ class BayesNet:
             node = model[name]
             if node.kind == "input":
                 raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")
+            node = _widened(node, value)
             stored = store(node, value)
             inside = node.support is None or node.domain is not None
             if not (inside or bool(np.all(node.support.contains(stored)))):
@@ -389,8 +393,10 @@ class BayesNet:
             for name, node in model.nodes.items():
                 if node.kind == "input":
                     continue
-                if not node.is_stochastic and name not in values:
+                if not node.is_stochastic:
                     stored[name], _ = model.evaluate(name, stored)
+                    if name in values:
+                        total = total + _agreement(node, stored[name], values[name])
                     continue
                 if name not in values:
                     raise EvidenceError(f"log_prob: node {name!r} has no value; give all stochastic nodes")
@@ -490,7 +496,7 @@ class BayesNet:
         replace_: bool,
     ) -> None:
         names, bound = bind(name, function, parents)
-        labels = None if states is None else tuple(states)
+        labels = None if states is None else _states(states)
         own = self._node_plates(name, plates)
         self._declare(
             Declaration(name, "function", names, own, labels, bound, vectorize), replace_
@@ -568,8 +574,9 @@ class BayesNet:
             for name, potential in self._potentials.items():
                 self._known_parents(name, potential.parents, "potential")
             order = topological_order(parents)
+            labels = {p: names for p, names in self._labels.items() if len(names) == sizes[p]}
             model = compile_model(
-                self.name, self._declarations, self._potentials, sizes, self._labels, inputs, order
+                self.name, self._declarations, self._potentials, sizes, labels, inputs, order
             )
             if small:
                 self._models[key] = model
@@ -593,9 +600,6 @@ class BayesNet:
         node = model[name]
         result, batch = model.evaluate(name, stored)
         axes = tuple(range(-len(node.plates), 0))
-        if not isinstance(result, Distribution):
-            own = tuple(range(-len(node.value_shape), 0))
-            return np.where((result == value).all(axis=own), 0.0, -np.inf)
         if result.invalid is not None:
             counts = np.broadcast_to(np.asarray(total) > -np.inf, np.broadcast_shapes(np.shape(total), batch))
             error = invalid_error(node, result, counts, counts.shape)
@@ -616,6 +620,25 @@ class _Constant:
 
     def __call__(self) -> Distribution:
         return self.distribution
+
+
+def _states(states: Sequence[Any]) -> tuple[Any, ...]:
+    """States as plain Python values, so that labels compare and print as they were typed."""
+    return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
+
+
+def _widened(node: CompiledNode, value: Any) -> CompiledNode:
+    """A deterministic node may be set to numbers its function never returns; then it has no domain."""
+    if node.is_stochastic or node.domain is None or node.domain.labels is not None:
+        return node
+    known = np.isin(np.asarray(value), np.asarray(node.domain.numbers)).all()
+    return node if known else replace(node, domain=None)
+
+
+def _agreement(node: CompiledNode, computed: np.ndarray, given: Any) -> np.ndarray:
+    """0 where a given deterministic value is the computed one, minus infinity elsewhere."""
+    own = tuple(range(-len(node.value_shape), 0))
+    return np.where((node.decode(computed) == np.asanyarray(given)).all(axis=own), 0.0, -np.inf)
 
 
 def _plate_size(plate: str, size: Any) -> int | None:

@@ -6,6 +6,7 @@ plate and event size, on parents whose batch shapes differ but broadcast and who
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -51,30 +52,59 @@ def _check_node(model: Model, node: CompiledNode) -> None:
 
 
 def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: Shape) -> None:
-    """Each entry of a batched call must equal the unbatched call."""
+    """Each entry of a batched call must equal the unbatched call, whatever the parents' ranks."""
     shape = model.probe_shape
-    offset = len(shape) - len(batch)
-    for index in np.ndindex(batch):
-        full = (0,) * offset + index
-        arguments, _ = arguments_of(node.links, entry(node.links, model.probe, shape, full))
+    _compare_entries(node, model.probe, shape, whole, np.ndindex(batch), batch)
+    if not batch:
+        return
+    first = {p: _part(model.probe[p], link.batch_shape(model.probe[p]), 1) for p, link in node.links}
+    arguments, short = arguments_of(node.links, first)
+    row = _signature(node, arguments, short + node.plate_shape)
+    for a, b in zip(whole.arrays, row.arrays, strict=True):
+        if not _close(a[0], b):
+            raise BroadcastError(_broadcast_message(node, (0,), whole, row))
+    if len(set(node.parents)) < 2:
+        return
+    mixed = {
+        p: _part(model.probe[p], link.batch_shape(model.probe[p]), k)
+        for k, (p, link) in enumerate(dict(node.links).items())
+    }
+    arguments, batch = arguments_of(node.links, mixed)
+    try:
+        ranks = _signature(node, arguments, batch + node.plate_shape)
+        q, p = shape
+        _compare_entries(node, mixed, shape, ranks, [(0, 0), (q - 1, 0), (q - 1, p - 1)], batch)
+    except BroadcastError:
+        raise
+    except BayesmcError:
+        return  # ranks mix draws, and what they make need not be reachable
+
+
+def _part(value: np.ndarray, batch: Shape, kind: int) -> np.ndarray:
+    """A value with batch axes (q, p) cut to another rank: (q, p), (p,), (q, 1) or () by turns."""
+    if len(batch) != 2:
+        return value
+    return (value, value[0], value[:, :1], value[0, 0, ...])[kind % 4]
+
+
+def _compare_entries(
+    node: CompiledNode,
+    values: Mapping[str, np.ndarray],
+    shape: Shape,
+    whole: _Signature,
+    indices: Iterable[Shape],
+    batch: Shape,
+) -> None:
+    for index in indices:
+        full = (0,) * (len(shape) - len(index)) + index
+        at = full[len(full) - len(batch) :]
+        at = tuple(i if n > 1 else 0 for i, n in zip(at, batch, strict=True))
+        arguments, _ = arguments_of(node.links, entry(node.links, values, shape, full))
         alone = _signature(node, arguments, node.plate_shape)
         if whole.family != alone.family or not all(
-            _close(a[index], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
+            _close(a[at], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
         ):
-            raise BroadcastError(_broadcast_message(node, index, whole, alone))
-    if len(batch) < 2:
-        return
-    row = {p: _row(model.probe[p], link.batch_shape(model.probe[p])) for p, link in node.links}
-    arguments, short = arguments_of(node.links, row)
-    one = _signature(node, arguments, short + node.plate_shape)
-    for a, b in zip(whole.arrays, one.arrays, strict=True):
-        if not _close(a[0], b):
-            raise BroadcastError(_broadcast_message(node, (0,), whole, one))
-
-
-def _row(value: np.ndarray, batch: Shape) -> np.ndarray:
-    """The first row of a value with two batch axes; others as they are."""
-    return value[0] if len(batch) == 2 else value
+            raise BroadcastError(_broadcast_message(node, at, whole, alone))
 
 
 def _check_mixing(model: Model, node: CompiledNode) -> None:
@@ -90,7 +120,7 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
             continue
         if before is None:
             before = _signature(node, arguments_of(node.links, base)[0], node.plate_shape)
-        for element in (0, size - 1):
+        for element in _elements(size):
             moved = dict(base)
             for parent in sharing:
                 moved[parent] = _perturbed(
@@ -123,7 +153,14 @@ def _perturbed(
             moved[at] = (moved[at] + 1) % parent.domain.size
         elif moved.dtype.kind == "f":
             moved[at] = moved[at] * 1.1 + 0.1
+        elif moved.dtype.kind in "iu":
+            moved[at] = moved[at] + 1
     return moved
+
+
+def _elements(size: int) -> list[int]:
+    """Elements of a plate to perturb: all of a small one, ends and some between of a large one."""
+    return sorted({round(k * (size - 1) / 7) for k in range(8)}) if size > 8 else list(range(size))
 
 
 class _Signature:
@@ -137,7 +174,7 @@ class _Signature:
 
 
 def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
-    result = call(node.declaration, arguments, lead)
+    result = call(node.declaration, arguments, lead, node.links)
     if isinstance(result, Distribution):
         parts = result.parameters()
         family = type(result).__name__

@@ -331,7 +331,7 @@ def _legend_entries(shapes: Iterable[Shape]) -> list[tuple[Shape, str]]:
         ),
         (Shape(**small, box=True, fill=GIVEN, dashed=True), "input", lambda s: s.dashed),
         (
-            Shape(**small, box=False, fill=CONTINUOUS, double=True),
+            Shape(**small, box=boxes, fill=GIVEN, double=True),
             "deterministic",
             lambda s: s.double,
         ),
@@ -365,8 +365,9 @@ def _with_legend(page: Rectangle, rows: list[list[tuple[Shape, str, float]]]) ->
 def _legend_places(
     rows: list[list[tuple[Shape, str, float]]], page: Rectangle
 ) -> Iterable[tuple[Point, Shape, str]]:
+    widest = max((sum(width for _, _, width in row) for row in rows), default=0.0)
     for i, row in enumerate(reversed(rows)):
-        x = (page.left + page.right - sum(width for _, _, width in row) + 0.3) / 2
+        x = (page.left + page.right - widest + 0.3) / 2
         for shape, text, width in row:
             yield (x + shape.width / 2, page.bottom + ROW * (i + 0.55)), shape, text
             x += width

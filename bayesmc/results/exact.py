@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -316,9 +317,8 @@ class ExactPosterior(Posterior):
         return self.resample(resample, rng).to_datatree()
 
     def __getstate__(self) -> dict[str, Any]:
-        raise UnsupportedError(
-            "pickle: an exact posterior holds its clique tree; keep probabilities(...) or resample(draws)"
-        )
+        state = super().__getstate__()
+        return {**state, "_net": replace(self._net, model=state["model"], evidence_sources=[])}
 
 
 def _spread(

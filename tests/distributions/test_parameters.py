@@ -164,6 +164,13 @@ def test_a_mixture_adopts_the_marks_of_its_parts() -> None:
     assert "scale" in str(stacked.problem)
 
 
+def test_a_linear_map_adopts_the_marks_of_its_gaussian() -> None:
+    with d.marking_invalid():
+        mapped = d.MvNormal(np.zeros(2), [np.eye(2), NOT_PD]).linear_map([[1.0, 1.0]])
+    assert mapped.invalid.tolist() == [False, True]
+    assert "cov" in str(mapped.problem)
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [

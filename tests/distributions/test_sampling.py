@@ -21,7 +21,7 @@ FIXED = settings(derandomize=True, max_examples=30, deadline=None, database=None
 
 
 def uniforms(dist: d.Distribution, draws: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Probability integral transform: uniform if the draws are right; atoms are spread at random."""
+    """Probability integral transform: uniform if the draws are right; atoms spread at random."""
     upper = dist.cdf(draws)
     if isinstance(dist, d.Beta):
         # near one, numbers are too far apart for a steep cdf: that mass is spread at random
@@ -188,6 +188,7 @@ def test_mixture_draws_fit(weights: list[float], seed: int) -> None:
         d.Beta(0.01, [0.01, 5.0]),
         d.Beta(2.0, [0.05, 0.3]),
         d.Dirichlet([[0.01, 0.01, 0.01], [0.001, 0.5, 3.0]]),
+        d.Dirichlet([0.001, 0.001, 0.001]),  # Gamma variates would all be zero in one of ten
         d.StudentT([0.05, 0.3], 0.0, 1.0),
         d.Exponential([1e-300, 1e300]),
         d.Uniform(0.1, 0.1 + 1e-16 * 3),

@@ -7,7 +7,13 @@ import string
 import numpy as np
 import pytest
 
-from bayesmc.errors import BudgetError, DensityError, EvidenceError, ShapeError, ZeroProbabilityError
+from bayesmc.errors import (
+    BudgetError,
+    DensityError,
+    EvidenceError,
+    ShapeError,
+    ZeroProbabilityError,
+)
 from bayesmc.factors import CliqueTree, LogTable, elimination_order, factor_from_log
 from bayesmc.factors import cliquetree as cliquetree_module
 

@@ -56,7 +56,8 @@ def test_reads_names_states_parents_and_tables():
 
 
 @pytest.mark.parametrize(
-    "state", ["<5", ">7.5", "5-12", "12+", "a.b", "n/a", "x=1", "50%", "été", "-", "'q'", "a:b", "1"]
+    "state",
+    ["<=5", ">7.5", "5-12-", "13+", "a.b", "n/a", "x=1", "50%", "été", "-", "'q'", "a:b", "1"],
 )
 def test_odd_state_names(state):
     age, ill = parse_bif(TINY.replace("5-12", state))
@@ -69,7 +70,11 @@ def test_quoted_names_keep_what_they_hold():
     age, ill = parse_bif(TINY.replace("5-12", quoted))
     assert age.states[1] == quoted.strip('"')
     np.testing.assert_array_equal(ill.probs[1], [0.2, 0.8])
-    renamed = parse_bif(TINY.replace("variable age", 'variable "my age"').replace("( age", '( "my age"').replace("| age", '| "my age"'))
+    renamed = parse_bif(
+        TINY.replace("variable age", 'variable "my age"')
+        .replace("( age", '( "my age"')
+        .replace("| age", '| "my age"')
+    )
     assert renamed[1].parents == ("my age",)
 
 
@@ -90,11 +95,14 @@ def test_table_with_parents_has_the_child_slowest():
 
 
 def test_two_parents_follow_their_order_in_the_block():
-    text = TINY + """variable x { type discrete[2] {a, b}; }
+    text = (
+        TINY
+        + """variable x { type discrete[2] {a, b}; }
     probability ( x | ill, age ) {
       (no, 12+) 0.25, 0.75;
       default 1.0, 0.0;
     }"""
+    )
     probs = parse_bif(text)[2].probs
     assert probs.shape == (2, 3, 2)
     np.testing.assert_array_equal(probs[1, 2], [0.25, 0.75])
@@ -131,7 +139,11 @@ def test_small_rounding_is_renormalised_and_exact_rows_are_left_alone():
 FAULTS = {
     "unknown parent": (("( ill | age )", "( ill | old )"), 14, "'old' is not a declared variable"),
     "unknown child": (("( ill | age )", "( sick | age )"), 14, "'sick' is not a declared"),
-    "unknown state": (("(5-12) 0.2", "(5-13) 0.2"), 16, "'5-13' is not a state of its parent 'age'"),
+    "unknown state": (
+        ("(5-12) 0.2", "(5-13) 0.2"),
+        16,
+        "'5-13' is not a state of its parent 'age'",
+    ),
     "too many states": (("(5-12) 0.2", "(5-12, yes) 0.2"), 16, "names 2 states for 1 parents"),
     "missing row": (("  (5-12) 0.2, 0.8;\n", ""), 14, r"1 of 3 rows are missing, first \(5-12\)"),
     "row twice": (("(5-12) 0.2", "(<5) 0.2"), 16, r"row \(<5\) is given twice"),
@@ -147,7 +159,9 @@ FAULTS = {
     "infinite": (("0.2, 0.8;", "0.2, inf;"), 16, "inf is not a probability"),
     "row sum": (("0.2, 0.8;", "0.2, 0.7;"), 16, "a row sums to 0.9, not 1"),
     "no block": (
-        ("probability ( age ) {\n  table 0.2, 0.3, 0.5;\n}\n", ""), 4, "'age' has no probability",
+        ("probability ( age ) {\n  table 0.2, 0.3, 0.5;\n}\n", ""),
+        4,
+        "'age' has no probability",
     ),
     "block twice": (("( ill | age )", "( age )"), 14, "'age' has a second probability block"),
     "variable twice": (("variable ill", "variable age"), 8, "'age' is declared twice"),
@@ -178,7 +192,11 @@ def test_every_truncation_is_an_error():
     whole = TINY.rstrip()
     complete = {whole.index("\nvariable") + 1, 0, 1}
     for end in range(2, len(whole)):
-        if not whole[:end].strip() or end in complete or whole[:end].rstrip().endswith("person\";\n}"):
+        if (
+            not whole[:end].strip()
+            or end in complete
+            or whole[:end].rstrip().endswith('person";\n}')
+        ):
             continue
         with pytest.raises(FileFormatError) as caught:
             parse_bif(whole[:end])
