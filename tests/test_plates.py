@@ -141,7 +141,6 @@ def test_gather_by_a_foreign_parent_is_the_loop(layout, data):
     assert_elementwise(v[index], reference, sizes, batch, left)
 
 
-@pytest.mark.xfail(strict=True, reason="an index in the very plate it gathers from: axes don't match")
 def test_gather_by_a_parent_in_the_gathered_plate_itself():
     v = PlateArray(np.array([10.0, 20.0, 30.0]), ("a",))
     parent = PlateArray(np.array([2, 2, 0]), ("a",))
@@ -173,7 +172,6 @@ def test_gather_of_labels_keeps_them():
         v[np.array([1, 0])] == "maybe"  # noqa: B015 - the comparison is the test
 
 
-@pytest.mark.xfail(strict=True, reason="np.take of one element drops the labels")
 def test_gather_of_one_label_keeps_it():
     v = PlateArray(StateArray(np.array([0, 1, 1]), ("no", "yes")), ("k",))
     assert v[1] == "yes"
@@ -222,16 +220,16 @@ def test_gather_refuses(key, message):
         v[key]
 
 
-@pytest.mark.xfail(strict=True, reason="an index with event axes gathers garbage")
 def test_a_vector_is_no_index():
     v = PlateArray(np.arange(3.0), ("k",))
     with pytest.raises(IndexError):
         v[PlateArray(np.zeros((2, 4), dtype=int), ("j",), event_ndim=1)]
 
 
-def test_gather_from_an_empty_plate_has_nothing_to_give():
-    v = PlateArray(np.empty((2, 0)), ("k",), own=0)
-    assert v[np.empty((2, 0), dtype=int)].shape == (2, 0) or True  # shape rules only; no crash
+def test_gather_from_and_into_an_empty_plate():
+    v = PlateArray(np.empty((2, 1, 0)), ("k",), own=1)
+    assert v[np.empty((2, 0), dtype=int)].shape == (2, 0)
+    assert PlateArray(np.ones((2, 1, 3)), ("k",), own=1)[np.empty((2, 0), int)].shape == (2, 0)
     with pytest.raises(IndexError, match="outside plate 'k'"):
         v[0]
 
@@ -240,6 +238,7 @@ def test_gather_from_an_empty_plate_has_nothing_to_give():
 
 
 @given(layouts(3), st.data())
+@settings(max_examples=40)
 def test_ufuncs_align_foreign_plates_by_name(layout, data):
     sizes, batch, parts = layout
     rng = np.random.default_rng(data.draw(st.integers(0, 999)))
@@ -262,6 +261,7 @@ def test_ufuncs_align_foreign_plates_by_name(layout, data):
 
 
 @given(layouts(2), st.data())
+@settings(max_examples=40)
 def test_generalised_ufuncs_keep_their_core(layout, data):
     """np.vecdot and np.matvec with own, foreign and constant operands."""
     sizes, batch, parts = layout
@@ -515,7 +515,6 @@ def test_a_lazy_gather_cannot_be_written_to():
         gathered[..., 0] = 0.0
 
 
-@pytest.mark.xfail(strict=True, raises=ValueError, reason="np.array(gathered) hands out the cache")
 def test_a_copy_of_a_lazy_gather_is_the_users_own():
     gathered, plain = lazy()
     mine = np.array(gathered)
@@ -523,12 +522,11 @@ def test_a_copy_of_a_lazy_gather_is_the_users_own():
     np.testing.assert_array_equal(np.asarray(gathered), plain)
 
 
-@pytest.mark.xfail(strict=True, raises=RecursionError, reason="in-place arithmetic recurses")
-def test_in_place_arithmetic_on_a_lazy_gather():
+def test_in_place_arithmetic_on_a_lazy_gather_is_refused():
     gathered, plain = lazy()
     name = gathered
-    name += 1.0
-    np.testing.assert_array_equal(name, plain + 1.0)
+    with pytest.raises(ValueError, match="read-only"):
+        name += 1.0
     np.testing.assert_array_equal(np.asarray(gathered), plain)
 
 

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.exact_posterior import ExactPosterior
 from bayesmc.errors import BudgetError, ParameterError, UnsupportedError, ZeroProbabilityError
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree
 from bayesmc.network import BayesNet, Model, Problem, pose
-from bayesmc.results import ExactPosterior, Posterior
+from bayesmc.results import Posterior
 from bayesmc.structure import DiscreteNet, Variable, discrete_net, why_not_discrete
 
 

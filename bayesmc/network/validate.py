@@ -185,6 +185,9 @@ def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
     for array, own in parts:
         array = np.asarray(array)
         tail = array.shape[array.ndim - own :] if own else ()
+        if array.shape == lead + tail:
+            arrays.append(array)
+            continue
         try:
             arrays.append(np.broadcast_to(array, lead + tail))
         except ValueError:
@@ -203,7 +206,7 @@ def _close(a: np.ndarray, b: np.ndarray) -> bool:
     """Equal up to rounding (vectorised and scalar loops may differ in the last digits)."""
     if a.shape != b.shape:
         return False
-    if (a == b).all():
+    if a is b or np.logical_and.reduce(a == b, axis=None):
         return True
     if a.dtype.kind != "f":
         return False

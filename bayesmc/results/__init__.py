@@ -1,7 +1,6 @@
 """Results: posteriors that answer the same queries whatever made them."""
 
 from bayesmc.results.draws import DrawsPosterior
-from bayesmc.results.exact import ExactPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.sums import Sums, SumsPosterior
@@ -9,7 +8,6 @@ from bayesmc.results.table import Summary
 
 __all__ = [
     "DrawsPosterior",
-    "ExactPosterior",
     "Marginal",
     "Posterior",
     "Summary",

@@ -1,0 +1,60 @@
+"""Where random choices come from: a seeded generator, or draws of a property-testing library.
+
+Both make the same nets, because every choice is one bounded integer; small integers stand for the
+simple options, so that a search for the smallest failing net (shrinking) goes the right way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+#: steps between the ends of a real number's range: few, so that numbers stay readable
+_STEPS = 16
+#: largest relative weight of a state
+_WEIGHT = 8
+
+
+class Choices:
+    """A source of choices.
+
+    Parameters
+    ----------
+    integer : callable
+        ``integer(low, high)`` chooses an integer, both ends included; ``low`` is the simplest.
+    """
+
+    def __init__(self, integer: Callable[[int, int], int]) -> None:
+        self.integer = integer
+
+    def flag(self, chance: float = 0.5) -> bool:
+        """True with about this chance; False is the simple answer."""
+        return self.integer(0, 15) >= 16 - round(16 * chance)
+
+    def pick(self, options: Sequence[Any]) -> Any:
+        """One of the options; the first is the simplest."""
+        return options[self.integer(0, len(options) - 1)] if len(options) > 1 else options[0]
+
+    def real(self, low: float, high: float) -> float:
+        """A number between ``low`` and ``high``, of a coarse grid."""
+        return low + (high - low) * self.integer(0, _STEPS) / _STEPS
+
+    def reals(self, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
+        """An array of such numbers."""
+        count = int(np.prod(shape, dtype=int))
+        return np.reshape([self.real(low, high) for _ in range(count)], shape)
+
+    def rows(self, count: int, states: int, zeros: bool = True) -> np.ndarray:
+        """Rows of probabilities, shape ``(count, states)``, in the ratios of small integers."""
+        lowest = 0 if zeros else 1
+        weights = [[self.integer(lowest, _WEIGHT) for _ in range(states)] for _ in range(count)]
+        table = np.array(weights, dtype=float).reshape(count, states)
+        table[table.sum(axis=1) == 0] = 1.0
+        return table / table.sum(axis=1, keepdims=True)
+
+
+def seeded(rng: np.random.Generator) -> Choices:
+    """Choices of a NumPy generator."""
+    return Choices(lambda low, high: int(rng.integers(low, high, endpoint=True)))
