@@ -8,6 +8,7 @@ rules alone; which plates are foreign to whom is the network's business.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -148,8 +149,8 @@ class PlateArray(NDArrayOperatorsMixin):
         rows: Any = 0
         for index, k in zip(indices, gathered, strict=True):
             rows = rows * sizes[k] + _expand(index, extra, 0, 0)
-        per_lead = int(np.prod([sizes[k] for k in gathered], dtype=int))
-        count = int(np.prod(lead, dtype=int))
+        per_lead = math.prod([sizes[k] for k in gathered])
+        count = math.prod(lead)
         if count > 1:
             rows = rows + (np.arange(count) * per_lead).reshape(lead)
         else:
@@ -158,13 +159,13 @@ class PlateArray(NDArrayOperatorsMixin):
 
     # ---- reductions -------------------------------------------------------------------------
 
-    def sum(self, *plates: str) -> Any:
+    def sum(self, *plates: str, **unknown: Any) -> Any:
         """Sum over the named foreign plates (all of them when none is named)."""
-        return self._reduce(np.sum, plates)
+        return self._reduce(np.sum, plates, **unknown)
 
-    def mean(self, *plates: str) -> Any:
+    def mean(self, *plates: str, **unknown: Any) -> Any:
         """Mean over the named foreign plates."""
-        return self._reduce(np.mean, plates)
+        return self._reduce(np.mean, plates, **unknown)
 
     def prod(self, *plates: str) -> Any:
         """Product over the named foreign plates."""
@@ -186,7 +187,14 @@ class PlateArray(NDArrayOperatorsMixin):
         """Whether all elements over the named foreign plates are true."""
         return self._reduce(np.all, plates)
 
-    def _reduce(self, function: Callable[..., Any], names: tuple[str, ...]) -> Any:
+    def _reduce(
+        self, function: Callable[..., Any], names: tuple[str, ...], **unknown: Any
+    ) -> Any:
+        if unknown:
+            raise TypeError(
+                f".{function.__name__}({next(iter(unknown))}=...): foreign plates are reduced by name, "
+                f"v.{function.__name__}({self.plates[0]!r})"
+            )
         for name in names:
             if name not in self.plates:
                 raise PlateError(
@@ -207,6 +215,8 @@ class PlateArray(NDArrayOperatorsMixin):
                 f"np.{ufunc.__name__}.{method} would mix batch and plate axes of {self!r}; "
                 f"reduce with .sum({self.plates[0]!r}) or gather first"
             )
+        if "out" in kwargs:
+            raise ValueError("a parent is read-only; write v = v + 1, not v += 1")
         bad = sorted(set(kwargs) & {"out", "where", "axis", "axes", "keepdims"})
         if bad:
             raise TypeError(f"np.{ufunc.__name__} on a parent with foreign plates takes no {bad[0]}=")
@@ -214,7 +224,14 @@ class PlateArray(NDArrayOperatorsMixin):
             raise TypeError("use np.vecdot(X, v) or np.matvec(A, v) instead of @ on plates")
         cores, core_out = _core_ndims(ufunc)
         aligned, names, event = align(inputs, cores)
-        result = ufunc(*aligned, **kwargs)
+        try:
+            result = ufunc(*aligned, **kwargs)
+        except ValueError as error:
+            raise PlateError(
+                f"np.{ufunc.__name__}: {error}. A plain array is taken as a value of the child, without "
+                f"the foreign plates {names}; for a constant along them use v.array, or make the "
+                "constant an input or a node in that plate"
+            ) from error
         wrap = [PlateArray(r, names, self.own, event + core_out) for r in _as_tuple(result)]
         return wrap[0] if len(wrap) == 1 else tuple(wrap)
 
@@ -222,8 +239,12 @@ class PlateArray(NDArrayOperatorsMixin):
         if func is np.where and len(args) == 3 and not kwargs:
             aligned, names, event = align(args, (0, 0, 0))
             return PlateArray(np.where(*aligned), names, self.own, event)
-        if func is np.clip and len(args) == 3 and not kwargs:
-            return np.minimum(np.maximum(args[0], args[1]), args[2])
+        if func is np.clip and not set(kwargs) - {"a_min", "a_max", "min", "max"}:
+            low, high = (*args[1:], None, None)[:2]
+            low = kwargs.get("a_min", kwargs.get("min", low))
+            high = kwargs.get("a_max", kwargs.get("max", high))
+            value = args[0] if low is None else np.maximum(args[0], low)
+            return value if high is None else np.minimum(value, high)
         raise TypeError(
             f"np.{func.__name__} does not know the foreign plates {self.plates}; gather with v[i], "
             f"reduce with .sum({self.plates[0]!r}), or take the plain array v.array"
@@ -231,6 +252,14 @@ class PlateArray(NDArrayOperatorsMixin):
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         raise self._ungathered()
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        raise AttributeError(
+            f"a parent in foreign plates {self.plates} has no .{name}; gather with v[i], reduce with "
+            f".sum({self.plates[0]!r}) and the like, or take the plain array v.array"
+        )
 
     def _ungathered(self) -> PlateError:
         plate = self.plates[0]
@@ -298,7 +327,7 @@ class Gathered(NDArrayOperatorsMixin):
 
     @property
     def size(self) -> int:
-        return int(np.prod(self.shape, dtype=int))
+        return math.prod(self.shape)
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         if self._array is None:

@@ -54,6 +54,8 @@ def owned(value: Any, dtype: Any = None) -> np.ndarray:
 
 def broadcasts_to(shape: Shape, target: Shape) -> bool:
     """Whether ``shape`` broadcasts to exactly ``target``, never beyond it."""
+    if shape == target or not shape:
+        return True
     if len(shape) > len(target):
         return False
     return all(

@@ -6,6 +6,7 @@ finite domain are passed through: what depends on them depends on the finite nod
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,6 +25,8 @@ TABLE_ENTRIES = 1 << 24
 
 #: one element of a finite node
 Variable = tuple[str, int]
+#: node, element, scope and the configurations of it at which the parameters are bad
+InvalidRows = tuple[str, int, tuple[Variable, ...], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,7 @@ def tabulate(
     if any(model[p].domain is None for p in varying):
         return None
     cards = tuple(model[p].domain.size for p in varying)  # type: ignore[union-attr]
-    if float(np.prod(cards, dtype=float)) * node.domain.size * np.prod(node.plate_shape) > limit:
+    if float(math.prod(cards)) * node.domain.size * math.prod(node.plate_shape) > limit:
         return None
     values = dict(constants)
     for axis, (parent, card) in enumerate(zip(varying, cards, strict=True)):
@@ -88,14 +91,21 @@ def constants_of(model: Model, inputs: Mapping[str, np.ndarray]) -> dict[str, np
 class FactorSource:
     """How one node or potential becomes factors: over which variables, at which plate elements.
 
-    ``alone`` are finite nodes whose element follows the factor's own; ``whole`` are those all of whose
-    elements matter (foreign plates), one axis each.
+    Attributes
+    ----------
+    alone : tuple of str
+        Finite nodes whose element follows the factor's own.
+    whole : tuple of str
+        Finite nodes all of whose elements matter (foreign plates), one axis each.
+    from_evidence : bool
+        Its tables depend on the values of observed continuous nodes.
     """
 
     name: str
     plates: tuple[str, ...]
     alone: tuple[str, ...]
     whole: tuple[str, ...]
+    from_evidence: bool
     is_potential: bool = False
 
 
@@ -105,14 +115,15 @@ class DiscreteNet:
 
     Attributes
     ----------
+    constants : dict
+        Stored values of inputs and fixed nodes.
     cards : dict
         Variable -> number of states.
     scopes : list of tuple
-        Scope of every factor: first the static ones, then those of continuous evidence.
+        Scope of every factor: first the static ones, then those that depend on the evidence.
     static : list of FactorLike
-        Tables that do not depend on the evidence.
     evidence_sources : list of FactorSource
-    invalid : list of (name, element, scope, mask)
+    invalid : list
         Configurations with bad parameters, to be refused if they turn out to be possible.
     """
 
@@ -122,15 +133,29 @@ class DiscreteNet:
     scopes: list[tuple[Variable, ...]] = field(default_factory=list)
     static: list[FactorLike] = field(default_factory=list)
     evidence_sources: list[FactorSource] = field(default_factory=list)
-    invalid: list[tuple[str, int, tuple[Variable, ...], np.ndarray]] = field(default_factory=list)
+    invalid: list[InvalidRows] = field(default_factory=list)
 
-    def evidence_factors(self, observed: Mapping[str, Observed]) -> list[FactorLike]:
-        """Log likelihoods of continuous evidence, in the order of their scopes."""
+    def evidence_factors(
+        self, observed: Mapping[str, Observed]
+    ) -> tuple[list[FactorLike], list[InvalidRows]]:
+        """Factors that depend on continuous evidence, in the order of their scopes.
+
+        Where a function gives bad parameters the factor is neutral, and the configuration is listed.
+        """
         factors: list[FactorLike] = []
+        bad: list[InvalidRows] = []
+        known = known_values(self.model, self.constants, observed)
         for source in self.evidence_sources:
-            log_density, _ = _log_density(self, source, observed)
-            factors.extend(LogTable(log_density[at]) for at in _elements(self.model, source, log_density))
-        return factors
+            _fill(self.model, source, known, factors, bad)
+        return factors, bad
+
+
+def known_values(
+    model: Model, constants: Mapping[str, np.ndarray], observed: Mapping[str, Observed]
+) -> dict[str, np.ndarray]:
+    """Constants and the values of wholly observed nodes without a finite domain."""
+    seen = {n: o.value for n, o in observed.items() if model[n].domain is None and o.mask is None}
+    return {**constants, **seen}
 
 
 def why_not_discrete(model: Model, observed: Mapping[str, Observed]) -> str | None:
@@ -166,49 +191,53 @@ def discrete_net(
         (name, element): node.domain.size
         for name, node in model.nodes.items()
         if node.domain is not None and node.kind != "fixed"
-        for element in range(int(np.prod(node.plate_shape, dtype=int)))
+        for element in range(math.prod(node.plate_shape))
     }
     net = DiscreteNet(model, constants_of(model, inputs), cards)
-    later = []
-    for name, node in model.nodes.items():
-        if node.kind in ("input", "fixed") or (node.domain is None and not node.is_stochastic):
-            continue
-        source = _source(model, name, node.parents, node.plates)
-        if node.domain is None:
-            later.append(source)
-        else:
-            _add_static(net, source, node)
-    for name, (potential, _) in model.potentials.items():
-        source = _source(model, name, potential.parents, potential.plates, is_potential=True)
-        later.append(source)
-    for source in later:
-        _check_size(net, source, 1)
-        net.evidence_sources.append(source)
+    continuous = {n for n, o in observed.items() if model[n].domain is None and o.mask is None}
+    sources = [
+        _source(model, name, node.parents, node.plates, continuous)
+        for name, node in model.nodes.items()
+        if node.kind not in ("input", "fixed") and (node.domain is not None or node.is_stochastic)
+    ]
+    sources += [
+        _source(model, name, potential.parents, potential.plates, continuous, is_potential=True)
+        for name, (potential, _) in model.potentials.items()
+    ]
+    for source in sorted(sources, key=lambda s: s.from_evidence):
+        _check_size(net, source)
         for element in np.ndindex(_plate_shape(model, source)):
-            net.scopes.append(_scope(model, source, element))
+            net.scopes.append(_full_scope(model, source, element))
+        if source.from_evidence:
+            net.evidence_sources.append(source)
+        else:
+            _fill(model, source, net.constants, net.static, net.invalid)
     return net
 
 
 def configure(
-    net: DiscreteNet, alone: Sequence[str], whole: Sequence[str], names: Sequence[str]
+    model: Model,
+    known: Mapping[str, np.ndarray],
+    alone: Sequence[str],
+    whole: Sequence[str],
+    names: Sequence[str],
 ) -> tuple[dict[str, np.ndarray], Shape]:
     """Stored values of ``names`` and what they need, over all configurations of the variables.
 
     Axis k of the batch runs over the k-th of: nodes ``alone`` (one axis each, all plate elements alike),
     then every element of the nodes ``whole``.
     """
-    model = net.model
     sizes = [model[n].domain.size for n in alone]  # type: ignore[union-attr]
     for name in whole:
         node = model[name]
-        sizes += [node.domain.size] * int(np.prod(node.plate_shape, dtype=int))  # type: ignore[union-attr]
-    values = dict(net.constants)
+        sizes += [node.domain.size] * math.prod(node.plate_shape)  # type: ignore[union-attr]
+    values = dict(known)
     for axis, name in enumerate(alone):
         values[name] = _along(axis, sizes[axis], len(sizes), model[name].plate_shape)
     axis = len(alone)
     for name in whole:
         node = model[name]
-        count = int(np.prod(node.plate_shape, dtype=int))
+        count = math.prod(node.plate_shape)
         batch = (1,) * axis + tuple(sizes[axis : axis + count]) + (1,) * (len(sizes) - axis - count)
         value = np.empty((*batch, count), dtype=np.intp)
         for element in range(count):
@@ -237,12 +266,15 @@ def _source(
     name: str,
     parents: Sequence[str],
     plates: tuple[str, ...],
+    continuous: set[str],
     is_potential: bool = False,
 ) -> FactorSource:
     """The finite nodes a factor depends on, through deterministic nodes without a domain."""
     found: dict[str, bool] = {}
+    from_evidence = name in continuous
 
     def visit(above: Sequence[str], own: tuple[str, ...], whole: bool) -> None:
+        nonlocal from_evidence
         for parent in above:
             node = model[parent]
             if node.kind in ("input", "fixed"):
@@ -252,15 +284,13 @@ def _source(
                 found[parent] = found.get(parent, False) or foreign
             elif not node.is_stochastic:
                 visit(node.parents, node.plates, foreign)
-            else:
-                raise UnsupportedError(
-                    f"{name!r} depends on {parent!r}, which has no finite set of values"
-                )
+            else:  # observed, since a hidden one is refused before
+                from_evidence = True
 
     visit(parents, plates, False)
     alone = tuple(p for p, is_whole in found.items() if not is_whole)
     whole_nodes = tuple(p for p, is_whole in found.items() if is_whole)
-    return FactorSource(name, plates, alone, whole_nodes, is_potential)
+    return FactorSource(name, plates, alone, whole_nodes, from_evidence, is_potential)
 
 
 def _plate_shape(model: Model, source: FactorSource) -> Shape:
@@ -275,14 +305,23 @@ def _scope(model: Model, source: FactorSource, element: Shape) -> tuple[Variable
         flat = int(np.ravel_multi_index(own, node.plate_shape)) if own else 0
         scope.append((name, flat))
     for name in source.whole:
-        scope += [(name, e) for e in range(int(np.prod(model[name].plate_shape, dtype=int)))]
+        scope += [(name, e) for e in range(math.prod(model[name].plate_shape))]
     return tuple(scope)
 
 
-def _check_size(net: DiscreteNet, source: FactorSource, states: int) -> None:
-    element = (0,) * len(source.plates)
-    entries = float(np.prod([net.cards[v] for v in _scope(net.model, source, element)], dtype=float))
-    entries *= states * float(np.prod(_plate_shape(net.model, source), dtype=float))
+def _full_scope(model: Model, source: FactorSource, element: Shape) -> tuple[Variable, ...]:
+    """The scope of a factor at one element, its own variable last where it is a finite node."""
+    scope = _scope(model, source, element)
+    if source.is_potential or model[source.name].domain is None:
+        return scope
+    flat = int(np.ravel_multi_index(element, _plate_shape(model, source))) if element else 0
+    return (*scope, (source.name, flat))
+
+
+def _check_size(net: DiscreteNet, source: FactorSource) -> None:
+    scope = _full_scope(net.model, source, (0,) * len(source.plates))
+    entries = float(math.prod(net.cards[v] for v in scope))
+    entries *= math.prod(_plate_shape(net.model, source))
     if entries > TABLE_ENTRIES:
         what = "potential" if source.is_potential else "node"
         raise BudgetError(
@@ -292,50 +331,48 @@ def _check_size(net: DiscreteNet, source: FactorSource, states: int) -> None:
         )
 
 
-def _add_static(net: DiscreteNet, source: FactorSource, node: CompiledNode) -> None:
-    assert node.domain is not None
-    _check_size(net, source, node.domain.size)
+def _fill(
+    model: Model,
+    source: FactorSource,
+    known: Mapping[str, np.ndarray],
+    factors: list[FactorLike],
+    bad: list[InvalidRows],
+) -> None:
+    """Append the factors of a source, one per plate element, and its rows with bad parameters."""
     with marking_invalid(), np.errstate(all="ignore"):
-        values, cards = configure(net, source.alone, source.whole, _parents_of(net.model, source))
-        result, _ = net.model.evaluate(node.name, values)
-        if isinstance(result, Distribution):
-            probs = result.probs_table
-            invalid = result.invalid
-        else:
-            probs = np.asarray(result)[..., None] == np.arange(node.domain.size)
-            invalid = None
-    shape = cards + node.plate_shape
-    table = np.broadcast_to(probs, (*shape, node.domain.size)).astype(float, copy=False)
-    masks = None if invalid is None else np.broadcast_to(invalid, shape)
-    for flat, element in enumerate(np.ndindex(node.plate_shape)):
+        values, cards = configure(
+            model, known, source.alone, source.whole, _parents_of(model, source)
+        )
+        table, is_log, invalid = _table(model, source, values, cards)
+    for flat, element in enumerate(np.ndindex(_plate_shape(model, source))):
         at = (slice(None),) * len(cards) + element
-        scope = _scope(net.model, source, element)
-        net.scopes.append((*scope, (node.name, flat)))
-        net.static.append(np.ascontiguousarray(table[at]))
-        if masks is not None and masks[at].any():
-            net.invalid.append((node.name, flat, scope, masks[at]))
+        part = np.ascontiguousarray(table[at])
+        factors.append(LogTable(part) if is_log else part)
+        if invalid is not None and invalid[at].any():
+            bad.append((source.name, flat, _scope(model, source, element), invalid[at]))
 
 
-def _log_density(
-    net: DiscreteNet, source: FactorSource, observed: Mapping[str, Observed]
-) -> tuple[np.ndarray, Any]:
-    """Log likelihood of one continuous observed node, shape ``(*cards, *plates)``."""
-    model = net.model
-    with marking_invalid(), np.errstate(all="ignore"):
-        values, cards = configure(net, source.alone, source.whole, _parents_of(model, source))
-        shape = cards + _plate_shape(model, source)
-        if source.is_potential:
-            potential, _ = model.potentials[source.name]
-            return np.broadcast_to(model.potential(source.name, values, total=False), shape), None
-        dist, _ = model.evaluate(source.name, values)
-        density = model.log_density(source.name, dist, observed[source.name].value)
-    return np.broadcast_to(density, shape), dist.invalid
-
-
-def _elements(model: Model, source: FactorSource, table: np.ndarray) -> list[tuple[Any, ...]]:
-    plates = _plate_shape(model, source)
-    lead = table.ndim - len(plates)
-    return [(slice(None),) * lead + element for element in np.ndindex(plates)]
+def _table(
+    model: Model, source: FactorSource, values: Mapping[str, np.ndarray], cards: Shape
+) -> tuple[np.ndarray, bool, np.ndarray | None]:
+    """Values of a factor ``(*cards, *plates[, states])``, whether they are logs, and bad rows."""
+    shape = cards + _plate_shape(model, source)
+    if source.is_potential:
+        return np.broadcast_to(model.potential(source.name, values, total=False), shape), True, None
+    node = model[source.name]
+    result, _ = model.evaluate(source.name, values)
+    if not isinstance(result, Distribution):
+        assert node.domain is not None
+        one_hot = np.asarray(result)[..., None] == np.arange(node.domain.size)
+        return np.broadcast_to(one_hot, (*shape, node.domain.size)).astype(float), False, None
+    invalid = result.invalid
+    invalid = None if invalid is None or not invalid.any() else np.broadcast_to(invalid, shape)
+    if node.domain is not None:
+        table = result.probs_table
+        return np.broadcast_to(table, (*shape, node.domain.size)), False, invalid
+    density = model.log_density(source.name, result, values[source.name])
+    density = np.broadcast_to(density, shape)
+    return (density if invalid is None else np.where(invalid, 0.0, density)), True, invalid
 
 
 def _parents_of(model: Model, source: FactorSource) -> tuple[str, ...]:

@@ -100,7 +100,8 @@ def _declare_surroundings(bmc: Any, net: Any) -> None:
 
     @net.node
     def load(wind):
-        return np.minimum(wind / 12.0, 1.0) ** 3
+        share = np.minimum(wind / 12.0, 1.0)
+        return share * share * share
 
 
 def _declare_condition(bmc: Any, net: Any) -> None:

@@ -13,7 +13,7 @@ from examples import data_faithful, demo, diagnosis, old_faithful
 
 @pytest.fixture(scope="module")
 def tables() -> list[demo.Table]:
-    return list(demo.questions(20_000))
+    return list(demo.questions(200_000))
 
 
 def test_demo_prints_tables_and_writes_pictures(
@@ -33,8 +33,8 @@ def test_demo_prints_tables_and_writes_pictures(
 def test_demo_engines_agree(tables: list[demo.Table]) -> None:
     """Every sampled figure lies within 4.5 of its Monte Carlo errors of the exact one.
 
-    The false-alarm rate of that is 7e-6 a figure, at a fixed seed, where the effective number of
-    draws is large; the table with one effective draw is left out.
+    The false-alarm rate of that is below 1e-3 for all figures together, at a fixed seed, where at
+    least 100 draws count; the table with one effective draw is left out.
     """
     checked = 0
     for table in tables:
@@ -42,7 +42,7 @@ def test_demo_engines_agree(tables: list[demo.Table]) -> None:
         for row in exact[1:]:
             assert row.answers == pytest.approx(exact[0].answers)
         for row in table.rows:
-            if row.ess is not None and row.ess > 30:
+            if row.ess is not None and row.ess > 100:
                 difference = np.abs(np.subtract(row.answers, exact[0].answers))
                 assert np.all(difference < 4.5 * np.array(row.errors)), (table.question, row)
                 checked += 1
@@ -54,7 +54,7 @@ def test_demo_says_what_does_not_work(tables: list[demo.Table]) -> None:
     assert len(refusals) == 1
     assert "duration" in refusals[0]
     (warned,) = (table for table in tables if table.warned)
-    assert min(row.ess for row in warned.rows if row.ess is not None) < 30
+    assert min(row.ess for row in warned.rows if row.ess is not None) < 100
 
 
 def test_chest_clinic_is_the_published_network(reference_data: Path) -> None:

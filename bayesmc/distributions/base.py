@@ -7,6 +7,7 @@ log probability the broadcast of the value's and the distribution's batch. A fam
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -170,10 +171,14 @@ class Distribution:
 
     def _finite(self, name: str, value: np.ndarray) -> np.ndarray:
         """A scalar parameter that must be finite."""
+        if value.ndim == 0 and math.isfinite(value):  # a constant, at the cost of no array operation
+            return value
         return self._check(name, value, np.isfinite(value), 0.0, "finite")
 
     def _positive(self, name: str, value: np.ndarray) -> np.ndarray:
         """A scalar parameter that must be positive and finite."""
+        if value.ndim == 0 and 0 < float(value) < math.inf:
+            return value
         ok = (value > 0) & (value < np.inf)
         return self._check(name, value, ok, 1.0, "positive and finite")
 

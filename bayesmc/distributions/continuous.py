@@ -65,7 +65,9 @@ class StudentT(Distribution):
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         df, z = self.df, (x - self.loc) / self.scale
-        tail = np.log1p(z * z / df)
+        ratio = z * z / df
+        # log1p costs twice a log, and its digits only count once (df + 1) / 2 magnifies them
+        tail = np.log1p(ratio) if df.ndim or df > 100 else np.log(1.0 + ratio)
         if np.isinf(tail).any():  # z * z overflowed; heavy tails do reach that far
             tail = np.where(np.isinf(tail), 2 * np.log(np.abs(z)) - np.log(df), tail)
         constant = np.log(special.poch(0.5 * df, 0.5)) - 0.5 * (np.log(df) + np.log(np.pi))

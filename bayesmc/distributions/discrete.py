@@ -37,11 +37,13 @@ class _Odds(Distribution):
             self.logits = self._check("logits", value, ~np.isnan(value), 0.0, "a number")
             self.probs = special.expit(self.logits)
 
-    def _log_odds_parts(self) -> tuple[np.ndarray, np.ndarray]:
-        """``log P(1)`` and ``log P(0)``, the tails kept where logits were given."""
-        if self.logits is not None:
-            return special.log_expit(self.logits), special.log_expit(-self.logits)
-        return np.log(self.probs), np.log1p(-self.probs)
+    def _log_one(self) -> np.ndarray:
+        """``log P(1)``, its tail kept where logits were given."""
+        return np.log(self.probs) if self.logits is None else special.log_expit(self.logits)
+
+    def _log_zero(self) -> np.ndarray:
+        """``log P(0)``, likewise."""
+        return np.log1p(-self.probs) if self.logits is None else special.log_expit(-self.logits)
 
 
 class Bernoulli(_Odds):
@@ -82,10 +84,10 @@ class Bernoulli(_Odds):
         return np.asarray(np.less(rng.random(shape), self.probs)).astype(np.int64)
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        one, zero = self._log_odds_parts()
         if x.ndim == 0:  # one observed value for the whole batch needs no selection
-            return np.array(one if x == 1 else zero if x == 0 else np.full_like(one, -np.inf))
-        return np.where(x == 1, one, np.where(x == 0, zero, -np.inf))
+            one = self._log_one if x == 1 else self._log_zero
+            return np.array(one() if x in (0, 1) else np.full(self.batch_shape, -np.inf))
+        return np.where(x == 1, self._log_one(), np.where(x == 0, self._log_zero(), -np.inf))
 
     @property
     def mean(self) -> np.ndarray:
@@ -168,7 +170,7 @@ class Binomial(_Odds):
         if self.logits is None:
             value = ways + special.xlogy(k, self.probs) + special.xlog1py(n - k, -self.probs)
         else:
-            one, zero = self._log_odds_parts()
+            one, zero = self._log_one(), self._log_zero()
             value = ways + np.where(k > 0, k * one, 0.0) + np.where(k < n, (n - k) * zero, 0.0)
         return np.where(inside, value, -np.inf)
 
@@ -234,7 +236,11 @@ class Poisson(Distribution):
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         inside = (x >= 0) & (x == np.floor(x)) & (x < np.inf)
         k = np.where(inside, x, 0.0)
-        value = special.xlogy(k, self.rate) - special.gammaln(k + 1) - self.rate
+        # one positive count needs no guard against 0 * log(0), and NumPy's log is the faster one
+        power = k * np.log(self.rate) if k.ndim == 0 and k > 0 else special.xlogy(k, self.rate)
+        value = power - special.gammaln(k + 1) - self.rate
+        if inside.ndim == 0 and inside:
+            return np.asarray(value)
         return np.where(inside, value, -np.inf)
 
     @property

@@ -55,8 +55,11 @@ class Normal(Distribution):
         return draws
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        z = (x - self.loc) / self.scale
-        return -0.5 * z * z - _HALF_LOG_2PI - np.log(self.scale)
+        z = np.asarray((x - self.loc) / self.scale)
+        z *= z  # in place: this is the hottest density there is
+        z *= -0.5
+        z -= _HALF_LOG_2PI
+        return z - np.log(self.scale)
 
     @property
     def mean(self) -> np.ndarray:

@@ -7,7 +7,7 @@ enters it. The cost is known, and refused if too high, before any large table ex
 from __future__ import annotations
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,13 @@ from bayesmc.errors import BudgetError, ParameterError, UnsupportedError, ZeroPr
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree
 from bayesmc.network import BayesNet, Model, Problem, pose
 from bayesmc.results import Posterior
-from bayesmc.structure import DiscreteNet, Variable, discrete_net, why_not_discrete
+from bayesmc.structure import (
+    DiscreteNet,
+    InvalidRows,
+    Variable,
+    discrete_net,
+    why_not_discrete,
+)
 
 
 @dataclass(frozen=True)
@@ -90,10 +96,11 @@ class Exact:
             raise error
         prepared = _prepared(problem)
         states = _states(problem)
-        calibrated = prepared.bound(problem).calibrate(states)
+        bound, invalid = prepared.bound(problem)
+        calibrated = bound.calibrate(states)
         if calibrated.log_z == -np.inf:
             raise ZeroProbabilityError(_impossible(prepared, problem, states))
-        _refuse_invalid(prepared.net, calibrated, states)
+        _refuse_invalid(problem.model, invalid, calibrated)
         return ExactPosterior(problem, self, prepared.net, calibrated)
 
     def _why_not(self, problem: Problem) -> UnsupportedError | None:
@@ -125,16 +132,17 @@ class _Prepared:
         self.tree = CliqueTree(self.net.cards, self.net.scopes)
         self._static: BoundTree | None = None
 
-    def bound(self, problem: Problem) -> BoundTree:
-        """The tree with its tables; kept between calls when no table depends on the evidence."""
+    def bound(self, problem: Problem) -> tuple[BoundTree, list[InvalidRows]]:
+        """The tree with its tables (kept between calls when none depends on the evidence), and the
+        configurations with bad parameters."""
         if self._static is not None:
-            return self._static
+            return self._static, self.net.invalid
         with marking_invalid(), np.errstate(all="ignore"):
-            extra = self.net.evidence_factors(problem.observed)
+            extra, invalid = self.net.evidence_factors(problem.observed)
         bound = self.tree.bind([*self.net.static, *extra])
         if not self.net.evidence_sources:
             self._static = bound
-        return bound
+        return bound, self.net.invalid + invalid
 
 
 _PLANS: weakref.WeakKeyDictionary[Model, dict[Any, _Prepared]] = weakref.WeakKeyDictionary()
@@ -143,7 +151,10 @@ _PLANS: weakref.WeakKeyDictionary[Model, dict[Any, _Prepared]] = weakref.WeakKey
 def _prepared(problem: Problem) -> _Prepared:
     """The plan, kept as long as the compiled model lives; inputs are part of a model's identity."""
     plans = _PLANS.setdefault(problem.model, {})
-    key = tuple(sorted((n, v.tobytes()) for n, v in problem.inputs.items()))
+    key = (
+        tuple(sorted((n, v.tobytes()) for n, v in problem.inputs.items())),
+        frozenset(n for n in problem.observed if problem.model[n].domain is None),
+    )
     if key not in plans:
         if len(plans) > 8:
             plans.clear()
@@ -168,7 +179,7 @@ def _states(problem: Problem) -> dict[Variable, int]:
 
 def _impossible(prepared: _Prepared, problem: Problem, states: Mapping[Variable, int]) -> str:
     """Say which piece of evidence first makes the rest impossible."""
-    bound = prepared.bound(problem)
+    bound, _ = prepared.bound(problem)
     entered: dict[Variable, int] = {}
     if bound.calibrate({}).log_z == -np.inf:
         return "the evidence has probability zero: no configuration of the hidden nodes explains it"
@@ -185,18 +196,20 @@ def _impossible(prepared: _Prepared, problem: Problem, states: Mapping[Variable,
     return "the evidence has probability zero"
 
 
-def _refuse_invalid(net: DiscreteNet, calibrated: Calibrated, states: Mapping[Variable, int]) -> None:
+def _refuse_invalid(
+    model: Model, invalid: Sequence[InvalidRows], calibrated: Calibrated
+) -> None:
     """Bad parameters at configurations that turn out to be possible are the user's to hear of."""
-    for name, element, scope, mask in net.invalid:
+    for name, element, scope, mask in invalid:
         possible = calibrated.joint(scope) > 0 if scope else np.asarray(True)
         bad = mask & possible
         if bad.any():
             at = tuple(int(i) for i in np.argwhere(bad)[0])
             config = ", ".join(
-                f"{v[0]}={net.model[v[0]].domain.states[i]!r}"  # type: ignore[union-attr]
+                f"{v[0]}={model[v[0]].domain.states[i]!r}"  # type: ignore[union-attr]
                 for v, i in zip(scope, at, strict=True)
             )
-            where = f" (plate element {element})" if net.model[name].plates else ""
+            where = f" (plate element {element})" if model[name].plates else ""
             raise ParameterError(
                 f"node {name!r}{where}: the function gives bad parameters at {config}, which is possible",
                 at,

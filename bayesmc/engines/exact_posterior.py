@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,7 +18,7 @@ from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Plates, Posterior
 from bayesmc.results.query import Query
-from bayesmc.structure import DiscreteNet, Variable, configure
+from bayesmc.structure import DiscreteNet, Variable, configure, known_values
 
 #: configurations up to which a function is averaged over a joint table
 _QUERY_ENTRIES = 1 << 22
@@ -40,6 +41,7 @@ class ExactPosterior(Posterior):
     ) -> None:
         super().__init__(problem, engine)
         self._net = net
+        self._known_values = known_values(problem.model, net.constants, problem.observed)
         self._calibrated = calibrated
         self.log_marginal_likelihood = float(calibrated.log_z)
 
@@ -69,7 +71,7 @@ class ExactPosterior(Posterior):
             return np.eye(node.domain.size)[node.declaration.value.astype(np.intp)]
         if not node.plate_shape:
             return self._calibrated.marginal((name, 0)).copy()
-        count = int(np.prod(node.plate_shape, dtype=int))
+        count = math.prod(node.plate_shape)
         rows = [self._calibrated.marginal((name, e)) for e in range(count)]
         return np.reshape(np.stack(rows), (*node.plate_shape, node.domain.size))
 
@@ -126,10 +128,8 @@ class ExactPosterior(Posterior):
         return self.expectation(lambda x: power(x), names={"x": name})
 
     def _known(self, name: str) -> np.ndarray | None:
-        """The value of a continuous node that does not vary."""
-        if self.problem is not None and name in self.problem.observed:
-            return self.problem.observed[name].value
-        return self._net.constants.get(name)
+        """The value of a node without a domain that does not vary."""
+        return self._known_values.get(name) if self.model[name].domain is None else None
 
     def cov(self, *names: str) -> np.ndarray:
         scalars: list[tuple[Variable, np.ndarray]] = []
@@ -138,7 +138,7 @@ class ExactPosterior(Posterior):
             if node.domain is None:
                 raise self._cannot(f"cov of {name!r}, which has no finite set of values,")
             numbers = np.asarray(node.domain.numbers, dtype=float)
-            count = int(np.prod(node.plate_shape, dtype=int))
+            count = math.prod(node.plate_shape)
             scalars += [((name, e), numbers) for e in range(count)]
         matrix = np.empty((len(scalars), len(scalars)))
         for i, (a, x) in enumerate(scalars):
@@ -198,8 +198,8 @@ class ExactPosterior(Posterior):
             alone = ()
         whole = tuple(n for n in finite if n not in alone)
         variables = [self._element(n, query.plates, (0,) * len(query.plates)) for n in alone]
-        rest = [(n, e) for n in whole for e in range(int(np.prod(self.model[n].plate_shape, dtype=int)))]
-        entries = float(np.prod([self._card(v) for v in [*variables, *rest]], dtype=float))
+        rest = [(n, e) for n in whole for e in range(math.prod(self.model[n].plate_shape))]
+        entries = float(math.prod([self._card(v) for v in [*variables, *rest]]))
         if entries > _QUERY_ENTRIES:
             raise BudgetError(
                 f"expectation: the function needs the joint table of {len(variables) + len(rest)} nodes "
@@ -207,8 +207,9 @@ class ExactPosterior(Posterior):
                 int(min(8 * entries, 2**62)),
             )
         with np.errstate(all="ignore"):
-            values, cards = configure(self._net, alone, whole, self._missing(query.nodes))
-        values.update({n: v for n in query.nodes if (v := self._known(n)) is not None})
+            values, cards = configure(
+                self.model, self._known_values, alone, whole, self._missing(query.nodes)
+            )
         results = query(_spread(values, self.model, query.nodes, cards), cards)
         if events and results.dtype.kind != "b":
             raise UnsupportedError(
@@ -282,14 +283,12 @@ class ExactPosterior(Posterior):
         count = 1000 if draws is None else int(draws)
         generator = stream(seed_sequence(rng), 0)
         drawn = self._calibrated.sample(generator, count)
-        values = dict(self._net.constants)
+        values = dict(self._known_values)
         for name, node in self.model.nodes.items():
             if node.domain is not None and node.kind != "fixed":
-                elements = range(int(np.prod(node.plate_shape, dtype=int)))
+                elements = range(math.prod(node.plate_shape))
                 columns = np.stack([drawn[(name, e)] for e in elements], axis=-1)
                 values[name] = columns.reshape((count, *node.plate_shape)).astype(node.domain.dtype)
-            elif name in problem.observed:
-                values[name] = problem.observed[name].value
         rest = [Compute(self.model, n) for name, n in self.model.nodes.items() if name not in values]
         with np.errstate(all="ignore"):
             values = run(rest, Pass(generator, (count,), values)).values

@@ -7,6 +7,7 @@ stay in cache; each draws from its own random stream, so results do not depend o
 
 from __future__ import annotations
 
+import math
 import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -23,7 +24,7 @@ from bayesmc.randomness import stream
 from bayesmc.structure import Table, constants_of, tabulate
 
 #: draws per chunk of a net whose largest node is a scalar
-CHUNK = 8192
+CHUNK = 16384
 #: array elements per node and chunk that larger nodes are cut to
 _CHUNK_ELEMENTS = 1 << 20
 #: table entries up to which a function, or a declared table, is turned into a step
@@ -55,7 +56,7 @@ def forward_chunks(
 
 def chunk_size(model: Model) -> int:
     """Draws per chunk, so that one node's values stay near the size of the cache."""
-    largest = max((int(np.prod(n.value_shape, dtype=int)) for n in model.nodes.values()), default=1)
+    largest = max((math.prod(n.value_shape) for n in model.nodes.values()), default=1)
     return max(1, min(CHUNK, _CHUNK_ELEMENTS // max(largest, 1)))
 
 
@@ -116,8 +117,8 @@ class RowIndex:
             rows *= card
         plates = lead[len(parents) :]
         self.offset: np.ndarray | None = None
-        if int(np.prod(plates, dtype=int)) > 1:
-            self.offset = np.arange(int(np.prod(plates, dtype=int))).reshape(plates)
+        if math.prod(plates) > 1:
+            self.offset = np.arange(math.prod(plates)).reshape(plates)
             rows *= self.offset.size
         self.rows = rows
         self.dtype = np.min_scalar_type(max(rows - 1, 1))
@@ -235,7 +236,7 @@ class TableCompute:
 
     def __call__(self, state: Pass) -> None:
         node = self.node
-        from_table = self.codes.take(self.index(state.values))
+        from_table = np.asarray(self.codes.take(self.index(state.values)))
         lead = from_table.shape[: from_table.ndim - len(node.plates)]
         if from_table.shape != lead + node.plate_shape:
             from_table = np.broadcast_to(from_table, lead + node.plate_shape)

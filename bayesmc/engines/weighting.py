@@ -153,28 +153,46 @@ def _joined(
     old: Posterior, stored: dict[str, np.ndarray], log_weights: np.ndarray, problem: Problem
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """Earlier draws of the same question and the new ones, end to end."""
-    if not isinstance(old, DrawsPosterior) or set(old._stored) != set(stored):
+    if not isinstance(old, DrawsPosterior) or not _same_question(old, problem, set(stored)):
         raise UnsupportedError(
-            'infer: resume= takes an earlier posterior of the same net, evidence and keep="draws"'
+            "infer: resume= takes an earlier LikelihoodWeighting posterior of the same net, evidence, "
+            'inputs and keep=, as infer returned it; this one answers another question'
         )
     before = old._shape[1]
     joined = {}
     for name, new in stored.items():
-        if new.shape[1] == 1 and old._stored[name].shape[1] == 1 and before > 1:
-            if not np.array_equal(new, old._stored[name]):
-                raise UnsupportedError(f"infer: resume= has other evidence on {name!r}")
-            joined[name] = new
-        else:
-            full = (1, log_weights.shape[1], *problem.model[name].value_shape)
-            joined[name] = np.concatenate(
-                [
-                    np.broadcast_to(old._stored[name], (1, before, *full[2:])),
-                    np.broadcast_to(new, full),
-                ],
-                axis=1,
-            )
+        tail = problem.model[name].value_shape
+        parts = [
+            np.broadcast_to(old._stored[name], (1, before, *tail)),
+            np.broadcast_to(new, (1, log_weights.shape[1], *tail)),
+        ]
+        constant = new.shape[1] == 1 == old._stored[name].shape[1]
+        joined[name] = new if constant else np.concatenate(parts, axis=1)
     earlier = np.zeros((1, before)) if old.log_weights is None else old.log_weights
     return joined, np.concatenate([earlier, log_weights], axis=1)
+
+
+def _same_question(old: DrawsPosterior, problem: Problem, names: set[str]) -> bool:
+    """Whether draws of ``old`` may be joined with new ones for ``problem``."""
+    was = old.problem
+    if was is None or set(old._stored) != names or not isinstance(old.engine, LikelihoodWeighting):
+        return False
+    weighted = bool(problem.observed or problem.model.potentials)
+    same_net = list(was.model.nodes) == list(problem.model.nodes) and all(
+        was.model[n].declaration is c.declaration for n, c in problem.model.nodes.items()
+    )
+    return (
+        same_net
+        and was.model.sizes == problem.model.sizes
+        and (old.log_weights is not None) == weighted
+        and was.observed.keys() == problem.observed.keys()
+        and all(
+            np.array_equal(o.value, problem.observed[n].value)
+            and np.array_equal(o.mask, problem.observed[n].mask)
+            for n, o in was.observed.items()
+        )
+        and all(np.array_equal(v, problem.inputs[n]) for n, v in was.inputs.items())
+    )
 
 
 def _refuse_zero(top: float, draws: int) -> None:

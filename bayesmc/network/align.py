@@ -33,7 +33,7 @@ class Aligner:
         Pass the positions themselves (tables want them).
     """
 
-    __slots__ = ("_axes", "_insert", "domain", "event_ndim", "foreign", "own", "trailing")
+    __slots__ = ("_axes", "_insert", "_plain", "domain", "event_ndim", "foreign", "own", "trailing")
 
     def __init__(
         self,
@@ -55,6 +55,7 @@ class Aligner:
         inserted = tuple(slice(None) if p in plates else None for p in child)
         rest = (slice(None),) * (len(self.foreign) + event_ndim)
         self._insert = (Ellipsis, *inserted, *rest) if None in inserted else None
+        self._plain = self._axes is None and self._insert is None
 
     def batch_shape(self, value: np.ndarray) -> Shape:
         """Shape of the batch axes of a stored value."""
@@ -62,13 +63,17 @@ class Aligner:
 
     def __call__(self, value: np.ndarray) -> Any:
         """The read-only argument (a ``PlateArray`` when plates are foreign)."""
-        value = self.place(self.domain.decode(value) if self.domain is not None else value)
+        if self.domain is not None:
+            value = self.domain.decode(value)
+        value = read_only(value) if self._plain else self.place(value)
         if self.foreign:
             return PlateArray(value, self.foreign, self.own, self.event_ndim)
         return value
 
     def place(self, value: np.ndarray) -> np.ndarray:
         """The value with its axes where the child wants them, read-only and not decoded."""
+        if self._plain:
+            return value
         if self._axes is not None:
             lead = value.ndim - self.trailing
             value = value.transpose(*range(lead), *(lead + a for a in self._axes))

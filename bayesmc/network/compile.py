@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -197,7 +198,7 @@ def _reachable(
         assert table is not None
         possible = np.broadcast_to(table > 0, (*lead, node.domain.size))
         rank = np.cumsum(possible, axis=-1)
-        turn = (np.arange(int(np.prod(lead, dtype=int))).reshape(lead) + count) % np.maximum(
+        turn = (np.arange(math.prod(lead)).reshape(lead) + count) % np.maximum(
             rank[..., -1], 1
         )
         return np.argmax(rank > turn[..., None], axis=-1).astype(node.domain.dtype)
@@ -259,7 +260,7 @@ def _tabulate_deterministic(node: CompiledNode) -> CompiledNode | None:
     if node.event_shape or not node.links or node.has_foreign_parents or None in domains:
         return None
     cards = tuple(d.size for d in domains if d is not None)
-    if np.prod(cards, dtype=float) * max(np.prod(node.plate_shape), 1) > _DETERMINISTIC_TABLE:
+    if math.prod(cards) * max(math.prod(node.plate_shape), 1) > _DETERMINISTIC_TABLE:
         return None
     values = configurations(node.links, cards)
     try:

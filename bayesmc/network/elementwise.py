@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -95,19 +96,13 @@ class Elementwise(Distribution):
         return Support(first.kind, low, high, first.open_low, first.open_high)
 
     def parameters(self) -> list[tuple[np.ndarray, int]]:
-        """One row per element: its family, and its parameters end to end."""
-        names = sorted({type(p).__name__ for p in self.parts})
-        rows = [
-            np.concatenate(
-                [[names.index(type(p).__name__)], *(np.ravel(a) for a, _ in p.parameters())]
-            )
-            for p in self.parts
-        ]
-        width = max(len(row) for row in rows)
-        table = np.zeros((len(rows), width))
-        for row, values in zip(table, rows, strict=True):
-            row[: len(values)] = values
-        return [(table.reshape((*self.batch_shape, width)), 1)]
+        """Three numbers per element that tell its family and parameters: families may be mixed."""
+        rows = []
+        for part in self.parts:
+            family = float(zlib.crc32(type(part).__name__.encode()))
+            values = np.concatenate([[0.0], *(np.ravel(a) for a, _ in part.parameters())])
+            rows.append([family, values.sum(), values @ np.sin(np.arange(values.size))])
+        return [(np.reshape(rows, (*self.batch_shape, 3)), 1)]
 
     def _each(self, what: str) -> np.ndarray:
         values = np.stack([getattr(p, what) for p in self.parts])

@@ -157,7 +157,7 @@ class Model:
         value = node.domain.to_support(stored) if node.domain is not None else stored
         with np.errstate(all="ignore"):
             result = distribution.log_prob(value)
-        if result.max(initial=-np.inf) < np.inf:  # false for NaN, too
+        if not result.size or result.max() < np.inf:  # false for NaN, too
             return result
         bad = ~(result < np.inf)
         if distribution.invalid is not None:
@@ -254,7 +254,7 @@ def call(
         if isinstance(result, PlateArray):
             raise result._ungathered()
         array = np.asarray(result)
-        if array.dtype == object:
+        if array.dtype.kind not in "biuf":
             raise ModelError(
                 f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "
                 "a frozen scipy.stats one), or an array of numbers for a deterministic node"

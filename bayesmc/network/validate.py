@@ -57,11 +57,12 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
     _compare_entries(node, model.probe, shape, whole, np.ndindex(batch), batch)
     if not batch:
         return
+    # backwards, so that a function that sorts the batch cannot find it sorted both times
     first = {p: _part(model.probe[p], link.batch_shape(model.probe[p]), 1) for p, link in node.links}
     arguments, short = arguments_of(node.links, first)
     row = _signature(node, arguments, short + node.plate_shape)
     for a, b in zip(whole.arrays, row.arrays, strict=True):
-        if not _close(a[0], b):
+        if not _close(a[0, ::-1], b):
             raise BroadcastError(_broadcast_message(node, (0,), whole, row))
     if len(set(node.parents)) < 2:
         return
@@ -81,10 +82,10 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
 
 
 def _part(value: np.ndarray, batch: Shape, kind: int) -> np.ndarray:
-    """A value with batch axes (q, p) cut to another rank: (q, p), (p,), (q, 1) or () by turns."""
+    """A value with batch axes (q, p) cut to another rank by turns: (q, p), (p,), (q, 1) or ()."""
     if len(batch) != 2:
         return value
-    return (value, value[0], value[:, :1], value[0, 0, ...])[kind % 4]
+    return (value, value[0, ::-1], value[:, :1], value[0, 0, ...])[kind % 4]
 
 
 def _compare_entries(

@@ -6,6 +6,7 @@ net's own forward pass from the posterior draws.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -105,8 +106,8 @@ class DrawsPosterior(Posterior):
             shape = [self.model.sizes[p] if p in node.plates else 1 for p in plates]
             code = code * node.domain.size + values.reshape(values.shape[:2] + tuple(shape)).astype(np.intp)
         cards = tuple(node.domain.size for node in nodes if node.domain is not None)
-        total = int(np.prod(cards))
-        flat = np.broadcast_to(code, self._shape + sizes).reshape(int(np.prod(self._shape)), -1)
+        total = math.prod(cards)
+        flat = np.broadcast_to(code, self._shape + sizes).reshape(math.prod(self._shape), -1)
         weights = None if self.weights is None else self.weights.ravel()
         table = np.stack(
             [np.bincount(column, weights=weights, minlength=total) for column in flat.T]
@@ -175,9 +176,9 @@ class DrawsPosterior(Posterior):
         return Marginal(name, flat, weights)
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
-        count = int(np.prod(self._shape)) if draws is None else int(draws)
+        count = math.prod(self._shape) if draws is None else int(draws)
         generator = stream(seed_sequence(rng), 0)
-        total = int(np.prod(self._shape))
+        total = math.prod(self._shape)
         weights = np.full(total, 1 / total) if self.weights is None else self.weights.ravel()
         picked = generator.permutation(systematic(weights, count, generator))
         chain, draw = np.divmod(picked, self._shape[1])

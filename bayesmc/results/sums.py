@@ -6,6 +6,7 @@ to a centre near each node's mean, so that neither overflows nor cancels.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -78,7 +79,7 @@ class Sums:
         groups: list[_Group] = []
         for name in self.names:
             node, value = self.model[name], values[name]
-            size = int(np.prod(node.value_shape, dtype=int))
+            size = math.prod(node.value_shape)
             if value.ndim == len(node.value_shape):
                 self._constant[name] = value
             elif node.domain is None:
@@ -104,7 +105,7 @@ class Sums:
         weights = np.empty((2, draws))
         np.exp(log_weight - (self.top if self.top > -np.inf else 0.0), out=weights[0])
         np.multiply(weights[0], weights[0], out=weights[1])
-        self.weight += weights.sum(axis=1)
+        self.weight += weights[0].sum(), weights[0] @ weights[0]
         return weights
 
     def _rescale(self, scale: np.ndarray) -> None:
@@ -123,10 +124,15 @@ class Sums:
             table[:, :, state] += weights @ (flat == state).astype(float)
 
     def _add_powers(self, name: str, value: np.ndarray, weights: np.ndarray) -> None:
-        centred = value.reshape(len(value), -1) - self._centre[name]
-        if centred.shape[1] == 1:
-            centred = centred[:, 0]
         first, second = self._powers[name]
+        if first.shape[1] == 1:  # a scalar: dot products, with what they share computed once
+            weight = weights[0]
+            centred = value.reshape(-1) - self._centre[name]
+            heavy = weight * centred
+            first[:, 0] += weight @ centred, weight @ heavy
+            second[:, 0] += heavy @ centred, heavy @ heavy
+            return
+        centred = value.reshape(len(value), -1) - self._centre[name]
         first += (weights @ centred).reshape(first.shape)
         np.multiply(centred, centred, out=centred)
         second += (weights @ centred).reshape(first.shape)
@@ -138,7 +144,7 @@ class _Group:
     def __init__(self, names: tuple[str, ...], cards: tuple[int, ...]) -> None:
         self.names = names
         self.cards = cards
-        self.size = int(np.prod(cards))
+        self.size = math.prod(cards)
         self.histogram = np.zeros((2, self.size))
 
     def with_node(self, name: str, card: int) -> _Group:

@@ -6,6 +6,7 @@ simple options, so that a search for the smallest failing net (shrinking) goes t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -43,7 +44,7 @@ class Choices:
 
     def reals(self, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
         """An array of such numbers."""
-        count = int(np.prod(shape, dtype=int))
+        count = math.prod(shape)
         return np.reshape([self.real(low, high) for _ in range(count)], shape)
 
     def rows(self, count: int, states: int, zeros: bool = True) -> np.ndarray:

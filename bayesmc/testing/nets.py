@@ -9,6 +9,7 @@ infinite parents are left to tests written by hand.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -139,7 +140,8 @@ def build_evidence(net: BayesNet, choices: Choices, chance: float = 0.4) -> dict
             continue
         value = draw[name][0]
         seen = np.ones(value.shape, dtype=bool)
-        if node.plates and choices.flag(0.5):
+        infinite = node.is_discrete and node.states is None  # what is hidden could not be enumerated
+        if node.plates and not infinite and choices.flag(0.5):
             seen = np.array([choices.flag(0.5) for _ in range(value.size)]).reshape(value.shape)
         if seen.any():
             evidence[name] = _as_user_gives(value, seen)
@@ -168,13 +170,18 @@ def _as_user_gives(value: Any, seen: np.ndarray) -> Any:
 
 @dataclass(frozen=True)
 class Known:
-    """What later nodes need to know of an earlier one. ``card`` is None for a number without states."""
+    """What later nodes need to know of an earlier one.
+
+    ``card`` is None for a number without states; ``is_smooth`` says that it varies continuously, so that
+    only smooth functions of it are left to exact quadrature.
+    """
 
     name: str
     plates: tuple[str, ...]
     card: int | None = None
     states: tuple[Any, ...] | None = None
     low: int = 0
+    is_smooth: bool = False
 
     @property
     def is_labelled(self) -> bool:
@@ -278,7 +285,7 @@ class _Builder:
         return kinds
 
     def _elements(self, plates: Sequence[str]) -> int:
-        return int(np.prod([self.sizes[p] for p in plates], dtype=int))
+        return math.prod([self.sizes[p] for p in plates])
 
     def _afford(self, states: int, plates: Sequence[str]) -> bool:
         return float(states) ** self._elements(plates) <= self.left
@@ -323,7 +330,7 @@ class _Builder:
         cards = tuple(k.card for k in chosen if k.card is not None)
         assert known.card is not None
         rows = self.choices.rows(
-            int(np.prod(cards, dtype=int)), known.card, self.options.zeros
+            math.prod(cards), known.card, self.options.zeros
         )
         table = rows.reshape((*cards, known.card))
         known = replace(known, states=self._states(known.card))
@@ -344,27 +351,27 @@ class _Builder:
     def _continuous(self, name: str, kind: str, plates: tuple[str, ...]) -> Known:
         score, parents = self._score(plates)
         if kind == "normal" and parents and self.choices.flag():
-            low, high = self.choices.real(0.75, 1.5), self.choices.real(0.75, 2.0)
+            spread = self.choices.real(0.0, 1.0)
             term = score.terms[0]  # the scale depends on a parent, too
             make: Callable[..., Any] = lambda *a: Normal(  # noqa: E731
-                score(a), np.where(term(a) > 0.3, high, low)
+                score(a), 0.75 + spread * _sigmoid(term(a))
             )
         else:
             make = _family(kind, score, self.choices.real(0.75, 2.0))
         self._declare(name, make, parents, plates)
-        return Known(name, plates)
+        return Known(name, plates, is_smooth=True)
 
-    def _deterministic(self, name: str, plates: tuple[str, ...]) -> Known | None:
+    def _deterministic(self, name: str, plates: tuple[str, ...]) -> Known:
         score, parents = self._score(plates, at_least=1)
-        if not parents:
-            plates = ()
-            score, parents = self._score(plates, at_least=1)
-        threshold = self.choices.pick((None, 0.1))
-        if threshold is None:
+        above = [k for k in self.known if k.name in parents]
+        if any(k.is_smooth for k in above) or self.choices.flag():
             self._declare(name, lambda *a: np.asarray(score(a)), parents, plates)
-            return Known(name, plates)
-        self._declare(name, lambda *a: np.where(score(a) > threshold, 1, 0), parents, plates)
-        return Known(name, plates)
+            return Known(name, plates, is_smooth=any(k.is_smooth for k in above))
+        # positions 0 and 1; states need finite parents that are not foreign
+        inside = all(k.card is not None and set(k.plates) <= set(plates) for k in above)
+        states = self._states(2) if inside else None
+        self._declare(name, lambda *a: np.where(score(a) > 0.1, 1, 0), parents, plates, states)
+        return Known(name, plates, 2 if states else None, states)
 
     # ---- parents ----------------------------------------------------------------------------
 
@@ -429,13 +436,14 @@ def _family(kind: str, score: Score, scale: float) -> Callable[..., Distribution
         "gamma": lambda *a: Gamma(1.0 + scale, _rate(score(a))),
         "beta": lambda *a: Beta(1.0 + scale, 1.0 + _rate(score(a))),
         "exponential": lambda *a: Exponential(_rate(score(a))),
-        "uniform": lambda *a: Uniform(score(a) - scale, score(a) + scale),
+        # bounds that follow a continuous parent would make densities jump
+        "uniform": lambda *a: Uniform(-scale, scale + 0.0 * np.asarray(score(a))),
     }
     return makers[kind]
 
 
 def _rate(score: Any) -> np.ndarray:
-    return np.exp(0.5 * np.clip(score, -3.0, 3.0))
+    return np.exp(1.5 * np.tanh(np.asarray(score) / 3.0))
 
 
 def _sigmoid(score: Any) -> np.ndarray:
