@@ -31,3 +31,35 @@ from bayesmc.plates import PlateArray, stack
 from bayesmc.results import Marginal, Posterior, Summary
 
 __version__ = "0.1.0"
+
+__all__ = [
+    "BayesNet",
+    "Bernoulli",
+    "Beta",
+    "Binomial",
+    "Categorical",
+    "Density",
+    "Dirichlet",
+    "DiscreteUniform",
+    "Distribution",
+    "Exact",
+    "Explanation",
+    "Exponential",
+    "Gamma",
+    "LikelihoodWeighting",
+    "Marginal",
+    "Mixture",
+    "MvNormal",
+    "Normal",
+    "PlateArray",
+    "Poisson",
+    "Posterior",
+    "StudentT",
+    "Summary",
+    "Uniform",
+    "errors",
+    "explain",
+    "infer",
+    "io",
+    "stack",
+]

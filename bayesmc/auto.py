@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from bayesmc.engines.exact import Exact
+from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, Problem, pose
@@ -30,6 +30,18 @@ class Explanation:
         Engine name -> why it was not taken.
     nodes : dict
         Node -> what the engine does to it.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Normal(0.0, 1.0))
+    >>> explanation = bmc.explain(net, engine=bmc.LikelihoodWeighting(100))
+    engine: LikelihoodWeighting(draws=100)
+      because it was asked for
+      x  sampled given its parents
+    >>> explanation.nodes
+    {'x': 'sampled given its parents'}
     """
 
     engine: Any
@@ -126,7 +138,7 @@ def explain(
     >>> net.add("a", bmc.Bernoulli(0.2))
     >>> _ = bmc.explain(net)
     engine: Exact(max_bytes=2147483648.0)
-      because all hidden nodes are finite: induced width 0, about 48 bytes
+      because all hidden nodes are finite: induced width 0, about ... bytes
       a  eliminated
     """
     problem = pose(net, evidence, inputs)
@@ -152,7 +164,7 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
         width, size = cost.induced_width, cost.bytes
         return (
             Exact(),
-            (f"all hidden nodes are finite: induced width {width}, about {size:.3g} bytes",),
+            (f"all hidden nodes are finite: induced width {width}, about {readable_bytes(size)}",),
             {},
         )
     weighting = LikelihoodWeighting()
@@ -164,9 +176,13 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
 
 def _checked(engine: Any) -> Any:
     if isinstance(engine, type):
-        raise TypeError(f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()")
+        raise TypeError(
+            f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"
+        )
     if not (hasattr(engine, "run") and hasattr(engine, "refusal")):
-        raise TypeError(f"engine={engine!r} is not an engine; use Exact(), LikelihoodWeighting(draws), ...")
+        raise TypeError(
+            f"engine={engine!r} is not an engine; use Exact(), LikelihoodWeighting(draws), ..."
+        )
     return engine
 
 
@@ -183,7 +199,9 @@ def _with_alternative(reason: str, engine: Any, problem: Problem) -> str:
 def _check_keep(keep: Any, problem: Problem) -> None:
     if isinstance(keep, str):
         if keep not in ("draws", "summaries"):
-            raise ValueError(f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names')
+            raise ValueError(
+                f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names'
+            )
         return
     for name in keep:
         if name not in problem.model.nodes:

@@ -187,9 +187,7 @@ class PlateArray(NDArrayOperatorsMixin):
         """Whether all elements over the named foreign plates are true."""
         return self._reduce(np.all, plates)
 
-    def _reduce(
-        self, function: Callable[..., Any], names: tuple[str, ...], **unknown: Any
-    ) -> Any:
+    def _reduce(self, function: Callable[..., Any], names: tuple[str, ...], **unknown: Any) -> Any:
         if unknown:
             raise TypeError(
                 f".{function.__name__}({next(iter(unknown))}=...): foreign plates are reduced by name, "
@@ -219,7 +217,9 @@ class PlateArray(NDArrayOperatorsMixin):
             raise ValueError("a parent is read-only; write v = v + 1, not v += 1")
         bad = sorted(set(kwargs) & {"out", "where", "axis", "axes", "keepdims"})
         if bad:
-            raise TypeError(f"np.{ufunc.__name__} on a parent with foreign plates takes no {bad[0]}=")
+            raise TypeError(
+                f"np.{ufunc.__name__} on a parent with foreign plates takes no {bad[0]}="
+            )
         if ufunc is np.matmul:
             raise TypeError("use np.vecdot(X, v) or np.matvec(A, v) instead of @ on plates")
         cores, core_out = _core_ndims(ufunc)
@@ -358,7 +358,7 @@ class Gathered(NDArrayOperatorsMixin):
         return getattr(np.asarray(self), name)
 
 
-def stack(arrays: Sequence[Any], axis: int = -1) -> np.ndarray:
+def stack(arrays: Sequence[Any], axis: int = -1) -> Any:
     """Broadcast the arrays together, then stack them along a new axis (the last by default).
 
     Parents' batch shapes may differ, so ``np.stack`` alone would refuse them.
@@ -379,9 +379,7 @@ def stack(arrays: Sequence[Any], axis: int = -1) -> np.ndarray:
     return np.stack(np.broadcast_arrays(*(np.asarray(a) for a in arrays)), axis=axis)
 
 
-def align(
-    operands: Sequence[Any], cores: Sequence[int]
-) -> tuple[list[Any], tuple[str, ...], int]:
+def align(operands: Sequence[Any], cores: Sequence[int]) -> tuple[list[Any], tuple[str, ...], int]:
     """Operands reshaped so that NumPy broadcasts foreign plates by name.
 
     Returns them with the union of their foreign plates and the number of event axes outside the
@@ -389,10 +387,14 @@ def align(
     """
     names = _union(tuple(x.plates for x in operands if isinstance(x, PlateArray)))
     event = max(
-        (x.event_ndim - c for x, c in zip(operands, cores, strict=True) if isinstance(x, PlateArray)),
+        (
+            x.event_ndim - c
+            for x, c in zip(operands, cores, strict=True)
+            if isinstance(x, PlateArray)
+        ),
         default=0,
     )
-    aligned = []
+    aligned: list[Any] = []
     for x, core in zip(operands, cores, strict=True):
         if isinstance(x, str):
             aligned.append(x)
@@ -403,9 +405,7 @@ def align(
             outer = array.ndim - core
             if outer > event:
                 split = outer - event
-                array = array.reshape(
-                    array.shape[:split] + (1,) * len(names) + array.shape[split:]
-                )
+                array = array.reshape(array.shape[:split] + (1,) * len(names) + array.shape[split:])
             aligned.append(array)
     return aligned, names, event
 

@@ -58,14 +58,13 @@ def broadcasts_to(shape: Shape, target: Shape) -> bool:
         return True
     if len(shape) > len(target):
         return False
-    return all(
-        a == b or a == 1 for a, b in zip(reversed(shape), reversed(target), strict=False)
-    )
+    return all(a == b or a == 1 for a, b in zip(reversed(shape), reversed(target), strict=False))
 
 
 def unused_sizes(taken: Iterable[int], count: int) -> Sequence[int]:
     """The ``count`` smallest sizes from 2 that differ from each other and from all ``taken``."""
-    used, sizes, candidate = set(taken), [], 2
+    used, candidate = set(taken), 2
+    sizes: list[int] = []
     while len(sizes) < count:
         if candidate not in used:
             sizes.append(candidate)

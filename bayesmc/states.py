@@ -66,7 +66,7 @@ class StateArray(np.ndarray):
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if func is np.isin and isinstance(args[0], StateArray):
-            return args[0].isin(np.atleast_1d(np.asarray(args[1], dtype=object)).ravel(), **kwargs)
+            return args[0].isin(np.atleast_1d(np.asarray(args[1], dtype=object)).ravel().tolist(), **kwargs)
         return super().__array_function__(func, types, args, kwargs)
 
     def __getitem__(self, key: Any) -> Any:
@@ -81,7 +81,7 @@ class StateArray(np.ndarray):
             raise TypeError("unhashable: an array of states")
         return hash(self.states[int(self.codes)])
 
-    def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> np.ndarray:  # type: ignore[override]
+    def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> np.ndarray:
         return self.codes.astype(dtype, *args, **kwargs)
 
     def tolist(self) -> Any:

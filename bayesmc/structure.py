@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.errors import BudgetError
 from bayesmc.factors import FactorLike, LogTable
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.shapes import Shape
@@ -48,7 +48,10 @@ class Table:
 
 
 def tabulate(
-    model: Model, node: CompiledNode, constants: Mapping[str, np.ndarray], limit: int = TABLE_ENTRIES
+    model: Model,
+    node: CompiledNode,
+    constants: Mapping[str, np.ndarray],
+    limit: int = TABLE_ENTRIES,
 ) -> Table | None:
     """The table of a finite node whose parents are finite and in its own plates; None if there is none.
 
@@ -346,7 +349,7 @@ def _fill(
         table, is_log, invalid = _table(model, source, values, cards)
     for flat, element in enumerate(np.ndindex(_plate_shape(model, source))):
         at = (slice(None),) * len(cards) + element
-        part = np.ascontiguousarray(table[at])
+        part = np.array(table[at])
         factors.append(LogTable(part) if is_log else part)
         if invalid is not None and invalid[at].any():
             bad.append((source.name, flat, _scope(model, source, element), invalid[at]))
@@ -369,6 +372,7 @@ def _table(
     invalid = None if invalid is None or not invalid.any() else np.broadcast_to(invalid, shape)
     if node.domain is not None:
         table = result.probs_table
+        assert table is not None
         return np.broadcast_to(table, (*shape, node.domain.size)), False, invalid
     density = model.log_density(source.name, result, values[source.name])
     density = np.broadcast_to(density, shape)

@@ -18,7 +18,7 @@ import numpy as np
 import bayesmc as bmc
 from examples import diagnosis, old_faithful
 
-SEED = 2024
+SEED = 1
 EXACT = "exact"
 
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for table in questions(20_000 if options.fast else 1_000_000):
         print_table(table)
     options.out.mkdir(parents=True, exist_ok=True)
-    for path in draw_pictures(options.out, 20_000 if options.fast else 200_000):
+    for path in draw_pictures(options.out, 20_000 if options.fast else 50_000):
         print(f"wrote {path}")
 
 

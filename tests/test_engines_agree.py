@@ -21,7 +21,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bayesmc as bmc
-from bayesmc.errors import LowEssWarning, UnsupportedError
+from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import pose
 from bayesmc.results import DrawsPosterior
 from bayesmc.testing import (
@@ -193,7 +193,10 @@ def test_exact_queries_agree_with_enumeration(kind: str) -> None:
             for b in numeric[-3:]:
                 f, g = total_of(net, a), total_of(net, b)
                 names = {"x": a, "y": b}
-                result = posterior.expectation(lambda x, y: f(x) * g(y), names=names)  # noqa: B023
+                try:
+                    result = posterior.expectation(lambda x, y: f(x) * g(y), names=names)  # noqa: B023
+                except BudgetError:
+                    continue  # the sums need all elements jointly
                 expected = found.expectation(lambda x, y: f(x) * g(y), a, b)  # noqa: B023
                 assert result == pytest.approx(expected, abs=1e-9)
                 event = posterior.probability(lambda x, y: f(x) > g(y), names=names)  # noqa: B023
@@ -222,12 +225,14 @@ def test_exact_queries_by_plate_agree_with_enumeration(kind: str) -> None:
             np.testing.assert_allclose(same, found.mean(name), atol=1e-9)
             turned = posterior.expectation(lambda x: x, plates=node.plates[::-1], names={"x": name})
             np.testing.assert_allclose(turned, found.mean(name).T, atol=1e-9)
-            rest = node.plates[1:]
-            reduced = posterior.expectation(
-                lambda x, p=node.plates[0]: x.max(p) ** 2, plates=rest, names={"x": name}
-            )
-            expected = found.expectation(lambda x: x.max(axis=1) ** 2, name)
-            np.testing.assert_allclose(reduced, expected, atol=1e-9)
+            if len(node.plates) == 2:  # the first is foreign to the query, the second shared
+                reduced = posterior.expectation(
+                    lambda x, p=node.plates[0]: x.max(p) ** 2,
+                    plates=node.plates[1],
+                    names={"x": name},
+                )
+                expected = found.expectation(lambda x: x.max(axis=1) ** 2, name)
+                np.testing.assert_allclose(reduced, expected, atol=1e-9)
             asked += 1
     assert asked > 30
 
@@ -327,8 +332,8 @@ def reweighted(change: Callable[[np.ndarray], np.ndarray | None]) -> Answer:
 
     def answer(net: bmc.BayesNet, evidence: dict[str, Any], seed: int) -> Any:
         right = by(bmc.LikelihoodWeighting(20_000))(net, evidence, seed)
-        if right is None or right.log_weights is None:
-            return None
+        if right is None or right.log_weights is None or np.ptp(right.log_weights) < 0.5:
+            return None  # the weights say next to nothing
         wrong = change(right.log_weights)
         stored = {n: v for n, v in right._stored.items()}
         return DrawsPosterior(right.problem, right.engine, stored, right._shape, wrong, True)
@@ -349,34 +354,34 @@ def transposed(net: bmc.BayesNet, evidence: dict[str, Any], seed: int) -> Any:
         if not np.allclose(swapped, probs):
             try:
                 return bmc.infer(wrong, evidence, engine=bmc.Exact())
-            except bmc.errors.ZeroProbabilityError:
+            except ZeroProbabilityError:
                 return None
     return None
 
 
-# Of 60 nets, some have no evidence, or evidence that says little; a third is asked for. The faults are
-# caught in 38, 39 and 17 of 38, 39 and 18.
-FAULTS: dict[str, tuple[Answer, dict[str, Any], int]] = {
-    "forgets the weights": (reweighted(lambda log_w: None), {}, 20),
-    "inverts the weights": (reweighted(lambda log_w: -np.maximum(log_w, -50)), {}, 20),
-    "squares the weights": (reweighted(lambda log_w: 2 * log_w), {}, 20),
-    "transposes a table": (transposed, {"states": 2}, 8),
+# fault, options of the nets
+FAULTS: dict[str, tuple[Answer, dict[str, Any]]] = {
+    "forgets the weights": (reweighted(lambda log_w: None), {}),
+    "inverts the weights": (reweighted(lambda log_w: -np.maximum(log_w, -50)), {}),
+    "squares the weights": (reweighted(lambda log_w: 2 * log_w), {}),
+    "transposes a table": (transposed, {"states": 2, "nodes": (4, 8)}),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_faulty_engine_is_caught(fault: str) -> None:
-    answer, options, least = FAULTS[fault]
+    """On most nets: some faults change no marginal (two parents that are both observed, say)."""
+    answer, options = FAULTS[fault]
     caught = tried = 0
-    for seed in range(60):
+    for seed in range(80):
         net = random_net(seed, **options)
         evidence = random_evidence(net, seed)
         posterior = answer(net, evidence, seed)
-        if posterior is None:
-            continue
-        tried += 1
-        caught += bool(compare(posterior, enumerate_posterior(net, evidence), ALPHA).rejected)
-    assert caught >= least, f"{caught} of {tried}"
+        if posterior is not None:
+            tried += 1
+            caught += bool(compare(posterior, enumerate_posterior(net, evidence), ALPHA).rejected)
+    assert tried >= 10
+    assert caught >= 0.75 * tried, f"{caught} of {tried}"
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -29,9 +29,7 @@ def layouts(draw, operands: int, event: tuple[int, ...] = ()):
     parts = []
     for _ in range(operands):
         keep = draw(st.integers(0, len(batch)))
-        own_batch = tuple(
-            n if draw(st.booleans()) else 1 for n in batch[len(batch) - keep :]
-        )
+        own_batch = tuple(n if draw(st.booleans()) else 1 for n in batch[len(batch) - keep :])
         shared = tuple(p for p in OWN if draw(st.booleans()))
         order = draw(st.permutations(FOREIGN))
         foreign = tuple(order[: draw(st.integers(1, 3))])
@@ -116,7 +114,9 @@ def test_gather_by_own_indices_is_the_loop(layout, data):
         places = dict(where)
         for plate, index in indices.items():
             full = (*b, *(where[p] for p in OWN))[len(batch) + len(OWN) - index.ndim :]
-            places[plate] = index[tuple(i if n > 1 else 0 for i, n in zip(full, index.shape, strict=True))]
+            places[plate] = index[
+                tuple(i if n > 1 else 0 for i, n in zip(full, index.shape, strict=True))
+            ]
         return at(v, places, b)
 
     assert_elementwise(result, reference, sizes, batch, kept)
@@ -210,8 +210,14 @@ def test_components_before_and_after_a_gather():
         (None, r"plate 'k' is gathered by integers 0\.\.2"),
         (np.array([True, False, True]), r"plate 'k' is gathered by integers 0\.\.2 .* not by bool"),
         (slice(1, None), r"only the full slice : keeps a foreign plate; gather elements by index"),
-        ((0, 0), r"2 indices for the foreign plates .* components of a vector are taken with v\[\.\.\., k\]"),
-        ((Ellipsis, 0), r"takes components of the event \(0 axes here\).*gather along plates .* with v\[i\]"),
+        (
+            (0, 0),
+            r"2 indices for the foreign plates .* components of a vector are taken with v\[\.\.\., k\]",
+        ),
+        (
+            (Ellipsis, 0),
+            r"takes components of the event \(0 axes here\).*gather along plates .* with v\[i\]",
+        ),
     ],
 )
 def test_gather_refuses(key, message):
@@ -271,9 +277,7 @@ def test_generalised_ufuncs_keep_their_core(layout, data):
     design = rng.normal(size=(*(sizes[p] for p in OWN), 2))
     both = set(x.plates) | set(y.plates)
 
-    assert_elementwise(
-        np.vecdot(x, y), lambda w, b: at(x, w, b) @ at(y, w, b), sizes, batch, both
-    )
+    assert_elementwise(np.vecdot(x, y), lambda w, b: at(x, w, b) @ at(y, w, b), sizes, batch, both)
     assert_elementwise(
         np.matvec(matrix, x), lambda w, b: at(matrix, w, b) @ at(x, w, b), sizes, batch, both
     )
@@ -379,8 +383,11 @@ UNGATHERED = {
 @pytest.mark.parametrize("use", UNGATHERED.values(), ids=UNGATHERED)
 def test_ungathered_use_says_what_to_do(use):
     v = PlateArray(np.array([1.0, 2.0, 3.0]), ("k",))
-    with pytest.raises(PlateError, match=r"'k', which the child lacks, is used ungathered; pick elements "
-                       r"with v\[index\], reduce with v\.sum\('k'\) .*v\.array"):
+    with pytest.raises(
+        PlateError,
+        match=r"'k', which the child lacks, is used ungathered; pick elements "
+        r"with v\[index\], reduce with v\.sum\('k'\) .*v\.array",
+    ):
         use(v)
 
 
@@ -400,21 +407,27 @@ MIXING = {
 @pytest.mark.parametrize("use", MIXING.values(), ids=MIXING)
 def test_numpy_functions_that_would_mix_say_what_to_do(use):
     v = PlateArray(np.array([1.0, 2.0, 3.0]), ("k",))
-    with pytest.raises(TypeError, match=r"foreign plates .*'k'.*gather with v\[i\], reduce with \.sum\('k'\)"):
+    with pytest.raises(
+        TypeError, match=r"foreign plates .*'k'.*gather with v\[i\], reduce with \.sum\('k'\)"
+    ):
         use(v)
 
 
 @pytest.mark.parametrize("method", ["reduce", "accumulate"])
 def test_ufunc_methods_say_what_to_do(method):
     v = PlateArray(np.array([1.0, 2.0, 3.0]), ("k",))
-    with pytest.raises(TypeError, match=rf"np\.add\.{method} would mix .* reduce with \.sum\('k'\) or gather"):
+    with pytest.raises(
+        TypeError, match=rf"np\.add\.{method} would mix .* reduce with \.sum\('k'\) or gather"
+    ):
         getattr(np.add, method)(v)
 
 
 def test_matmul_points_at_vecdot_and_matvec():
     v = PlateArray(np.array([1.0, 2.0, 3.0]), ("k",))
     for use in (lambda: v @ v, lambda: np.ones(3) @ v, lambda: v @ np.ones(3)):
-        with pytest.raises(TypeError, match=r"np\.vecdot\(X, v\) or np\.matvec\(A, v\) instead of @"):
+        with pytest.raises(
+            TypeError, match=r"np\.vecdot\(X, v\) or np\.matvec\(A, v\) instead of @"
+        ):
             use()
 
 
@@ -454,7 +467,7 @@ def lazy(seed=0):
 AS_ARRAY = {
     "log": np.log,
     "arithmetic": lambda g: 2.0 - g * 3.0 + g / 2.0,
-    "negative": lambda g: -abs(g) ** 2,
+    "negative": lambda g: -(abs(g) ** 2),
     "compare": lambda g: g > 0.2,
     "two": lambda g: g + g,
     "sum method": lambda g: g.sum(axis=-1),

@@ -50,7 +50,14 @@ def test_unused_sizes_are_unlike_everything(taken, count):
 
 @pytest.mark.parametrize(
     ("given_", "expected"),
-    [(3, (3,)), (np.int64(2), (2,)), ((2, 3), (2, 3)), ([4], (4,)), ((), ()), (np.array([1, 2]), (1, 2))],
+    [
+        (3, (3,)),
+        (np.int64(2), (2,)),
+        ((2, 3), (2, 3)),
+        ([4], (4,)),
+        ((), ()),
+        (np.array([1, 2]), (1, 2)),
+    ],
 )
 def test_as_shape(given_, expected):
     shape = as_shape(given_)

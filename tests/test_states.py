@@ -49,7 +49,8 @@ def test_comparison_between_nodes():
     b = StateArray([0, 0, 1], ("no", "yes"))
     assert (a == b).tolist() == [True, False, True]
     swapped = StateArray([1, 1, 0], ("yes", "no"))  # the same labels in another order
-    assert (swapped == b).tolist() == [True, True, False]  # no no yes against no no yes ...
+    assert swapped.tolist() == b.tolist() == ["no", "no", "yes"]
+    assert (swapped == b).all() and (b == swapped).all() and not (b != swapped).any()
     assert (a == swapped).tolist() == [True, False, True]
 
 
@@ -62,8 +63,19 @@ def test_arithmetic_gives_plain_integers(x):
 
 
 def test_shape_operations_keep_the_labels(x):
-    for part in (x[0], x[..., 1], x[:, None], x.T, x.reshape(-1), x[np.array([1, 0])], x[x == "mid"],
-                 np.take(x, [0, 1], axis=1), x.copy(), np.broadcast_to(x, (4, 2, 3), subok=True), x.squeeze()):
+    for part in (
+        x[0],
+        x[..., 1],
+        x[:, None],
+        x.T,
+        x.reshape(-1),
+        x[np.array([1, 0])],
+        x[x == "mid"],
+        np.take(x, [0, 1], axis=1),
+        x.copy(),
+        np.broadcast_to(x, (4, 2, 3), subok=True),
+        x.squeeze(),
+    ):
         assert isinstance(part, StateArray) and part.states == STATES
     one = x[0, 1]
     assert isinstance(one, StateArray) and one == "mid" and str(one) == "mid"

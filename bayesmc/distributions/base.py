@@ -31,6 +31,13 @@ class Distribution:
         ``log_prob`` has the batch shape; one draw has ``batch_shape + event_shape``.
     is_discrete : bool
         Whether the values are isolated points.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dist: bmc.Distribution = bmc.Normal([0.0, 10.0], 1.0)
+    >>> dist.batch_shape, dist.sample(rng=0, sample_shape=3).shape, dist.mean.tolist()
+    ((2,), (3, 2), [0.0, 10.0])
     """
 
     is_discrete: ClassVar[bool] = False

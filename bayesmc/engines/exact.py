@@ -90,7 +90,9 @@ class Exact:
     ) -> Posterior:
         """Answer a posed problem; ``infer`` is the way in."""
         if resume is not None:
-            raise UnsupportedError("infer: resume= continues sampling; an exact answer has nothing to resume")
+            raise UnsupportedError(
+                "infer: resume= continues sampling; an exact answer has nothing to resume"
+            )
         error = self._why_not(problem)
         if error is not None:
             raise error
@@ -116,9 +118,10 @@ class Exact:
             return BudgetError(f"Exact: {error}; use LikelihoodWeighting(draws)", error.bytes)
         if cost.bytes > self.max_bytes:
             return BudgetError(
-                f"Exact would need about {_size(cost.bytes)} (induced width {cost.induced_width}, largest "
-                f"table {cost.largest_entries:.3g} entries), above max_bytes={_size(self.max_bytes)}; use "
-                "LikelihoodWeighting(draws), or raise Exact(max_bytes=)",
+                f"Exact would need about {readable_bytes(cost.bytes)} (induced width "
+                f"{cost.induced_width}, largest table {cost.largest_entries:.3g} entries), above "
+                f"max_bytes={readable_bytes(self.max_bytes)}; use LikelihoodWeighting(draws), or raise "
+                "Exact(max_bytes=)",
                 int(cost.bytes),
             )
         return None
@@ -186,7 +189,10 @@ def _impossible(prepared: _Prepared, problem: Problem, states: Mapping[Variable,
     for variable, state in states.items():
         entered[variable] = state
         if bound.calibrate(entered).log_z == -np.inf:
-            before = ", ".join(f"{_name(problem, v)}={_label(problem, v, s)!r}" for v, s in list(entered.items())[:-1])
+            before = ", ".join(
+                f"{_name(problem, v)}={_label(problem, v, s)!r}"
+                for v, s in list(entered.items())[:-1]
+            )
             return (
                 f"the evidence has probability zero: {_name(problem, variable)}="
                 f"{_label(problem, variable, state)!r} is impossible"
@@ -196,9 +202,7 @@ def _impossible(prepared: _Prepared, problem: Problem, states: Mapping[Variable,
     return "the evidence has probability zero"
 
 
-def _refuse_invalid(
-    model: Model, invalid: Sequence[InvalidRows], calibrated: Calibrated
-) -> None:
+def _refuse_invalid(model: Model, invalid: Sequence[InvalidRows], calibrated: Calibrated) -> None:
     """Bad parameters at configurations that turn out to be possible are the user's to hear of."""
     for name, element, scope, mask in invalid:
         possible = calibrated.joint(scope) > 0 if scope else np.asarray(True)
@@ -237,13 +241,18 @@ def _treatment(problem: Problem, name: str) -> str:
         return "given"
     seen = problem.observed.get(name)
     if seen is not None:
-        return "observed: a likelihood factor" if node.domain is None else "observed: its axis is sliced"
+        return (
+            "observed: a likelihood factor"
+            if node.domain is None
+            else "observed: its axis is sliced"
+        )
     if not node.is_stochastic and node.domain is None:
         return "passed through to the finite nodes above it"
     return "eliminated"
 
 
-def _size(count: float) -> str:
+def readable_bytes(count: float) -> str:
+    """A number of bytes in words, such as ``4.8 GiB``."""
     for unit, scale in (("TiB", 2**40), ("GiB", 2**30), ("MiB", 2**20), ("KiB", 2**10)):
         if count >= scale:
             return f"{count / scale:.3g} {unit}" if count < 1e6 * 2**40 else f"{count:.3g} bytes"

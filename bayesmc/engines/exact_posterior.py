@@ -222,7 +222,9 @@ class ExactPosterior(Posterior):
             table = self._joint([self._element(n, query.plates, at) for n in alone] + rest)
             part = results[(slice(None),) * len(cards) + at]
             axes = list(range(len(cards)))
-            possible = np.where((table > 0).reshape(cards + (1,) * (part.ndim - len(cards))), part, 0.0)
+            possible = np.where(
+                (table > 0).reshape(cards + (1,) * (part.ndim - len(cards))), part, 0.0
+            )
             out.append(np.tensordot(table, possible, axes=(axes, axes)))
         return np.reshape(np.stack(out), sizes + out[0].shape) if sizes else out[0]
 
@@ -289,11 +291,15 @@ class ExactPosterior(Posterior):
                 elements = range(math.prod(node.plate_shape))
                 columns = np.stack([drawn[(name, e)] for e in elements], axis=-1)
                 values[name] = columns.reshape((count, *node.plate_shape)).astype(node.domain.dtype)
-        rest = [Compute(self.model, n) for name, n in self.model.nodes.items() if name not in values]
+        rest = [
+            Compute(self.model, n) for name, n in self.model.nodes.items() if name not in values
+        ]
         with np.errstate(all="ignore"):
             values = run(rest, Pass(generator, (count,), values)).values
         stored = {
-            name: value[None] if value.ndim > len(self.model[name].value_shape) else value[None, None]
+            name: value[None]
+            if value.ndim > len(self.model[name].value_shape)
+            else value[None, None]
             for name, value in values.items()
         }
         return DrawsPosterior(problem, self.engine, stored, (1, count), independent=True)
@@ -312,7 +318,9 @@ class ExactPosterior(Posterior):
 
     def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
         if resample is None:
-            raise UnsupportedError("to_datatree: an exact posterior has no draws; pass resample=draws")
+            raise UnsupportedError(
+                "to_datatree: an exact posterior has no draws; pass resample=draws"
+            )
         return self.resample(resample, rng).to_datatree()
 
     def __getstate__(self) -> dict[str, Any]:

@@ -209,7 +209,9 @@ class TableWeigh:
             logs = np.log(table.probs.reshape(-1, table.probs.shape[-1]))
         self.states = logs.shape[1]
         # without plates one column will do; with them the state differs from element to element
-        self.logs = np.ascontiguousarray(logs[:, int(seen.value)]) if not self.plates else logs.ravel()
+        self.logs = (
+            np.ascontiguousarray(logs[:, int(seen.value)]) if not self.plates else logs.ravel()
+        )
 
     def __call__(self, state: Pass) -> None:
         index = self.index(state.values)
@@ -283,4 +285,3 @@ def _random_bits(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray
     words = rng.bit_generator.random_raw((count + 1) // 2).view(np.uint32)[:count]
     words >>= np.uint32(32 - _BITS)
     return words.reshape(shape)
-

@@ -48,8 +48,14 @@ class LikelihoodWeighting:
     draws: int = 10_000
 
     def __post_init__(self) -> None:
-        if isinstance(self.draws, bool) or not isinstance(self.draws, (int, np.integer)) or self.draws < 1:
-            raise ValueError(f"LikelihoodWeighting(draws={self.draws!r}): give a positive number of draws")
+        if (
+            isinstance(self.draws, bool)
+            or not isinstance(self.draws, (int, np.integer))
+            or self.draws < 1
+        ):
+            raise ValueError(
+                f"LikelihoodWeighting(draws={self.draws!r}): give a positive number of draws"
+            )
 
     def unsupported(
         self,
@@ -90,7 +96,9 @@ class LikelihoodWeighting:
             kept = names if isinstance(keep, str) else tuple(keep)
             return self._draws(problem, chunks, kept, weighted, resume)
 
-    def _summaries(self, problem: Problem, chunks: Any, names: Any, weighted: bool) -> SumsPosterior:
+    def _summaries(
+        self, problem: Problem, chunks: Any, names: Any, weighted: bool
+    ) -> SumsPosterior:
         sums = Sums(problem.model, names)
         for chunk in chunks:
             sums.add(chunk.values, chunk.log_weight, chunk.batch[0])
@@ -156,7 +164,7 @@ def _joined(
     if not isinstance(old, DrawsPosterior) or not _same_question(old, problem, set(stored)):
         raise UnsupportedError(
             "infer: resume= takes an earlier LikelihoodWeighting posterior of the same net, evidence, "
-            'inputs and keep=, as infer returned it; this one answers another question'
+            "inputs and keep=, as infer returned it; this one answers another question"
         )
     before = old._shape[1]
     joined = {}
@@ -188,11 +196,15 @@ def _same_question(old: DrawsPosterior, problem: Problem, names: set[str]) -> bo
         and was.observed.keys() == problem.observed.keys()
         and all(
             np.array_equal(o.value, problem.observed[n].value)
-            and np.array_equal(o.mask, problem.observed[n].mask)
+            and _same_mask(o.mask, problem.observed[n].mask)
             for n, o in was.observed.items()
         )
         and all(np.array_equal(v, problem.inputs[n]) for n, v in was.inputs.items())
     )
+
+
+def _same_mask(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
 
 
 def _refuse_zero(top: float, draws: int) -> None:
@@ -212,7 +224,7 @@ def _set_evidence(posterior: Any, log_total: float, draws: int, weighted: bool) 
     ess = posterior.weight_ess
     posterior.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
     remedy = "use more draws, or Exact() where explain(net, evidence) says it can"
-    if ess < diagnostics.MIN_WEIGHT_ESS:
+    if ess < min(diagnostics.MIN_WEIGHT_ESS, 0.9 * draws):
         warnings.warn(
             f"likelihood weighting: the {draws} draws are worth only {ess:.1f} equally weighted ones "
             f"(weight_ess); answers and their error bars are unreliable: {remedy}",
@@ -238,5 +250,8 @@ def _treatment(problem: Problem, name: str) -> str:
     seen = problem.observed.get(name)
     if seen is None:
         return "sampled given its parents" + slow
-    return "weights the draws" + (" (missing elements sampled)" if seen.mask is not None else "") + slow
-
+    return (
+        "weights the draws"
+        + (" (missing elements sampled)" if seen.mask is not None else "")
+        + slow
+    )

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
+from typing import Any
 from typing import cast
 
 import numpy as np
@@ -65,7 +66,7 @@ class CliqueTree:
 
     def __init__(
         self,
-        cardinalities: Mapping[Hashable, int] | Sequence[int],
+        cardinalities: Mapping[Any, int] | Sequence[int],
         scopes: Iterable[Sequence[Hashable]],
         elimination: Elimination | None = None,
     ) -> None:
@@ -110,7 +111,7 @@ class CliqueTree:
         return BoundTree(self, given)
 
     def calibrate(
-        self, factors: Sequence[FactorLike], evidence: Mapping[Hashable, int] | None = None
+        self, factors: Sequence[FactorLike], evidence: Mapping[Any, int] | None = None
     ) -> Calibrated:
         """Both passes for these tables and this evidence; see `BoundTree.calibrate`."""
         return self.bind(factors).calibrate(evidence)
@@ -204,7 +205,7 @@ class BoundTree:
         return Potentials(tables, LOG), log_scale
 
     def calibrate(
-        self, evidence: Mapping[Hashable, int] | None = None, *, log_domain: bool = False
+        self, evidence: Mapping[Any, int] | None = None, *, log_domain: bool = False
     ) -> Calibrated:
         """The distribution given that variables are in these states.
 
@@ -255,7 +256,7 @@ class BoundTree:
         return Calibrated(context, log_z, collected, ratios, flat)
 
 
-def _evidence_states(tree: CliqueTree, evidence: Mapping[Hashable, int]) -> dict[int, int]:
+def _evidence_states(tree: CliqueTree, evidence: Mapping[Any, int]) -> dict[int, int]:
     states = {}
     for variable, state in evidence.items():
         k = tree.index.get(variable)

@@ -64,7 +64,9 @@ def write(net: BayesNet, path: str | PathLike[str]) -> None:
     _check_suffix(path)
     model = net.model()
     if model.potentials:
-        raise UnsupportedError(f"write: BIF has no potentials, but the net has {list(model.potentials)}")
+        raise UnsupportedError(
+            f"write: BIF has no potentials, but the net has {list(model.potentials)}"
+        )
     text = format_bif([_bif_node(model, name) for name in model.nodes], net.name or "unknown")
     data = text.encode()
     Path(path).write_bytes(gzip.compress(data, mtime=0) if str(path).endswith(".gz") else data)
@@ -86,7 +88,8 @@ def _bif_node(model: Model, name: str) -> BifNode:
     if table is None:
         fixed = [p for p in parents if model[p].kind == "fixed"]
         raise UnsupportedError(
-            f"write: {name!r} is no table of discrete parents" + (f" (fixed: {fixed})" if fixed else "")
+            f"write: {name!r} is no table of discrete parents"
+            + (f" (fixed: {fixed})" if fixed else "")
         )
     return BifNode(name, states, table.parents, table.probs)
 
@@ -94,4 +97,6 @@ def _bif_node(model: Model, name: str) -> BifNode:
 def _check_suffix(path: str | PathLike[str]) -> None:
     name = str(path).removesuffix(".gz")
     if not name.lower().endswith(".bif"):
-        raise FileFormatError("the name does not end in .bif or .bif.gz, the formats known here", path)
+        raise FileFormatError(
+            "the name does not end in .bif or .bif.gz, the formats known here", path
+        )

@@ -6,4 +6,14 @@ from bayesmc.network.net import BayesNet
 from bayesmc.network.node import Node
 from bayesmc.network.problem import Problem, pose
 
-__all__ = ["BayesNet", "CompiledNode", "Model", "Node", "Observed", "Problem", "pose", "read_evidence", "read_inputs"]
+__all__ = [
+    "BayesNet",
+    "CompiledNode",
+    "Model",
+    "Node",
+    "Observed",
+    "Problem",
+    "pose",
+    "read_evidence",
+    "read_inputs",
+]

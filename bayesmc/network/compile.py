@@ -37,6 +37,7 @@ from bayesmc.shapes import Shape, read_only, unused_sizes
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
 
+
 def compile_model(
     name: str | None,
     declarations: Mapping[str, Declaration],
@@ -59,7 +60,9 @@ def compile_model(
             plates = tuple(sizes[p] for p in declaration.plates)
             if declaration.source == "table":
                 _check_table_parents(declaration, links, nodes)
-            node, value = _discover(declaration, links, plates, model.probe, shape, count, rng, inputs)
+            node, value = _discover(
+                declaration, links, plates, model.probe, shape, count, rng, inputs
+            )
             nodes[key] = node
             model.probe[key] = value
     for key, potential in potentials.items():
@@ -181,9 +184,9 @@ def _discover_stochastic(
         support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
     )
-    error = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
-    if error is not None:
-        raise error
+    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
+    if bad is not None:
+        raise bad
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
 
@@ -198,9 +201,7 @@ def _reachable(
         assert table is not None
         possible = np.broadcast_to(table > 0, (*lead, node.domain.size))
         rank = np.cumsum(possible, axis=-1)
-        turn = (np.arange(math.prod(lead)).reshape(lead) + count) % np.maximum(
-            rank[..., -1], 1
-        )
+        turn = (np.arange(math.prod(lead)).reshape(lead) + count) % np.maximum(rank[..., -1], 1)
         return np.argmax(rank > turn[..., None], axis=-1).astype(node.domain.dtype)
     try:
         return np.asarray(dist.sample_to(rng, lead))
@@ -218,7 +219,9 @@ def _point_in(support: Support, shape: Shape, rng: np.random.Generator) -> np.nd
     low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
     both = np.isfinite(low) & np.isfinite(high)
     with np.errstate(invalid="ignore"):
-        value = np.where(both, low + u * (high - low), np.where(np.isfinite(low), low + u, high - u))
+        value = np.where(
+            both, low + u * (high - low), np.where(np.isfinite(low), low + u, high - u)
+        )
     value = np.where(np.isfinite(value), value, u)
     return np.broadcast_to(np.floor(value) if support.is_discrete else value, shape)
 
@@ -239,7 +242,9 @@ def _discover_deterministic(
     full = batch + plates + event
     value = deterministic_fit(declaration, result, batch, plates, full)
     if value.dtype.kind == "f" and np.isnan(value).any():
-        raise DensityError(f"node {declaration.name!r}: the function returns NaN on reachable values")
+        raise DensityError(
+            f"node {declaration.name!r}: the function returns NaN on reachable values"
+        )
     integral = value.dtype.kind in "biu"
     node = CompiledNode(declaration, links, plates, event, integral, False)
     if declaration.states is not None and event:
@@ -326,7 +331,7 @@ def entry(
         value = probe[parent]
         batch = link.batch_shape(value)
         own = index[len(shape) - len(batch) :]
-        at = tuple(i if n > 1 else 0 for i, n in zip(own, batch, strict=True))
+        at: tuple[Any, ...] = tuple(i if n > 1 else 0 for i, n in zip(own, batch, strict=True))
         picked[parent] = value[(*at, Ellipsis)]  # an array still, also without axes
     return picked
 

@@ -151,5 +151,3 @@ def _unique_labels(array: np.ndarray) -> tuple[list[Any], np.ndarray]:
 
 def _first(array: np.ndarray) -> Any:
     return array.ravel().tolist()[0] if array.size else None
-
-

@@ -45,7 +45,9 @@ def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str,
     for name, value in (evidence or {}).items():
         node = model.nodes.get(name)
         if node is None:
-            raise EvidenceError(f"evidence on {name!r}, which the net does not have{_close(name, model)}")
+            raise EvidenceError(
+                f"evidence on {name!r}, which the net does not have{_close(name, model)}"
+            )
         if not node.is_stochastic:
             raise EvidenceError(
                 f"evidence on {name!r}, which is {_ARTICLE[node.kind]} node and takes none; "
@@ -60,7 +62,9 @@ def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str,
 
 
 def read_inputs(
-    declarations: Mapping[str, Declaration], sizes: Mapping[str, int], inputs: Mapping[str, Any] | None
+    declarations: Mapping[str, Declaration],
+    sizes: Mapping[str, int],
+    inputs: Mapping[str, Any] | None,
 ) -> dict[str, np.ndarray]:
     """Check the values of input nodes; all that are declared must be given."""
     given = dict(inputs or {})
@@ -79,7 +83,9 @@ def read_inputs(
             raise EvidenceError(f"input {name!r} has dtype {value.dtype}; give numbers")
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             at = first_index(~np.isfinite(value))
-            raise EvidenceError(f"input {name!r} is {value[at]} at index {at}; inputs must be finite")
+            raise EvidenceError(
+                f"input {name!r} is {value[at]} at index {at}; inputs must be finite"
+            )
         shape = tuple(sizes[p] for p in declaration.plates) + declaration.event_shape
         if value.shape != shape:
             raise EvidenceError(
@@ -158,7 +164,7 @@ def _observe(node: CompiledNode, value: Any) -> Observed | None:
     filler = array[first_index(~missing)] if array.size else 0
     filled = np.where(missing, filler, array) if missing.any() else array
     stored = store(node, filled)
-    observed = ~every
+    observed = np.asarray(~every)
     _check_support(node, stored, observed)
     return Observed(stored, None if observed.all() else observed)
 
@@ -203,7 +209,9 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
         bad = ~(finite.all(axis=event) if event else finite) & observed
         if bad.any():
             at = first_index(bad)
-            raise EvidenceError(f"evidence on {node.name!r} is {stored[at]}{_at(at)}; it must be finite")
+            raise EvidenceError(
+                f"evidence on {node.name!r} is {stored[at]}{_at(at)}; it must be finite"
+            )
     if node.domain is not None or node.support is None:
         return
     if node.support.event_ndim not in (0, len(node.event_shape)):
@@ -240,7 +248,9 @@ def _shape(value: Any) -> Shape:
 
 def _peek(value: Any) -> str:
     array = np.asarray(value, dtype=object)
-    return repr(array.item()) if array.size == 1 else repr(array.ravel()[:3].tolist())[:-1] + ", ...]"
+    return (
+        repr(array.item()) if array.size == 1 else repr(array.ravel()[:3].tolist())[:-1] + ", ...]"
+    )
 
 
 def _at(index: Shape) -> str:
@@ -249,7 +259,9 @@ def _at(index: Shape) -> str:
 
 def _close(name: str, model: Model) -> str:
     near = difflib.get_close_matches(str(name), model.nodes, n=1)
-    return f" (did you mean {near[0]!r}?)" if near else f"; its nodes are {_some(list(model.nodes))}"
+    return (
+        f" (did you mean {near[0]!r}?)" if near else f"; its nodes are {_some(list(model.nodes))}"
+    )
 
 
 def _some(names: list[str]) -> str:

@@ -6,7 +6,7 @@ with some. A pass is a list of steps, one per node; engines may put faster steps
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -118,6 +118,7 @@ class DrawAndWeigh:
     def __init__(self, model: Model, node: CompiledNode, seen: Observed) -> None:
         self.model, self.node, self.seen = model, node, seen
         assert seen.mask is not None
+        self.elements = seen.mask
         self.mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
         self.plate_axes = tuple(range(-len(node.plates), 0))
 
@@ -127,7 +128,7 @@ class DrawAndWeigh:
         values = np.where(self.mask, self.seen.value, draws)
         values.flags.writeable = False
         density = self.model.log_density(self.node.name, dist, values)
-        state.weigh(np.where(self.seen.mask, density, 0.0).sum(axis=self.plate_axes))
+        state.weigh(np.where(self.elements, density, 0.0).sum(axis=self.plate_axes))
         state.values[self.node.name] = values
 
 
@@ -141,12 +142,13 @@ class Potential:
         state.weigh(self.model.potential(self.name, state.values))
 
 
-def refuse_unsampled(model: Model, observed: Mapping[str, Observed], who: str) -> str | None:
+def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None:
     """Why the forward pass cannot run on a model: a hidden node whose density has no sampler."""
+    given = set(known)
     from_density = [
         node.name
         for node in model.nodes.values()
-        if node.is_stochastic and node.name not in observed and node.unsampled
+        if node.is_stochastic and node.name not in given and node.unsampled
     ]
     if not from_density:
         return None

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Categorical, Distribution, as_distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     BayesmcError,
@@ -23,15 +22,14 @@ from bayesmc.errors import (
     DensityError,
     ModelError,
     ParameterError,
-    PlateError,
     ShapeError,
 )
 from bayesmc.network.align import Aligner
-from bayesmc.network.domain import Domain, domain_with_states, states_domain
+from bayesmc.network.domain import Domain
 from bayesmc.network.elementwise import call_elementwise
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.plates import Gathered, PlateArray
-from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, read_only, unused_sizes
+from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, read_only
 
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
@@ -85,7 +83,13 @@ class CompiledNode:
         """The public, frozen view."""
         states = self.domain.states if self.domain is not None and self.is_discrete else None
         return Node(
-            self.name, self.parents, self.plates, self.event_shape, states, self.is_discrete, self.kind
+            self.name,
+            self.parents,
+            self.plates,
+            self.event_shape,
+            states,
+            self.is_discrete,
+            self.kind,
         )
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
@@ -149,9 +153,7 @@ class Model:
         shape = batch + node.plate_shape + node.event_shape
         return deterministic_fit(node.declaration, result, batch, node.plate_shape, shape), batch
 
-    def log_density(
-        self, name: str, distribution: Distribution, stored: np.ndarray
-    ) -> np.ndarray:
+    def log_density(self, name: str, distribution: Distribution, stored: np.ndarray) -> np.ndarray:
         """Log density of stored values, shape the broadcast of batch and plates; NaN never passes."""
         node = self.nodes[name]
         value = node.domain.to_support(stored) if node.domain is not None else stored
@@ -179,14 +181,18 @@ class Model:
         arguments, batch = arguments_of(links, values)
         plates = tuple(self.sizes[p] for p in potential.plates)
         what = Declaration(f"potential {name}", "function", function=potential.function)
-        result = np.asarray(call(what, arguments, batch + plates, links, wants_array=True), dtype=float)
+        result = np.asarray(
+            call(what, arguments, batch + plates, links, wants_array=True), dtype=float
+        )
         if not broadcasts_to(result.shape, batch + plates):
             raise ShapeError(
                 f"potential {name!r} returns shape {result.shape}, which does not fit "
                 f"{batch + plates}; reduce foreign plates with .sum(plate) or name plates="
             )
         if not (result < np.inf).all():
-            raise DensityError(f"potential {name!r} is NaN or infinite; a log factor must be finite")
+            raise DensityError(
+                f"potential {name!r} is NaN or infinite; a log factor must be finite"
+            )
         full = np.broadcast_to(result, batch + plates)
         if not (plates and total):
             return full
@@ -313,6 +319,7 @@ def invalid_error(
 def deterministic_fit(
     declaration: Declaration, result: Any, batch: Shape, plates: Shape, shape: Shape
 ) -> np.ndarray:
+    """A deterministic node's value broadcast to its full ``shape``; one that does not fit is refused."""
     array = np.asarray(result)
     if isinstance(result, Distribution) or not broadcasts_to(array.shape, shape):
         raise ShapeError(

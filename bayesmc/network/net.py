@@ -15,6 +15,7 @@ import numpy as np
 from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import (
+    DensityError,
     DuplicateNodeError,
     EvidenceError,
     ModelError,
@@ -70,7 +71,9 @@ class BayesNet:
     """
 
     def __init__(
-        self, name: str | None = None, plates: Mapping[str, int | Sequence[Any] | None] | None = None
+        self,
+        name: str | None = None,
+        plates: Mapping[str, int | Sequence[Any] | None] | None = None,
     ) -> None:
         self.name = name
         self._declarations: dict[str, Declaration] = {}
@@ -168,7 +171,9 @@ class BayesNet:
             self._declare_function(name, cpd, parents, plates, states, vectorize, replace)
         else:
             if isinstance(parents, Mapping):
-                raise ModelError(f"node {name!r}: a table lists its parents in the order of its axes")
+                raise ModelError(
+                    f"node {name!r}: a table lists its parents in the order of its axes"
+                )
             self.table(name, parents or (), cpd, states, plates=plates, replace=replace)
 
     def table(
@@ -200,7 +205,9 @@ class BayesNet:
         if probs is None:
             raise ModelError(f"node {name!r}: table() needs probs=")
         if isinstance(parents, str):
-            raise ModelError(f"node {name!r}: parents={parents!r} is one string; give a list of names")
+            raise ModelError(
+                f"node {name!r}: parents={parents!r} is one string; give a list of names"
+            )
         table = np.array(probs, dtype=float)
         if table.ndim != len(parents) + 1:
             raise ModelError(
@@ -227,7 +234,9 @@ class BayesNet:
     def input(self, name: str, plates: str | Sequence[str] = (), event_shape: Any = ()) -> None:
         """Declare a known value, passed as ``inputs=`` to ``infer``, ``sample``, ``log_prob``."""
         plates = self._node_plates(name, plates)
-        self._declare(Declaration(name, "input", (), plates, event_shape=as_shape(event_shape)), False)
+        self._declare(
+            Declaration(name, "input", (), plates, event_shape=as_shape(event_shape)), False
+        )
 
     def potential(
         self,
@@ -277,11 +286,7 @@ class BayesNet:
                 raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")
             node = _widened(node, value)
             stored = store(node, value)
-            inside = node.support is None or node.domain is not None
-            if not (inside or bool(np.all(node.support.contains(stored)))):
-                raise EvidenceError(
-                    f"do({name}=...): {value!r} is outside the support ({node.support.describe()})"
-                )
+            _check_do(name, node, value, stored, model)
             if stored.shape != node.value_shape:
                 raise EvidenceError(f"do({name}=...): shape {stored.shape}, not {node.value_shape}")
             if stored.dtype.kind == "f" and not np.isfinite(stored).all():
@@ -399,7 +404,9 @@ class BayesNet:
                         total = total + _agreement(node, stored[name], values[name])
                     continue
                 if name not in values:
-                    raise EvidenceError(f"log_prob: node {name!r} has no value; give all stochastic nodes")
+                    raise EvidenceError(
+                        f"log_prob: node {name!r} has no value; give all stochastic nodes"
+                    )
                 value = store(node, values[name])
                 total = total + self._one_log_prob(model, name, value, stored, total)
                 stored[name] = value
@@ -467,7 +474,9 @@ class BayesNet:
         """The validated snapshot that engines run on, with plate sizes settled by the data."""
         for plate in plates or {}:
             if plate not in self._sizes:
-                raise PlateError(f"plates= gives {plate!r}; the net's plates are {list(self._sizes)}")
+                raise PlateError(
+                    f"plates= gives {plate!r}; the net's plates are {list(self._sizes)}"
+                )
         sizes = plate_sizes({**self._sizes, **(plates or {})}, self._declarations, evidence, inputs)
         open_plates = [p for p, n in sizes.items() if n is None and self._uses(p)]
         if open_plates:
@@ -498,9 +507,7 @@ class BayesNet:
         names, bound = bind(name, function, parents)
         labels = None if states is None else _states(states)
         own = self._node_plates(name, plates)
-        self._declare(
-            Declaration(name, "function", names, own, labels, bound, vectorize), replace_
-        )
+        self._declare(Declaration(name, "function", names, own, labels, bound, vectorize), replace_)
 
     def _declare(self, declaration: Declaration, replace_: bool) -> None:
         name = declaration.name
@@ -553,7 +560,7 @@ class BayesNet:
         settled.update(zip(open_, stand_in, strict=True))
         try:
             return self._compile(settled, {})
-        except ModelError:
+        except (ModelError, ParameterError, DensityError):  # inputs may have to be integers
             zeros = {
                 n: owned(np.zeros(tuple(settled[p] for p in d.plates) + d.event_shape, dtype=int))
                 for n, d in self._declarations.items()
@@ -601,7 +608,9 @@ class BayesNet:
         result, batch = model.evaluate(name, stored)
         axes = tuple(range(-len(node.plates), 0))
         if result.invalid is not None:
-            counts = np.broadcast_to(np.asarray(total) > -np.inf, np.broadcast_shapes(np.shape(total), batch))
+            counts = np.broadcast_to(
+                np.asarray(total) > -np.inf, np.broadcast_shapes(np.shape(total), batch)
+            )
             error = invalid_error(node, result, counts, counts.shape)
             if error is not None:
                 raise error
@@ -635,6 +644,19 @@ def _widened(node: CompiledNode, value: Any) -> CompiledNode:
     return node if known else replace(node, domain=None)
 
 
+def _check_do(
+    name: str, node: CompiledNode, value: Any, stored: np.ndarray, model: Model
+) -> None:
+    """Refuse a value outside the support, where that is known without the values of inputs."""
+    has_inputs = any(n.kind == "input" for n in model.nodes.values())
+    if node.support is None or node.domain is not None or has_inputs:
+        return
+    if not np.all(node.support.contains(stored)):
+        raise EvidenceError(
+            f"do({name}=...): {value!r} is outside the support ({node.support.describe()})"
+        )
+
+
 def _agreement(node: CompiledNode, computed: np.ndarray, given: Any) -> np.ndarray:
     """0 where a given deterministic value is the computed one, minus infinity elsewhere."""
     own = tuple(range(-len(node.value_shape), 0))
@@ -647,7 +669,9 @@ def _plate_size(plate: str, size: Any) -> int | None:
     if size is None:
         return None
     if isinstance(size, str):
-        raise PlateError(f"plate {plate!r}: {size!r} is one string; give a size or a list of labels")
+        raise PlateError(
+            f"plate {plate!r}: {size!r} is one string; give a size or a list of labels"
+        )
     count = int(size) if isinstance(size, (int, np.integer)) else len(size)
     if count < 0:
         raise PlateError(f"plate {plate!r}: size {count} is negative")
@@ -672,5 +696,8 @@ def _checked_rows(name: str, table: np.ndarray) -> np.ndarray:
 
 def _full(value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The user's own writable array of the full shape."""
-    return value.copy() if value.shape == shape else np.array(np.broadcast_to(value, shape, subok=True), subok=True)
-
+    return (
+        value.copy()
+        if value.shape == shape
+        else np.array(np.broadcast_to(value, shape, subok=True), subok=True)
+    )

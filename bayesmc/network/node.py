@@ -112,7 +112,9 @@ def bind(
 
 def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:
     """Names of positional and of keyword-only arguments without default, and of ``*args``."""
-    positional, keyword, starred = [], [], ""
+    positional: list[str] = []
+    keyword: list[str] = []
+    starred = ""
     for argument in signature.parameters.values():
         if argument.kind is argument.VAR_KEYWORD:
             raise ModelError(
@@ -122,7 +124,9 @@ def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list
         if argument.kind is argument.VAR_POSITIONAL:
             starred = argument.name
         elif argument.default is argument.empty:
-            (keyword if argument.kind is argument.KEYWORD_ONLY else positional).append(argument.name)
+            (keyword if argument.kind is argument.KEYWORD_ONLY else positional).append(
+                argument.name
+            )
     return positional, keyword, starred
 
 

@@ -58,7 +58,9 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
     if not batch:
         return
     # backwards, so that a function that sorts the batch cannot find it sorted both times
-    first = {p: _part(model.probe[p], link.batch_shape(model.probe[p]), 1) for p, link in node.links}
+    first = {
+        p: _part(model.probe[p], link.batch_shape(model.probe[p]), 1) for p, link in node.links
+    }
     arguments, short = arguments_of(node.links, first)
     row = _signature(node, arguments, short + node.plate_shape)
     for a, b in zip(whole.arrays, row.arrays, strict=True):
@@ -225,5 +227,3 @@ def _broadcast_message(
         "every operation must act on the last axes or element by element (axis=-1, np.where for if, "
         "components as v[..., k]), or declare vectorize=True (slow)"
     )
-
-

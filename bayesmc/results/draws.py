@@ -15,8 +15,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import UnknownNodeError, UnsupportedError, missing_extra
-from bayesmc.network import Problem, read_inputs
-from bayesmc.network import forward
+from bayesmc.network import Problem, forward, read_inputs
 from bayesmc.randomness import seed_sequence, stream
 from bayesmc.resampling import systematic
 from bayesmc.results.marginal import Marginal
@@ -81,7 +80,9 @@ class DrawsPosterior(Posterior):
         blocks = [self._full(name, "cov").reshape(*self._shape, -1) for name in names]
         flat = np.concatenate(blocks, axis=-1)
         flat = (flat - self._average(flat)).reshape(-1, flat.shape[-1])
-        weights = np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
+        weights = (
+            np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
+        )
         matrix = (flat * weights[:, None]).T @ flat
         return matrix[0, 0] if matrix.size == 1 else matrix
 
@@ -104,7 +105,9 @@ class DrawsPosterior(Posterior):
             order = [node.plates.index(p) for p in plates if p in node.plates]
             values = self._of(name).transpose(0, 1, *(2 + i for i in order))
             shape = [self.model.sizes[p] if p in node.plates else 1 for p in plates]
-            code = code * node.domain.size + values.reshape(values.shape[:2] + tuple(shape)).astype(np.intp)
+            code = code * node.domain.size + values.reshape(values.shape[:2] + tuple(shape)).astype(
+                np.intp
+            )
         cards = tuple(node.domain.size for node in nodes if node.domain is not None)
         total = math.prod(cards)
         flat = np.broadcast_to(code, self._shape + sizes).reshape(math.prod(self._shape), -1)
@@ -172,7 +175,9 @@ class DrawsPosterior(Posterior):
         draws = self._full(name, "marginal")
         flat = draws.reshape((-1, *draws.shape[2:]))
         flat = flat[(slice(None), *(index if isinstance(index, tuple) else (index,)))]
-        weights = np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
+        weights = (
+            np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
+        )
         return Marginal(name, flat, weights)
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
@@ -185,12 +190,18 @@ class DrawsPosterior(Posterior):
         stored = {
             name: values
             if values.shape[:2] == (1, 1)
-            else values[chain if values.shape[0] > 1 else 0, draw if values.shape[1] > 1 else 0][None]
+            else values[chain if values.shape[0] > 1 else 0, draw if values.shape[1] > 1 else 0][
+                None
+            ]
             for name, values in self._stored.items()
         }
         # duplicates of few heavy draws are not independent, so their error is the chain's business
         return DrawsPosterior(
-            self._live("resample"), self.engine, stored, (1, count), independent=self.weights is None
+            self._live("resample"),
+            self.engine,
+            stored,
+            (1, count),
+            independent=self.weights is None,
         )
 
     def predict(
@@ -205,7 +216,9 @@ class DrawsPosterior(Posterior):
         wanted = (names,) if isinstance(names, str) else tuple(names)
         for name in wanted:
             if not self._node(name).is_stochastic and self._node(name).kind != "deterministic":
-                raise UnsupportedError(f"predict({name!r}): {self._node(name).kind} nodes are not drawn")
+                raise UnsupportedError(
+                    f"predict({name!r}): {self._node(name).kind} nodes are not drawn"
+                )
         seed = seed_sequence(rng)
         source = self if self.weights is None else self.resample(draws, stream(seed, 1))
         return source._predict(problem, wanted, inputs, plates or {}, stream(seed, 0))
@@ -238,9 +251,8 @@ class DrawsPosterior(Posterior):
                 steps.append(forward.step_for(model, node, {}))
             else:
                 values[name] = self._of(name)
-        refused = forward.refuse_unsampled(
-            model, {n: problem.observed.get(n) for n in model.nodes if n not in anew}, "predict"  # type: ignore[misc]
-        )
+        kept = [n for n in model.nodes if n not in anew]
+        refused = forward.refuse_unsampled(model, kept, "predict")
         if refused:
             raise UnsupportedError(refused)
         with marking_invalid(), np.errstate(all="ignore"):
@@ -263,7 +275,9 @@ class DrawsPosterior(Posterior):
             raise missing_extra("arviz-base", "arviz") from None
         free = [n for n in self.names if self._is_free(n)]
         groups = {"posterior": {n: np.asarray(self[n]) for n in free}}
-        seen = {n: self.model[n].decode(o.value) for n, o in self._live("to_datatree").observed.items()}
+        seen = {
+            n: self.model[n].decode(o.value) for n, o in self._live("to_datatree").observed.items()
+        }
         if seen:
             groups["observed_data"] = {n: np.asarray(v) for n, v in seen.items()}
         dims = {n: [*self.model[n].plates, *self._event_dims(n)] for n in [*free, *seen]}
@@ -297,10 +311,13 @@ class DrawsPosterior(Posterior):
             return np.asarray(values[0, 0], dtype=float)
         return np.asarray(diagnostics.weighted_mean(values, self.weights))
 
-    def _evaluate(self, function: Any, plates: Plates, names: Mapping[str, str] | None) -> np.ndarray:
+    def _evaluate(
+        self, function: Any, plates: Plates, names: Mapping[str, str] | None
+    ) -> np.ndarray:
         query = Query(self.model, function, plates, names)
         stored = {
-            n: np.broadcast_to(self._of(n), self._shape + self.model[n].value_shape) for n in query.nodes
+            n: np.broadcast_to(self._of(n), self._shape + self.model[n].value_shape)
+            for n in query.nodes
         }
         return query(stored, self._shape)
 

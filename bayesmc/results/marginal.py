@@ -23,6 +23,17 @@ class Marginal:
         Weights that sum to 1.
     states : tuple or None
         For a finite discrete node.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Normal(0.0, 1.0))
+    >>> marginal = bmc.infer(net, engine=bmc.LikelihoodWeighting(20_000), rng=0).marginal("x")
+    >>> heights, edges = marginal.histogram(bins=30)
+    >>> bool(abs(marginal.density(0.0) - 0.3989) < 0.02)
+    True
     """
 
     name: str
@@ -34,7 +45,9 @@ class Marginal:
     def probabilities(self) -> np.ndarray:
         """Probabilities of the states, shape ``(*plates, states)``."""
         if self.states is None:
-            raise UnsupportedError(f"marginal({self.name!r}): a continuous node has no table of states")
+            raise UnsupportedError(
+                f"marginal({self.name!r}): a continuous node has no table of states"
+            )
         return self.weights
 
     def histogram(self, bins: Any = 40, range: Any = None, density: bool = True) -> tuple[Any, Any]:  # noqa: A002
@@ -68,7 +81,9 @@ class Marginal:
 
     def _scalar(self, what: str) -> np.ndarray:
         if self.states is not None:
-            raise UnsupportedError(f"marginal({self.name!r}).{what}: use .probabilities of a discrete node")
+            raise UnsupportedError(
+                f"marginal({self.name!r}).{what}: use .probabilities of a discrete node"
+            )
         if self.values.ndim != 1:
             raise UnsupportedError(
                 f"marginal({self.name!r}).{what}: the node has shape {self.values.shape[1:]}; ask for one "

@@ -31,6 +31,17 @@ class Posterior:
         Log probability (density) of the evidence.
     log_marginal_likelihood_mcse : float or None
         Its Monte Carlo standard error; 0 where exact.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("die", bmc.DiscreteUniform(1, 6))
+    >>> net.add("odd", lambda die: die % 2 == 1)
+    >>> posterior = bmc.infer(net)
+    >>> high = posterior.probability(lambda die, odd: odd & (die > 1))
+    >>> float(posterior.mean("die").round(6)), float(high.round(6))
+    (3.5, 0.333333)
     """
 
     log_marginal_likelihood: float | None = None
@@ -199,7 +210,8 @@ class Posterior:
             axes.append([str(s) for s in node.domain.states])
         shape = tuple(len(a) for a in axes)
         return [
-            node.name + (f"[{', '.join(a[i] for a, i in zip(axes, at, strict=True))}]" if at else "")
+            node.name
+            + (f"[{', '.join(a[i] for a, i in zip(axes, at, strict=True))}]" if at else "")
             for at in np.ndindex(shape)
         ]
 

@@ -39,7 +39,9 @@ class Query:
         self.plates = (plates,) if isinstance(plates, str) else tuple(plates)
         for plate in self.plates:
             if plate not in model.sizes:
-                raise UnknownNodeError(f"query: no plate {plate!r}; the plates are {list(model.sizes)}")
+                raise UnknownNodeError(
+                    f"query: no plate {plate!r}; the plates are {list(model.sizes)}"
+                )
         if isinstance(function, str):
             self.nodes: tuple[str, ...] = (function,)
             self.function: Callable[..., Any] = _identity
@@ -73,13 +75,19 @@ class Query:
         array = np.asarray(result)
         lead = batch + self.plate_shape
         short = array.shape[: len(lead)]
-        if array.ndim < len(batch) or not broadcasts_to(short, lead) or array.shape[: len(batch)] != batch:
+        if (
+            array.ndim < len(batch)
+            or not broadcasts_to(short, lead)
+            or array.shape[: len(batch)] != batch
+        ):
             raise ShapeError(
                 f"query: the function returns shape {array.shape} for draws of batch shape {batch}; keep "
                 "the leading axes (reduce with axis=-1, take components as v[..., k])"
             )
         if array.ndim < len(lead):
-            raise ShapeError(f"query: the result's shape {array.shape} lacks the plates {self.plates}")
+            raise ShapeError(
+                f"query: the result's shape {array.shape} lacks the plates {self.plates}"
+            )
         if array.dtype.kind not in "biufc":
             raise ShapeError(f"query: the function returns {array.dtype} values; return numbers")
         return np.broadcast_to(array, lead + array.shape[len(lead) :])

@@ -151,7 +151,7 @@ class _Group:
         return _Group((*self.names, name), (*self.cards, card))
 
     def add(self, values: Mapping[str, np.ndarray], weights: np.ndarray) -> None:
-        code = values[self.names[0]].astype(np.uint16 if self.size <= 1 << 16 else np.intp)
+        code: Any = values[self.names[0]].astype(np.uint16 if self.size <= 1 << 16 else np.intp)
         for name, card in zip(self.names[1:], self.cards[1:], strict=True):
             code *= card
             code += values[name]
@@ -260,7 +260,8 @@ class SumsPosterior(Posterior):
         counts, heavy = self._sums.counts(what)
         p = counts / total
         if node.domain.labels is not None:
-            return np.sqrt(heavy * (1 - p) ** 2 + (squares - heavy) * p**2) / total
+            rest = np.maximum(squares - heavy, 0.0)  # a rounding below zero otherwise
+            return np.sqrt(heavy * (1 - p) ** 2 + rest * p**2) / total
         numbers = np.asarray(node.domain.numbers, dtype=float)
         centred = numbers - (p @ numbers)[..., None]
         return np.sqrt((heavy * centred**2).sum(axis=-1)) / total

@@ -22,6 +22,15 @@ class Summary:
     columns : dict
         Column name -> array, one entry per row.
     title : str
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("rain", bmc.Bernoulli(0.2), states=("no", "yes"))
+    >>> summary = bmc.infer(net).summary()
+    >>> summary.names, float(summary["rain[yes]"]["mean"].__round__(6))
+    (('rain[no]', 'rain[yes]'), 0.2)
     """
 
     names: tuple[str, ...]
@@ -35,7 +44,9 @@ class Summary:
         if key in self.names:
             row = self.names.index(key)
             return {column: float(values[row]) for column, values in self.columns.items()}
-        raise UnknownNodeError(f"summary: no row or column {key!r}; columns are {list(self.columns)}")
+        raise UnknownNodeError(
+            f"summary: no row or column {key!r}; columns are {list(self.columns)}"
+        )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -58,7 +69,10 @@ class Summary:
         widths = [max(len(r[c]) for r in [head, *rows]) for c in range(len(head))]
         lines = [
             "  ".join(
-                [row[0].ljust(widths[0]), *(t.rjust(w) for t, w in zip(row[1:], widths[1:], strict=True))]
+                [
+                    row[0].ljust(widths[0]),
+                    *(t.rjust(w) for t, w in zip(row[1:], widths[1:], strict=True)),
+                ]
             ).rstrip()
             for row in [head, *rows]
         ]

@@ -19,16 +19,7 @@ from tests.network.zoo import ZOO, build
 # ---- no false alarms ----------------------------------------------------------------------------
 
 
-BROKEN = {"elementwise_families": "families of different parameter counts under vectorize=True"}
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        pytest.param(n, marks=pytest.mark.xfail(strict=True, reason=BROKEN[n])) if n in BROKEN else n
-        for n in ZOO
-    ],
-)
+@pytest.mark.parametrize("name", ZOO)
 def test_good_models_pass(name):
     net, inputs = build(name)
     net.validate(inputs)
@@ -83,7 +74,6 @@ def test_mixing_the_batch_is_caught(mix, position):
         net.validate()
 
 
-@pytest.mark.xfail(strict=True, reason="a probe whose rows are sorted by chance hides a sort")
 def test_sorting_the_batch_is_caught():
     """Two values are in order by chance every second time, so many positions are tried."""
     for position in range(8):
@@ -426,7 +416,6 @@ def test_what_is_no_distribution_is_refused():
             net.validate()
 
 
-@pytest.mark.xfail(strict=True, reason="a string counts as a deterministic value")
 def test_text_is_no_value():
     net = bmc.BayesNet()
     net.add("x", lambda: "text")

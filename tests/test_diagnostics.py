@@ -1,0 +1,127 @@
+"""Effective sizes, Monte Carlo errors and tails against closed forms and ArviZ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import scipy.special
+from arviz_stats.base import array_stats
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from bayesmc import diagnostics
+
+logs = hnp.arrays(float, st.integers(1, 20), elements=st.floats(-700, 700) | st.just(-np.inf))
+
+
+@given(logs)
+def test_log_sum_exp_is_scipys(values):
+    got = diagnostics.log_sum_exp(values)
+    with np.errstate(divide="ignore"):
+        np.testing.assert_allclose(got, scipy.special.logsumexp(values), rtol=1e-12)
+
+
+def test_log_sum_exp_edges_and_axes():
+    assert diagnostics.log_sum_exp(np.empty(0)) == -np.inf
+    assert diagnostics.log_sum_exp(np.full(3, -np.inf)) == -np.inf
+    assert diagnostics.log_sum_exp(np.array([1e5, 1e5])) == pytest.approx(1e5 + np.log(2))
+    values = np.random.default_rng(0).normal(size=(3, 4, 2)) * 100
+    for axis in (0, -1, (0, 2)):
+        np.testing.assert_allclose(
+            diagnostics.log_sum_exp(values, axis=axis), scipy.special.logsumexp(values, axis=axis)
+        )
+
+
+def test_weights_and_their_ess():
+    lw = np.array([[0.0, 0.0, -np.inf, 0.0]])
+    assert diagnostics.weight_ess(lw) == pytest.approx(3.0)
+    assert diagnostics.weight_ess(lw - 5000.0) == pytest.approx(3.0)
+    weights = diagnostics.normalised(lw + 5000.0)
+    np.testing.assert_allclose(weights, [[1 / 3, 1 / 3, 0, 1 / 3]])
+    one = np.array([[0.0, -800.0, -900.0]])
+    assert diagnostics.weight_ess(one) == pytest.approx(1.0)
+
+
+def test_weighted_moments_by_hand():
+    values = np.array([[[1.0, 10.0], [2.0, 10.0], [4.0, 10.0]]])
+    weights = np.array([[0.5, 0.25, 0.25]])
+    np.testing.assert_allclose(diagnostics.weighted_mean(values, weights), [2.0, 10.0])
+    np.testing.assert_allclose(diagnostics.weighted_mean(values, None), [7 / 3, 10.0])
+    error = np.sqrt(0.25 * 1 + 0.0625 * 0 + 0.0625 * 4)
+    np.testing.assert_allclose(diagnostics.weighted_mcse(values, weights), [error, 0.0])
+    ess = diagnostics.weighted_ess(values, weights)
+    np.testing.assert_allclose(ess, [1.5 / error**2, 1 / 0.375])
+
+
+def test_weighted_mcse_is_the_error_seen():
+    """Spread over 400 repetitions of an importance-sampled mean against the mean of its mcse.
+
+    A chi-square of 399 degrees of freedom keeps the ratio within 15 % but for about 1e-4.
+    """
+    rng = np.random.default_rng(1)
+    means, errors = [], []
+    for _ in range(400):
+        x = rng.normal(size=(1, 500))
+        weights = diagnostics.normalised(0.7 * x)  # tilts N(0, 1) to N(0.7, 1)
+        means.append(float(diagnostics.weighted_mean(x, weights)))
+        errors.append(float(diagnostics.weighted_mcse(x, weights)))
+    assert np.mean(means) == pytest.approx(0.7, abs=5 * np.std(means) / 20)
+    assert np.std(means) / np.mean(errors) == pytest.approx(1.0, abs=0.15)
+    # negative control: the unweighted formula is far off
+    assert abs(np.std(means) / (1 / np.sqrt(500)) - 1) > 0.15
+
+
+@pytest.mark.parametrize("k", [0.2, 0.5, 0.9])
+def test_pareto_k_finds_the_shape_of_a_pareto_tail(k):
+    """Weights with a generalised Pareto tail of known shape; the fit's spread at 20 000 is about 0.05."""
+    u = np.random.default_rng(3).random(20_000)
+    weights = np.log1p(np.expm1(-k * np.log(u)) / k)  # 1 + a GPD of shape k
+    assert diagnostics.pareto_k(weights, len(weights)) == pytest.approx(k, abs=0.2)
+    _, reference = array_stats.psislw(-weights)
+    assert diagnostics.pareto_k(weights, len(weights)) == pytest.approx(float(reference), abs=0.05)
+
+
+def test_pareto_k_needs_only_the_tail():
+    lw = np.random.default_rng(4).normal(size=50_000) * 1.5
+    tail = np.sort(lw)[-5 * diagnostics.tail_length(len(lw)) :]
+    assert diagnostics.pareto_k(tail, len(lw)) == pytest.approx(diagnostics.pareto_k(lw, len(lw)))
+    assert diagnostics.pareto_k(lw + 1000.0, len(lw)) == pytest.approx(diagnostics.pareto_k(lw, len(lw)), abs=1e-6)
+
+
+def test_pareto_k_of_equal_and_of_few_weights():
+    assert diagnostics.pareto_k(np.zeros(1000), 1000) == -np.inf
+    assert np.isnan(diagnostics.pareto_k(np.arange(10.0), 10))
+
+
+def test_tail_length_is_vehtaris():
+    assert diagnostics.tail_length(100) == 20  # 0.2 n
+    assert diagnostics.tail_length(10_000) == 300  # 3 sqrt n
+    assert [diagnostics.tail_length(n) for n in (225, 226)] == [45, 46]
+
+
+@pytest.mark.parametrize("kind", ["ess", "rhat", "mcse"])
+def test_chain_statistics_are_arvizs(kind):
+    rng = np.random.default_rng(5)
+    values = np.cumsum(rng.normal(size=(4, 200, 2, 3)), axis=1) * 0.1 + rng.normal(size=(4, 200, 2, 3))
+    got = diagnostics.chain_statistic(kind, values)
+    assert got.shape == (2, 3)
+    for i in np.ndindex(2, 3):
+        one = getattr(array_stats, kind)(values[(..., *i)], chain_axis=0, draw_axis=1)
+        np.testing.assert_allclose(got[i], one, rtol=1e-10)
+
+
+def test_chain_statistics_of_constants_and_of_too_few():
+    constant = np.full((2, 50, 3), 7.0)
+    assert diagnostics.chain_statistic("ess", constant).tolist() == [100.0] * 3
+    assert diagnostics.chain_statistic("mcse", constant).tolist() == [0.0] * 3
+    assert np.isnan(diagnostics.chain_statistic("rhat", constant)).all()
+    assert np.isnan(diagnostics.chain_statistic("ess", np.zeros((2, 3, 2)))).all()
+
+
+def test_rhat_sees_chains_that_disagree():
+    rng = np.random.default_rng(6)
+    good = rng.normal(size=(4, 500))
+    bad = good + np.array([[0.0], [0.0], [0.0], [3.0]])
+    assert diagnostics.chain_statistic("rhat", good) < 1.02
+    assert diagnostics.chain_statistic("rhat", bad) > 1.3
