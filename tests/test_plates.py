@@ -355,7 +355,6 @@ def test_other_ufuncs_and_clip():
     assert v.sizes == {"k": 3} and "k: 3" in repr(v)
 
 
-@pytest.mark.xfail(strict=True, reason="np.clip takes None for no bound")
 def test_clip_with_one_bound():
     v = PlateArray(np.array([-1.5, 0.5]), ("k",))
     assert np.clip(v, 0.0, None).array.tolist() == [0.0, 0.5]
@@ -431,16 +430,19 @@ def test_matmul_points_at_vecdot_and_matvec():
             use()
 
 
-@pytest.mark.parametrize("option", [{"where": True}, {"out": np.empty(3)}])
-def test_ufunc_options_that_bypass_alignment_are_refused(option):
+def test_ufunc_options_that_bypass_alignment_are_refused():
     v = PlateArray(np.array([1.0, 2.0, 3.0]), ("k",))
-    with pytest.raises(TypeError, match=r"np\.exp on a parent with foreign plates takes no"):
-        np.exp(v, **option)
+    with pytest.raises(TypeError, match=r"np\.exp on a parent with foreign plates takes no where="):
+        np.exp(v, where=True)
+    target = np.zeros(3)
+    with pytest.raises(ValueError, match="read-only"):
+        np.exp(v, out=target)
+    assert not target.any()
 
 
-def test_in_place_arithmetic_is_refused_and_changes_nothing():
+def test_in_place_arithmetic_is_refused_with_the_remedy():
     v = PlateArray(np.array([1.0, 2.0, 3.0]), ("k",))
-    with pytest.raises(TypeError):
+    with pytest.raises(ValueError, match=r"a parent is read-only; write v = v \+ 1"):
         v += 1
     assert v.array.tolist() == [1.0, 2.0, 3.0]
 

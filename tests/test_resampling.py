@@ -23,7 +23,9 @@ def test_counts_are_the_floor_or_ceiling_of_their_expectation(weights, draws, se
     counts = np.bincount(picked, minlength=len(weights))
     expected = draws * weights / weights.sum()
     # between neighbours' edges rounding may cost one more in floating point
-    assert (counts >= np.floor(expected - 1e-9)).all() and (counts <= np.ceil(expected + 1e-9)).all()
+    assert (counts >= np.floor(expected - 1e-9)).all() and (
+        counts <= np.ceil(expected + 1e-9)
+    ).all()
     assert counts[weights == 0].sum() == 0
 
 

@@ -25,10 +25,22 @@ class Choices:
     ----------
     integer : callable
         ``integer(low, high)`` chooses an integer, both ends included; ``low`` is the simplest.
+    group : callable, optional
+        ``group(make)`` returns ``make(choices)`` and marks what it chooses as belonging together, so that
+        shrinking can drop it as a whole.
     """
 
-    def __init__(self, integer: Callable[[int, int], int]) -> None:
+    def __init__(
+        self,
+        integer: Callable[[int, int], int],
+        group: Callable[[Callable[[Choices], Any]], Any] | None = None,
+    ) -> None:
         self.integer = integer
+        self._group = group
+
+    def group(self, make: Callable[[Choices], Any]) -> Any:
+        """``make(choices)``, as one part that can be left out."""
+        return make(self) if self._group is None else self._group(make)
 
     def flag(self, chance: float = 0.5) -> bool:
         """True with about this chance; False is the simple answer."""

@@ -220,7 +220,7 @@ def _compare_states(table: _Table, posterior: Any, exact: Any, name: str, node: 
     for at in np.ndindex(value.shape):
         p, q, n = float(value[at]), float(found[at]), float(count[(*at[:-1], 0)])
         what = f"node {name!r}{_element(at[:-1])}, state {node.domain.states[at[-1]]!r}"
-        if p == 0.0 or not np.isfinite(n) or not np.isfinite(q):
+        if p in (0.0, 1.0) or not np.isfinite(n) or not np.isfinite(q):
             if p == 0.0 and table.tolerance < 1e-6:
                 exactly = table.is_close(q, 0.0) if not np.isfinite(n) else q == 0.0
                 table.add(what, q, p, 0.0 if exactly else np.inf, 1.0 if exactly else 0.0)

@@ -242,8 +242,9 @@ class _Builder:
         self.left = float(options.configurations)
         self.story: list[str] = []
 
-    def add(self, number: int) -> None:
+    def add(self, number: int, choices: Choices) -> None:
         """Declare one more node, as far as the configurations allow."""
+        self.choices = choices
         name = f"v{number}"
         plates = self._plates()
         kind = self.choices.pick(self._kinds())
@@ -417,11 +418,13 @@ class _Builder:
 def build_net(choices: Choices, options: NetOptions) -> BayesNet:
     """``random_net`` from any source of choices."""
     builder = _Builder(choices, options)
-    count = choices.integer(*options.nodes)
-    for number in range(count):
-        if number and builder.left < 2:
+    fewest, most = options.nodes
+    for number in range(most):
+        # asked before every node, not once for their number, so that any node can be shrunk away
+        more = number < fewest or choices.integer(0, most - fewest) > 0
+        if not more or (number and builder.left < 2):
             break
-        builder.add(number)
+        choices.group(lambda inner, n=number: builder.add(n, inner))  # type: ignore[misc]
     builder.net.name = "; ".join(builder.story)
     return builder.net
 

@@ -115,7 +115,7 @@ def enumerate_posterior(
     A hidden continuous scalar takes ``points`` values ``ppf(Phi(z))`` with ``z`` on an even grid over
     +-6.5, weighted by the normal density (the trapezoidal rule in normal scores, whose error falls
     exponentially for smooth integrands). With ``points=32`` log evidence and means are good to about
-    1e-6 where the likelihood is no narrower than a third of the node's conditional distribution; the
+    1e-5 where the likelihood is no narrower than a third of the node's conditional distribution; the
     result's ``accuracy`` estimates it. Moments of heavy tails are cut at those scores.
 
     Hidden nodes that cannot be enumerated (infinitely many values, vectors) are left out where nothing
@@ -201,6 +201,7 @@ class _Configurations:
             raise ZeroProbabilityError("enumerate_posterior: the evidence has probability zero")
         if (self.invalid & (self.log_weight > -np.inf)).any():
             raise self.problems[0]
+        self.take(np.flatnonzero(self.log_weight > -np.inf))
         stored = {n: self.full(n, v) for n, v in self.values.items()}
         weights = np.exp(self.log_weight - total)
         return Enumerated(self.model, float(total), weights, stored, accuracy)

@@ -81,7 +81,11 @@ def evidence_for(net: BayesNet, chance: float = 0.4) -> SearchStrategy[dict[str,
 
 
 def _drawn(draw: Any, strategies: Any) -> Choices:
-    return Choices(lambda low, high: draw(strategies.integers(low, high)))
+    def group(make: Any) -> Any:
+        part = strategies.composite(lambda inner: make(_drawn(inner, strategies)))
+        return draw(part())
+
+    return Choices(lambda low, high: draw(strategies.integers(low, high)), group)
 
 
 def _strategies() -> Any:

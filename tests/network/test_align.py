@@ -99,7 +99,9 @@ def test_two_shared_and_two_foreign_plates_in_every_order(sizes):
                     expected = sum(
                         pick(value, parent, {**where, "c": c, "d": k}, b) for k in range(sizes["d"])
                     )
-                    np.testing.assert_allclose(np.broadcast_to(total, both.shape)[(*b, *own)], expected)
+                    np.testing.assert_allclose(
+                        np.broadcast_to(total, both.shape)[(*b, *own)], expected
+                    )
 
 
 # ---- whole nets against a loop ------------------------------------------------------------------
@@ -227,11 +229,15 @@ def test_vector_parents_in_own_and_foreign_plates():
         + np.einsum("pj,ngj->np", design, draws["effect"])
     )
     total = -0.5 * ((draws["y"] - loc) ** 2).sum(-1)
-    total += -0.5 * ((draws["next"] - np.einsum("ij,npj->npi", a, draws["state"])) ** 2).sum((-1, -2))
+    total += -0.5 * ((draws["next"] - np.einsum("ij,npj->npi", a, draws["state"])) ** 2).sum(
+        (-1, -2)
+    )
     for name, axes in (("beta", -1), ("state", (-1, -2)), ("effect", (-1, -2))):
         total += -0.5 * (draws[name] ** 2).sum(axes)
     count = 2 + 8 + 6 + 4 + 8
-    np.testing.assert_allclose(net.log_prob(draws), total - 0.5 * count * np.log(2 * np.pi), rtol=1e-11)
+    np.testing.assert_allclose(
+        net.log_prob(draws), total - 0.5 * count * np.log(2 * np.pi), rtol=1e-11
+    )
 
 
 def test_index_by_inputs_constants_and_foreign_parents():
@@ -253,7 +259,9 @@ def test_index_by_inputs_constants_and_foreign_parents():
     np.testing.assert_allclose(draws["total"], picked.sum(1), rtol=1e-12)
     with pytest.raises(ValueError, match=r"node 'from_input': .*index 3 is outside plate 'school'"):
         net.sample(2, rng=0, inputs={"which": [0, 1, 2, 3]})
-    with pytest.raises(ValueError, match=r"node 'from_input': .*index -1 is outside plate 'school'"):
+    with pytest.raises(
+        ValueError, match=r"node 'from_input': .*index -1 is outside plate 'school'"
+    ):
         net.sample(2, rng=0, inputs={"which": [0, 1, 2, -1]})
 
 

@@ -39,10 +39,16 @@ def test_values_and_labels_of_every_kind(net):
     assert seen["spin"].value.tolist() == [0, 1, 0]
     assert seen["die"].value.tolist() == [0, 5, 2]
     assert seen["x"].value.dtype == float
-    for labels in (np.array(["low", "high", "mid"]), np.array(["low", "high", "mid"], dtype=object)):
+    for labels in (
+        np.array(["low", "high", "mid"]),
+        np.array(["low", "high", "mid"], dtype=object),
+    ):
         assert observed(net, zs=labels)["zs"].value.tolist() == [0, 2, 1]
     draws = net.sample(4, rng=0, inputs={"u": 0.0})  # what a net gives, it takes
-    one = {name: draws[name][0] for name in ("z", "zs", "spin", "die", "x", "xs", "v", "count", "share")}
+    one = {
+        name: draws[name][0]
+        for name in ("z", "zs", "spin", "die", "x", "xs", "v", "count", "share")
+    }
     again = observed(net, **one)
     assert again["zs"].value.tolist() == draws["zs"][0].codes.tolist()
 
@@ -51,7 +57,11 @@ def test_values_and_labels_of_every_kind(net):
     ("name", "value", "mask"),
     [
         ("xs", [[1.0, np.nan], [np.nan, np.nan], [2.0, 3.0]], [[1, 0], [0, 0], [1, 1]]),
-        ("xs", np.ma.masked_array(np.zeros((3, 2)), [[0, 1], [1, 1], [0, 0]]), [[1, 0], [0, 0], [1, 1]]),
+        (
+            "xs",
+            np.ma.masked_array(np.zeros((3, 2)), [[0, 1], [1, 1], [0, 0]]),
+            [[1, 0], [0, 0], [1, 1]],
+        ),
         ("die", [1, None, 6], [1, 0, 1]),
         ("die", [1, np.nan, 6], [1, 0, 1]),
         ("die", np.ma.masked_array([1, 77, 6], [0, 1, 0]), [1, 0, 1]),
@@ -79,8 +89,11 @@ def test_wholly_unobserved(net, name, value):
 
 def test_draws_of_a_partly_observed_node_keep_what_was_seen(net):
     posterior = bmc.infer(
-        net, {"xs": [[1.0, np.nan], [np.nan, np.nan], [2.0, 3.0]], "count": [4, np.nan, 0]},
-        inputs={"u": 0.0}, engine=bmc.LikelihoodWeighting(200), rng=0,
+        net,
+        {"xs": [[1.0, np.nan], [np.nan, np.nan], [2.0, 3.0]], "count": [4, np.nan, 0]},
+        inputs={"u": 0.0},
+        engine=bmc.LikelihoodWeighting(200),
+        rng=0,
     )
     draws = posterior["xs"]
     assert draws.shape == (1, 200, 3, 2)
@@ -102,7 +115,10 @@ def test_counts_stay_integers_and_may_gather():
 REFUSED = {
     "unknown": ({"zz": 1}, r"evidence on 'zz', which the net does not have"),
     "close": ({"rat": 1}, r"evidence on 'rat'.*did you mean 'rate'"),
-    "deterministic": ({"double": 1.0}, r"evidence on 'double', which is a deterministic node and takes none; observe"),
+    "deterministic": (
+        {"double": 1.0},
+        r"evidence on 'double', which is a deterministic node and takes none; observe",
+    ),
     "input": ({"u": 1.0}, r"evidence on 'u', which is an input node"),
     "label": ({"z": "lo"}, r"'lo' is not a state; the states are 'low', 'mid', 'high'"),
     "position": ({"z": 1}, r"1 is not a state.*; give the label, not its position"),
@@ -112,18 +128,42 @@ REFUSED = {
     "die fraction": ({"die": [1.5, 1, 2]}, r"'die'.*1\.5 is not among the values"),
     "text for number": ({"x": "high"}, r"evidence on 'x': 'high' is not among its values"),
     "text for numbers": ({"die": ["a", 1, 2]}, r"evidence on 'die'"),
-    "shape": ({"xs": np.zeros((2, 3))}, r"evidence on 'xs' has shape \(2, 3\).*p=3, q=2.*make \(3, 2\)"),
+    "shape": (
+        {"xs": np.zeros((2, 3))},
+        r"evidence on 'xs' has shape \(2, 3\).*p=3, q=2.*make \(3, 2\)",
+    ),
     "scalar for plate": ({"die": 3}, r"evidence on 'die' has shape \(\).*p=3.*make \(3,\)"),
-    "plate for scalar": ({"x": [1.0, 2.0]}, r"evidence on 'x' has shape \(2,\).*plates \(none\).*make \(\)"),
+    "plate for scalar": (
+        {"x": [1.0, 2.0]},
+        r"evidence on 'x' has shape \(2,\).*plates \(none\).*make \(\)",
+    ),
     "batch": ({"die": [[1, 2, 3]] * 4}, r"evidence on 'die' has shape \(4, 3\)"),
     "lone NaN": ({"x": np.nan}, r"evidence on 'x' is nan, which means nothing.*leave it out"),
-    "infinity": ({"xs": np.full((3, 2), np.inf)}, r"evidence on 'xs' is inf at index \(0, 0\); it must be finite"),
+    "infinity": (
+        {"xs": np.full((3, 2), np.inf)},
+        r"evidence on 'xs' is inf at index \(0, 0\); it must be finite",
+    ),
     "infinity alone": ({"x": -np.inf}, r"evidence on 'x' is -inf; it must be finite"),
-    "support": ({"rate": [1.0, -2.0, 3.0]}, r"evidence on 'rate' is -2\.0 at index 1, outside its support \(numbers >=? 0\)"),
-    "count": ({"count": [1, -1, 0]}, r"evidence on 'count' is -1 at index 1, outside its support \(integers >= 0\)"),
-    "fraction": ({"count": [1, 0.5, 0]}, r"evidence on 'count' is 0\.5 at index 1, outside its support"),
-    "simplex": ({"share": [0.5, 0.5, 0.5]}, r"evidence on 'share'.*outside its support \(vectors of probabilities that sum to 1\)"),
-    "part of a vector": ({"v": [[1.0, np.nan], [0, 0], [0, 0]]}, r"evidence on 'v': some components of one vector are missing.*split the vector"),
+    "support": (
+        {"rate": [1.0, -2.0, 3.0]},
+        r"evidence on 'rate' is -2\.0 at index 1, outside its support \(numbers >=? 0\)",
+    ),
+    "count": (
+        {"count": [1, -1, 0]},
+        r"evidence on 'count' is -1 at index 1, outside its support \(integers >= 0\)",
+    ),
+    "fraction": (
+        {"count": [1, 0.5, 0]},
+        r"evidence on 'count' is 0\.5 at index 1, outside its support",
+    ),
+    "simplex": (
+        {"share": [0.5, 0.5, 0.5]},
+        r"evidence on 'share'.*outside its support \(vectors of probabilities that sum to 1\)",
+    ),
+    "part of a vector": (
+        {"v": [[1.0, np.nan], [0, 0], [0, 0]]},
+        r"evidence on 'v': some components of one vector are missing.*split the vector",
+    ),
 }
 
 
@@ -135,13 +175,18 @@ def test_refused_with_the_reason(net, evidence, message):
 
 def test_evidence_that_is_no_mapping(net):
     for bad in ([("x", 1.0)], "x", 3.0):
-        with pytest.raises(EvidenceError, match="evidence is a .*; give a dict from node name to value"):
+        with pytest.raises(
+            EvidenceError, match="evidence is a .*; give a dict from node name to value"
+        ):
             bmc.infer(net, bad, inputs={"u": 0.0})
 
 
 INPUTS = {
     "missing": ({}, r"input 'u' has no value; pass inputs=\{'u': value\}"),
-    "unknown": ({"u": 1.0, "w": 1.0}, r"inputs= gives 'w', which is not a declared input; the inputs are \['u'\]"),
+    "unknown": (
+        {"u": 1.0, "w": 1.0},
+        r"inputs= gives 'w', which is not a declared input; the inputs are \['u'\]",
+    ),
     "node": ({"u": 1.0, "x": 1.0}, r"inputs= gives 'x', which is not a declared input"),
     "shape": ({"u": [1.0, 2.0]}, r"input 'u' has shape \(2,\).*make \(\)"),
     "NaN": ({"u": np.nan}, r"input 'u' is nan at index \(\); inputs must be finite"),

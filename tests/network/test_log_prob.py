@@ -91,7 +91,9 @@ def test_a_deterministic_value_must_agree():
 def test_refusals():
     net = hybrid()
     values = {"a": "no", "m": 0.0, "x": np.zeros(3), "n": np.ones(3, dtype=int)}
-    with pytest.raises(EvidenceError, match="log_prob: node 'm' has no value; give all stochastic nodes"):
+    with pytest.raises(
+        EvidenceError, match="log_prob: node 'm' has no value; give all stochastic nodes"
+    ):
         net.log_prob({k: v for k, v in values.items() if k != "m"})
     with pytest.raises(EvidenceError, match="log_prob: the net has no node 'mm'.*did you mean 'm'"):
         net.log_prob({**values, "mm": 0.0})
@@ -106,7 +108,12 @@ def test_refusals():
 def test_a_density_that_is_not_finite_names_the_node():
     for value in (np.nan, np.inf):
         net = bmc.BayesNet()
-        net.add("x", lambda v=value: bmc.Density(lambda x: np.where(x > 0, v, -x * x), sample=lambda r, s: -r.random(s)))
+        net.add(
+            "x",
+            lambda v=value: bmc.Density(
+                lambda x: np.where(x > 0, v, -x * x), sample=lambda r, s: -r.random(s)
+            ),
+        )
         with pytest.raises(DensityError, match=rf"node 'x': the log density of .* is {value}"):
             net.log_prob({"x": 1.0})
         assert net.log_prob({"x": -1.0}) == -1.0
@@ -116,7 +123,9 @@ def test_parameters_out_of_range_name_the_node_and_first_index():
     net = bmc.BayesNet(plates={"p": 3})
     net.add("s", bmc.Normal(5.0, 0.1), plates="p")
     net.add("x", lambda s: bmc.Normal(0.0, s), plates="p")
-    with pytest.raises(ParameterError, match=r"node 'x' \(plate element 1\): .*scale must be positive.*got -2"):
+    with pytest.raises(
+        ParameterError, match=r"node 'x' \(plate element 1\): .*scale must be positive.*got -2"
+    ):
         net.log_prob({"s": [1.0, -2.0, -3.0], "x": np.zeros(3)})
 
 
@@ -129,7 +138,9 @@ def test_potentials_multiply_the_density():
     for value in (np.nan, np.inf):
         net = hybrid()
         net.potential("bad", lambda m, v=value: m + v)
-        with pytest.raises(DensityError, match="potential 'bad' is NaN or infinite; a log factor must be finite"):
+        with pytest.raises(
+            DensityError, match="potential 'bad' is NaN or infinite; a log factor must be finite"
+        ):
             net.log_prob(draws)
     net = hybrid()
     net.potential("ban", lambda m: np.where(m > -50, -np.inf, 0.0))

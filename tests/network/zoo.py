@@ -196,7 +196,9 @@ def vector_dynamics(net):
     a = np.array([[1.0, 0.1], [0.0, 0.95]])
     net.add("s0", bmc.MvNormal(np.zeros(2), np.eye(2)))
     for i in range(1, 4):
-        net.add(f"s{i}", lambda s: bmc.MvNormal(np.matvec(a, s), 0.1 * np.eye(2)), parents=[f"s{i-1}"])
+        net.add(
+            f"s{i}", lambda s: bmc.MvNormal(np.matvec(a, s), 0.1 * np.eye(2)), parents=[f"s{i - 1}"]
+        )
         net.add(f"y{i}", lambda s: bmc.Normal(s[..., 0], 0.5), parents=[f"s{i}"])
 
 
@@ -206,7 +208,9 @@ def bearings(net):
     net.add(
         "z",
         lambda pose: bmc.MvNormal(
-            bmc.stack([np.hypot(pose[..., 0], pose[..., 1]), np.arctan2(pose[..., 1], pose[..., 0])]),
+            bmc.stack(
+                [np.hypot(pose[..., 0], pose[..., 1]), np.arctan2(pose[..., 1], pose[..., 0])]
+            ),
             0.01 * np.eye(2),
         ),
         plates="robot",
@@ -226,7 +230,11 @@ def stack_of_mixed_ranks(net):
 def switch_by_where(net):
     net.add("on", bmc.Bernoulli(0.3), plates="point")
     net.add("m", bmc.Normal(0.0, 1.0))
-    net.add("y", lambda on, m: bmc.Normal(np.where(on == 1, m, 5.0), np.where(on, 1.0, 2.0)), plates="point")
+    net.add(
+        "y",
+        lambda on, m: bmc.Normal(np.where(on == 1, m, 5.0), np.where(on, 1.0, 2.0)),
+        plates="point",
+    )
 
 
 @model({"point": 6})
@@ -243,7 +251,9 @@ def labels_by_where(net):
 def masked_by_constant(net):
     mask = np.array([True, False, True, True])
     net.add("m", bmc.Normal(0.0, 1.0), plates="point")
-    net.add("y", lambda m: bmc.Normal(np.where(mask, m, 0.0), np.where(mask, 1.0, 10.0)), plates="point")
+    net.add(
+        "y", lambda m: bmc.Normal(np.where(mask, m, 0.0), np.where(mask, 1.0, 10.0)), plates="point"
+    )
 
 
 @model({"point": 6})
@@ -263,7 +273,11 @@ def dirichlet_categorical(net):
 @model({"point": 4})
 def softmax_classifier(net):
     net.add("w", bmc.MvNormal(np.zeros(3), np.eye(3)))
-    net.add("c", lambda w: bmc.Categorical(scipy.special.softmax(w * T[:4, None], axis=-1)), plates="point")
+    net.add(
+        "c",
+        lambda w: bmc.Categorical(scipy.special.softmax(w * T[:4, None], axis=-1)),
+        plates="point",
+    )
 
 
 @model({"point": 4})
@@ -431,7 +445,10 @@ def cumulative_in_another_plate(net):
 def ornstein_uhlenbeck_covariance(net):
     lag = np.abs(np.subtract.outer(np.arange(4), np.arange(4)))
     net.add("length", bmc.Gamma(3.0, 1.0))
-    net.add("f", lambda length: bmc.MvNormal(np.zeros(4), np.exp(-lag / (length[..., None, None] + 0.5))))
+    net.add(
+        "f",
+        lambda length: bmc.MvNormal(np.zeros(4), np.exp(-lag / (length[..., None, None] + 0.5))),
+    )
 
 
 @model({"a": 2, "b": 3})
@@ -454,7 +471,11 @@ def interpolation(net):
     left = np.minimum(((T + 1) * 1.5).astype(int), 2)
     weight = (T + 1) * 1.5 - left
     net.add("h", bmc.Normal(0.0, 1.0), plates="knot")
-    net.add("y", lambda h: bmc.Normal((1 - weight) * h[left] + weight * h[left + 1], 0.1), plates="point")
+    net.add(
+        "y",
+        lambda h: bmc.Normal((1 - weight) * h[left] + weight * h[left + 1], 0.1),
+        plates="point",
+    )
 
 
 @model({"team": 4, "game": 5})
@@ -462,7 +483,10 @@ def bradley_terry(net):
     home, away = np.array([0, 1, 2, 3, 0]), np.array([1, 2, 3, 0, 2])
     net.add("skill", bmc.Normal(0.0, 1.0), plates="team")
     net.add(
-        "won", lambda skill: bmc.Bernoulli(logits=skill[home] - skill[away]), plates="game", states=("away", "home")
+        "won",
+        lambda skill: bmc.Bernoulli(logits=skill[home] - skill[away]),
+        plates="game",
+        states=("away", "home"),
     )
 
 
@@ -514,7 +538,9 @@ def elementwise_loop(net):
 @model()
 def elementwise_families(net):
     net.add("a", bmc.Bernoulli(0.5))
-    net.add("y", lambda a: bmc.Normal(0.0, 1.0) if a else bmc.StudentT(3.0, 0.0, 1.0), vectorize=True)
+    net.add(
+        "y", lambda a: bmc.Normal(0.0, 1.0) if a else bmc.StudentT(3.0, 0.0, 1.0), vectorize=True
+    )
 
 
 @model({"point": 1, "k": 1})

@@ -87,10 +87,11 @@ def test_a_normal_mean(noise: float) -> None:
     precision = 1 + noise**-2
     mean = (1 + 2.0 * noise**-2) / precision
     evidence = scipy.stats.norm.logpdf(2.0, 1.0, np.hypot(1, noise))
-    # the promise: 1e-6 where the likelihood is no narrower than a third
-    assert found.log_marginal_likelihood == pytest.approx(evidence, abs=1e-6)
-    assert found.mean("x") == pytest.approx(mean, abs=1e-6)
-    assert found.var("x") == pytest.approx(1 / precision, abs=1e-5)
+    # the promise: 1e-5 where the likelihood is no narrower than a third
+    assert found.log_marginal_likelihood == pytest.approx(evidence, abs=1e-5)
+    assert found.mean("x") == pytest.approx(mean, abs=1e-5)
+    assert found.var("x") == pytest.approx(1 / precision, abs=1e-4)
+    assert found.accuracy < 0.05
 
 
 def test_accuracy_tells_when_the_rule_is_too_coarse() -> None:

@@ -1,0 +1,17 @@
+"""All benchmarks in one run: ``make bench`` (``make peers`` first to have the peers beside)."""
+
+from __future__ import annotations
+
+from benchmarks import bench_exact, bench_scale, bench_weighting
+from benchmarks.harness import data_folder, peer_python
+
+if __name__ == "__main__":
+    if peer_python() is None:
+        print("no peers installed: run `make peers` to have their figures beside\n")
+    bench_scale.main()
+    print()
+    if data_folder().exists():
+        bench_weighting.main()
+        bench_exact.main()
+    else:
+        print(f"no networks at {data_folder()}: set BAYESMC_DATA to time them")

@@ -1,0 +1,87 @@
+"""What size costs: declaring, validating and sampling 200 and 2,000 scalar nodes; importing."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+
+import bayesmc as bmc
+from benchmarks.harness import table
+
+
+def main() -> None:
+    """Print seconds for each size, and the import beside what it cannot avoid."""
+    rows: list[list[object]] = []
+    for count in (200, 2_000):
+        rows.append(
+            [
+                count,
+                _median(lambda count=count: declared(count)),  # type: ignore[misc]
+                _median(lambda count=count: declared(count).validate()),  # type: ignore[misc]
+                _median(lambda net=_valid(count): net.sample(1_000, rng=0)),  # type: ignore[misc]
+            ]
+        )
+    rows.append(["ratio", *(b / a for a, b in zip(rows[0][1:], rows[1][1:], strict=True))])  # type: ignore[operator]
+    rows.append(["goal", "ratio 12", "2 s", "2 s"])
+    header = ["nodes", "declare, s", "declare and validate, s", "1,000 draws, s"]
+    print(table("size", header, rows) + "\n")
+    base, own = _imports()
+    difference = own - base
+    print(
+        table(
+            "import, median of 20 processes",
+            ["", "s"],
+            [
+                ["numpy, scipy.special", base],
+                ["and bayesmc", own],
+                ["difference (goal .35)", difference],
+            ],
+        )
+    )
+
+
+def declared(count: int) -> bmc.BayesNet:
+    """A net of scalar nodes, each with two parents declared before it."""
+    net = bmc.BayesNet()
+    net.add("x0", bmc.Normal(0.0, 1.0))
+    for i in range(1, count):
+        net.add(f"x{i}", _mean_of, parents=[f"x{i - 1}", f"x{max(i - 7, 0)}"])
+    return net
+
+
+def _mean_of(a, b):  # noqa: ANN001, ANN202
+    return bmc.Normal(0.5 * a + 0.1 * b, 1.0)
+
+
+def _valid(count: int) -> bmc.BayesNet:
+    net = declared(count)
+    net.validate()
+    return net
+
+
+def _median(work: Callable[[], object], repeats: int = 5) -> float:
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times)
+
+
+def _imports() -> tuple[float, float]:
+    """Medians of 20 interleaved processes each."""
+    commands = ("import numpy, scipy.special", "import numpy, scipy.special, bayesmc")
+    times: list[list[float]] = [[], []]
+    for _ in range(20):
+        for kept, command in zip(times, commands, strict=True):
+            start = time.perf_counter()
+            subprocess.run([sys.executable, "-c", command], check=True)
+            kept.append(time.perf_counter() - start)
+    return statistics.median(times[0]), statistics.median(times[1])
+
+
+if __name__ == "__main__":
+    main()
