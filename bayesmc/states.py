@@ -134,6 +134,8 @@ def _comparable(a: Any, b: Any) -> tuple[Any, Any]:
     if isinstance(b, StateArray):
         other, codes = _comparable(b, a)
         return codes, other
+    if isinstance(b, tuple) and b in a.states:  # a label that happens to be a tuple
+        return a, np.asarray(a.states.index(b))
     plain = np.asarray(b, dtype=object) if isinstance(b, (str, list, tuple)) else np.asarray(b)
     if plain.dtype.kind in "US" or plain.dtype == object:
         codes = [label_code(a.states, label) for label in plain.ravel().tolist()]

@@ -261,7 +261,7 @@ def draw_to(
 
 
 def _short(value: Any) -> str:
-    return np.array2string(np.asarray(value), precision=6, threshold=8)
+    return " ".join(np.array2string(np.asarray(value), precision=6, threshold=8).split())
 
 
 def _at(index: Shape) -> str:

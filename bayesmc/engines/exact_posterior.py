@@ -164,6 +164,20 @@ class ExactPosterior(Posterior):
         reach = below >= levels.reshape(levels.shape + (1,) * below.ndim) - 1e-12
         return numbers[order][np.argmax(reach, axis=-1)]
 
+    def _figures(self, name: str) -> dict[str, np.ndarray]:
+        node = self.model[name]
+        if node.domain is not None or self._known(name) is not None or self.problem is not None:
+            return super()._figures(name)
+        empty = np.full(node.value_shape, np.nan)  # its function stayed behind when it was pickled
+        columns = ("mean", "sd", *self._quantile_columns(name), "mcse", "ess", "rhat")
+        return dict.fromkeys(columns, empty)
+
+    def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
+        node = self.model[name]
+        if node.domain is not None or self._known(name) is not None:
+            return super()._quantile_columns(name)
+        return {column: np.full(node.value_shape, np.nan) for column in self._quantile_names()}
+
     # ---- functions ---------------------------------------------------------------------------
 
     def expectation(

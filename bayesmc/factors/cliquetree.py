@@ -15,8 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 

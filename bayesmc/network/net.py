@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bayesmc.distributions import Distribution, as_distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import (
     DensityError,
     DuplicateNodeError,
@@ -22,17 +20,17 @@ from bayesmc.errors import (
     ParameterError,
     PlateError,
     UnknownNodeError,
-    UnsupportedError,
 )
-from bayesmc.network import forward
 from bayesmc.network.compile import compile_model
-from bayesmc.network.evidence import plate_sizes, read_inputs, store
-from bayesmc.network.model import CompiledNode, Model, invalid_error
-from bayesmc.network.node import Declaration, Node, Potential, bind
+from bayesmc.network.evidence import plate_sizes, read_inputs
+from bayesmc.network.intervene import fixed
+from bayesmc.network.joint import joint_log_prob, joint_sample
+from bayesmc.network.model import Model
+from bayesmc.network.node import Declaration, Node, Potential, bind, checked_rows
 from bayesmc.network.ordering import topological_order
 from bayesmc.network.validate import validate_model
 from bayesmc.randomness import seed_sequence, stream
-from bayesmc.shapes import as_shape, first_index, owned, unused_sizes
+from bayesmc.shapes import as_shape, owned, unused_sizes
 
 if TYPE_CHECKING:
     import networkx
@@ -216,9 +214,10 @@ class BayesNet:
             )
         if states is not None and len(states) != table.shape[-1]:
             raise ModelError(
-                f"node {name!r}: states= has {len(states)} entries but the table's last axis {table.shape[-1]}"
+                f"node {name!r}: states= has {len(states)} entries, but the last axis of the table "
+                f"{table.shape[-1]}"
             )
-        table = _checked_rows(name, table)
+        table = checked_rows(name, table)
         self._declare(
             Declaration(
                 name,
@@ -281,26 +280,7 @@ class BayesNet:
         model = self._probe_model(sizes)
         copy = self.copy()
         for name, value in chosen.items():
-            node = model[name]
-            if node.kind == "input":
-                raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")
-            node = _widened(node, value)
-            stored = store(node, value)
-            _check_do(name, node, value, stored, model)
-            if stored.shape != node.value_shape:
-                raise EvidenceError(f"do({name}=...): shape {stored.shape}, not {node.value_shape}")
-            if stored.dtype.kind == "f" and not np.isfinite(stored).all():
-                raise EvidenceError(f"do({name}=...): {value!r} is not finite")
-            copy._declarations[name] = Declaration(
-                name,
-                "fixed",
-                (),
-                node.plates,
-                node.declaration.states,
-                event_shape=node.event_shape,
-                value=owned(stored),
-                domain=node.domain,
-            )
+            copy._declarations[name] = fixed(name, model[name], value, model)
         copy._changed()
         return copy
 
@@ -342,6 +322,11 @@ class BayesNet:
     def plates(self) -> dict[str, int | None]:
         """Plate name -> size (None where it is read from the data)."""
         return dict(self._sizes)
+
+    @property
+    def potentials(self) -> dict[str, Potential]:
+        """Name -> potential, with its ``parents`` and ``plates``."""
+        return dict(self._potentials)
 
     @property
     def graph(self) -> networkx.DiGraph:
@@ -392,27 +377,8 @@ class BayesNet:
         unknown = [n for n in values if n not in model.nodes]
         if unknown:
             raise EvidenceError(f"log_prob: {self._unknown(unknown[0])}")
-        stored: dict[str, np.ndarray] = {**read_inputs(self._declarations, model.sizes, inputs)}
-        total: Any = np.zeros(())
-        with marking_invalid(), np.errstate(all="ignore"):
-            for name, node in model.nodes.items():
-                if node.kind == "input":
-                    continue
-                if not node.is_stochastic:
-                    stored[name], _ = model.evaluate(name, stored)
-                    if name in values:
-                        total = total + _agreement(node, stored[name], values[name])
-                    continue
-                if name not in values:
-                    raise EvidenceError(
-                        f"log_prob: node {name!r} has no value; give all stochastic nodes"
-                    )
-                value = store(node, values[name])
-                total = total + self._one_log_prob(model, name, value, stored, total)
-                stored[name] = value
-            for name in model.potentials:
-                total = total + model.potential(name, stored)
-        return total
+        given = read_inputs(self._declarations, model.sizes, inputs)
+        return joint_log_prob(model, values, given)
 
     def sample(
         self,
@@ -445,25 +411,8 @@ class BayesNet:
         if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 0:
             raise ValueError(f"sample(draws={draws!r}): draws is a number of draws, 0 or more")
         model = self.model(None, inputs, plates)
-        if model.potentials:
-            raise UnsupportedError(
-                f"sample: the potential {next(iter(model.potentials))!r} reweights the joint density, "
-                "which ancestral sampling cannot follow; use infer with LikelihoodWeighting and resample"
-            )
-        refusal = forward.refuse_unsampled(model, {}, "sample")
-        if refusal:
-            raise UnsupportedError(refusal)
-        start = forward.Pass(
-            stream(seed_sequence(rng), 0),
-            (int(draws),),
-            dict(read_inputs(self._declarations, model.sizes, inputs)),
-        )
-        with marking_invalid(), np.errstate(all="ignore"):
-            values = forward.run(forward.steps_for(model, {}), start).values
-        return {
-            name: _full(node.decode(values[name]), (int(draws), *node.value_shape))
-            for name, node in model.nodes.items()
-        }
+        given = read_inputs(self._declarations, model.sizes, inputs)
+        return joint_sample(model, int(draws), stream(seed_sequence(rng), 0), given)
 
     def model(
         self,
@@ -599,27 +548,6 @@ class BayesNet:
         lead = len(shape) - event - len(declaration.plates)
         return np.empty(shape[lead:], dtype=bool) if lead >= 0 else None
 
-    @staticmethod
-    def _one_log_prob(
-        model: Model, name: str, value: np.ndarray, stored: Mapping[str, np.ndarray], total: Any
-    ) -> np.ndarray:
-        """Log density of one node's values given its parents', summed over its plates."""
-        node = model[name]
-        result, batch = model.evaluate(name, stored)
-        axes = tuple(range(-len(node.plates), 0))
-        if result.invalid is not None:
-            counts = np.broadcast_to(
-                np.asarray(total) > -np.inf, np.broadcast_shapes(np.shape(total), batch)
-            )
-            error = invalid_error(node, result, counts, counts.shape)
-            if error is not None:
-                raise error
-        density = model.log_density(name, result, value)
-        if axes:
-            lead = density.shape[: max(density.ndim - len(axes), 0)]
-            density = np.broadcast_to(density, lead + node.plate_shape).sum(axis=axes)
-        return density
-
 
 class _Constant:
     """A function of no parents that returns one distribution."""
@@ -636,33 +564,6 @@ def _states(states: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
 
 
-def _widened(node: CompiledNode, value: Any) -> CompiledNode:
-    """A deterministic node may be set to numbers its function never returns; then it has no domain."""
-    if node.is_stochastic or node.domain is None or node.domain.labels is not None:
-        return node
-    known = np.isin(np.asarray(value), np.asarray(node.domain.numbers)).all()
-    return node if known else replace(node, domain=None)
-
-
-def _check_do(
-    name: str, node: CompiledNode, value: Any, stored: np.ndarray, model: Model
-) -> None:
-    """Refuse a value outside the support, where that is known without the values of inputs."""
-    has_inputs = any(n.kind == "input" for n in model.nodes.values())
-    if node.support is None or node.domain is not None or has_inputs:
-        return
-    if not np.all(node.support.contains(stored)):
-        raise EvidenceError(
-            f"do({name}=...): {value!r} is outside the support ({node.support.describe()})"
-        )
-
-
-def _agreement(node: CompiledNode, computed: np.ndarray, given: Any) -> np.ndarray:
-    """0 where a given deterministic value is the computed one, minus infinity elsewhere."""
-    own = tuple(range(-len(node.value_shape), 0))
-    return np.where((node.decode(computed) == np.asanyarray(given)).all(axis=own), 0.0, -np.inf)
-
-
 def _plate_size(plate: str, size: Any) -> int | None:
     if not isinstance(plate, str):
         raise PlateError(f"a plate's name is a string, not {plate!r}")
@@ -676,28 +577,3 @@ def _plate_size(plate: str, size: Any) -> int | None:
     if count < 0:
         raise PlateError(f"plate {plate!r}: size {count} is negative")
     return count
-
-
-def _checked_rows(name: str, table: np.ndarray) -> np.ndarray:
-    """Rows renormalised where they are off by rounding; worse ones raise with their index."""
-    from_one = np.abs(table.sum(axis=-1) - 1)
-    bad = ~((table >= 0).all(axis=-1) & (from_one <= 1e-6))
-    if bad.any():
-        at = first_index(bad)
-        raise ParameterError(
-            f"node {name!r}: the row at parents' index {at} is {table[at]}, which is not a probability "
-            f"vector (sum {table[at].sum():.6g}); every row of a table sums to 1",
-            at,
-        )
-    table = table / table.sum(axis=-1, keepdims=True)
-    table.flags.writeable = False
-    return table
-
-
-def _full(value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """The user's own writable array of the full shape."""
-    return (
-        value.copy()
-        if value.shape == shape
-        else np.array(np.broadcast_to(value, shape, subok=True), subok=True)
-    )

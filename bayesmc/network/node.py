@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError
+from bayesmc.errors import ModelError, ParameterError
 from bayesmc.network.domain import Domain
-from bayesmc.shapes import Shape
+from bayesmc.shapes import Shape, first_index
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,22 @@ def bind(
     if starred:
         raise ModelError(f"node {name!r}: *{starred} needs parents= to say which nodes they are")
     return tuple(positional + keyword), _with_keywords(function, len(positional), keyword)
+
+
+def checked_rows(name: str, table: np.ndarray) -> np.ndarray:
+    """Rows renormalised where they are off by rounding; worse ones raise with their index."""
+    from_one = np.abs(table.sum(axis=-1) - 1)
+    bad = ~((table >= 0).all(axis=-1) & (from_one <= 1e-6))
+    if bad.any():
+        at = first_index(bad)
+        raise ParameterError(
+            f"node {name!r}: the row at parents' index {at} is {table[at]}, which is not a probability "
+            f"vector (sum {table[at].sum():.6g}); every row of a table sums to 1",
+            at,
+        )
+    table = table / table.sum(axis=-1, keepdims=True)
+    table.flags.writeable = False
+    return table
 
 
 def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:

@@ -16,9 +16,12 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, BroadcastError, ModelError
 from bayesmc.network.compile import entry
 from bayesmc.network.model import CompiledNode, Model, arguments_of, call
+from bayesmc.network.node import Declaration
 from bayesmc.shapes import Shape
 
 _RTOL = 1e-7
+#: of the largest value of a parameter, for what cancels
+_ATOL = 1e-12
 
 
 def validate_model(model: Model) -> None:
@@ -33,6 +36,13 @@ def validate_model(model: Model) -> None:
         for node in model.nodes.values():
             if node.declaration.source == "function":
                 _check_node(model, node)
+        for name, (potential, links) in model.potentials.items():
+            what = Declaration(
+                f"potential {name}", "function", potential.parents, potential.plates,
+                function=potential.function,
+            )  # fmt: skip
+            sizes = tuple(model.sizes[p] for p in potential.plates)
+            _check_node(model, CompiledNode(what, links, sizes, is_stochastic=False))
 
 
 def _check_node(model: Model, node: CompiledNode) -> None:
@@ -42,7 +52,7 @@ def _check_node(model: Model, node: CompiledNode) -> None:
     again = _signature(node, arguments, lead)
     if not _same(whole, again):
         raise ModelError(
-            f"node {node.name!r}: two calls with the same parents differ; a conditional density must "
+            f"{_what(node)}: two calls with the same parents differ; a conditional density must "
             "not draw random numbers or change state (randomness belongs in a parent node)"
         )
     if not node.links:
@@ -123,47 +133,54 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
             continue
         if before is None:
             before = _signature(node, arguments_of(node.links, base)[0], node.plate_shape)
-        for element in _elements(size):
+        for chosen in _masks(size):
             moved = dict(base)
             for parent in sharing:
                 moved[parent] = _perturbed(
-                    model.nodes[parent], base[parent], other[parent], plate, element
+                    model.nodes[parent], base[parent], other[parent], plate, chosen
                 )
             try:
                 after = _signature(node, arguments_of(node.links, moved)[0], node.plate_shape)
             except BayesmcError:
                 continue  # the perturbed values may not be reachable
-            rest = (slice(None),) * axis + (np.arange(size) != element,)
+            rest = (slice(None),) * axis + (~chosen,)
             for a, b in zip(before.arrays, after.arrays, strict=True):
                 if not _close(a[rest], b[rest]):
                     raise BroadcastError(
-                        f"node {node.name!r}: changing element {element} of {sharing} along plate "
-                        f"{plate!r} moves other elements too; a function acts element by element on a "
-                        "shared plate. To mix elements (a mean, a cumulative sum), use an unplated "
+                        f"{_what(node)}: changing some elements of {sharing} along plate {plate!r} "
+                        "moves other elements too; a function acts element by element on a shared "
+                        "plate. To mix elements (a mean, a cumulative sum), use an unplated "
                         "deterministic node that reads the whole plate"
                     )
 
 
 def _perturbed(
-    parent: CompiledNode, value: np.ndarray, other: np.ndarray, plate: str, element: int
+    parent: CompiledNode, value: np.ndarray, other: np.ndarray, plate: str, chosen: np.ndarray
 ) -> np.ndarray:
-    """``value`` with one element along ``plate`` changed, to a reachable one where there is one."""
-    at = (slice(None),) * parent.plates.index(plate) + (element,)
+    """``value`` with the chosen elements along ``plate`` changed, to reachable ones where there are."""
+    at = (slice(None),) * parent.plates.index(plate) + (chosen,)
     moved = np.array(value)
-    moved[at] = np.array(other)[at]
-    if np.array_equal(moved, value):
-        if parent.domain is not None:
-            moved[at] = (moved[at] + 1) % parent.domain.size
-        elif moved.dtype.kind == "f":
-            moved[at] = moved[at] * 1.1 + 0.1
-        elif moved.dtype.kind in "iu":
-            moved[at] = moved[at] + 1
+    new = np.array(other)[at]
+    same = new == moved[at]
+    if parent.domain is not None:
+        new = np.where(same, (new + 1) % parent.domain.size, new)
+    elif new.dtype.kind == "f":
+        new = np.where(same, new * 1.1 + 0.1, new)
+    elif new.dtype.kind in "iu":
+        new = np.where(same, new + 1, new)
+    moved[at] = new
     return moved
 
 
-def _elements(size: int) -> list[int]:
-    """Elements of a plate to perturb: all of a small one, ends and some between of a large one."""
-    return sorted({round(k * (size - 1) / 7) for k in range(8)}) if size > 8 else list(range(size))
+def _what(node: CompiledNode) -> str:
+    """How messages name the node (or potential)."""
+    return node.name if node.name.startswith("potential ") else f"node {node.name!r}"
+
+
+def _masks(size: int) -> list[np.ndarray]:
+    """Sets of elements such that for any two, one set holds the first and not the second."""
+    bits = [(np.arange(size) >> k) & 1 == 1 for k in range(max((size - 1).bit_length(), 1))]
+    return [mask for bit in bits for mask in (bit, ~bit)]
 
 
 class _Signature:
@@ -195,7 +212,7 @@ def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
             arrays.append(np.broadcast_to(array, lead + tail))
         except ValueError:
             raise BroadcastError(
-                f"node {node.name!r}: a parameter of shape {array.shape} does not fit the batch and "
+                f"{_what(node)}: a parameter of shape {array.shape} does not fit the batch and "
                 f"plates {lead}; write the function so that it broadcasts"
             ) from None
     return _Signature(family, arrays)
@@ -214,7 +231,8 @@ def _close(a: np.ndarray, b: np.ndarray) -> bool:
     if a.dtype.kind != "f":
         return False
     scale = np.maximum(np.abs(a), np.abs(b))
-    near = np.abs(a - b) <= _RTOL * np.where(np.isfinite(scale), scale, 0.0) + 1e-12
+    scale = np.where(np.isfinite(scale), scale, 0.0)
+    near = np.abs(a - b) <= _RTOL * scale + _ATOL * scale.max(initial=0.0)
     return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
 
 
@@ -222,7 +240,7 @@ def _broadcast_message(
     node: CompiledNode, index: Shape, whole: _Signature, alone: _Signature
 ) -> str:
     return (
-        f"node {node.name!r} does not broadcast: entry {index} of a call on a batch differs from the "
+        f"{_what(node)} does not broadcast: entry {index} of a call on a batch differs from the "
         f"call on that entry alone ({whole.family} against {alone.family} with other parameters); "
         "every operation must act on the last axes or element by element (axis=-1, np.where for if, "
         "components as v[..., k]), or declare vectorize=True (slow)"

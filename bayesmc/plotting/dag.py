@@ -82,7 +82,7 @@ def plot_dag(
     plt = pyplot()
     nodes = [net[name] for name in net]
     shaded = {net[name].name for name in observed}
-    factors = net._potentials
+    factors = net.potentials
     shapes = {node.name: _shape(node, node.name in shaded) for node in nodes}
     shapes |= {name: _factor_shape(name) for name in factors}
     every = {node.name: node for node in nodes} | factors

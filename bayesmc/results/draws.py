@@ -55,6 +55,11 @@ class DrawsPosterior(Posterior):
             self.weight_ess = diagnostics.weight_ess(log_weights)
 
     @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that can be asked about: those that were kept."""
+        return tuple(n for n in super().names if n in self._stored)
+
+    @property
     def pareto_k(self) -> float | None:  # type: ignore[override]
         """Tail shape of the weights (above 0.7 they cannot be trusted); None where uniform."""
         if self.log_weights is None:

@@ -183,7 +183,7 @@ class Posterior:
             p = self.probabilities(name)
             nan = np.full(p.shape, np.nan)
             columns = {"mean": p, "sd": np.sqrt(p * (1 - p))}
-            columns.update({f"{100 * q:g}%": nan for q in _QUANTILES})
+            columns.update(dict.fromkeys(self._quantile_names(), nan))
         else:
             columns = {"mean": self.mean(name), "sd": self.std(name)}
             columns.update(self._quantile_columns(name))
@@ -194,7 +194,11 @@ class Posterior:
 
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         values = self.quantile(name, list(_QUANTILES))
-        return {f"{100 * q:g}%": v for q, v in zip(_QUANTILES, values, strict=True)}
+        return dict(zip(self._quantile_names(), values, strict=True))
+
+    @staticmethod
+    def _quantile_names() -> list[str]:
+        return [f"{100 * q:g}%" for q in _QUANTILES]
 
     def _title(self) -> str:
         return type(self.engine).__name__

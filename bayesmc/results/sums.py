@@ -6,6 +6,7 @@ to a centre near each node's mean, so that neither overflows nor cancels.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -283,6 +284,12 @@ class SumsPosterior(Posterior):
 
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        sums = copy.copy(self._sums)
+        sums.model = state["model"]
+        return {**state, "_sums": sums}
 
     def _figures(self, name: str) -> dict[str, np.ndarray]:
         columns = super()._figures(name)

@@ -189,7 +189,9 @@ class _Table:
         near = self.is_close(found, exact, scale)
         self.add(what, found, exact, 0.0 if near else np.inf, 1.0 if near else 0.0)
 
-    def normal(self, what: str, found: float, exact: float, error: float, scale: float = 1.0) -> None:
+    def normal(
+        self, what: str, found: float, exact: float, error: float, scale: float = 1.0
+    ) -> None:
         """A figure with a normal error; what the tolerance explains does not count."""
         excess = max(abs(found - exact) - self.tolerance * max(scale, abs(exact)), 0.0)
         z = excess / error
@@ -215,12 +217,14 @@ def _compare_evidence(table: _Table, posterior: Any, exact: Any) -> None:
 def _compare_states(table: _Table, posterior: Any, exact: Any, name: str, node: Any) -> None:
     found, value = posterior.probabilities(name), exact.probabilities(name)
     if found.shape != value.shape:
-        raise AssertionError(f"node {name!r}: probabilities of shape {found.shape}, not {value.shape}")
+        raise AssertionError(
+            f"node {name!r}: probabilities of shape {found.shape}, not {value.shape}"
+        )
     count = np.broadcast_to(_effective(posterior, name, node)[..., None], value.shape[:-1] + (1,))
     for at in np.ndindex(value.shape):
         p, q, n = float(value[at]), float(found[at]), float(count[(*at[:-1], 0)])
         what = f"node {name!r}{_element(at[:-1])}, state {node.domain.states[at[-1]]!r}"
-        if p in (0.0, 1.0) or not np.isfinite(n) or not np.isfinite(q):
+        if p == 0.0 or p > 1 - 1e-12 or not np.isfinite(n) or not np.isfinite(q):
             if p == 0.0 and table.tolerance < 1e-6:
                 exactly = table.is_close(q, 0.0) if not np.isfinite(n) else q == 0.0
                 table.add(what, q, p, 0.0 if exactly else np.inf, 1.0 if exactly else 0.0)

@@ -140,7 +140,9 @@ def build_evidence(net: BayesNet, choices: Choices, chance: float = 0.4) -> dict
             continue
         value = draw[name][0]
         seen = np.ones(value.shape, dtype=bool)
-        infinite = node.is_discrete and node.states is None  # what is hidden could not be enumerated
+        infinite = (
+            node.is_discrete and node.states is None
+        )  # what is hidden could not be enumerated
         if node.plates and not infinite and choices.flag(0.5):
             seen = np.array([choices.flag(0.5) for _ in range(value.size)]).reshape(value.shape)
         if seen.any():
@@ -326,13 +328,13 @@ class _Builder:
         return known
 
     def _tabular(self, known: Known, kind: str) -> Known:
-        inside = [k for k in self.known if k.card is not None and set(k.plates) <= set(known.plates)]
+        inside = [
+            k for k in self.known if k.card is not None and set(k.plates) <= set(known.plates)
+        ]
         chosen = self._some(inside)
         cards = tuple(k.card for k in chosen if k.card is not None)
         assert known.card is not None
-        rows = self.choices.rows(
-            math.prod(cards), known.card, self.options.zeros
-        )
+        rows = self.choices.rows(math.prod(cards), known.card, self.options.zeros)
         table = rows.reshape((*cards, known.card))
         known = replace(known, states=self._states(known.card))
         parents = [k.name for k in chosen]

@@ -251,7 +251,7 @@ def _visit(
     origin = np.arange(count)
     if not mask.all():
         options, log_probs = _options(state, node, dist, grid)
-        for element in np.flatnonzero(~mask):
+        for element in np.flatnonzero(~mask).tolist():
             origin, columns = _multiply(
                 state, origin, columns, element, options[:, element], log_probs[:, element]
             )
@@ -359,7 +359,9 @@ def _is_infinite(node: CompiledNode) -> bool:
 
 def _states_of(node: CompiledNode) -> int:
     if node.domain is None:
-        raise UnsupportedError(f"probabilities({node.name!r}): the node has no finite set of states")
+        raise UnsupportedError(
+            f"probabilities({node.name!r}): the node has no finite set of states"
+        )
     return node.domain.size
 
 
