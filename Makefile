@@ -23,7 +23,7 @@ help:
 demo: .venv/.extras-plot
 	$(PY) -m examples.demo
 
-test: .venv/.extras-plot,test
+test: .venv/.extras-plot,arviz,test
 	$(PY) -m pytest -q
 
 lint: .venv/.extras-dev
@@ -35,10 +35,10 @@ format: .venv/.extras-dev
 	$(PY) -m ruff check --fix-only -q .
 	$(PY) -m ruff format .
 
-docs: .venv/.extras-plot,test
+docs: .venv/.extras-plot,arviz,test
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
 
-bench: .venv/.extras-plot,test
+bench: .venv/.extras-plot,arviz,test
 	$(PY) -m benchmarks
 
 peers: .venv-peers/.installed

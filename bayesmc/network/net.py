@@ -214,7 +214,7 @@ class BayesNet:
             )
         if states is not None and len(states) != table.shape[-1]:
             raise ModelError(
-                f"node {name!r}: states= has {len(states)} entries, but the last axis of the table "
+                f"node {name!r}: states= has {len(states)} entries, but the last axis of probs has "
                 f"{table.shape[-1]}"
             )
         table = checked_rows(name, table)

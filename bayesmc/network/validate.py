@@ -37,6 +37,7 @@ def validate_model(model: Model) -> None:
             if node.declaration.source == "function":
                 _check_node(model, node)
         for name, (potential, links) in model.potentials.items():
+            model.potential(name, model.probe)  # its shape, said in its own words
             what = Declaration(
                 f"potential {name}", "function", potential.parents, potential.plates,
                 function=potential.function,

@@ -5,7 +5,8 @@ Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for 
 """
 
 from bayesmc.testing.matching import Comparison, Match, assert_matches, compare
-from bayesmc.testing.nets import NetOptions, random_evidence, random_net
+from bayesmc.testing.nets import NetOptions, random_net
+from bayesmc.testing.observing import random_evidence
 from bayesmc.testing.oracle import Enumerated, enumerate_posterior
 from bayesmc.testing.strategies import bayes_nets, evidence_for
 

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 from bayesmc.errors import missing_extra
 from bayesmc.network import BayesNet
 from bayesmc.testing.choices import Choices
-from bayesmc.testing.nets import NetOptions, build_evidence, build_net
+from bayesmc.testing.nets import NetOptions, build_net
+from bayesmc.testing.observing import build_evidence
 
 if TYPE_CHECKING:
     from hypothesis.strategies import SearchStrategy

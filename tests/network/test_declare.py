@@ -425,7 +425,7 @@ def test_states_given_wrongly():
     with pytest.raises(ModelError, match="node 'a': states= need .*; Normal is on real numbers"):
         declared(("x", "y"), bmc.Normal(0.0, 1.0)).validate()
     with pytest.raises(
-        ModelError, match="node 'a': states= has 3 entries but the table's last axis 2"
+        ModelError, match="node 'a': states= has 3 entries, but the last axis of probs has 2"
     ):
         declared(("x", "y", "z"), [0.5, 0.5])
     net = bmc.BayesNet()

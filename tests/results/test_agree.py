@@ -155,7 +155,6 @@ def test_sums_keep_precision_far_from_zero():
     np.testing.assert_allclose(p.mean("x") - 1e9, 0.0, atol=0.05)
 
 
-@pytest.mark.xfail(strict=True, reason="summary asks quantiles of a node without a finite domain")
 def test_exact_summary_has_every_node(answers):
     s = answers["exact"].summary()
     assert s["total"]["mean"] == pytest.approx(answers["exact"].mean("total"))
@@ -203,9 +202,7 @@ def test_exact_refuses_raw_draws_with_the_remedy(answers):
     [
         "exact",
         "draws",
-        pytest.param(
-            "sums", marks=pytest.mark.xfail(strict=True, reason="the sums keep the functions")
-        ),
+        "sums",
     ],
 )
 def test_every_posterior_pickles_without_its_functions(answers, kind):

@@ -453,7 +453,6 @@ def test_nodes_that_were_not_kept():
     assert {n.split("[")[0] for n in p.summary(["s", "z"]).names} == {"s", "z"}
 
 
-@pytest.mark.xfail(strict=True, reason="the default summary asks for nodes that were not kept")
 def test_summary_of_what_was_kept():
     p = bmc.infer(the_net(), engine=bmc.LikelihoodWeighting(500), rng=0, keep=["s", "z"])
     assert {n.split("[")[0] for n in p.summary().names} == {"s", "z"}
