@@ -53,16 +53,22 @@ def pareto_k(top_log_weights: np.ndarray, draws: int) -> float:
     """
     from arviz_stats.base import array_stats
 
-    tail = tail_length(draws)
-    if draws < 25 or len(top_log_weights) < 5:
+    length = tail_length(draws)
+    top = np.sort(top_log_weights)
+    if draws < 25 or len(top) <= length:
         return float("nan")
-    size = min(len(top_log_weights), 5 * tail)
-    top = np.sort(top_log_weights)[-size:]
-    if not top[-1] - top[-tail - 1 if tail < size else 0] > 1e-9:
+    tail, below = top[-length:], top[:-length]
+    if tail[-1] - tail[0] <= 1e-9:
         return -np.inf
-    # ArviZ takes min(n / 5, 3 sqrt(n / r_eff)) weights as the tail; n / 5 is ours by construction
-    top = np.maximum(top, top[-1] - 700)
-    _, k = array_stats.psislw(-top, r_eff=min(1.0, 9 * size / max(tail, 1) ** 2))
+    # Weights of discrete nets are tied; the cut must lie strictly below the tail, or its lower
+    # quarter has no excess and the fit divides by zero. The tail's length is ours: ArviZ takes
+    # min(n / 5, 3 sqrt(n / r_eff)) of n weights, and n / 5 is it by construction.
+    lower = below[below < tail[0] - 1e-12]
+    cut = lower[-1] if len(lower) else tail[0] - 1e-6
+    weights = np.concatenate([np.full(4 * length, cut), tail])
+    weights = np.maximum(weights, tail[-1] - 700.0)
+    with np.errstate(all="ignore"):
+        _, k = array_stats.psislw(-weights, r_eff=min(1.0, 45.0 / length))
     return float(k)
 
 

@@ -66,7 +66,9 @@ class StateArray(np.ndarray):
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if func is np.isin and isinstance(args[0], StateArray):
-            return args[0].isin(np.atleast_1d(np.asarray(args[1], dtype=object)).ravel().tolist(), **kwargs)
+            return args[0].isin(
+                np.atleast_1d(np.asarray(args[1], dtype=object)).ravel().tolist(), **kwargs
+            )
         return super().__array_function__(func, types, args, kwargs)
 
     def __getitem__(self, key: Any) -> Any:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import bayesmc as bmc
 from benchmarks.harness import table
@@ -19,9 +20,9 @@ def main() -> None:
         rows.append(
             [
                 count,
-                _median(lambda count=count: declared(count)),  # type: ignore[misc]
-                _median(lambda count=count: declared(count).validate()),  # type: ignore[misc]
-                _median(lambda net=_valid(count): net.sample(1_000, rng=0)),  # type: ignore[misc]
+                _median(partial(declared, count)),
+                _median(partial(_valid, count)),
+                _median(partial(_valid(count).sample, 1_000, rng=0)),
             ]
         )
     rows.append(["ratio", *(b / a for a, b in zip(rows[0][1:], rows[1][1:], strict=True))])  # type: ignore[operator]

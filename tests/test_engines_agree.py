@@ -1,10 +1,11 @@
 """Every engine against enumeration, on random nets: an engine joins the matrix with one line.
 
 Seeds are fixed, so a run is repeatable; ``BAYESMC_SEED`` shifts them on demand. One net under one engine
-is compared at a false-alarm rate of 1e-3 (Holm over its states, means and evidence). With some 800 such
-comparisons a chance rejection is likely somewhere, so a rejected net is drawn again, with other random
-numbers, and fails if it is rejected again (1e-6 each, 1e-3 for a whole run); and more than 3 first
-rejections among 60 nets (probability 5e-7) fail, too.
+is compared at a false-alarm rate of 1e-3 (Holm over its states, means and evidence), and at the fixed
+seeds none may be rejected. At fresh ones, with some 1,200 such comparisons, a chance rejection is likely
+somewhere; there a rejected net is drawn again, with other random numbers, and fails if it is rejected
+again (1e-6 each, 1e-3 for a whole run); and more than 3 first rejections among 60 nets (probability
+5e-7) fail, too.
 """
 
 from __future__ import annotations
@@ -109,9 +110,9 @@ def rejected(answer: Answer, kind: str, seed: int, draw: int, observed: bool = T
 
 def check_all(answer: Answer, kind: str, observed: bool = True) -> int:
     """How many nets were answered; wrong answers raise."""
-    results = [rejected(answer, kind, seed, seed, observed) for seed in SEEDS]
+    results = [rejected(answer, kind, seed, seed + 1_000, observed) for seed in SEEDS]
     doubtful = [seed for seed, result in zip(SEEDS, results, strict=True) if result]
-    assert len(doubtful) <= 3, "\n".join(filter(None, results))
+    assert len(doubtful) <= (3 if SHIFT else 0), "\n".join(filter(None, results))
     for seed in doubtful:
         again = rejected(answer, kind, seed, seed + 10**6, observed)
         assert not again, again

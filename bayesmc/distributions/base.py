@@ -178,7 +178,9 @@ class Distribution:
 
     def _finite(self, name: str, value: np.ndarray) -> np.ndarray:
         """A scalar parameter that must be finite."""
-        if value.ndim == 0 and math.isfinite(value):  # a constant, at the cost of no array operation
+        if value.ndim == 0 and math.isfinite(
+            value
+        ):  # a constant, at the cost of no array operation
             return value
         return self._check(name, value, np.isfinite(value), 0.0, "finite")
 
