@@ -19,7 +19,7 @@ from bayesmc.network import Problem, forward, read_inputs
 from bayesmc.randomness import seed_sequence, stream
 from bayesmc.resampling import systematic
 from bayesmc.results.marginal import Marginal
-from bayesmc.results.posterior import Plates, Posterior
+from bayesmc.results.posterior import Plates, Posterior, circular_variance
 from bayesmc.results.query import Query
 
 
@@ -75,10 +75,15 @@ class DrawsPosterior(Posterior):
     # ---- moments -----------------------------------------------------------------------------
 
     def mean(self, name: str) -> np.ndarray:
-        return self._average(self._values(name, "mean"))
+        values = self._values(name, "mean")
+        if self._is_circular(name):
+            return np.arctan2(self._average(np.sin(values)), self._average(np.cos(values)))
+        return self._average(values)
 
     def var(self, name: str) -> np.ndarray:
         values = self._values(name, "var")
+        if self._is_circular(name):
+            return circular_variance(self._average(np.cos(values)), self._average(np.sin(values)))
         return self._average((values - self._average(values)) ** 2)
 
     def cov(self, *names: str) -> np.ndarray:
@@ -93,6 +98,9 @@ class DrawsPosterior(Posterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         values = self._full(name, "quantile")
+        if self._is_circular(name):  # an order needs a cut: opposite the mean
+            mean = self.mean(name)
+            values = mean + np.remainder(values - mean + np.pi, 2 * np.pi) - np.pi
         flat = values.reshape((-1, *values.shape[2:]))
         if self.weights is None:
             return np.quantile(flat, q, axis=0)
@@ -334,7 +342,12 @@ class DrawsPosterior(Posterior):
         if node.domain is not None and node.domain.labels is not None:
             codes = np.broadcast_to(self._of(what), self._shape + node.value_shape)
             return (codes[..., None] == np.arange(node.domain.size)).astype(float)
-        return self._full(what, "mean").astype(float)
+        values = self._full(what, "mean").astype(float)
+        if not self._is_circular(what):
+            return values
+        # to first order the circular mean errs as the mean of these does (delta method)
+        length = np.sqrt(self._average(np.cos(values)) ** 2 + self._average(np.sin(values)) ** 2)
+        return np.sin(values - self.mean(what)) / np.maximum(length, 1e-300)
 
 
 def _chained(values: np.ndarray, trailing: int) -> np.ndarray:

@@ -61,11 +61,14 @@ class Posterior:
     # ---- what every subclass answers ---------------------------------------------------------
 
     def mean(self, name: str) -> np.ndarray:
-        """Posterior mean, shape ``(*plates, *event)``; labels have none."""
+        """Posterior mean, shape ``(*plates, *event)``; circular for angles; labels have none."""
         raise NotImplementedError
 
     def var(self, name: str) -> np.ndarray:
-        """Posterior variance of every scalar, shape ``(*plates, *event)``."""
+        """Posterior variance of every scalar, shape ``(*plates, *event)``.
+
+        For angles ``-2 log R``, with R the mean resultant length, so that ``std`` is the circular one.
+        """
         raise NotImplementedError
 
     def std(self, name: str) -> np.ndarray:
@@ -246,6 +249,11 @@ class Posterior:
             )
         return node
 
+    def _is_circular(self, name: str) -> bool:
+        """Whether the node's values are angles, whose mean and deviation are circular."""
+        support = self.model.nodes[name].support
+        return support is not None and support.kind == "circle"
+
     def _is_free(self, name: str) -> bool:
         return self.model.nodes[name].kind != "fixed" and name not in self._observed
 
@@ -270,6 +278,12 @@ class Posterior:
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"
+
+
+def circular_variance(cosine: Any, sine: Any) -> np.ndarray:
+    """Square of the circular standard deviation, from mean cosine and sine (Mardia and Jupp 2000, 2.3)."""
+    with np.errstate(divide="ignore"):
+        return -np.log(np.minimum(np.asarray(cosine) ** 2 + np.asarray(sine) ** 2, 1.0))
 
 
 def _is_labelled(node: CompiledNode) -> bool:

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ShapeError, UnknownNodeError
+from bayesmc.errors import ShapeError, UnknownNodeError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.network.align import Aligner
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, broadcasts_to
+from bayesmc.states import StateArray
 
 
 class Query:
@@ -72,6 +73,11 @@ class Query:
         result = self.function(*arguments)
         if isinstance(result, PlateArray):
             raise result._ungathered()
+        if isinstance(result, StateArray):
+            raise UnsupportedError(
+                f"query: the function returns labels {result.states}, which have no mean; compare them, as "
+                f"in {self.nodes[0]} == {result.states[0]!r}"
+            )
         array = np.asarray(result)
         lead = batch + self.plate_shape
         short = array.shape[: len(lead)]

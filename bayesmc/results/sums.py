@@ -16,7 +16,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Model, Problem
-from bayesmc.results.posterior import Posterior
+from bayesmc.results.posterior import Posterior, circular_variance
 
 #: joint states up to which scalar finite nodes share one histogram, so that it stays in cache
 _GROUP_STATES = 2048
@@ -41,6 +41,7 @@ class Sums:
         self._states: dict[str, np.ndarray] = {}
         self._powers: dict[str, np.ndarray] = {}
         self._centre: dict[str, np.ndarray] = {}
+        self._turns: dict[str, np.ndarray] = {}
         self._constant: dict[str, np.ndarray] = {}
 
     def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
@@ -54,6 +55,11 @@ class Sums:
             self._add_states(name, values[name], weights)
         for name in self._centre:
             self._add_powers(name, values[name], weights)
+        for name, sums in self._turns.items():
+            angle = values[name].reshape(len(values[name]), -1)
+            c, s = np.cos(angle), np.sin(angle)
+            for k, figure in enumerate((c, s, c * c, c * s, s * s)):
+                sums[:, k] += weights @ figure
 
     def counts(self, name: str) -> np.ndarray:
         """Weight of each state of a finite node by w and by w**2, shape ``(2, *plates, states)``."""
@@ -75,6 +81,15 @@ class Sums:
         first, second = self._powers[name].reshape((2, 2, *shape))
         return self._centre[name].reshape(shape), first, second
 
+    def turns(self, name: str) -> np.ndarray:
+        """Sums of cos, sin, cos^2, cos sin, sin^2 of an angle, shape ``(2, 5, *plates, *event)``."""
+        shape = self.model[name].value_shape
+        if name in self._constant:
+            c, s = np.cos(self._constant[name]), np.sin(self._constant[name])
+            figures = np.stack([c, s, c * c, c * s, s * s])
+            return self.weight.reshape((2,) + (1,) * figures.ndim) * figures
+        return self._turns[name].reshape((2, 5, *shape))
+
     def _sort(self, values: Mapping[str, np.ndarray]) -> list[_Group]:
         """Decide from the first chunk how each node is summed."""
         groups: list[_Group] = []
@@ -83,6 +98,8 @@ class Sums:
             size = math.prod(node.value_shape)
             if value.ndim == len(node.value_shape):
                 self._constant[name] = value
+            elif node.domain is None and node.support is not None and node.support.kind == "circle":
+                self._turns[name] = np.zeros((2, 5, size))
             elif node.domain is None:
                 self._centre[name] = _finite(value.reshape(-1, size).astype(float).mean(axis=0))
                 self._powers[name] = np.zeros((2, 2, size))
@@ -117,6 +134,8 @@ class Sums:
             array *= scale[:, None, None]
         for array in self._powers.values():
             array *= scale[None, :, None]
+        for array in self._turns.values():
+            array *= scale[:, None, None]
 
     def _add_states(self, name: str, codes: np.ndarray, weights: np.ndarray) -> None:
         table = self._states[name]
@@ -226,6 +245,9 @@ class SumsPosterior(Posterior):
         if node.domain is not None:
             return self.probabilities(name) @ np.asarray(node.domain.numbers, dtype=float)
         self._kept(name)
+        if self._is_circular(name):
+            cosine, sine = self._sums.turns(name)[0, :2]
+            return np.arctan2(sine, cosine)
         centre, first, _ = self._sums.powers(name)
         return centre + first[0] / self._sums.weight[0]
 
@@ -236,6 +258,8 @@ class SumsPosterior(Posterior):
             p = self.probabilities(name)
             return p @ numbers**2 - (p @ numbers) ** 2
         self._kept(name)
+        if self._is_circular(name):
+            return circular_variance(*(self._sums.turns(name)[0, :2] / self._sums.weight[0]))
         _, first, second = self._sums.powers(name)
         total = self._sums.weight[0]
         return np.maximum(second[0] / total - (first[0] / total) ** 2, 0.0)
@@ -253,6 +277,11 @@ class SumsPosterior(Posterior):
         node = self._node(what)
         self._kept(what)
         total, squares = self._sums.weight
+        if self._is_circular(what):
+            turns, mean = self._sums.turns(what), self.mean(what)
+            c, s = np.cos(mean), np.sin(mean)
+            spread = turns[1, 4] * c * c - 2 * turns[1, 3] * c * s + turns[1, 2] * s * s
+            return np.sqrt(np.maximum(spread, 0.0)) / np.hypot(turns[0, 0], turns[0, 1])
         if node.domain is None:
             _, first, second = self._sums.powers(what)
             mean = first[0] / total
