@@ -4,6 +4,9 @@ A conditional density is a function whose argument names are its parents and whi
 distribution. See ``bayesmc.BayesNet`` and ``bayesmc.infer``.
 """
 
+import importlib
+from typing import Any
+
 from bayesmc import errors, io
 from bayesmc.auto import Explanation, explain, infer
 from bayesmc.distributions import (
@@ -63,3 +66,10 @@ __all__ = [
     "io",
     "stack",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """``bayesmc.plotting`` and ``bayesmc.testing`` load when first asked for."""
+    if name in ("plotting", "testing"):
+        return importlib.import_module(f"bayesmc.{name}")
+    raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError
@@ -179,7 +180,7 @@ def _checked(engine: Any) -> Any:
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"
         )
-    if not (hasattr(engine, "run") and hasattr(engine, "refusal")):
+    if not isinstance(engine, Engine):
         raise TypeError(
             f"engine={engine!r} is not an engine; use Exact(), LikelihoodWeighting(draws), ..."
         )

@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.base import Engine
 from bayesmc.engines.exact_posterior import ExactPosterior
 from bayesmc.errors import BudgetError, ParameterError, UnsupportedError, ZeroProbabilityError
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree
-from bayesmc.network import BayesNet, Model, Problem, pose
+from bayesmc.network import Model, Problem
 from bayesmc.results import Posterior
 from bayesmc.structure import (
     DiscreteNet,
@@ -29,7 +30,7 @@ from bayesmc.structure import (
 
 
 @dataclass(frozen=True)
-class Exact:
+class Exact(Engine):
     """Variable elimination in both directions: all marginals and the evidence's probability at once.
 
     It takes nets whose hidden nodes have finitely many values; continuous nodes may be observed.
@@ -58,17 +59,7 @@ class Exact:
 
     max_bytes: float = 2.0 * 2**30
 
-    def unsupported(
-        self,
-        net: BayesNet,
-        evidence: Mapping[str, Any] | None = None,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> str | None:
-        """Why this engine cannot answer (too costly included), or None."""
-        return self.refusal(pose(net, evidence, inputs))
-
     def refusal(self, problem: Problem) -> str | None:
-        """Why this engine cannot answer a posed problem, or None."""
         error = self._why_not(problem)
         return None if error is None else str(error)
 
@@ -77,7 +68,6 @@ class Exact:
         return _prepared(problem).tree.cost
 
     def describe(self, problem: Problem) -> dict[str, str]:
-        """What the engine does to each node."""
         return {name: _treatment(problem, name) for name in problem.model.nodes}
 
     def run(
@@ -88,7 +78,6 @@ class Exact:
         progress: bool | None = None,
         resume: Posterior | None = None,
     ) -> Posterior:
-        """Answer a posed problem; ``infer`` is the way in."""
         if resume is not None:
             raise UnsupportedError(
                 "infer: resume= continues sampling; an exact answer has nothing to resume"

@@ -3,23 +3,23 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc import diagnostics
+from bayesmc.engines.base import Engine
 from bayesmc.engines.forward import chunk_size, forward_chunks
 from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
-from bayesmc.network import BayesNet, Model, Problem, pose
+from bayesmc.network import Model, Problem
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
 
 
 @dataclass(frozen=True)
-class LikelihoodWeighting:
+class LikelihoodWeighting(Engine):
     """Draw every hidden node given its parents and weight by the density of what is observed.
 
     It runs on any net that can be sampled forwards, and gives ``log_marginal_likelihood`` without bias
@@ -57,21 +57,10 @@ class LikelihoodWeighting:
                 f"LikelihoodWeighting(draws={self.draws!r}): give a positive number of draws"
             )
 
-    def unsupported(
-        self,
-        net: BayesNet,
-        evidence: Mapping[str, Any] | None = None,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> str | None:
-        """Why this engine cannot answer, or None."""
-        return self.refusal(pose(net, evidence, inputs))
-
     def refusal(self, problem: Problem) -> str | None:
-        """Why this engine cannot answer a posed problem, or None."""
         return refuse_unsampled(problem.model, problem.observed, "LikelihoodWeighting")
 
     def describe(self, problem: Problem) -> dict[str, str]:
-        """What the engine does to each node."""
         return {name: _treatment(problem, name) for name in problem.model.nodes}
 
     def run(
@@ -82,7 +71,6 @@ class LikelihoodWeighting:
         progress: bool | None = None,
         resume: Posterior | None = None,
     ) -> Posterior:
-        """Answer a posed problem; ``infer`` is the way in."""
         names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
         weighted = bool(problem.observed or problem.model.potentials)
         with Progress(self.draws, "likelihood weighting", progress) as bar:
