@@ -16,7 +16,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.distributions.support import Support
-from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
+from bayesmc.errors import BayesmcError, ParameterError, ShapeError, UnsupportedError
 from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
 
 _mark_invalid: ContextVar[bool] = ContextVar("mark_invalid", default=False)
@@ -219,8 +219,13 @@ def marking_invalid() -> Iterator[None]:
 
 
 def as_float(value: Any) -> np.ndarray:
-    """A parameter as a float array; what cannot become one raises with its own message."""
-    return np.asarray(value, dtype=float)
+    """A parameter as a float array; what cannot become one raises and says what it is."""
+    try:
+        return np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, BayesmcError):
+            raise
+        raise ParameterError(f"a distribution's parameter is {value!r}, not numbers") from error
 
 
 def as_quantile(q: Any) -> np.ndarray:

@@ -133,8 +133,8 @@ def _call_batched(
     try:
         return call(declaration, arguments, lead, links)
     except BayesmcError as error:
-        if not links or declaration.source == "table":
-            raise
+        if not links or declaration.source == "table" or isinstance(error.__cause__, IndexError):
+            raise  # an index out of range is a fault of its own, not of broadcasting
         try:
             one, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
             call(declaration, one, lead[len(lead) - len(declaration.plates) :], links)

@@ -73,6 +73,14 @@ class BayesNet:
         name: str | None = None,
         plates: Mapping[str, int | Sequence[Any] | None] | None = None,
     ) -> None:
+        if name is not None and not isinstance(name, str):
+            raise ModelError(
+                f"BayesNet({name!r}): the name is a string; plates are given as plates="
+            )
+        if plates is not None and not isinstance(plates, Mapping):
+            raise PlateError(
+                f"BayesNet(plates={plates!r}): give a dict from plate name to size, labels or None"
+            )
         self.name = name
         self._declarations: dict[str, Declaration] = {}
         self._potentials: dict[str, Potential] = {}
@@ -123,6 +131,11 @@ class BayesNet:
         DuplicateNodeError, PlateError, ModelError
         """
 
+        if function is not None and not callable(function):
+            raise ModelError(
+                f"net.node({function!r}): it decorates a function; give the node's name with name="
+            )
+
         def declare(f: Callable[..., Any]) -> Callable[..., Any]:
             own = name if name is not None else getattr(f, "__name__", "<lambda>")
             if own == "<lambda>":
@@ -157,6 +170,10 @@ class BayesNet:
         >>> net["c"].parents
         ('a',)
         """
+        if isinstance(cpd, str):
+            raise ModelError(
+                f"node {name!r}: {cpd!r} is text; give a distribution, a function or a table"
+            )
         dist = cpd if isinstance(cpd, Distribution) else as_distribution(cpd)
         if dist is not None:
             if parents:
@@ -454,6 +471,11 @@ class BayesNet:
         replace_: bool,
     ) -> None:
         names, bound = bind(name, function, parents)
+        if isinstance(function, type) and issubclass(function, Distribution) and not names:
+            raise ModelError(
+                f"node {name!r}: {function.__name__} is a class; call it, {function.__name__}(...), or "
+                "list parents= for its arguments"
+            )
         labels = None if states is None else _states(states)
         own = self._node_plates(name, plates)
         self._declare(Declaration(name, "function", names, own, labels, bound, vectorize), replace_)
@@ -573,7 +595,13 @@ def _plate_size(plate: str, size: Any) -> int | None:
         raise PlateError(
             f"plate {plate!r}: {size!r} is one string; give a size or a list of labels"
         )
+    if not isinstance(size, (int, np.integer, Sequence, np.ndarray)) or isinstance(size, bool):
+        raise PlateError(
+            f"plate {plate!r}: {size!r} is no size; give an int, a list of labels or None"
+        )
     count = int(size) if isinstance(size, (int, np.integer)) else len(size)
+    if not isinstance(size, (int, np.integer)) and len(set(size)) != count:
+        raise PlateError(f"plate {plate!r}: a label stands twice in {list(size)}")
     if count < 0:
         raise PlateError(f"plate {plate!r}: size {count} is negative")
     return count
