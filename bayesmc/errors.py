@@ -49,6 +49,10 @@ class BroadcastError(ModelError):
     """A function that does not act element by element over batch axes or a shared plate."""
 
 
+class QueryError(BayesmcError, ValueError):
+    """A function passed to a posterior that cannot be evaluated on arrays of draws."""
+
+
 class StateError(ModelError):
     """A label that is not among a node's states."""
 

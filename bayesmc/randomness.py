@@ -25,7 +25,12 @@ def seed_sequence(rng: Any = None) -> np.random.SeedSequence:
         return np.random.SeedSequence([int(n) for n in draw(0, 2**31 - 1, size=8)])
     if isinstance(rng, np.random.BitGenerator):
         return seed_sequence(np.random.Generator(rng))
-    return np.random.SeedSequence(rng)
+    try:
+        return np.random.SeedSequence(rng)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"rng={rng!r}: give a nonnegative whole number, a SeedSequence, a Generator or None"
+        ) from error
 
 
 def stream(seed: np.random.SeedSequence, *key: int) -> np.random.Generator:

@@ -59,6 +59,12 @@ class Exact(Engine):
 
     max_bytes: float = 2.0 * 2**30
 
+    def __post_init__(self) -> None:
+        if not (isinstance(self.max_bytes, (int, float)) and self.max_bytes > 0):
+            raise ValueError(
+                f"Exact(max_bytes={self.max_bytes!r}): give a positive number of bytes"
+            )
+
     def refusal(self, problem: Problem) -> str | None:
         error = self._why_not(problem)
         return None if error is None else str(error)

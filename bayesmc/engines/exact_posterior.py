@@ -16,7 +16,7 @@ from bayesmc.network.forward import Compute, Pass, run
 from bayesmc.randomness import seed_sequence, stream
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
-from bayesmc.results.posterior import Plates, Posterior
+from bayesmc.results.posterior import Plates, Posterior, whole_draws
 from bayesmc.results.query import Query
 from bayesmc.structure import DiscreteNet, Variable, configure, known_values
 
@@ -151,7 +151,7 @@ class ExactPosterior(Posterior):
     def quantile(self, name: str, q: Any) -> np.ndarray:
         node = self._numeric(name, "quantile")
         levels = np.asarray(q, dtype=float)
-        if ((levels < 0) | (levels > 1)).any():
+        if not ((levels >= 0) & (levels <= 1)).all():
             raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
         if node.domain is None:
             seen = self._known(name)
@@ -296,7 +296,7 @@ class ExactPosterior(Posterior):
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
         problem = self._live("resample")
-        count = 1000 if draws is None else int(draws)
+        count = 1000 if draws is None else whole_draws(draws)
         generator = stream(seed_sequence(rng), 0)
         drawn = self._calibrated.sample(generator, count)
         values = dict(self._known_values)

@@ -11,7 +11,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.engines.base import Engine
 from bayesmc.engines.forward import chunk_size, forward_chunks
-from bayesmc.errors import LowEssWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
@@ -54,7 +54,8 @@ class LikelihoodWeighting(Engine):
             or self.draws < 1
         ):
             raise ValueError(
-                f"LikelihoodWeighting(draws={self.draws!r}): give a positive number of draws"
+                f"LikelihoodWeighting(draws={self.draws!r}): draws is a whole number, 1 or more, such as "
+                "100_000"
             )
 
     def refusal(self, problem: Problem) -> str | None:
@@ -82,7 +83,13 @@ class LikelihoodWeighting(Engine):
                     raise UnsupportedError('infer: resume= continues draws; give keep="draws"')
                 return self._summaries(problem, chunks, names, weighted)
             kept = names if isinstance(keep, str) else tuple(keep)
-            return self._draws(problem, chunks, kept, weighted, resume)
+            try:
+                return self._draws(problem, chunks, kept, weighted, resume)
+            except MemoryError as error:
+                raise BudgetError(
+                    f"LikelihoodWeighting: {self.draws} draws of {len(kept)} nodes do not fit in memory; "
+                    'ask for keep="summaries", or name the nodes to keep'
+                ) from error
 
     def _summaries(
         self, problem: Problem, chunks: Any, names: Any, weighted: bool

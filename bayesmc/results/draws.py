@@ -19,7 +19,7 @@ from bayesmc.network import Problem, forward, read_inputs
 from bayesmc.randomness import seed_sequence, stream
 from bayesmc.resampling import systematic
 from bayesmc.results.marginal import Marginal
-from bayesmc.results.posterior import Plates, Posterior, circular_variance
+from bayesmc.results.posterior import Plates, Posterior, circular_variance, whole_draws
 from bayesmc.results.query import Query
 
 
@@ -194,7 +194,7 @@ class DrawsPosterior(Posterior):
         return Marginal(name, flat, weights)
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
-        count = math.prod(self._shape) if draws is None else int(draws)
+        count = math.prod(self._shape) if draws is None else whole_draws(draws)
         generator = stream(seed_sequence(rng), 0)
         total = math.prod(self._shape)
         weights = np.full(total, 1 / total) if self.weights is None else self.weights.ravel()

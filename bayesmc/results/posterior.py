@@ -280,6 +280,13 @@ class Posterior:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"
 
 
+def whole_draws(draws: Any) -> int:
+    """A number of draws to resample, checked."""
+    if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 1:
+        raise ValueError(f"resample(draws={draws!r}): draws is a whole number, 1 or more")
+    return int(draws)
+
+
 def circular_variance(cosine: Any, sine: Any) -> np.ndarray:
     """Square of the circular standard deviation, from mean cosine and sine (Mardia and Jupp 2000, 2.3)."""
     with np.errstate(divide="ignore"):

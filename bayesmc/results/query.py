@@ -8,7 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ShapeError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import (
+    BayesmcError,
+    QueryError,
+    ShapeError,
+    UnknownNodeError,
+    UnsupportedError,
+)
 from bayesmc.network import Model
 from bayesmc.network.align import Aligner
 from bayesmc.plates import PlateArray
@@ -70,7 +76,17 @@ class Query:
             else:
                 decoded = node.decode(value)
                 arguments.append(_frozen(decoded))
-        result = self.function(*arguments)
+        try:
+            result = self.function(*arguments)
+        except BayesmcError:
+            raise
+        except Exception as error:
+            shapes = ", ".join(str(np.shape(getattr(a, "array", a))) for a in arguments)
+            raise QueryError(
+                f"query: the function fails on arrays of shape {shapes} ({type(error).__name__}: {error}); "
+                "it gets all draws at once, so write it with NumPy (& for and, np.where for if, "
+                "np.maximum for max)"
+            ) from error
         if isinstance(result, PlateArray):
             raise result._ungathered()
         if isinstance(result, StateArray):
