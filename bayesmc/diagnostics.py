@@ -81,20 +81,32 @@ def weighted_mean(values: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
     """Mean over the two leading axes (chain, draw); ``weights`` sum to 1."""
     if weights is None:
         return np.mean(values, axis=(0, 1))
-    return np.tensordot(weights, values, axes=([0, 1], [0, 1]))
+    return weighted_sum(values, weights)
+
+
+def weighted_sum(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Sum of ``weights * values`` over (chain, draw); a weight of zero silences even infinity."""
+    with np.errstate(invalid="ignore"):
+        total = np.tensordot(weights, values, axes=([0, 1], [0, 1]))
+    if np.isfinite(total).all():
+        return total
+    lead = (weights > 0).reshape(weights.shape + (1,) * (values.ndim - 2))
+    return np.tensordot(weights, np.where(lead, values, 0.0), axes=([0, 1], [0, 1]))
 
 
 def weighted_mcse(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Standard error of a self-normalised weighted mean (Owen 2013, eq. 9.9)."""
-    centred = values - weighted_mean(values, weights)
-    return np.sqrt(np.tensordot(weights**2, centred**2, axes=([0, 1], [0, 1])))
+    with np.errstate(invalid="ignore"):
+        centred = values - weighted_mean(values, weights)
+    return np.sqrt(weighted_sum(centred**2, weights**2))
 
 
 def weighted_ess(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Number of independent draws from the posterior with the same error; the weights' own for constants."""
-    centred = values - weighted_mean(values, weights)
-    variance = np.tensordot(weights, centred**2, axes=([0, 1], [0, 1]))
-    error = np.tensordot(weights**2, centred**2, axes=([0, 1], [0, 1]))
+    with np.errstate(invalid="ignore"):
+        centred = values - weighted_mean(values, weights)
+    variance = weighted_sum(centred**2, weights)
+    error = weighted_sum(centred**2, weights**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(error > 0, variance / error, 1.0 / np.sum(weights**2))
 

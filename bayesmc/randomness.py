@@ -6,6 +6,7 @@ spawned from, so a seed sequence can be used twice and give the same draws twice
 
 from __future__ import annotations
 
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -33,11 +34,21 @@ def seed_sequence(rng: Any = None) -> np.random.SeedSequence:
         ) from error
 
 
-def stream(seed: np.random.SeedSequence, *key: int) -> np.random.Generator:
-    """The generator of one unit of work, named by integers (its chunk, its chain, ...).
+class Purpose(IntEnum):
+    """What a stream is for: the same seed never gives two kinds of work the same numbers."""
+
+    INFER = 0
+    SAMPLE = 1
+    RESAMPLE = 2
+    PREDICT = 3
+
+
+def stream(seed: np.random.SeedSequence, purpose: Purpose, unit: int = 0) -> np.random.Generator:
+    """The generator of one unit of work of one kind (its chunk, its chain, ...).
 
     SFC64 is the fastest of NumPy's generators; its period does not depend on the key.
     """
+    key = (int(purpose), unit)
     child = np.random.SeedSequence(
         seed.entropy, spawn_key=(*seed.spawn_key, *key), pool_size=seed.pool_size
     )

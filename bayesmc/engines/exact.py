@@ -6,7 +6,6 @@ enters it. The cost is known, and refused if too high, before any large table ex
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -143,12 +142,9 @@ class _Prepared:
         return bound, self.net.invalid + invalid
 
 
-_PLANS: weakref.WeakKeyDictionary[Model, dict[Any, _Prepared]] = weakref.WeakKeyDictionary()
-
-
 def _prepared(problem: Problem) -> _Prepared:
     """The plan, kept as long as the compiled model lives; inputs are part of a model's identity."""
-    plans = _PLANS.setdefault(problem.model, {})
+    plans: dict[Any, _Prepared] = problem.model.cache.setdefault("exact plans", {})
     key = (
         tuple(sorted((n, v.tobytes()) for n, v in problem.inputs.items())),
         frozenset(n for n in problem.observed if problem.model[n].domain is None),

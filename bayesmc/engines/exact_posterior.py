@@ -13,10 +13,10 @@ from bayesmc.errors import BudgetError, UnknownNodeError, UnsupportedError
 from bayesmc.factors import Calibrated
 from bayesmc.network import Problem
 from bayesmc.network.forward import Compute, Pass, run
-from bayesmc.randomness import seed_sequence, stream
+from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
-from bayesmc.results.posterior import Plates, Posterior, whole_draws
+from bayesmc.results.posterior import Plates, Posterior, table_variance, whole_draws
 from bayesmc.results.query import Query
 from bayesmc.structure import DiscreteNet, Variable, configure, known_values
 
@@ -73,6 +73,8 @@ class ExactPosterior(Posterior):
             return self._calibrated.marginal((name, 0)).copy()
         count = math.prod(node.plate_shape)
         rows = [self._calibrated.marginal((name, e)) for e in range(count)]
+        if not rows:
+            return np.zeros((*node.plate_shape, node.domain.size))
         return np.reshape(np.stack(rows), (*node.plate_shape, node.domain.size))
 
     def _joint(self, variables: Sequence[Variable]) -> np.ndarray:
@@ -115,8 +117,7 @@ class ExactPosterior(Posterior):
         node = self._numeric(name, "var")
         if node.domain is not None:
             numbers = np.asarray(node.domain.numbers, dtype=float)
-            table = self._table(name)
-            return table @ numbers**2 - (table @ numbers) ** 2
+            return table_variance(self._table(name), numbers)
         mean = self.mean(name)
         return self._moment(name, lambda x: (x - mean) ** 2)
 
@@ -204,8 +205,9 @@ class ExactPosterior(Posterior):
         events: bool = False,
     ) -> np.ndarray:
         """The function on every configuration of what it needs, averaged over their joint table."""
-        self._live("expectation")
         query = Query(self.model, function, plates, names)
+        if self._missing(query.nodes):
+            self._live("expectation of a deterministic node")
         finite = self._above(query.nodes)
         alone = tuple(n for n in finite if set(self.model[n].plates) <= set(query.plates))
         if any(set(self.model[n].plates) - set(query.plates) for n in self._passed(query.nodes)):
@@ -297,7 +299,7 @@ class ExactPosterior(Posterior):
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
         problem = self._live("resample")
         count = 1000 if draws is None else whole_draws(draws)
-        generator = stream(seed_sequence(rng), 0)
+        generator = stream(seed_sequence(rng), Purpose.RESAMPLE)
         drawn = self._calibrated.sample(generator, count)
         values = dict(self._known_values)
         for name, node in self.model.nodes.items():
@@ -327,8 +329,8 @@ class ExactPosterior(Posterior):
         draws: int | None = None,
     ) -> DrawsPosterior:
         seed = seed_sequence(rng)
-        source = self.resample(4000 if draws is None else draws, stream(seed, 1))
-        return source.predict(names, inputs, plates, stream(seed, 0))
+        source = self.resample(4000 if draws is None else draws, seed)
+        return source.predict(names, inputs, plates, seed)
 
     def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
         if resample is None:

@@ -8,7 +8,6 @@ stay in cache; each draws from its own random stream, so results do not depend o
 from __future__ import annotations
 
 import math
-import weakref
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -20,7 +19,7 @@ from bayesmc.network import CompiledNode, Model, Observed, Problem
 from bayesmc.network.align import Aligner
 from bayesmc.network.forward import Pass, Step, run, step_for, steps_for
 from bayesmc.progress import Progress
-from bayesmc.randomness import stream
+from bayesmc.randomness import Purpose, stream
 from bayesmc.structure import Table, constants_of, tabulate
 
 #: draws per chunk of a net whose largest node is a scalar
@@ -31,8 +30,6 @@ _CHUNK_ELEMENTS = 1 << 20
 _FUNCTION_ENTRIES = 1 << 20
 _TABLE_ENTRIES = 1 << 26
 _BITS = 31
-#: steps of nets without inputs, as long as their compiled models live
-_TABLES: weakref.WeakKeyDictionary[Model, dict[str, _Tabulated]] = weakref.WeakKeyDictionary()
 
 
 def forward_chunks(
@@ -46,12 +43,13 @@ def forward_chunks(
     model = problem.model
     steps = fast_steps(model, problem.observed, problem.inputs)
     size = chunk_size(model)
-    with marking_invalid(), np.errstate(all="ignore"):
-        for number, start in enumerate(range(0, draws, size)):
-            count = min(size, draws - start)
-            state = Pass(stream(seed, first + number), (count,), dict(problem.inputs))
-            yield run(steps, state)
-            progress.advance(count)
+    for number, start in enumerate(range(0, draws, size)):
+        count = min(size, draws - start)
+        rng = stream(seed, Purpose.INFER, first + number)
+        with marking_invalid(), np.errstate(all="ignore"):
+            state = run(steps, Pass(rng, (count,), dict(problem.inputs)))
+        yield state
+        progress.advance(count)
 
 
 def chunk_size(model: Model) -> int:
@@ -65,7 +63,7 @@ def fast_steps(
 ) -> list[Step]:
     """One step per node: from a table where there is one, else by the node's function."""
     constants = constants_of(model, inputs)
-    kept: dict[str, _Tabulated] = {} if inputs else _TABLES.setdefault(model, {})
+    kept: dict[str, _Tabulated] = {} if inputs else model.cache.setdefault("tables", {})
     steps: list[Step] = []
     for node in model.nodes.values():
         seen = observed.get(node.name)
@@ -258,8 +256,7 @@ class _Guard:
             return
         bad = self.invalid.take(index)
         alive = np.asarray(state.log_weight) > -np.inf
-        while alive.ndim < np.ndim(bad):
-            alive = alive[..., None]
+        alive = alive.reshape(alive.shape + (1,) * len(self.node.plates))
         if (bad & alive).any():
             raise ParameterError(
                 f"node {self.node.name!r}: the function gives bad parameters at a configuration of its "

@@ -75,8 +75,7 @@ class LikelihoodWeighting(Engine):
         names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
         weighted = bool(problem.observed or problem.model.potentials)
         with Progress(self.draws, "likelihood weighting", progress) as bar:
-            before = 0 if not isinstance(resume, DrawsPosterior) else resume._shape[1]
-            first = -(-before // chunk_size(problem.model))
+            first = resume.streams if isinstance(resume, DrawsPosterior) else 0
             chunks = forward_chunks(problem, self.draws, seed, bar, first)
             if isinstance(keep, str) and keep == "summaries":
                 if resume is not None:
@@ -129,6 +128,8 @@ class LikelihoodWeighting(Engine):
             log_weights if weighted else None,
             independent=True,
         )
+        used = -(-self.draws // chunk_size(problem.model))
+        posterior.streams = used + (resume.streams if isinstance(resume, DrawsPosterior) else 0)
         _set_evidence(posterior, float(diagnostics.log_sum_exp(log_weights)), total, weighted)
         return posterior
 

@@ -36,6 +36,8 @@ from bayesmc.shapes import Shape, read_only, unused_sizes
 
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
+#: values up to which a finite support is enumerated
+_DOMAIN_SIZE = 1 << 16
 
 
 def compile_model(
@@ -161,7 +163,9 @@ def _discover_stochastic(
     support = dist.support
     domain = None
     constant = np.size(support.low) == 1 and np.size(support.high) == 1
-    if support.size is not None and constant and not dist.event_shape:
+    small = support.size is not None and support.size <= _DOMAIN_SIZE
+    if small and constant and not dist.event_shape:
+        assert support.size is not None
         try:
             domain = domain_with_states(
                 support.size, int(np.asarray(support.low).flat[0]), declaration.states

@@ -86,12 +86,11 @@ class Elementwise(Distribution):
     @property
     def support(self) -> Support:
         first = self.parts[0].support
-        if first.kind not in ("interval", "integers"):
+        # bounds stay one per element, even if all are equal here: elsewhere they need not be
+        if not self.batch_shape or first.kind not in ("interval", "integers"):
             return first
         low = np.array([np.asarray(p.support.low).flat[0] for p in self.parts])
         high = np.array([np.asarray(p.support.high).flat[0] for p in self.parts])
-        if (low == low[0]).all() and (high == high[0]).all():
-            return first
         low, high = low.reshape(self.batch_shape), high.reshape(self.batch_shape)
         return Support(first.kind, low, high, first.open_low, first.open_high)
 

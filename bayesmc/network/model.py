@@ -18,7 +18,6 @@ from bayesmc.distributions import Categorical, Distribution, as_distribution
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     BayesmcError,
-    BroadcastError,
     DensityError,
     ModelError,
     ParameterError,
@@ -122,6 +121,8 @@ class Model:
     labels: dict[str, tuple[Any, ...]] = field(default_factory=dict)
     probe: dict[str, np.ndarray] = field(default_factory=dict, repr=False)
     probe_shape: Shape = ()
+    #: what others derived from this model and may use again; it lives as long as the model
+    cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
     def __getitem__(self, name: str) -> CompiledNode:
         return self.nodes[name]
@@ -132,7 +133,7 @@ class Model:
             name: replace(node, declaration=replace(node.declaration, function=None))
             for name, node in self.nodes.items()
         }
-        return replace(self, nodes=nodes, potentials={}, probe={})
+        return replace(self, nodes=nodes, potentials={}, probe={}, cache={})
 
     def evaluate(self, name: str, values: Mapping[str, np.ndarray]) -> tuple[Any, Shape]:
         """What node ``name`` is given its parents' stored values, and the batch shape of those.
@@ -269,7 +270,7 @@ def call(
     except BayesmcError as error:
         raise _renamed(error, f"node {name!r}: {error}") from error
     except Exception as error:
-        raise BroadcastError(f"node {name!r}: {_explain(error, arguments)}") from error
+        raise ModelError(f"node {name!r}: {_explain(error, arguments)}") from error
 
 
 def fit(declaration: Declaration, dist: Distribution, batch: Shape, plates: Shape) -> None:

@@ -29,7 +29,7 @@ from bayesmc.network.model import Model
 from bayesmc.network.node import Declaration, Node, Potential, bind, checked_rows
 from bayesmc.network.ordering import topological_order
 from bayesmc.network.validate import validate_model
-from bayesmc.randomness import seed_sequence, stream
+from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape, owned, unused_sizes
 
 if TYPE_CHECKING:
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 Parents = Sequence[str] | Mapping[str, str] | None
 #: bytes of inputs up to which a compiled model is kept for the next call with the same inputs
 _KEEP_INPUTS = 1 << 20
+#: compiled models kept for other plate sizes and inputs
+_KEEP_MODELS = 8
 
 
 class BayesNet:
@@ -374,9 +376,7 @@ class BayesNet:
             self.model(inputs=inputs)
             return
         model = self._probe_model(self._sizes)
-        if not self._valid:
-            validate_model(model)
-            self._valid = True
+        self._validate(model)
 
     def log_prob(
         self, values: Mapping[str, Any], *, inputs: Mapping[str, Any] | None = None
@@ -429,7 +429,7 @@ class BayesNet:
             raise ValueError(f"sample(draws={draws!r}): draws is a number of draws, 0 or more")
         model = self.model(None, inputs, plates)
         given = read_inputs(self._declarations, model.sizes, inputs)
-        return joint_sample(model, int(draws), stream(seed_sequence(rng), 0), given)
+        return joint_sample(model, int(draws), stream(seed_sequence(rng), Purpose.SAMPLE), given)
 
     def model(
         self,
@@ -453,9 +453,7 @@ class BayesNet:
         settled = {p: n if n is not None else 0 for p, n in sizes.items()}
         given = read_inputs(self._declarations, settled, inputs)
         model = self._compile(settled, given)
-        if not self._valid:
-            validate_model(model)
-            self._valid = True
+        self._validate(model)
         return model
 
     # ---- private ----------------------------------------------------------------------------
@@ -507,6 +505,16 @@ class BayesNet:
             raise PlateError(f"node {name!r}: plates={names} names a plate twice")
         return names
 
+    def _validate(self, model: Model) -> None:
+        """Once for a net, and again while a plate has been too small to show mixing."""
+        if self._valid:
+            return
+        if not model.cache.get("valid"):
+            validate_model(model)
+            model.cache["valid"] = True
+        used = {p for d in self._declarations.values() for p in d.plates}
+        self._valid = all(model.sizes[p] > 1 for p in used)
+
     def _known_parents(self, name: str, parents: Sequence[str], what: str = "node") -> None:
         for parent in parents:
             if parent not in self._declarations:
@@ -557,6 +565,8 @@ class BayesNet:
                 self.name, self._declarations, self._potentials, sizes, labels, inputs, order
             )
             if small:
+                while len(self._models) >= _KEEP_MODELS:
+                    del self._models[next(iter(self._models))]
                 self._models[key] = model
         return model
 

@@ -91,7 +91,7 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
     except BroadcastError:
         raise
     except BayesmcError:
-        return  # ranks mix draws, and what they make need not be reachable
+        return  # ranks mix draws, and what they make together need not be reachable
 
 
 def _part(value: np.ndarray, batch: Shape, kind: int) -> np.ndarray:

@@ -15,12 +15,13 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import UnknownNodeError, UnsupportedError, missing_extra
-from bayesmc.network import Problem, forward, read_inputs
-from bayesmc.randomness import seed_sequence, stream
+from bayesmc.network import Model, Observed, Problem, forward, read_inputs
+from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Plates, Posterior, circular_variance, whole_draws
 from bayesmc.results.query import Query
+from bayesmc.states import StateArray
 
 
 class DrawsPosterior(Posterior):
@@ -33,7 +34,16 @@ class DrawsPosterior(Posterior):
     log_weights : ndarray, shape (chain, draw), optional
     independent : bool
         Draws are independent of each other (no chain to diagnose).
+    ancestors : ndarray of int, shape (draw,), optional
+        Which weighted draw each was resampled from; copies of one draw count once in errors.
+
+    Attributes
+    ----------
+    streams : int
+        Random streams used so far, so that ``resume`` takes fresh ones.
     """
+
+    streams = 0
 
     def __init__(
         self,
@@ -43,11 +53,14 @@ class DrawsPosterior(Posterior):
         shape: tuple[int, int],
         log_weights: np.ndarray | None = None,
         independent: bool = False,
+        ancestors: np.ndarray | None = None,
     ) -> None:
         super().__init__(problem, engine)
         self._stored = dict(stored)
         self._shape = shape
         self._independent = independent
+        self._ancestors = ancestors
+        self._inputs = dict(problem.inputs)
         self.log_weights = log_weights
         if log_weights is not None:
             self.weights = diagnostics.normalised(log_weights)
@@ -157,23 +170,31 @@ class DrawsPosterior(Posterior):
 
     def mcse(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
+        if self._ancestors is not None:
+            return diagnostics.weighted_mcse(*self._distinct(values))
         if self.weights is not None:
             return diagnostics.weighted_mcse(values, self.weights)
         if self._independent:
-            return values.std(axis=(0, 1), ddof=1) / np.sqrt(np.prod(self._shape))
+            count = math.prod(self._shape)
+            spread = (
+                values.std(axis=(0, 1), ddof=1) if count > 1 else np.full(values.shape[2:], np.nan)
+            )
+            return spread / np.sqrt(count)
         return diagnostics.chain_statistic("mcse", values)
 
     def ess(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
+        if self._ancestors is not None:
+            return diagnostics.weighted_ess(*self._distinct(values))
         if self.weights is not None:
             return diagnostics.weighted_ess(values, self.weights)
         if self._independent:
-            return np.full(values.shape[2:], float(np.prod(self._shape)))
+            return np.full(values.shape[2:], float(math.prod(self._shape)))
         return diagnostics.chain_statistic("ess", values)
 
     def rhat(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
-        if self.weights is not None or self._independent:
+        if self.weights is not None or self._independent or self._ancestors is not None:
             return np.full(values.shape[2:], np.nan)
         return diagnostics.chain_statistic("rhat", values)
 
@@ -195,7 +216,7 @@ class DrawsPosterior(Posterior):
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
         count = math.prod(self._shape) if draws is None else whole_draws(draws)
-        generator = stream(seed_sequence(rng), 0)
+        generator = stream(seed_sequence(rng), Purpose.RESAMPLE)
         total = math.prod(self._shape)
         weights = np.full(total, 1 / total) if self.weights is None else self.weights.ravel()
         picked = generator.permutation(systematic(weights, count, generator))
@@ -208,13 +229,15 @@ class DrawsPosterior(Posterior):
             ]
             for name, values in self._stored.items()
         }
-        # duplicates of few heavy draws are not independent, so their error is the chain's business
+        ancestors = picked if self._ancestors is None else self._ancestors[picked]
+        duplicated = self.weights is not None or self._ancestors is not None
         return DrawsPosterior(
             self._live("resample"),
             self.engine,
             stored,
             (1, count),
-            independent=self.weights is None,
+            independent=not duplicated,
+            ancestors=ancestors if duplicated else None,
         )
 
     def predict(
@@ -233,8 +256,8 @@ class DrawsPosterior(Posterior):
                     f"predict({name!r}): {self._node(name).kind} nodes are not drawn"
                 )
         seed = seed_sequence(rng)
-        source = self if self.weights is None else self.resample(draws, stream(seed, 1))
-        return source._predict(problem, wanted, inputs, plates or {}, stream(seed, 0))
+        source = self if self.weights is None else self.resample(draws, seed)
+        return source._predict(problem, wanted, inputs, plates or {}, stream(seed, Purpose.PREDICT))
 
     def _predict(
         self,
@@ -247,6 +270,7 @@ class DrawsPosterior(Posterior):
         sizes = {**self.model.sizes, **plates}
         given = problem.inputs if inputs is None else inputs
         model = problem.net.model(None, given, sizes)
+        _refuse_potentials(model, wanted)
         known = read_inputs({n: c.declaration for n, c in model.nodes.items()}, sizes, given)
         values: dict[str, np.ndarray] = {}
         anew: set[str] = set()
@@ -262,8 +286,11 @@ class DrawsPosterior(Posterior):
             elif not node.is_stochastic and anew & set(node.parents):
                 anew.add(name)
                 steps.append(forward.step_for(model, node, {}))
-            else:
+            elif name in self._stored:
                 values[name] = self._of(name)
+        missing = {p for n in anew for p in model[n].parents} - anew - set(values)
+        if missing:
+            self._of(min(missing))  # says that it was not kept
         kept = [n for n in model.nodes if n not in anew]
         refused = forward.refuse_unsampled(model, kept, "predict")
         if refused:
@@ -302,7 +329,15 @@ class DrawsPosterior(Posterior):
     def _event_dims(self, name: str) -> list[str]:
         return [f"{name}_dim_{i}" for i in range(len(self.model[name].event_shape))]
 
+    def _distinct(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Each resampled draw once, weighted by its copies."""
+        assert self._ancestors is not None
+        _, first, copies = np.unique(self._ancestors, return_index=True, return_counts=True)
+        return values[:, first], (copies / copies.sum())[None]
+
     def _of(self, name: str) -> np.ndarray:
+        if name in self._inputs:
+            return self._inputs[name][None, None]
         if name not in self._stored:
             self._node(name)
             raise UnsupportedError(
@@ -354,3 +389,27 @@ def _chained(values: np.ndarray, trailing: int) -> np.ndarray:
     """Values with exactly two batch axes."""
     missing = 2 - (values.ndim - trailing)
     return values.reshape((1,) * missing + values.shape) if missing > 0 else values
+
+
+def _refuse_potentials(model: Model, wanted: Sequence[str]) -> None:
+    """Drawing a node anew from its parents would ignore a potential on it."""
+    for name, (potential, _) in model.potentials.items():
+        hit = [n for n in wanted if n in potential.parents]
+        if hit:
+            raise UnsupportedError(
+                f"predict({hit[0]!r}): the potential {name!r} reweights it, which drawing it given its "
+                "parents would ignore"
+            )
+
+
+def _with_gaps(values: np.ndarray, seen: Observed) -> np.ndarray:
+    """Observed values with NaN (None for labels) where nothing was observed."""
+    if seen.mask is None:
+        return np.asarray(values)
+    if isinstance(values, StateArray):
+        labels = values.labels.astype(object)
+        labels[~seen.mask] = None
+        return labels
+    numbers = np.array(values, dtype=float)
+    numbers[~seen.mask] = np.nan
+    return numbers

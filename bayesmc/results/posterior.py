@@ -287,6 +287,12 @@ def whole_draws(draws: Any) -> int:
     return int(draws)
 
 
+def table_variance(table: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Variances of numbers under tables of probabilities, shape ``table.shape[:-1]``."""
+    centred = numbers - (table @ numbers)[..., None]
+    return (table * centred**2).sum(axis=-1)
+
+
 def circular_variance(cosine: Any, sine: Any) -> np.ndarray:
     """Square of the circular standard deviation, from mean cosine and sine (Mardia and Jupp 2000, 2.3)."""
     with np.errstate(divide="ignore"):

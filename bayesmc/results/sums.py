@@ -16,7 +16,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Model, Problem
-from bayesmc.results.posterior import Posterior, circular_variance
+from bayesmc.results.posterior import Posterior, circular_variance, table_variance
 
 #: joint states up to which scalar finite nodes share one histogram, so that it stays in cache
 _GROUP_STATES = 2048
@@ -36,6 +36,7 @@ class Sums:
         self.draws = 0
         self.top = -np.inf
         self.weight = np.zeros(2)
+        self._summed = np.zeros(2)
         self.tail = _Tail()
         self._groups: list[_Group] | None = None
         self._states: dict[str, np.ndarray] = {}
@@ -46,6 +47,7 @@ class Sums:
 
     def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
         """Take in one chunk of ``draws`` draws with their log weights (a scalar: all equal)."""
+        before = self.top
         weights = self._relative(np.asarray(log_weight, dtype=float), draws)
         if self._groups is None:
             self._groups = self._sort(values)
@@ -54,7 +56,10 @@ class Sums:
         for name in self._states:
             self._add_states(name, values[name], weights)
         for name in self._centre:
-            self._add_powers(name, values[name], weights)
+            value = values[name].reshape(draws, -1)
+            if self.top > before:  # heavier draws than any before: they say best where the mean is
+                self._move_centre(name, value, weights[0])
+            self._add_powers(name, value, weights)
         for name, sums in self._turns.items():
             angle = values[name].reshape(len(values[name]), -1)
             c, s = np.cos(angle), np.sin(angle)
@@ -101,7 +106,7 @@ class Sums:
             elif node.domain is None and node.support is not None and node.support.kind == "circle":
                 self._turns[name] = np.zeros((2, 5, size))
             elif node.domain is None:
-                self._centre[name] = _finite(value.reshape(-1, size).astype(float).mean(axis=0))
+                self._centre[name] = np.zeros(size)
                 self._powers[name] = np.zeros((2, 2, size))
             elif node.plates:
                 self._states[name] = np.zeros((2, size, node.domain.size))
@@ -123,6 +128,7 @@ class Sums:
         weights = np.empty((2, draws))
         np.exp(log_weight - (self.top if self.top > -np.inf else 0.0), out=weights[0])
         np.multiply(weights[0], weights[0], out=weights[1])
+        self._summed = self.weight.copy()
         self.weight += weights[0].sum(), weights[0] @ weights[0]
         return weights
 
@@ -147,15 +153,32 @@ class Sums:
         first, second = self._powers[name]
         if first.shape[1] == 1:  # a scalar: dot products, with what they share computed once
             weight = weights[0]
-            centred = value.reshape(-1) - self._centre[name]
+            centred = value[:, 0] - self._centre[name]
             heavy = weight * centred
-            first[:, 0] += weight @ centred, weight @ heavy
-            second[:, 0] += heavy @ centred, heavy @ heavy
-            return
-        centred = value.reshape(len(value), -1) - self._centre[name]
-        first += (weights @ centred).reshape(first.shape)
-        np.multiply(centred, centred, out=centred)
-        second += (weights @ centred).reshape(first.shape)
+            rows = np.array([[weight @ centred], [weight @ heavy]])
+            squares = np.array([[heavy @ centred], [heavy @ heavy]])
+        else:
+            centred = value - self._centre[name]
+            rows = weights @ centred
+            squares = weights @ (centred * centred)
+        if not np.isfinite(squares).all():  # a draw of weight zero may be infinite
+            kept = np.where(weights[0][:, None] > 0, value - self._centre[name], 0.0)
+            rows, squares = weights @ kept, weights @ (kept * kept)
+        first += rows
+        second += squares
+
+    def _move_centre(self, name: str, value: np.ndarray, weight: np.ndarray) -> None:
+        """Take the chunk's weighted mean as the centre, and the sums so far along with it."""
+        alive = weight > 0
+        mean = (weight[alive] @ value[alive]) / weight[alive].sum()
+        mean = np.where(np.isfinite(mean), mean, self._centre[name])
+        step = mean - self._centre[name]
+        first, second = self._powers[name]
+        # the chunk's own weight is not in these sums yet
+        total = self._summed[:, None]
+        second += step * (step * total - 2 * first)
+        first -= step * total
+        self._centre[name] = mean
 
 
 class _Group:
@@ -255,8 +278,7 @@ class SumsPosterior(Posterior):
         node = self._numeric(name, "var")
         if node.domain is not None:
             numbers = np.asarray(node.domain.numbers, dtype=float)
-            p = self.probabilities(name)
-            return p @ numbers**2 - (p @ numbers) ** 2
+            return table_variance(self.probabilities(name), numbers)
         self._kept(name)
         if self._is_circular(name):
             return circular_variance(*(self._sums.turns(name)[0, :2] / self._sums.weight[0]))
@@ -330,7 +352,3 @@ class SumsPosterior(Posterior):
 
     def _remedy(self) -> str:
         return 'call infer with keep="draws"'
-
-
-def _finite(values: np.ndarray) -> np.ndarray:
-    return np.where(np.isfinite(values), values, 0.0)
