@@ -68,7 +68,7 @@ def pareto_k(top_log_weights: np.ndarray, draws: int) -> float:
     weights = np.concatenate([np.full(4 * length, cut), tail])
     weights = np.maximum(weights, tail[-1] - 700.0)
     with np.errstate(all="ignore"):
-        _, k = array_stats.psislw(-weights, r_eff=min(1.0, 45.0 / length))
+        _, k = array_stats.psislw(-weights, r_eff=min(1.0, 44.0 / length))
     return float(k)
 
 

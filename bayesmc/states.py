@@ -13,6 +13,50 @@ import numpy as np
 
 from bayesmc.errors import StateError
 
+#: NumPy functions that move elements about without changing them, so that labels survive
+_MOVERS = frozenset(
+    (
+        np.stack, np.concatenate, np.vstack, np.hstack, np.broadcast_to, np.broadcast_arrays,
+        np.copy, np.reshape, np.ravel, np.transpose, np.squeeze, np.expand_dims, np.moveaxis,
+        np.swapaxes, np.repeat, np.tile, np.take, np.take_along_axis, np.flip, np.roll,
+        np.atleast_1d, np.atleast_2d, np.where,
+    )
+)  # fmt: skip
+
+
+class NumberArray(np.ndarray):
+    """Numbers that refuse to be compared with labels, where NumPy would quietly answer False.
+
+    Functions are tried on it and queries receive it, so that a forgotten ``states=`` is heard of.
+    """
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
+        if ufunc in (np.equal, np.not_equal):
+            label = next((x for x in inputs if isinstance(x, (str, np.str_))), None)
+            texts = [x for x in inputs if isinstance(x, np.ndarray) and x.dtype.kind in "US"]
+            if label is not None or texts:
+                raise StateError(
+                    f"numbers are compared with the label {label if label is not None else texts[0]!r}: "
+                    "the node has no labels (or they were lost on the way); declare it with states="
+                )
+        plain = [_bare(x) for x in inputs]
+        if "out" in kwargs:
+            kwargs["out"] = tuple(_bare(x) for x in kwargs["out"])
+        result = getattr(ufunc, method)(*plain, **kwargs)
+        return as_numbers(result) if isinstance(result, np.ndarray) else result
+
+    def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
+        result = func(*_bare(args), **{k: _bare(v) for k, v in kwargs.items()})
+        return as_numbers(result) if type(result) is np.ndarray else result
+
+    def __repr__(self) -> str:
+        return repr(self.view(np.ndarray))
+
+
+def as_numbers(array: np.ndarray) -> np.ndarray:
+    """The array as one that refuses labels."""
+    return array.view(NumberArray) if type(array) is np.ndarray else array
+
 
 class StateArray(np.ndarray):
     """Integer codes whose ``==`` and ``!=`` accept labels; arithmetic gives plain integers.
@@ -61,15 +105,24 @@ class StateArray(np.ndarray):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if ufunc in (np.equal, np.not_equal) and method == "__call__":
             inputs = _comparable(*inputs)
-        plain = [x.codes if isinstance(x, StateArray) else x for x in inputs]
-        return getattr(ufunc, method)(*plain, **kwargs)
+            return getattr(ufunc, method)(*(_bare(x) for x in inputs), **kwargs)
+        result = getattr(ufunc, method)(*(_bare(x) for x in inputs), **kwargs)
+        return as_numbers(result) if isinstance(result, np.ndarray) else result
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if func is np.isin and isinstance(args[0], StateArray):
             return args[0].isin(
                 np.atleast_1d(np.asarray(args[1], dtype=object)).ravel().tolist(), **kwargs
             )
-        return super().__array_function__(func, types, args, kwargs)
+        result = func(*_bare(args), **{k: _bare(v) for k, v in kwargs.items()})
+        moved = args[1:] if func is np.where else args
+        states = {x.states for x in _leaves(moved) if isinstance(x, StateArray)}
+        keeps = func in _MOVERS and len(states) == 1 and _all_labelled(func, moved)
+        if keeps and isinstance(result, (list, tuple)):
+            return type(result)(StateArray(r, next(iter(states))) for r in result)
+        if keeps and isinstance(result, np.ndarray):
+            return StateArray(result, next(iter(states)))
+        return as_numbers(result) if type(result) is np.ndarray else result
 
     def __getitem__(self, key: Any) -> Any:
         item = super().__getitem__(key)
@@ -124,6 +177,27 @@ def label_code(states: Sequence[Any], label: Any) -> int:
             if not isinstance(state, str) and state == label:
                 return code
     raise StateError(f"{label!r} is not a state; the states are {', '.join(map(repr, states))}")
+
+
+def _bare(value: Any) -> Any:
+    """Plain arrays in place of those defined here, also inside lists and tuples."""
+    if isinstance(value, (StateArray, NumberArray)):
+        return value.view(np.ndarray)
+    if isinstance(value, (list, tuple)):
+        return type(value)(_bare(v) for v in value)
+    return value
+
+
+def _leaves(value: Any) -> list[Any]:
+    if isinstance(value, (list, tuple)):
+        return [leaf for v in value for leaf in _leaves(v)]
+    return [value]
+
+
+def _all_labelled(func: Any, args: Any) -> bool:
+    """Whether everything a function moves is labelled; its other arguments say how."""
+    moved = args if func in (np.where, np.broadcast_arrays) else args[:1]
+    return all(isinstance(leaf, StateArray) for leaf in _leaves(moved))
 
 
 def _comparable(a: Any, b: Any) -> tuple[Any, Any]:

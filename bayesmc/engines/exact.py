@@ -15,7 +15,13 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact_posterior import ExactPosterior
-from bayesmc.errors import BudgetError, ParameterError, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import (
+    BudgetError,
+    ModelError,
+    ParameterError,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree
 from bayesmc.network import Model, Problem
 from bayesmc.results import Posterior
@@ -110,6 +116,11 @@ class Exact(Engine):
             cost = _prepared(problem).tree.cost
         except BudgetError as error:
             return BudgetError(f"Exact: {error}; use LikelihoodWeighting(draws)", error.bytes)
+        except ModelError as error:
+            return UnsupportedError(
+                f"Exact evaluates functions on all configurations of their parents, also impossible ones, "
+                f"and one of them fails there: {error}; use LikelihoodWeighting(draws)"
+            )
         if cost.bytes > self.max_bytes:
             return BudgetError(
                 f"Exact would need about {readable_bytes(cost.bytes)} (induced width "

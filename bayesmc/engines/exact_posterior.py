@@ -60,7 +60,7 @@ class ExactPosterior(Posterior):
             self._joint([self._element(name, plates, at) for name in names])
             for at in np.ndindex(sizes)
         ]
-        return np.reshape(np.stack(tables), sizes + cards)
+        return np.reshape(np.stack(tables) if tables else np.zeros(sizes + cards), sizes + cards)
 
     def _table(self, name: str) -> np.ndarray:
         """Marginal tables of all elements of a finite node, shape ``(*plates, states)``."""
@@ -305,7 +305,8 @@ class ExactPosterior(Posterior):
         for name, node in self.model.nodes.items():
             if node.domain is not None and node.kind != "fixed":
                 elements = range(math.prod(node.plate_shape))
-                columns = np.stack([drawn[(name, e)] for e in elements], axis=-1)
+                empty = np.zeros((count, 0))
+                columns = np.stack([drawn[(name, e)] for e in elements], -1) if elements else empty
                 values[name] = columns.reshape((count, *node.plate_shape)).astype(node.domain.dtype)
         rest = [
             Compute(self.model, n) for name, n in self.model.nodes.items() if name not in values

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import ParameterError
+from bayesmc.errors import BayesmcError, ParameterError
 from bayesmc.network import CompiledNode, Model, Observed, Problem
 from bayesmc.network.align import Aligner
 from bayesmc.network.forward import Pass, Step, run, step_for, steps_for
@@ -90,7 +90,10 @@ class _Tabulated:
                 self.hidden = TableCompute(node)
             return
         limit = _FUNCTION_ENTRIES if node.declaration.probs is None else _TABLE_ENTRIES
-        self.table = tabulate(model, node, constants, limit)
+        try:
+            self.table = tabulate(model, node, constants, limit)
+        except BayesmcError:
+            return  # it fails at some configuration, perhaps an impossible one: call it draw by draw
         if self.table is not None:
             self.hidden = TableDraw(node, self.table)
 

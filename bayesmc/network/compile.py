@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from bayesmc.network.model import (
 )
 from bayesmc.network.node import Declaration, Potential
 from bayesmc.shapes import Shape, read_only, unused_sizes
+from bayesmc.states import StateArray
 
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
@@ -250,20 +252,33 @@ def _discover_deterministic(
             f"node {declaration.name!r}: the function returns NaN on reachable values"
         )
     integral = value.dtype.kind in "biu"
+    labels = declaration.states
+    if labels is None and isinstance(one, StateArray):
+        labels = one.states  # labels that a function passes on stay labels
     node = CompiledNode(declaration, links, plates, event, integral, False)
-    if declaration.states is not None and event:
-        raise ModelError(f"node {declaration.name!r}: states= need scalar values")
-    tabulated = _tabulate_deterministic(node)
-    if tabulated is None:
-        if declaration.states is not None:
-            raise ModelError(
-                f"node {declaration.name!r}: states= on a deterministic node need finite parents"
-            )
-        return node, value
-    return tabulated, lookup(tabulated, probe)
+    if labels is None:
+        tabulated = _tabulate_deterministic(node, None)
+        return (node, value) if tabulated is None else (tabulated, lookup(tabulated, probe))
+    if event or not integral or (value.size and not 0 <= value.min() <= value.max() < len(labels)):
+        raise ModelError(
+            f"node {declaration.name!r}: with states= a deterministic node returns scalar positions "
+            f"0..{len(labels) - 1}, not {np.unique(value)[:6].tolist()}"
+        )
+    domain = _states_of(declaration.name, labels)
+    tabulated = _tabulate_deterministic(node, domain)
+    if tabulated is not None:
+        return tabulated, lookup(tabulated, probe)
+    return replace(node, domain=domain, is_discrete=True), value
 
 
-def _tabulate_deterministic(node: CompiledNode) -> CompiledNode | None:
+def _states_of(name: str, states: tuple[Any, ...]) -> Domain:
+    try:
+        return states_domain(states)
+    except ModelError as error:
+        raise ModelError(f"node {name!r}: {error}") from None
+
+
+def _tabulate_deterministic(node: CompiledNode, domain: Domain | None) -> CompiledNode | None:
     """``node`` with the table of its positions over all configurations of its parents, if small."""
     domains = [link.domain for _, link in node.links]
     if node.event_shape or not node.links or node.has_foreign_parents or None in domains:
@@ -280,20 +295,18 @@ def _tabulate_deterministic(node: CompiledNode) -> CompiledNode | None:
     full = np.broadcast_to(result, cards + node.plate_shape)
     if full.dtype.kind == "f" and not np.isfinite(full).all():
         return None
-    unique, positions = np.unique(full, return_inverse=True)
-    positions = positions.reshape(full.shape)
-    declared = node.declaration.states
-    if declared is not None:
-        size = int(unique.max()) + 1
-        if unique.dtype.kind not in "biu" or unique.min() < 0 or size > len(declared):
-            raise ModelError(
-                f"node {node.name!r}: with states= a deterministic node returns positions "
-                f"0..{len(declared) - 1}, not {unique[:6].tolist()}"
-            )
-        domain, positions = states_domain(declared), full
-    else:
+    if domain is None:
+        unique, positions = np.unique(full, return_inverse=True)
         unique.flags.writeable = False
         domain = Domain(len(unique), values=unique)
+        positions = positions.reshape(full.shape)
+    elif full.size and not 0 <= full.min() <= full.max() < domain.size:
+        raise ModelError(
+            f"node {node.name!r}: with states= a deterministic node returns positions "
+            f"0..{domain.size - 1}, not {np.unique(full)[:6].tolist()}"
+        )
+    else:
+        positions = full
     return CompiledNode(
         node.declaration,
         node.links,

@@ -133,6 +133,11 @@ def states_domain(states: tuple[Any, ...], low: int = 0) -> Domain:
     """Numeric states arrive as numbers, all others as labelled codes."""
     if len({(type(s) is str, s) for s in states}) != len(states):
         raise ModelError(f"states= names a state twice: {states}")
+    numbers = [isinstance(s, (int, float, bool, np.number, np.bool_)) for s in states]
+    if any(numbers) and not all(numbers):
+        raise ModelError(f"states= mixes numbers and labels: {states}; give one kind")
+    if any(s is None or s != s for s in states):
+        raise ModelError(f"states= has an entry that names nothing: {states}")
     if all(isinstance(s, (int, float, bool, np.number, np.bool_)) for s in states):
         values = np.asarray(states)
         values.flags.writeable = False

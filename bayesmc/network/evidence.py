@@ -67,6 +67,8 @@ def read_inputs(
     inputs: Mapping[str, Any] | None,
 ) -> dict[str, np.ndarray]:
     """Check the values of input nodes; all that are declared must be given."""
+    if inputs is not None and not isinstance(inputs, Mapping):
+        raise EvidenceError(f"inputs is a {type(inputs).__name__}; give a dict from name to value")
     given = dict(inputs or {})
     wanted = {n: d for n, d in declarations.items() if d.source == "input"}
     for name in given:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import EvidenceError, UnsupportedError
+from bayesmc.errors import BayesmcError, EvidenceError, UnsupportedError
 from bayesmc.network import forward
 from bayesmc.network.evidence import store
 from bayesmc.network.model import CompiledNode, Model, invalid_error
@@ -34,7 +34,16 @@ def joint_log_prob(
                     f"log_prob: node {name!r} has no value; give all stochastic nodes"
                 )
             stored_value = store(node, values[name])
-            total = total + _one_log_prob(model, name, stored_value, stored, total)
+            try:
+                total = total + _one_log_prob(model, name, stored_value, stored, total)
+            except ValueError as error:
+                if isinstance(error, BayesmcError):
+                    raise
+                batch = stored_value.shape[: stored_value.ndim - len(node.value_shape)]
+                raise EvidenceError(
+                    f"log_prob: the values of {name!r} have batch shape {batch}, which does not broadcast "
+                    "with that of the nodes before it"
+                ) from error
             stored[name] = stored_value
         for name in model.potentials:
             total = total + model.potential(name, stored)

@@ -29,6 +29,7 @@ from bayesmc.network.elementwise import call_elementwise
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.plates import Gathered, PlateArray
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, read_only
+from bayesmc.states import StateArray
 
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
@@ -182,9 +183,13 @@ class Model:
         arguments, batch = arguments_of(links, values)
         plates = tuple(self.sizes[p] for p in potential.plates)
         what = Declaration(f"potential {name}", "function", function=potential.function)
-        result = np.asarray(
-            call(what, arguments, batch + plates, links, wants_array=True), dtype=float
-        )
+        raw = np.asarray(call(what, arguments, batch + plates, links, wants_array=True))
+        if raw.dtype.kind == "b":
+            raise ModelError(
+                f"potential {name!r} returns booleans; a log factor is a number, so for a constraint "
+                "return np.where(condition, 0.0, -np.inf)"
+            )
+        result = raw.astype(float)
         if not broadcasts_to(result.shape, batch + plates):
             raise ShapeError(
                 f"potential {name!r} returns shape {result.shape}, which does not fit "
@@ -192,7 +197,7 @@ class Model:
             )
         if not (result < np.inf).all():
             raise DensityError(
-                f"potential {name!r} is NaN or infinite; a log factor must be finite"
+                f"potential {name!r} is NaN or plus infinity; a log factor must be finite (or -inf)"
             )
         full = np.broadcast_to(result, batch + plates)
         if not (plates and total):
@@ -260,7 +265,7 @@ def call(
             raise ModelError("the function returns None; return a distribution or an array")
         if isinstance(result, PlateArray):
             raise result._ungathered()
-        array = np.asarray(result)
+        array = result if isinstance(result, StateArray) else np.asarray(result)
         if array.dtype.kind not in "biuf":
             raise ModelError(
                 f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "

@@ -5,8 +5,9 @@ It wraps a networkx graph (``net.graph``) and is not one, and it knows no engine
 
 from __future__ import annotations
 
+import copy
 import difflib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -183,7 +184,8 @@ class BayesNet:
                     f"node {name!r}: a distribution has no arguments for parents={parents!r}; pass a "
                     "function of them that returns it"
                 )
-            self._declare_function(name, _Constant(dist), (), plates, states, False, replace)
+            own = copy.deepcopy(dist)  # the user's arrays stay the user's
+            self._declare_function(name, _Constant(own), (), plates, states, False, replace)
         elif callable(cpd):
             self._declare_function(name, cpd, parents, plates, states, vectorize, replace)
         else:
@@ -291,17 +293,19 @@ class BayesNet:
         >>> float(net.do(a=1).log_prob({"b": 2.0}).round(4))
         -0.9189
         """
+        if mapping is not None and not isinstance(mapping, Mapping):
+            raise EvidenceError(f"do({mapping!r}): give a dict, or name=value")
         chosen = {**(mapping or {}), **values}
         for name in chosen:
             if name not in self._declarations:
                 raise UnknownNodeError(f"do({name}=...): {self._unknown(name)}")
         sizes = plate_sizes(self._sizes, self._declarations, chosen)
         model = self._probe_model(sizes)
-        copy = self.copy()
+        other = self.copy()
         for name, value in chosen.items():
-            copy._declarations[name] = fixed(name, model[name], value, model)
-        copy._changed()
-        return copy
+            other._declarations[name] = fixed(name, model[name], value, model)
+        other._changed()
+        return other
 
     def copy(self) -> BayesNet:
         """An independent net with the same declarations."""
@@ -593,6 +597,8 @@ class _Constant:
 
 def _states(states: Sequence[Any]) -> tuple[Any, ...]:
     """States as plain Python values, so that labels compare and print as they were typed."""
+    if isinstance(states, (str, Set)) or not isinstance(states, (Sequence, np.ndarray)):
+        raise ModelError(f"states={states!r}: give a list or tuple, in the order of the support")
     return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
 
 

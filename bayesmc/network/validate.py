@@ -17,7 +17,9 @@ from bayesmc.errors import BayesmcError, BroadcastError, ModelError
 from bayesmc.network.compile import entry
 from bayesmc.network.model import CompiledNode, Model, arguments_of, call
 from bayesmc.network.node import Declaration
+from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
+from bayesmc.states import as_numbers
 
 _RTOL = 1e-7
 #: of the largest value of a parameter, for what cancels
@@ -50,7 +52,7 @@ def _check_node(model: Model, node: CompiledNode) -> None:
     arguments, batch = arguments_of(node.links, model.probe)
     lead = batch + node.plate_shape
     whole = _signature(node, arguments, lead)
-    again = _signature(node, arguments, lead)
+    again = _signature(node, [_guarded(a) for a in arguments], lead)
     if not _same(whole, again):
         raise ModelError(
             f"{_what(node)}: two calls with the same parents differ; a conditional density must "
@@ -171,6 +173,14 @@ def _perturbed(
         new = np.where(same, new + 1, new)
     moved[at] = new
     return moved
+
+
+def _guarded(argument: Any) -> Any:
+    """Numbers that refuse to be compared with labels."""
+    if isinstance(argument, PlateArray):
+        array = as_numbers(argument.array)
+        return PlateArray(array, argument.plates, argument.own, argument.event_ndim)
+    return as_numbers(argument)
 
 
 def _what(node: CompiledNode) -> str:

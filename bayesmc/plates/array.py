@@ -313,7 +313,7 @@ def stack(arrays: Sequence[Any], axis: int = -1) -> Any:
         aligned, names, event = align(tuple(arrays), (0,) * len(arrays))
         own = next(a.own for a in arrays if isinstance(a, PlateArray))
         return PlateArray(np.stack(np.broadcast_arrays(*aligned), -1), names, own, event + 1)
-    return np.stack(np.broadcast_arrays(*(np.asarray(a) for a in arrays)), axis=axis)
+    return np.stack(np.broadcast_arrays(*(np.asanyarray(a) for a in arrays)), axis=axis)
 
 
 def align(operands: Sequence[Any], cores: Sequence[int]) -> tuple[list[Any], tuple[str, ...], int]:

@@ -185,7 +185,7 @@ class Posterior:
         if _is_labelled(node):
             p = self.probabilities(name)
             nan = np.full(p.shape, np.nan)
-            columns = {"mean": p, "sd": np.sqrt(p * (1 - p))}
+            columns = {"mean": p, "sd": np.sqrt(np.maximum(p * (1 - p), 0.0))}
             columns.update(dict.fromkeys(self._quantile_names(), nan))
         else:
             columns = {"mean": self.mean(name), "sd": self.std(name)}

@@ -19,7 +19,7 @@ from bayesmc.network import Model
 from bayesmc.network.align import Aligner
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, broadcasts_to
-from bayesmc.states import StateArray
+from bayesmc.states import StateArray, as_numbers
 
 
 class Query:
@@ -72,10 +72,11 @@ class Query:
             value = stored[name]
             if self.plates:
                 link = Aligner(self.plates, node.plates, len(node.event_shape), node.domain)
-                arguments.append(link(value))
+                argument = link(value)
+                plain = isinstance(argument, np.ndarray)
+                arguments.append(as_numbers(argument) if plain else argument)
             else:
-                decoded = node.decode(value)
-                arguments.append(_frozen(decoded))
+                arguments.append(as_numbers(_frozen(node.decode(value))))
         try:
             result = self.function(*arguments)
         except BayesmcError:

@@ -47,6 +47,10 @@ class Sums:
 
     def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
         """Take in one chunk of ``draws`` draws with their log weights (a scalar: all equal)."""
+        with np.errstate(all="ignore"):  # draws of weight zero may hold anything
+            self._add(values, log_weight, draws)
+
+    def _add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
         before = self.top
         weights = self._relative(np.asarray(log_weight, dtype=float), draws)
         if self._groups is None:
@@ -151,21 +155,25 @@ class Sums:
 
     def _add_powers(self, name: str, value: np.ndarray, weights: np.ndarray) -> None:
         first, second = self._powers[name]
-        if first.shape[1] == 1:  # a scalar: dot products, with what they share computed once
+        rows, squares = self._centred_sums(name, value, weights)
+        if not np.isfinite(squares).all():  # a draw of weight zero may be infinite
+            kept = np.where(weights[0][:, None] > 0, value, self._centre[name])
+            rows, squares = self._centred_sums(name, kept, weights)
+        first += rows
+        second += squares
+
+    def _centred_sums(
+        self, name: str, value: np.ndarray, weights: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Sums of the centred values and of their squares, each by w and by w**2, ``(2, size)``."""
+        if value.shape[1] == 1:  # a scalar: dot products, with what they share computed once
             weight = weights[0]
             centred = value[:, 0] - self._centre[name]
             heavy = weight * centred
             rows = np.array([[weight @ centred], [weight @ heavy]])
-            squares = np.array([[heavy @ centred], [heavy @ heavy]])
-        else:
-            centred = value - self._centre[name]
-            rows = weights @ centred
-            squares = weights @ (centred * centred)
-        if not np.isfinite(squares).all():  # a draw of weight zero may be infinite
-            kept = np.where(weights[0][:, None] > 0, value - self._centre[name], 0.0)
-            rows, squares = weights @ kept, weights @ (kept * kept)
-        first += rows
-        second += squares
+            return rows, np.array([[heavy @ centred], [heavy @ heavy]])
+        centred = value - self._centre[name]
+        return weights @ centred, weights @ (centred * centred)
 
     def _move_centre(self, name: str, value: np.ndarray, weight: np.ndarray) -> None:
         """Take the chunk's weighted mean as the centre, and the sums so far along with it."""
