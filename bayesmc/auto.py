@@ -151,7 +151,8 @@ def explain(
         if why is not None:
             refused = {type(chosen).__name__: why}
             reasons = ("it was asked for, but it cannot answer",)
-    explanation = Explanation(chosen, tuple(reasons), refused, chosen.describe(problem))
+    nodes = {} if type(chosen).__name__ in refused else chosen.describe(problem)
+    explanation = Explanation(chosen, tuple(reasons), refused, nodes)
     print(explanation)
     return explanation
 
@@ -204,6 +205,8 @@ def _check_keep(keep: Any, problem: Problem) -> None:
                 f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names'
             )
         return
+    if not isinstance(keep, Sequence):
+        raise ValueError(f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names')
     for name in keep:
         if name not in problem.model.nodes:
             raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node")

@@ -117,10 +117,6 @@ class LowEssWarning(BayesmcWarning):
     """Importance weights rest on too few draws for the answer to be trusted."""
 
 
-class SlowModelWarning(BayesmcWarning):
-    """The model runs, but in a way that costs much more time than needed."""
-
-
 def missing_extra(package: str, extra: str) -> MissingExtraError:
     """The error for an absent optional ``package`` that ``bayesmc[extra]`` installs."""
     return MissingExtraError(

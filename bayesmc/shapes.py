@@ -13,6 +13,10 @@ import numpy as np
 
 Shape = tuple[int, ...]
 
+_RTOL = 1e-7
+#: of the largest value of a parameter, for what cancels
+_ATOL = 1e-12
+
 
 def as_shape(shape: int | Iterable[int]) -> Shape:
     """``shape`` as a tuple of ints; a bare int is one axis."""
@@ -75,3 +79,23 @@ def unused_sizes(taken: Iterable[int], count: int) -> Sequence[int]:
 def first_index(mask: np.ndarray) -> Shape:
     """Index of the first True in ``mask``, in C order."""
     return tuple(int(i) for i in np.unravel_index(int(np.argmax(mask)), mask.shape))
+
+
+def masks(size: int) -> list[np.ndarray]:
+    """Sets of elements such that for any two, one set holds the first and not the second."""
+    bits = [(np.arange(size) >> k) & 1 == 1 for k in range(max((size - 1).bit_length(), 1))]
+    return [mask for bit in bits for mask in (bit, ~bit)]
+
+
+def nearly_equal(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal up to rounding (vectorised and scalar loops may differ in the last digits)."""
+    if a.shape != b.shape:
+        return False
+    if a is b or np.logical_and.reduce(a == b, axis=None):
+        return True
+    if a.dtype.kind != "f":
+        return False
+    scale = np.maximum(np.abs(a), np.abs(b))
+    scale = np.where(np.isfinite(scale), scale, 0.0)
+    near = np.abs(a - b) <= _RTOL * scale + _ATOL * scale.max(initial=0.0)
+    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())

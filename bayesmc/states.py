@@ -40,6 +40,10 @@ class NumberArray(np.ndarray):
                     "the node has no labels (or they were lost on the way); declare it with states="
                 )
         plain = [_bare(x) for x in inputs]
+        if ufunc is np.invert and plain[0].dtype.kind in "iu" and np.isin(plain[0], (0, 1)).all():
+            raise StateError(
+                "~ on the integers 0 and 1 gives -1 and -2, which are both true; write k == 0, or 1 - k"
+            )
         if "out" in kwargs:
             kwargs["out"] = tuple(_bare(x) for x in kwargs["out"])
         result = getattr(ufunc, method)(*plain, **kwargs)
@@ -107,7 +111,7 @@ class StateArray(np.ndarray):
             inputs = _comparable(*inputs)
             return getattr(ufunc, method)(*(_bare(x) for x in inputs), **kwargs)
         result = getattr(ufunc, method)(*(_bare(x) for x in inputs), **kwargs)
-        return as_numbers(result) if isinstance(result, np.ndarray) else result
+        return as_numbers(np.asarray(result))
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if func is np.isin and isinstance(args[0], StateArray):

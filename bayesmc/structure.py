@@ -169,8 +169,11 @@ def why_not_discrete(model: Model, observed: Mapping[str, Observed]) -> str | No
         seen = observed.get(name)
         if seen is None or seen.mask is not None:
             partly = "is only partly observed and " if seen is not None else ""
+            many = node.support is not None and node.support.size is not None
             what = (
-                f"has infinitely many values ({node.support.describe()})"
+                f"has too many values to enumerate ({node.support.describe()})"  # type: ignore[union-attr]
+                if many
+                else f"has infinitely many values ({node.support.describe()})"
                 if node.is_discrete and node.support is not None
                 else "has values that depend on its parents"
                 if node.is_discrete
@@ -322,6 +325,8 @@ def _full_scope(model: Model, source: FactorSource, element: Shape) -> tuple[Var
 
 
 def _check_size(net: DiscreteNet, source: FactorSource) -> None:
+    if 0 in _plate_shape(net.model, source):
+        return
     scope = _full_scope(net.model, source, (0,) * len(source.plates))
     entries = float(math.prod(net.cards[v] for v in scope))
     entries *= math.prod(_plate_shape(net.model, source))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayesmc.errors import StateError
-from bayesmc.states import StateArray, label_array, label_code
+from bayesmc.states import NumberArray, StateArray, as_numbers, label_array, label_code
 
 STATES = ("low", "mid", "high")
 
@@ -54,9 +54,11 @@ def test_comparison_between_nodes():
     assert (a == swapped).tolist() == [True, False, True]
 
 
-def test_arithmetic_gives_plain_integers(x):
-    for result in (x + 1, x * 2, np.maximum(x, 1), x < 2, -x):
-        assert type(result) is np.ndarray
+def test_arithmetic_gives_integers_without_labels(x):
+    for result in (x + 1, x * 2, np.maximum(x, 1), x < 2, -x, np.minimum(x, x), x & x):
+        assert type(result) is NumberArray and not isinstance(result, StateArray)
+        with pytest.raises(StateError, match=r"label 'mid'.*declare it with states="):
+            result == "mid"  # noqa: B015
     np.testing.assert_array_equal(x + 1, x.codes + 1)
     assert x.sum() == x.codes.sum() and x.max() == 2
     assert x.astype(float).dtype == float and type(x.astype(float)) is np.ndarray

@@ -133,6 +133,8 @@ class ExactPosterior(Posterior):
         return self._known_values.get(name) if self.model[name].domain is None else None
 
     def cov(self, *names: str) -> np.ndarray:
+        if not names:
+            raise UnknownNodeError("cov(): name at least one node")
         scalars: list[tuple[Variable, np.ndarray]] = []
         for name in names:
             node = self._numeric(name, "cov")
@@ -206,6 +208,8 @@ class ExactPosterior(Posterior):
     ) -> np.ndarray:
         """The function on every configuration of what it needs, averaged over their joint table."""
         query = Query(self.model, function, plates, names)
+        if 0 in query.plate_shape:
+            return np.zeros(query.plate_shape)
         if self._missing(query.nodes):
             self._live("expectation of a deterministic node")
         finite = self._above(query.nodes)
@@ -226,23 +230,20 @@ class ExactPosterior(Posterior):
             values, cards = configure(
                 self.model, self._known_values, alone, whole, self._missing(query.nodes)
             )
-        results = query(_spread(values, self.model, query.nodes, cards), cards)
+        flat = {n: _flat(values[n], cards, self.model[n].value_shape) for n in query.nodes}
+        results = query(flat, (math.prod(cards),))
         if events and results.dtype.kind != "b":
             raise UnsupportedError(
                 f"probability: the function returns {results.dtype} values, not booleans; use expectation"
             )
-        results = results.astype(float)
         sizes = query.plate_shape
-        out = []
+        out = np.empty(sizes + results.shape[1 + len(sizes) :])
         for at in np.ndindex(sizes):
-            table = self._joint([self._element(n, query.plates, at) for n in alone] + rest)
-            part = results[(slice(None),) * len(cards) + at]
-            axes = list(range(len(cards)))
-            possible = np.where(
-                (table > 0).reshape(cards + (1,) * (part.ndim - len(cards))), part, 0.0
-            )
-            out.append(np.tensordot(table, possible, axes=(axes, axes)))
-        return np.reshape(np.stack(out), sizes + out[0].shape) if sizes else out[0]
+            table = self._joint([self._element(n, query.plates, at) for n in alone] + rest).ravel()
+            part = results[(slice(None), *at)].astype(float)
+            possible = table > 0  # elsewhere the function may give anything
+            out[at] = np.tensordot(table[possible], part[possible], axes=1)
+        return out
 
     def _above(self, nodes: Sequence[str]) -> tuple[str, ...]:
         """Finite nodes that the named ones are, or are computed from."""
@@ -345,8 +346,6 @@ class ExactPosterior(Posterior):
         return {**state, "_net": replace(self._net, model=state["model"], evidence_sources=[])}
 
 
-def _spread(
-    values: Mapping[str, np.ndarray], model: Any, nodes: Sequence[str], cards: tuple[int, ...]
-) -> dict[str, np.ndarray]:
-    """Values of the nodes with all batch axes."""
-    return {n: np.broadcast_to(values[n], cards + model[n].value_shape) for n in nodes}
+def _flat(values: np.ndarray, cards: tuple[int, ...], shape: tuple[int, ...]) -> np.ndarray:
+    """Values over all configurations, with one batch axis."""
+    return np.broadcast_to(values, cards + shape).reshape((math.prod(cards), *shape))

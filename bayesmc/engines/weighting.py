@@ -17,6 +17,9 @@ from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
 
+#: share of the draws above which weights are even enough to leave their tail unfitted
+_EVEN = 0.5
+
 
 @dataclass(frozen=True)
 class LikelihoodWeighting(Engine):
@@ -120,6 +123,7 @@ class LikelihoodWeighting(Engine):
         for array in stored.values():
             array.flags.writeable = False
         log_weights.flags.writeable = False
+        before = resume.streams if isinstance(resume, DrawsPosterior) else 0
         posterior = DrawsPosterior(
             problem,
             self,
@@ -127,9 +131,8 @@ class LikelihoodWeighting(Engine):
             (1, total),
             log_weights if weighted else None,
             independent=True,
+            streams=before + -(-self.draws // chunk_size(problem.model)),
         )
-        used = -(-self.draws // chunk_size(problem.model))
-        posterior.streams = used + (resume.streams if isinstance(resume, DrawsPosterior) else 0)
         _set_evidence(posterior, float(diagnostics.log_sum_exp(log_weights)), total, weighted)
         return posterior
 
@@ -185,6 +188,10 @@ def _same_question(old: DrawsPosterior, problem: Problem, names: set[str]) -> bo
     same_net = list(was.model.nodes) == list(problem.model.nodes) and all(
         was.model[n].declaration is c.declaration for n, c in problem.model.nodes.items()
     )
+    same_net = same_net and list(was.model.potentials) == list(problem.model.potentials)
+    same_net = same_net and all(
+        was.model.potentials[n][0] is v[0] for n, v in problem.model.potentials.items()
+    )
     return (
         same_net
         and was.model.sizes == problem.model.sizes
@@ -227,7 +234,7 @@ def _set_evidence(posterior: Any, log_total: float, draws: int, weighted: bool) 
             LowEssWarning,
             stacklevel=5,
         )
-    elif ess < 0.5 * draws and posterior.pareto_k > diagnostics.MAX_PARETO_K:
+    elif ess < _EVEN * draws and posterior.pareto_k > diagnostics.MAX_PARETO_K:
         warnings.warn(
             f"likelihood weighting: the weights have a heavy tail (Pareto k = {posterior.pareto_k:.2f}, "
             f"above {diagnostics.MAX_PARETO_K}); answers converge slowly: {remedy}",

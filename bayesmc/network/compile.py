@@ -176,8 +176,9 @@ def _discover_stochastic(
             raise ModelError(f"node {declaration.name!r}: {error}") from None
     elif declaration.states is not None:
         raise ModelError(
-            f"node {declaration.name!r}: states= need a distribution with finitely many values that "
-            f"do not depend on the parents; {type(dist).__name__} is on {support.describe()}"
+            f"node {declaration.name!r}: states= need a distribution with finitely many values (at most "
+            f"{_DOMAIN_SIZE}) that do not depend on the parents; {type(dist).__name__} is on "
+            f"{support.describe()}"
         )
     node = CompiledNode(
         declaration,

@@ -26,6 +26,8 @@ def call_elementwise(
         picked = [_pick(a, n, index) for a, n in zip(arguments, event_ndims, strict=True)]
         results.append(function(*picked))
     parts = [as_distribution(r) for r in results]
+    if any(p is None for p in parts) and not all(p is None for p in parts):
+        raise TypeError("it returns a distribution for some elements and a number for others")
     if results and parts[0] is not None:
         return Elementwise([p for p in parts if p is not None], lead)
     values = [np.asarray(r) for r in results]

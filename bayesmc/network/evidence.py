@@ -150,7 +150,12 @@ def store(node: CompiledNode, value: Any) -> np.ndarray:
 
 
 def _observe(node: CompiledNode, value: Any) -> Observed | None:
-    array, missing = _missing(node, value)
+    try:
+        array, missing = _missing(node, value)
+    except ValueError as error:
+        if isinstance(error, EvidenceError):
+            raise
+        raise EvidenceError(f"evidence on {node.name!r} is ragged or no array: {error}") from error
     if array.shape != node.value_shape:
         raise EvidenceError(_shape_message(node, array.shape))
     event = tuple(range(len(node.plate_shape), array.ndim))

@@ -264,7 +264,7 @@ def call(
         if result is None:
             raise ModelError("the function returns None; return a distribution or an array")
         if isinstance(result, PlateArray):
-            raise result._ungathered()
+            raise result.ungathered()
         array = result if isinstance(result, StateArray) else np.asarray(result)
         if array.dtype.kind not in "biuf":
             raise ModelError(
@@ -357,9 +357,12 @@ def _renamed(error: BayesmcError, message: str) -> BayesmcError:
 
 
 def _explain(error: Exception, arguments: Sequence[Any]) -> str:
+    hint = ""
+    if "matmul" in str(error):
+        hint = "; in a plate use np.matvec(A, v) or np.vecdot(x, v) instead of @"
     if isinstance(error, ValueError) and "read-only" in str(error):
         return "the function changes a parent in place; parents are read-only, so make a new array"
     shapes = ", ".join(
         str(a.array.shape if isinstance(a, PlateArray) else np.shape(a)) for a in arguments
     )
-    return f"{type(error).__name__}: {error} (arguments of shapes {shapes or 'none'})"
+    return f"{type(error).__name__}: {error} (arguments of shapes {shapes or 'none'}){hint}"

@@ -173,9 +173,9 @@ class BayesNet:
         >>> net["c"].parents
         ('a',)
         """
-        if isinstance(cpd, str):
+        if cpd is None or isinstance(cpd, str):
             raise ModelError(
-                f"node {name!r}: {cpd!r} is text; give a distribution, a function or a table"
+                f"node {name!r}: {cpd!r} is no density; give a distribution, a function or a table"
             )
         dist = cpd if isinstance(cpd, Distribution) else as_distribution(cpd)
         if dist is not None:
@@ -342,6 +342,11 @@ class BayesNet:
         return f"BayesNet({self.name!r}, {len(self)} nodes)"
 
     @property
+    def nodes(self) -> tuple[str, ...]:
+        """Names of the nodes, as declared; ``net[name]`` describes one."""
+        return tuple(self._declarations)
+
+    @property
     def plates(self) -> dict[str, int | None]:
         """Plate name -> size (None where it is read from the data)."""
         return dict(self._sizes)
@@ -393,6 +398,10 @@ class BayesNet:
             Stochastic node -> array ``(*batch, *plates, *event)`` or labels. Deterministic nodes may be
             left out; where one is given and differs from its function, the result is minus infinity.
         """
+        if not isinstance(values, Mapping):
+            raise EvidenceError(
+                f"log_prob: values is a {type(values).__name__}; give a dict from node name to value"
+            )
         trimmed = {n: self._unbatched(n, v) for n, v in values.items() if n in self._declarations}
         model = self.model(trimmed, inputs)
         unknown = [n for n in values if n not in model.nodes]
@@ -442,11 +451,13 @@ class BayesNet:
         plates: Mapping[str, int] | None = None,
     ) -> Model:
         """The validated snapshot that engines run on, with plate sizes settled by the data."""
-        for plate in plates or {}:
+        for plate, size in (plates or {}).items():
             if plate not in self._sizes:
                 raise PlateError(
                     f"plates= gives {plate!r}; the net's plates are {list(self._sizes)}"
                 )
+            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
+                raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
         sizes = plate_sizes({**self._sizes, **(plates or {})}, self._declarations, evidence, inputs)
         open_plates = [p for p, n in sizes.items() if n is None and self._uses(p)]
         if open_plates:

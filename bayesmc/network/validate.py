@@ -18,12 +18,8 @@ from bayesmc.network.compile import entry
 from bayesmc.network.model import CompiledNode, Model, arguments_of, call
 from bayesmc.network.node import Declaration
 from bayesmc.plates import PlateArray
-from bayesmc.shapes import Shape
+from bayesmc.shapes import Shape, masks, nearly_equal
 from bayesmc.states import as_numbers
-
-_RTOL = 1e-7
-#: of the largest value of a parameter, for what cancels
-_ATOL = 1e-12
 
 
 def validate_model(model: Model) -> None:
@@ -77,7 +73,7 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
     arguments, short = arguments_of(node.links, first)
     row = _signature(node, arguments, short + node.plate_shape)
     for a, b in zip(whole.arrays, row.arrays, strict=True):
-        if not _close(a[0, ::-1], b):
+        if not nearly_equal(a[0, ::-1], b):
             raise BroadcastError(_broadcast_message(node, (0,), whole, row))
     if len(set(node.parents)) < 2:
         return
@@ -88,12 +84,26 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
     arguments, batch = arguments_of(node.links, mixed)
     try:
         ranks = _signature(node, arguments, batch + node.plate_shape)
-        q, p = shape
-        _compare_entries(node, mixed, shape, ranks, [(0, 0), (q - 1, 0), (q - 1, p - 1)], batch)
-    except BroadcastError:
-        raise
+    except BayesmcError as error:
+        if not _works_alone(node, mixed, shape):
+            return  # ranks mix draws, and what they make together need not be reachable
+        raise BroadcastError(
+            f"{_what(node)} does not broadcast parents of unlike batch shapes: {error}; use bmc.stack for "
+            "np.stack, and let every operation broadcast"
+        ) from error
+    q, p = shape
+    _compare_entries(node, mixed, shape, ranks, [(0, 0), (q - 1, 0), (q - 1, p - 1)], batch)
+
+
+def _works_alone(node: CompiledNode, values: Mapping[str, np.ndarray], shape: Shape) -> bool:
+    """Whether every entry of a batch can be evaluated by itself."""
+    try:
+        for index in np.ndindex(shape):
+            arguments, _ = arguments_of(node.links, entry(node.links, values, shape, index))
+            _signature(node, arguments, node.plate_shape)
     except BayesmcError:
-        return  # ranks mix draws, and what they make together need not be reachable
+        return False
+    return True
 
 
 def _part(value: np.ndarray, batch: Shape, kind: int) -> np.ndarray:
@@ -118,7 +128,7 @@ def _compare_entries(
         arguments, _ = arguments_of(node.links, entry(node.links, values, shape, full))
         alone = _signature(node, arguments, node.plate_shape)
         if whole.family != alone.family or not all(
-            _close(a[at], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
+            nearly_equal(a[at], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
         ):
             raise BroadcastError(_broadcast_message(node, at, whole, alone))
 
@@ -136,7 +146,7 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
             continue
         if before is None:
             before = _signature(node, arguments_of(node.links, base)[0], node.plate_shape)
-        for chosen in _masks(size):
+        for chosen in masks(size):
             moved = dict(base)
             for parent in sharing:
                 moved[parent] = _perturbed(
@@ -148,7 +158,7 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
                 continue  # the perturbed values may not be reachable
             rest = (slice(None),) * axis + (~chosen,)
             for a, b in zip(before.arrays, after.arrays, strict=True):
-                if not _close(a[rest], b[rest]):
+                if not nearly_equal(a[rest], b[rest]):
                     raise BroadcastError(
                         f"{_what(node)}: changing some elements of {sharing} along plate {plate!r} "
                         "moves other elements too; a function acts element by element on a shared "
@@ -188,12 +198,6 @@ def _what(node: CompiledNode) -> str:
     return node.name if node.name.startswith("potential ") else f"node {node.name!r}"
 
 
-def _masks(size: int) -> list[np.ndarray]:
-    """Sets of elements such that for any two, one set holds the first and not the second."""
-    bits = [(np.arange(size) >> k) & 1 == 1 for k in range(max((size - 1).bit_length(), 1))]
-    return [mask for bit in bits for mask in (bit, ~bit)]
-
-
 class _Signature:
     """What a call returned, as arrays of shape ``lead + own axes`` that can be compared."""
 
@@ -230,21 +234,7 @@ def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
 
 
 def _same(a: _Signature, b: _Signature) -> bool:
-    return a.family == b.family and all(map(_close, a.arrays, b.arrays))
-
-
-def _close(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal up to rounding (vectorised and scalar loops may differ in the last digits)."""
-    if a.shape != b.shape:
-        return False
-    if a is b or np.logical_and.reduce(a == b, axis=None):
-        return True
-    if a.dtype.kind != "f":
-        return False
-    scale = np.maximum(np.abs(a), np.abs(b))
-    scale = np.where(np.isfinite(scale), scale, 0.0)
-    near = np.abs(a - b) <= _RTOL * scale + _ATOL * scale.max(initial=0.0)
-    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
+    return a.family == b.family and all(map(nearly_equal, a.arrays, b.arrays))
 
 
 def _broadcast_message(

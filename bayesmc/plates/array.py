@@ -202,6 +202,11 @@ class PlateArray(NDArrayOperatorsMixin):
         chosen = names or self.plates
         start = len(self._split()[0])
         axes = tuple(start + self.plates.index(name) for name in chosen)
+        if hasattr(self.array, "states") and function not in (np.any, np.all):
+            raise TypeError(
+                f".{function.__name__}() of labels {self.array.states} means nothing; compare them first, as "
+                f"in (v == {self.array.states[0]!r}).any({self.plates[0]!r})"
+            )
         result = function(np.asarray(self.array), axis=axes)
         left = tuple(name for name in self.plates if name not in chosen)
         return PlateArray(result, left, self.own, self.event_ndim) if left else result
@@ -252,7 +257,7 @@ class PlateArray(NDArrayOperatorsMixin):
         )
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__"):
@@ -262,7 +267,8 @@ class PlateArray(NDArrayOperatorsMixin):
             f".sum({self.plates[0]!r}) and the like, or take the plain array v.array"
         )
 
-    def _ungathered(self) -> PlateError:
+    def ungathered(self) -> PlateError:
+        """The error for using this value as it stands."""
         plate = self.plates[0]
         return PlateError(
             f"a parent in plate {plate!r}, which the child lacks, is used ungathered; pick elements "
@@ -270,22 +276,22 @@ class PlateArray(NDArrayOperatorsMixin):
         )
 
     def __bool__(self) -> bool:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def __float__(self) -> float:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def __int__(self) -> int:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def __index__(self) -> int:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def __len__(self) -> int:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def __iter__(self) -> Any:
-        raise self._ungathered()
+        raise self.ungathered()
 
     def _split(self) -> tuple[Shape, Shape, Shape]:
         """Shapes of (batch and own plates), foreign plates, event."""

@@ -36,14 +36,9 @@ class DrawsPosterior(Posterior):
         Draws are independent of each other (no chain to diagnose).
     ancestors : ndarray of int, shape (draw,), optional
         Which weighted draw each was resampled from; copies of one draw count once in errors.
-
-    Attributes
-    ----------
     streams : int
         Random streams used so far, so that ``resume`` takes fresh ones.
     """
-
-    streams = 0
 
     def __init__(
         self,
@@ -54,12 +49,14 @@ class DrawsPosterior(Posterior):
         log_weights: np.ndarray | None = None,
         independent: bool = False,
         ancestors: np.ndarray | None = None,
+        streams: int = 0,
     ) -> None:
         super().__init__(problem, engine)
         self._stored = dict(stored)
         self._shape = shape
         self._independent = independent
         self._ancestors = ancestors
+        self.streams = streams
         self._inputs = dict(problem.inputs)
         self.log_weights = log_weights
         if log_weights is not None:
@@ -100,6 +97,8 @@ class DrawsPosterior(Posterior):
         return self._average((values - self._average(values)) ** 2)
 
     def cov(self, *names: str) -> np.ndarray:
+        if not names:
+            raise UnknownNodeError("cov(): name at least one node")
         blocks = [self._full(name, "cov").reshape(*self._shape, -1) for name in names]
         flat = np.concatenate(blocks, axis=-1)
         flat = (flat - self._average(flat)).reshape(-1, flat.shape[-1])
@@ -115,9 +114,15 @@ class DrawsPosterior(Posterior):
             mean = self.mean(name)
             values = mean + np.remainder(values - mean + np.pi, 2 * np.pi) - np.pi
         flat = values.reshape((-1, *values.shape[2:]))
-        if self.weights is None:
-            return np.quantile(flat, q, axis=0)
-        return np.quantile(flat, q, axis=0, weights=self.weights.ravel(), method="inverted_cdf")
+        levels = np.asarray(q, dtype=float)
+        if not ((levels >= 0) & (levels <= 1)).all():
+            raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+        if self.weights is not None:
+            weights = self.weights.ravel()
+            return np.quantile(flat, levels, axis=0, weights=weights, method="inverted_cdf")
+        if self.model[name].is_discrete:  # between two states lies no value
+            return np.quantile(flat, levels, axis=0, method="inverted_cdf")
+        return np.quantile(flat, levels, axis=0)
 
     def probabilities(self, *names: str) -> np.ndarray:
         if not names:
@@ -249,8 +254,12 @@ class DrawsPosterior(Posterior):
         draws: int | None = None,
     ) -> DrawsPosterior:
         problem = self._live("predict")
-        wanted = (names,) if isinstance(names, str) else tuple(names)
+        wanted = (names,) if isinstance(names, str) or callable(names) else tuple(names)
         for name in wanted:
+            if not isinstance(name, str):
+                raise UnknownNodeError(
+                    f"predict: {name!r} is no node name; use expectation on its result"
+                )
             if not self._node(name).is_stochastic and self._node(name).kind != "deterministic":
                 raise UnsupportedError(
                     f"predict({name!r}): {self._node(name).kind} nodes are not drawn"
@@ -299,7 +308,14 @@ class DrawsPosterior(Posterior):
             drawn = forward.run(steps, forward.Pass(rng, self._shape, values)).values
         stored = {n: _chained(drawn[n], len(model[n].value_shape)) for n in drawn}
         new = Problem(problem.net, model, {}, dict(known))
-        return DrawsPosterior(new, self.engine, stored, self._shape, independent=self._independent)
+        return DrawsPosterior(
+            new,
+            self.engine,
+            stored,
+            self._shape,
+            independent=self._independent,
+            ancestors=self._ancestors,
+        )
 
     def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
         if self.weights is not None and resample is None:
@@ -314,12 +330,12 @@ class DrawsPosterior(Posterior):
         except ImportError:
             raise missing_extra("arviz-base", "arviz") from None
         free = [n for n in self.names if self._is_free(n)]
-        groups = {"posterior": {n: np.asarray(self[n]) for n in free}}
+        groups = {"posterior": {n: _labelled(self[n]) for n in free}}
         seen = {
             n: self.model[n].decode(o.value) for n, o in self._live("to_datatree").observed.items()
         }
         if seen:
-            groups["observed_data"] = {n: np.asarray(v) for n, v in seen.items()}
+            groups["observed_data"] = {n: _labelled(v) for n, v in seen.items()}
         dims = {n: [*self.model[n].plates, *self._event_dims(n)] for n in [*free, *seen]}
         coords = {p: list(self.model.labels.get(p, range(n))) for p, n in self.model.sizes.items()}
         return arviz_base.from_dict(groups, dims=dims, coords=coords)
@@ -402,10 +418,15 @@ def _refuse_potentials(model: Model, wanted: Sequence[str]) -> None:
             )
 
 
+def _labelled(values: np.ndarray) -> np.ndarray:
+    """Plain values: labels where there are labels."""
+    return values.labels if isinstance(values, StateArray) else np.asarray(values)
+
+
 def _with_gaps(values: np.ndarray, seen: Observed) -> np.ndarray:
     """Observed values with NaN (None for labels) where nothing was observed."""
     if seen.mask is None:
-        return np.asarray(values)
+        return values
     if isinstance(values, StateArray):
         labels = values.labels.astype(object)
         labels[~seen.mask] = None

@@ -223,6 +223,10 @@ class Posterior:
         ]
 
     def _node(self, name: str) -> CompiledNode:
+        if callable(name):
+            raise UnknownNodeError(
+                "posterior: a function is asked for with expectation, probability, mcse, ess or rhat"
+            )
         node = self.model.nodes.get(name) if isinstance(name, str) else None
         if node is None:
             raise UnknownNodeError(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -18,8 +19,11 @@ from bayesmc.errors import (
 from bayesmc.network import Model
 from bayesmc.network.align import Aligner
 from bayesmc.plates import PlateArray
-from bayesmc.shapes import Shape, broadcasts_to
+from bayesmc.shapes import Shape, broadcasts_to, masks, nearly_equal, unused_sizes
 from bayesmc.states import StateArray, as_numbers
+
+#: draws on which a function is tried alone
+_DRAWS_TRIED = 8
 
 
 class Query:
@@ -65,18 +69,19 @@ class Query:
         self.plate_shape = tuple(model.sizes[p] for p in self.plates)
 
     def __call__(self, stored: Mapping[str, np.ndarray], batch: Shape) -> np.ndarray:
-        """The function's values, shape ``(*batch, *plates, ...)``."""
-        arguments = []
-        for name in self.nodes:
-            node = self.model.nodes[name]
-            value = stored[name]
-            if self.plates:
-                link = Aligner(self.plates, node.plates, len(node.event_shape), node.domain)
-                argument = link(value)
-                plain = isinstance(argument, np.ndarray)
-                arguments.append(as_numbers(argument) if plain else argument)
-            else:
-                arguments.append(as_numbers(_frozen(node.decode(value))))
+        """The function's values, shape ``(*batch, *plates, ...)``.
+
+        Like a node's function it acts draw by draw, and on ``plates`` element by element; it is
+        called again on a few draws to see that it does.
+        """
+        values = self._evaluate(stored, batch)
+        if self.function is not _identity and values.size:
+            self._check_draws(stored, batch, values)
+            self._check_plates(stored, batch)
+        return values
+
+    def _evaluate(self, stored: Mapping[str, np.ndarray], batch: Shape) -> np.ndarray:
+        arguments = [self._argument(name, stored[name]) for name in self.nodes]
         try:
             result = self.function(*arguments)
         except BayesmcError:
@@ -89,20 +94,26 @@ class Query:
                 "np.maximum for max)"
             ) from error
         if isinstance(result, PlateArray):
-            raise result._ungathered()
+            raise result.ungathered()
         if isinstance(result, StateArray):
             raise UnsupportedError(
                 f"query: the function returns labels {result.states}, which have no mean; compare them, as "
                 f"in {self.nodes[0]} == {result.states[0]!r}"
             )
-        array = np.asarray(result)
+        return self._fitted(np.asarray(result), batch)
+
+    def _argument(self, name: str, value: np.ndarray) -> Any:
+        node = self.model.nodes[name]
+        if not self.plates:
+            return as_numbers(_frozen(node.decode(value)))
+        link = Aligner(self.plates, node.plates, len(node.event_shape), node.domain)
+        argument = link(value)
+        return as_numbers(argument) if isinstance(argument, np.ndarray) else argument
+
+    def _fitted(self, array: np.ndarray, batch: Shape) -> np.ndarray:
+        """The result broadcast to batch and plates; one without its batch axes is refused."""
         lead = batch + self.plate_shape
-        short = array.shape[: len(lead)]
-        if (
-            array.ndim < len(batch)
-            or not broadcasts_to(short, lead)
-            or array.shape[: len(batch)] != batch
-        ):
+        if array.shape[: len(batch)] != batch or not broadcasts_to(array.shape[: len(lead)], lead):
             raise ShapeError(
                 f"query: the function returns shape {array.shape} for draws of batch shape {batch}; keep "
                 "the leading axes (reduce with axis=-1, take components as v[..., k])"
@@ -114,6 +125,58 @@ class Query:
         if array.dtype.kind not in "biufc":
             raise ShapeError(f"query: the function returns {array.dtype} values; return numbers")
         return np.broadcast_to(array, lead + array.shape[len(lead) :])
+
+    def _check_draws(
+        self, stored: Mapping[str, np.ndarray], batch: Shape, values: np.ndarray
+    ) -> None:
+        """A few draws by themselves, in another order, must give the same values."""
+        taken = [*range(_DRAWS_TRIED), *batch, *values.shape, *self.model.sizes.values()]
+        count = int(unused_sizes(taken, 1)[0])
+        flat = np.linspace(math.prod(batch) - 1, 0, count).round().astype(int)
+        for chosen in (flat, *flat[:_DRAWS_TRIED, None]):  # together, and one by one
+            at = np.unravel_index(chosen, batch)
+            few = {name: stored[name][at] for name in self.nodes}
+            try:
+                alone = self._evaluate(few, chosen.shape)
+            except BayesmcError as error:
+                raise QueryError(self._mixed(str(error))) from error
+            if not nearly_equal(values[at], alone):
+                raise QueryError(self._mixed("a few draws alone give other values"))
+
+    def _mixed(self, why: str) -> str:
+        return (
+            f"query: the function mixes draws ({why}); it must act on each draw by itself, so that its "
+            "values can be weighted: take x.mean() and the like from posterior.mean, var or quantile"
+        )
+
+    def _check_plates(self, stored: Mapping[str, np.ndarray], batch: Shape) -> None:
+        """Changing some elements of a plate must leave the values of the others."""
+        first, last = (0,) * len(batch), tuple(n - 1 for n in batch)
+        for axis, plate in enumerate(self.plates):
+            size = self.plate_shape[axis]
+            for chosen in masks(size) if size > 1 else ():
+                pair = {
+                    n: self._blend(n, stored[n][first], stored[n][last], plate, chosen)
+                    for n in self.nodes
+                }
+                before, after = self._evaluate(pair, (2,))
+                rest = (slice(None),) * axis + (~chosen,)
+                if not nearly_equal(before[rest], after[rest]):
+                    raise QueryError(
+                        f"query: the function mixes elements of plate {plate!r}; with plates= it acts "
+                        "element by element. Leave plates= out to reduce over a plate"
+                    )
+
+    def _blend(
+        self, name: str, base: np.ndarray, other: np.ndarray, plate: str, chosen: np.ndarray
+    ) -> np.ndarray:
+        """A value, and the same with the chosen elements of a plate taken from another draw."""
+        node = self.model.nodes[name]
+        if plate not in node.plates:
+            return np.stack([base, base])
+        axis = node.plates.index(plate)
+        mask = chosen.reshape((-1,) + (1,) * (base.ndim - axis - 1))
+        return np.stack([base, np.where(mask, other, base)])
 
 
 def _arguments(function: Callable[..., Any], names: Mapping[str, str]) -> tuple[str, ...]:

@@ -23,8 +23,6 @@ EXACT = ["alarm", "asia", "cancer", "earthquake", "hepar2", "mildew", "pigs", "s
 #: false-alarm rate per net and scenario (Holm): 1e-3, so 4 % over the 40 of them at fresh seeds
 ALPHA = 1e-3
 
-#: remove when `diagnostics.pareto_k` takes tied weights
-
 
 class Reference:
     """A scenario's published answer, as `compare` reads it."""

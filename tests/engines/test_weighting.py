@@ -70,7 +70,7 @@ def test_what_is_asked_of_does_not_change() -> None:
     data = np.array([0.2, 1.9, np.nan, 0.7])
     before = data.copy()
     net = mixture()
-    posterior = bmc.infer(net, {"x": data}, engine=weighting(500), rng=0)
+    posterior = bmc.infer(net, {"x": data}, engine=weighting(2000), rng=0)
     np.testing.assert_array_equal(data, before)
     mean = posterior.mean("mean")
     data[:] = 100.0
@@ -128,19 +128,19 @@ def test_resume_continues_the_draws() -> None:
     ids=["other value", "no evidence", "more evidence"],
 )
 def test_resume_of_another_question_is_refused(other: dict) -> None:
-    first = bmc.infer(mixture(), DATA, engine=weighting(500), rng=0)
+    first = bmc.infer(mixture(), DATA, engine=weighting(2000), rng=0)
     with pytest.raises(UnsupportedError, match="resume"):
-        bmc.infer(mixture(), other, engine=weighting(500), rng=0, resume=first)
+        bmc.infer(mixture(), other, engine=weighting(2000), rng=0, resume=first)
 
 
 def test_resume_of_other_draws_is_refused() -> None:
-    first = bmc.infer(mixture(), DATA, engine=weighting(500), rng=0)
-    equal = first.resample(500, rng=0)  # its weights are gone
+    first = bmc.infer(mixture(), DATA, engine=weighting(2000), rng=0)
+    equal = first.resample(2000, rng=0)  # its weights are gone
     with pytest.raises(UnsupportedError, match="resume"):
-        bmc.infer(mixture(), DATA, engine=weighting(500), rng=0, resume=equal)
-    sums = bmc.infer(mixture(), DATA, engine=weighting(500), rng=0, keep="summaries")
+        bmc.infer(mixture(), DATA, engine=weighting(2000), rng=0, resume=equal)
+    sums = bmc.infer(mixture(), DATA, engine=weighting(2000), rng=0, keep="summaries")
     with pytest.raises(UnsupportedError, match="resume"):
-        bmc.infer(mixture(), DATA, engine=weighting(500), rng=0, resume=sums)
+        bmc.infer(mixture(), DATA, engine=weighting(2000), rng=0, resume=sums)
 
 
 # ---- evidence -----------------------------------------------------------------------------------
@@ -303,7 +303,7 @@ def test_bad_parameters_matter_only_where_possible() -> None:
 
 @pytest.mark.parametrize("draws", [0, -1, 2.5, True, "many"])
 def test_options_are_checked(draws) -> None:
-    with pytest.raises(ValueError, match="give a positive number of draws"):
+    with pytest.raises(ValueError, match="draws is a whole number, 1 or more"):
         bmc.LikelihoodWeighting(draws)
 
 

@@ -98,7 +98,7 @@ def test_refusals():
     with pytest.raises(UnsupportedError, match="potential 'f' reweights .*LikelihoodWeighting"):
         b.sample(1)
     c = bmc.BayesNet()
-    c.add("s", bmc.Normal(5.0, 1.0))
+    c.add("s", bmc.Normal(3.5, 1.0))  # below 0 in 2.3e-4 of the draws
     c.add("x", lambda s: bmc.Normal(0.0, s))
     with pytest.raises(ParameterError, match="node 'x': Normal: scale must be positive"):
-        c.sample(1_000_000, rng=0)
+        c.sample(200_000, rng=0)

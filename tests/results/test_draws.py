@@ -277,10 +277,11 @@ def test_summary(weighted):
     assert s["s"]["mcse"] == pytest.approx(p.mcse("s"))
     assert all(len(v) == len(s) for v in s.columns.values())
     assert list(p.summary(["v"])) == ["v[0]", "v[1]"]
-    text = str(s)
-    assert (
-        "m[first]" in text and "mcse" in text and len({len(r) > 0 for r in text.splitlines()}) == 1
-    )
+    title, head, *lines = str(s).splitlines()
+    assert "LikelihoodWeighting" in title
+    assert head.split() == list(s.columns)
+    assert [line[: line.index("  ")] for line in lines] == list(s.names)
+    assert {len(line) for line in lines} == {len(head)}  # columns aligned
     with pytest.raises(UnknownNodeError, match="no row or column 'median'"):
         s["median"]
     with pytest.raises(UnknownNodeError, match="no node 'w'"):
