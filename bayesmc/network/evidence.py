@@ -140,7 +140,7 @@ def store(node: CompiledNode, value: Any) -> np.ndarray:
                 stored = stored.astype(float, copy=False)
             elif stored.dtype.kind != "i" and (stored == np.floor(stored)).all():
                 stored = stored.astype(np.int64)
-    except EvidenceError as error:
+    except (EvidenceError, TypeError) as error:  # a list among labels is unhashable
         raise EvidenceError(f"node {node.name!r}: {error}") from None
     trailing = len(node.value_shape)
     if stored.shape[stored.ndim - trailing :] != node.value_shape or stored.ndim < trailing:
@@ -152,7 +152,7 @@ def store(node: CompiledNode, value: Any) -> np.ndarray:
 def _observe(node: CompiledNode, value: Any) -> Observed | None:
     try:
         array, missing = _missing(node, value)
-    except ValueError as error:
+    except (TypeError, ValueError) as error:
         if isinstance(error, EvidenceError):
             raise
         raise EvidenceError(f"evidence on {node.name!r} is ragged or no array: {error}") from error

@@ -22,13 +22,20 @@ def fixed(name: str, node: CompiledNode, value: Any, model: Model) -> Declaratio
     above = ancestors({n: c.parents for n, c in model.nodes.items()}, [name])
     has_inputs = any(model.nodes[n].kind == "input" for n in above)
     node = _widened(node, value, has_inputs)
-    stored = store(node, value)
+    try:
+        stored = store(node, value)
+    except (TypeError, ValueError) as error:
+        raise EvidenceError(
+            f"do({name}=...): {error}; it needs a value for every element"
+        ) from error
+    if stored.dtype.kind == "f" and not np.isfinite(stored).all():
+        raise EvidenceError(
+            f"do({name}=...): {value!r} is not finite; it needs a value for every element"
+        )
     if not has_inputs:  # whose values, and so the support, are not known yet
         _check_do(name, node, value, stored)
     if stored.shape != node.value_shape:
         raise EvidenceError(f"do({name}=...): shape {stored.shape}, not {node.value_shape}")
-    if stored.dtype.kind == "f" and not np.isfinite(stored).all():
-        raise EvidenceError(f"do({name}=...): {value!r} is not finite")
     return Declaration(
         name,
         "fixed",

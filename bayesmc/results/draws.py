@@ -94,7 +94,8 @@ class DrawsPosterior(Posterior):
         values = self._values(name, "var")
         if self._is_circular(name):
             return circular_variance(self._average(np.cos(values)), self._average(np.sin(values)))
-        return self._average((values - self._average(values)) ** 2)
+        with np.errstate(over="ignore", invalid="ignore"):  # a draw of weight zero may be infinite
+            return self._average((values - self._average(values)) ** 2)
 
     def cov(self, *names: str) -> np.ndarray:
         if not names:
@@ -143,9 +144,8 @@ class DrawsPosterior(Posterior):
         total = math.prod(cards)
         flat = np.broadcast_to(code, self._shape + sizes).reshape(math.prod(self._shape), -1)
         weights = None if self.weights is None else self.weights.ravel()
-        table = np.stack(
-            [np.bincount(column, weights=weights, minlength=total) for column in flat.T]
-        ).astype(float)
+        rows = [np.bincount(column, weights=weights, minlength=total) for column in flat.T]
+        table = np.reshape(rows, (len(rows), total)).astype(float)
         if weights is None:
             table /= len(flat)
         return table.reshape(sizes + cards)
@@ -254,7 +254,8 @@ class DrawsPosterior(Posterior):
         draws: int | None = None,
     ) -> DrawsPosterior:
         problem = self._live("predict")
-        wanted = (names,) if isinstance(names, str) or callable(names) else tuple(names)
+        listed = isinstance(names, Sequence) and not isinstance(names, str)
+        wanted: tuple[str, ...] = tuple(names) if listed else (names,)  # type: ignore[assignment]
         for name in wanted:
             if not isinstance(name, str):
                 raise UnknownNodeError(
@@ -332,7 +333,8 @@ class DrawsPosterior(Posterior):
         free = [n for n in self.names if self._is_free(n)]
         groups = {"posterior": {n: _labelled(self[n]) for n in free}}
         seen = {
-            n: self.model[n].decode(o.value) for n, o in self._live("to_datatree").observed.items()
+            n: _with_gaps(self.model[n].decode(o.value), o)
+            for n, o in self._live("to_datatree").observed.items()
         }
         if seen:
             groups["observed_data"] = {n: _labelled(v) for n, v in seen.items()}
