@@ -96,18 +96,17 @@ def weighted_sum(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 def weighted_mcse(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Standard error of a self-normalised weighted mean (Owen 2013, eq. 9.9)."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         centred = values - weighted_mean(values, weights)
-    return np.sqrt(weighted_sum(centred**2, weights**2))
+        return np.sqrt(weighted_sum(centred**2, weights**2))
 
 
 def weighted_ess(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Number of independent draws from the posterior with the same error; the weights' own for constants."""
-    with np.errstate(invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         centred = values - weighted_mean(values, weights)
-    variance = weighted_sum(centred**2, weights)
-    error = weighted_sum(centred**2, weights**2)
-    with np.errstate(divide="ignore", invalid="ignore"):
+        variance = weighted_sum(centred**2, weights)
+        error = weighted_sum(centred**2, weights**2)
         return np.where(error > 0, variance / error, 1.0 / np.sum(weights**2))
 
 

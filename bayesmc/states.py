@@ -32,13 +32,7 @@ class NumberArray(np.ndarray):
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if ufunc in (np.equal, np.not_equal):
-            label = next((x for x in inputs if isinstance(x, (str, np.str_))), None)
-            texts = [x for x in inputs if isinstance(x, np.ndarray) and x.dtype.kind in "US"]
-            if label is not None or texts:
-                raise StateError(
-                    f"numbers are compared with the label {label if label is not None else texts[0]!r}: "
-                    "the node has no labels (or they were lost on the way); declare it with states="
-                )
+            _refuse_labels(inputs)
         plain = [_bare(x) for x in inputs]
         if ufunc is np.invert and plain[0].dtype.kind in "iu" and np.isin(plain[0], (0, 1)).all():
             raise StateError(
@@ -47,11 +41,12 @@ class NumberArray(np.ndarray):
         if "out" in kwargs:
             kwargs["out"] = tuple(_bare(x) for x in kwargs["out"])
         result = getattr(ufunc, method)(*plain, **kwargs)
-        return as_numbers(result) if isinstance(result, np.ndarray) else result
+        return _numbers_too(result)
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
-        result = func(*_bare(args), **{k: _bare(v) for k, v in kwargs.items()})
-        return as_numbers(result) if type(result) is np.ndarray else result
+        if func is np.isin:
+            _refuse_labels(args)
+        return _numbers_too(func(*_bare(args), **{k: _bare(v) for k, v in kwargs.items()}))
 
     def __repr__(self) -> str:
         return repr(self.view(np.ndarray))
@@ -94,8 +89,8 @@ class StateArray(np.ndarray):
 
     @property
     def codes(self) -> np.ndarray:
-        """The positions as a plain array."""
-        return self.view(np.ndarray)
+        """The positions as numbers."""
+        return self.view(NumberArray)
 
     @property
     def labels(self) -> np.ndarray:
@@ -126,7 +121,7 @@ class StateArray(np.ndarray):
             return type(result)(StateArray(r, next(iter(states))) for r in result)
         if keeps and isinstance(result, np.ndarray):
             return StateArray(result, next(iter(states)))
-        return as_numbers(result) if type(result) is np.ndarray else result
+        return _numbers_too(result)
 
     def __getitem__(self, key: Any) -> Any:
         item = super().__getitem__(key)
@@ -141,7 +136,7 @@ class StateArray(np.ndarray):
         return hash(self.states[int(self.codes)])
 
     def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> np.ndarray:
-        return self.codes.astype(dtype, *args, **kwargs)
+        return as_numbers(self.view(np.ndarray).astype(dtype, *args, **kwargs))
 
     def tolist(self) -> Any:
         """The labels as (nested) lists."""
@@ -183,6 +178,23 @@ def label_code(states: Sequence[Any], label: Any) -> int:
     raise StateError(f"{label!r} is not a state; the states are {', '.join(map(repr, states))}")
 
 
+def _refuse_labels(values: Any) -> None:
+    """Raise if a label is among what numbers are compared with."""
+    labels = (leaf for leaf in _leaves(list(values)) if isinstance(leaf, (str, np.str_)))
+    label = next(labels, None)
+    if label is not None:
+        raise StateError(
+            f"numbers are compared with the label {str(label)!r}: the node has no labels (or they were lost "
+            "on the way); declare it with states="
+        )
+
+
+def _numbers_too(result: Any) -> Any:
+    """Arrays and NumPy scalars as numbers that refuse labels; anything else as it is."""
+    plain = type(result) is np.ndarray or isinstance(result, (np.number, np.bool_))
+    return as_numbers(np.asarray(result)) if plain else result
+
+
 def _bare(value: Any) -> Any:
     """Plain arrays in place of those defined here, also inside lists and tuples."""
     if isinstance(value, (StateArray, NumberArray)):
@@ -195,6 +207,8 @@ def _bare(value: Any) -> Any:
 def _leaves(value: Any) -> list[Any]:
     if isinstance(value, (list, tuple)):
         return [leaf for v in value for leaf in _leaves(v)]
+    if isinstance(value, np.ndarray) and value.dtype.kind in "USO":
+        return value.ravel().tolist()
     return [value]
 
 

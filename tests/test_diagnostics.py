@@ -82,6 +82,20 @@ def test_pareto_k_finds_the_shape_of_a_pareto_tail(k):
     assert diagnostics.pareto_k(weights, len(weights)) == pytest.approx(float(reference), abs=0.05)
 
 
+@pytest.mark.parametrize("family", ["exponential", "student"])
+def test_pareto_k_is_arvizs_whatever_the_number_of_weights(family):
+    """One weight less in the tail is another fit, and a cut at the tail itself has no excess."""
+    # numbers of weights at which the tail's length is whole; ArviZ rounds it down elsewhere, and we up
+    few = [25, 30, 40, 60, 100, 220, 225]
+    # tails of 339 and 609 weights (113 and 203 squared) are easily one short by rounding
+    squares = [m * m for m in (16, 17, 39, 40, 71, 100, 113, 150, 203)]
+    for n in few + squares:
+        rng = np.random.default_rng(n)
+        lw = 1.5 * rng.exponential(size=n) if family == "exponential" else rng.standard_t(3, n)
+        _, k = array_stats.psislw(-lw, r_eff=1.0)
+        assert diagnostics.pareto_k(lw, n) == pytest.approx(float(k), abs=1e-6), n
+
+
 def test_pareto_k_needs_only_the_tail():
     lw = np.random.default_rng(4).normal(size=50_000) * 1.5
     tail = np.sort(lw)[-5 * diagnostics.tail_length(len(lw)) :]

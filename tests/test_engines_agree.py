@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import os
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -180,6 +180,14 @@ def test_enumeration_agrees_with_the_joint_density(kind: str) -> None:
 # ---- queries ------------------------------------------------------------------------------------
 
 
+def answered_by_tables(kind: str) -> Iterator[tuple[bmc.BayesNet, Any, Any]]:
+    """The nets that `Exact` takes, each with its posterior and the enumerated one."""
+    for seed in SEEDS:
+        net, evidence = problem(kind, seed)
+        if not bmc.Exact().unsupported(net, evidence):
+            yield net, bmc.infer(net, evidence, engine=bmc.Exact()), exact(kind, seed)
+
+
 def total_of(net: bmc.BayesNet, name: str) -> Callable[[Any], Any]:
     axes = tuple(range(-len(net[name].plates), 0))
     return lambda value: np.asarray(value, dtype=float).sum(axis=axes)
@@ -188,11 +196,7 @@ def total_of(net: bmc.BayesNet, name: str) -> Callable[[Any], Any]:
 @pytest.mark.parametrize("kind", ["discrete", "plates", "hybrid plates"])
 def test_exact_queries_agree_with_enumeration(kind: str) -> None:
     asked = 0
-    for seed in SEEDS:
-        net, evidence = problem(kind, seed)
-        if bmc.Exact().unsupported(net, evidence):
-            continue
-        posterior, found = bmc.infer(net, evidence, engine=bmc.Exact()), exact(kind, seed)
+    for net, posterior, found in answered_by_tables(kind):
         finite = [n for n in found.names if found.model[n].domain is not None]
         numeric = [n for n in found.names if not _is_labelled(found.model[n])]
         for a in finite[:2]:
@@ -225,11 +229,7 @@ def test_exact_queries_agree_with_enumeration(kind: str) -> None:
 @pytest.mark.parametrize("kind", ["plates", "hybrid plates"])
 def test_exact_queries_by_plate_agree_with_enumeration(kind: str) -> None:
     asked = 0
-    for seed in SEEDS:
-        net, evidence = problem(kind, seed)
-        if bmc.Exact().unsupported(net, evidence):
-            continue
-        posterior, found = bmc.infer(net, evidence, engine=bmc.Exact()), exact(kind, seed)
+    for _, posterior, found in answered_by_tables(kind):
         for name in found.names:
             node = found.model[name]
             if _is_labelled(node) or not node.plates:
@@ -255,11 +255,7 @@ def test_exact_queries_by_plate_agree_with_enumeration(kind: str) -> None:
 
 def test_exact_quantiles_agree_with_enumeration() -> None:
     levels = np.array([0.0, 0.1, 0.5, 0.9, 1.0])
-    for seed in SEEDS:
-        net, evidence = problem("plates", seed)
-        if bmc.Exact().unsupported(net, evidence):
-            continue
-        posterior, found = bmc.infer(net, evidence, engine=bmc.Exact()), exact("plates", seed)
+    for _, posterior, found in answered_by_tables("plates"):
         for name in found.names:
             node = found.model[name]
             if node.domain is None or _is_labelled(node):

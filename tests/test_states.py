@@ -61,7 +61,7 @@ def test_arithmetic_gives_integers_without_labels(x):
             result == "mid"  # noqa: B015
     np.testing.assert_array_equal(x + 1, x.codes + 1)
     assert x.sum() == x.codes.sum() and x.max() == 2
-    assert x.astype(float).dtype == float and type(x.astype(float)) is np.ndarray
+    assert x.astype(float).dtype == float and not isinstance(x.astype(float), StateArray)
 
 
 def test_shape_operations_keep_the_labels(x):
@@ -82,6 +82,95 @@ def test_shape_operations_keep_the_labels(x):
     one = x[0, 1]
     assert isinstance(one, StateArray) and one == "mid" and str(one) == "mid"
     assert [str(v) for v in x[0]] == list(STATES)
+
+
+def test_functions_that_move_elements_keep_the_labels(x):
+    y = StateArray(x.codes[::-1].copy(), STATES)
+    for moved, codes in (
+        (np.stack([x, y], axis=-1), np.stack([x.codes, y.codes], axis=-1)),
+        (np.concatenate([x, y]), np.concatenate([x.codes, y.codes])),
+        (np.where(x == "mid", x, y), np.where(x.codes == 1, x.codes, y.codes)),
+        (np.broadcast_to(x[0], (2, 3)), np.broadcast_to(x.codes[0], (2, 3))),
+        (np.broadcast_arrays(x, y[0])[1], np.broadcast_to(y.codes[0], (2, 3))),
+        (np.copy(x), x.codes),
+        (np.roll(x, 1, axis=-1), np.roll(x.codes, 1, axis=-1)),
+        (np.take_along_axis(x, np.array([[0], [2]]), axis=1), x.codes[[0, 1], [0, 2]][:, None]),
+        (np.moveaxis(x, 0, 1), x.codes.T),
+    ):
+        assert isinstance(moved, StateArray) and moved.states == STATES
+        np.testing.assert_array_equal(moved.codes, codes)
+
+
+def test_moving_unlike_things_together_loses_the_labels_loudly(x):
+    other = StateArray([0, 1, 1], ("a", "b"))
+    for moved in (
+        np.stack([x[0], other]),
+        np.concatenate([x[0], np.arange(3)]),
+        np.where(x[0] == "mid", x[0], 0),
+        np.where(x[0] == "mid", x[0], other),
+    ):
+        assert type(moved) is NumberArray
+        with pytest.raises(StateError, match="'mid'.*states="):
+            moved == "mid"  # noqa: B015
+
+
+@pytest.mark.parametrize("label", ["mid", np.str_("mid"), np.array(["mid"]), np.array("mid")])
+def test_numbers_refuse_labels(label):
+    for numbers in (
+        as_numbers(np.arange(3)),
+        as_numbers(np.arange(3.0)) * 2,
+        as_numbers(np.array(1)),
+    ):
+        for compare in (
+            lambda n=numbers: n == label,
+            lambda n=numbers: n != label,
+            lambda n=numbers: label == n,
+            lambda n=numbers: np.equal(n, label),
+            lambda n=numbers: n[..., None] == label,
+            lambda n=numbers: np.copy(n) == label,
+        ):
+            with pytest.raises(StateError, match="mid.*no labels.*states="):
+                compare()
+
+
+@pytest.mark.parametrize(
+    "compare",
+    [
+        lambda n: n == ["mid"],
+        lambda n: n != np.array(["mid"], dtype=object),
+        lambda n: np.isin(n, ["mid", "high"]),
+        lambda n: np.isin(n, "mid"),
+    ],
+    ids=["list", "objects", "isin", "isin one"],
+)
+def test_numbers_refuse_lists_of_labels(compare):
+    for numbers in (as_numbers(np.arange(3)), as_numbers(np.array(1))):
+        with pytest.raises(StateError, match="mid.*no labels.*states="):
+            compare(numbers)
+    assert np.isin(as_numbers(np.arange(3)), [1, 2]).tolist() == [False, True, True]
+
+
+def test_numbers_are_numbers_otherwise():
+    plain = np.array([[0.5, 2.0], [3.0, -1.0]])
+    numbers = as_numbers(plain)
+    for function in (
+        lambda v: v + 1,
+        lambda v: np.exp(v),
+        lambda v: v == 2.0,
+        lambda v: v[..., 0],
+        lambda v: np.where(v > 0, v, 0.0),
+        lambda v: np.vecdot(v, v),
+        lambda v: v @ v,
+        lambda v: v.sum(axis=-1),
+        lambda v: np.cumsum(v, axis=-1),
+        lambda v: np.linalg.norm(v, axis=-1),
+    ):
+        np.testing.assert_array_equal(np.asarray(function(numbers)), function(plain))
+    assert repr(numbers) == repr(plain) and float(numbers[0, 0]) == 0.5
+    assert as_numbers(plain) is not plain and type(plain) is np.ndarray
+    out = np.empty(2)
+    np.add(numbers[0], 1.0, out=out)
+    assert out.tolist() == [1.5, 3.0]
 
 
 def test_where_select_and_isin(x):

@@ -74,11 +74,52 @@ def as_distribution(obj: Any) -> Distribution | None:
     )
 
 
-class ScipyUnivariate(Distribution):
+class _ScipyScalar(Distribution):
+    """Numbers from an object of SciPy, whichever interface it has; a subclass knows which.
+
+    Each call goes through SciPy and is slow beside the families of this package.
+    """
+
+    #: the object of SciPy
+    scipy: Any
+    _low: Any
+    _high: Any
+
+    def _draw(self, rng: np.random.Generator, sample_shape: Shape) -> np.ndarray:
+        """Draws of shape ``sample_shape + batch_shape``."""
+        raise NotImplementedError
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        draws = draw_to(lambda lead: self._draw(rng, lead), self.batch_shape, shape, ())
+        return draws.astype(np.int64 if self.is_discrete else float, copy=False)
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        if not self.is_discrete:  # at infinity some of SciPy's formulas give NaN
+            return np.where(np.isinf(x), -np.inf, self.scipy.logpdf(x))
+        whole = x == np.floor(x)
+        return np.where(whole, self.scipy.logpmf(np.where(whole, x, 0)), -np.inf)
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.broadcast_to(self.scipy.mean(), self.batch_shape)
+
+    @property
+    def support(self) -> Support:
+        if self.is_discrete:
+            return integers(self._low, self._high)
+        if np.all(np.isneginf(self._low)) and np.all(np.isposinf(self._high)):
+            return real
+        return interval(self._low, self._high)
+
+    def cdf(self, x: Any) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            return np.asarray(self.scipy.cdf(np.asarray(x)))
+
+
+class ScipyUnivariate(_ScipyScalar):
     """A frozen univariate ``scipy.stats`` distribution, continuous or discrete.
 
-    Made by ``as_distribution``; each call goes through SciPy and is slow beside the families of
-    this package.
+    Made by ``as_distribution``.
 
     Parameters
     ----------
@@ -105,7 +146,7 @@ class ScipyUnivariate(Distribution):
 
     def __init__(self, frozen: Any) -> None:
         self.is_discrete = not hasattr(frozen.dist, "logpdf")  # type: ignore[misc]
-        self.frozen = frozen
+        self.scipy = frozen
         values = [*frozen.args, *frozen.kwds.values()]
         self._set_batch(*(np.shape(value) for value in values))
         low, high = frozen.support()
@@ -126,49 +167,26 @@ class ScipyUnivariate(Distribution):
 
     @property
     def _family(self) -> str:
-        return f"scipy.stats.{self.frozen.dist.name}"
+        return f"scipy.stats.{self.scipy.dist.name}"
 
     def parameters(self) -> list[tuple[np.ndarray, int]]:
-        keywords = [self.frozen.kwds[key] for key in sorted(self.frozen.kwds)]
-        return [(np.asarray(value), 0) for value in (*self.frozen.args, *keywords)]
+        keywords = [self.scipy.kwds[key] for key in sorted(self.scipy.kwds)]
+        return [(np.asarray(value), 0) for value in (*self.scipy.args, *keywords)]
 
-    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
-        def draw(sample_shape: Shape) -> np.ndarray:
-            size = sample_shape + self.batch_shape
-            draws = np.asarray(self.frozen.rvs(size=size, random_state=rng))
-            return draws.reshape(size)
-
-        draws = draw_to(draw, self.batch_shape, shape, ())
-        return draws.astype(np.int64) if self.is_discrete else draws.astype(float, copy=False)
-
-    def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        if not self.is_discrete:  # at infinity some of SciPy's formulas give NaN
-            return np.where(np.isinf(x), -np.inf, self.frozen.logpdf(x))
-        whole = x == np.floor(x)
-        return np.where(whole, self.frozen.logpmf(np.where(whole, x, 0)), -np.inf)
-
-    @property
-    def mean(self) -> np.ndarray:
-        return np.broadcast_to(self.frozen.mean(), self.batch_shape)
+    def _draw(self, rng: np.random.Generator, sample_shape: Shape) -> np.ndarray:
+        size = sample_shape + self.batch_shape
+        return np.asarray(self.scipy.rvs(size=size, random_state=rng)).reshape(size)
 
     @property
     def var(self) -> np.ndarray:
-        return np.broadcast_to(self.frozen.var(), self.batch_shape)
-
-    @property
-    def support(self) -> Support:
-        return _between(self._low, self._high, self.is_discrete)
-
-    def cdf(self, x: Any) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            return np.asarray(self.frozen.cdf(x))
+        return np.broadcast_to(self.scipy.var(), self.batch_shape)
 
     def ppf(self, q: Any) -> np.ndarray:
         with np.errstate(all="ignore"):
-            return np.asarray(self.frozen.ppf(q))
+            return np.asarray(self.scipy.ppf(q))
 
     def _arguments(self, index: Shape) -> np.ndarray:
-        values = [*self.frozen.args, *self.frozen.kwds.values()]
+        values = [*self.scipy.args, *self.scipy.kwds.values()]
         return np.array(
             [np.broadcast_to(value, self.batch_shape)[index] for value in values], float
         )
@@ -179,20 +197,20 @@ class ScipyUnivariate(Distribution):
             from scipy import stats
 
             half = np.full(self.batch_shape, 0.5)
-            self.frozen = stats.bernoulli(half) if self.is_discrete else stats.norm(half)
-            return self.frozen.support()
+            self.scipy = stats.bernoulli(half) if self.is_discrete else stats.norm(half)
+            return self.scipy.support()
         good = tuple(np.argwhere(ok)[0])
 
         def mend(value: Any) -> np.ndarray:
             value = np.broadcast_to(value, self.batch_shape)
             return np.where(ok, value, value[good])
 
-        keywords = {key: mend(value) for key, value in self.frozen.kwds.items()}
-        self.frozen = self.frozen.dist(*(mend(value) for value in self.frozen.args), **keywords)
-        return self.frozen.support()
+        keywords = {key: mend(value) for key, value in self.scipy.kwds.items()}
+        self.scipy = self.scipy.dist(*(mend(value) for value in self.scipy.args), **keywords)
+        return self.scipy.support()
 
 
-class ScipyVariable(Distribution):
+class ScipyVariable(_ScipyScalar):
     """A random variable of SciPy's newer interface, such as ``scipy.stats.Normal(mu=0, sigma=1)``.
 
     Made by ``as_distribution``.
@@ -214,7 +232,7 @@ class ScipyVariable(Distribution):
     """
 
     def __init__(self, variable: Any) -> None:
-        self.variable = variable
+        self.scipy = variable
         low, high = variable.support()
         self._set_batch(np.shape(low), np.shape(high), np.shape(variable.mean()))
         ok = ~(np.isnan(low) | np.isnan(high))
@@ -234,37 +252,15 @@ class ScipyVariable(Distribution):
         points = (0.25, 0.75)
         return [(np.broadcast_to(self.ppf(q), self.batch_shape), 0) for q in points]
 
-    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
-        draws = draw_to(
-            lambda lead: np.asarray(self.variable.sample(lead, rng=rng)),
-            self.batch_shape,
-            shape,
-            (),
-        )
-        return draws.astype(np.int64 if self.is_discrete else float)
-
-    def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        if not self.is_discrete:
-            return np.where(np.isinf(x), -np.inf, self.variable.logpdf(x))
-        return np.where(x == np.floor(x), self.variable.logpmf(x), -np.inf)
-
-    @property
-    def mean(self) -> np.ndarray:
-        return np.broadcast_to(self.variable.mean(), self.batch_shape)
+    def _draw(self, rng: np.random.Generator, sample_shape: Shape) -> np.ndarray:
+        return np.asarray(self.scipy.sample(sample_shape, rng=rng))
 
     @property
     def var(self) -> np.ndarray:
-        return np.broadcast_to(self.variable.variance(), self.batch_shape)
-
-    @property
-    def support(self) -> Support:
-        return _between(self._low, self._high, self.is_discrete)
-
-    def cdf(self, x: Any) -> np.ndarray:
-        return np.asarray(self.variable.cdf(np.asarray(x)))
+        return np.broadcast_to(self.scipy.variance(), self.batch_shape)
 
     def ppf(self, q: Any) -> np.ndarray:
-        return np.asarray(self.variable.icdf(as_quantile(q)))
+        return np.asarray(self.scipy.icdf(as_quantile(q)))
 
 
 class ScipyMultivariate(Distribution):
@@ -367,14 +363,6 @@ class ScipyMultivariate(Distribution):
         if moment is None:
             raise UnsupportedError(f"{self._family} has no closed {name}; use draws instead")
         return np.asarray(moment() if callable(moment) else moment, dtype=float)
-
-
-def _between(low: Any, high: Any, is_discrete: bool) -> Support:
-    if is_discrete:
-        return integers(low, high)
-    if np.all(np.isneginf(low)) and np.all(np.isposinf(high)):
-        return real
-    return interval(low, high)
 
 
 def _fractional(bound: Any) -> bool:

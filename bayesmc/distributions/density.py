@@ -62,7 +62,9 @@ class Density(Distribution):
         batch_shape: int | Shape | None = None,
     ) -> None:
         if not callable(log_prob):
-            raise TypeError(f"Density({log_prob!r}): the first argument is a function, the log density")
+            raise TypeError(
+                f"Density({log_prob!r}): the first argument is a function, the log density"
+            )
         self._function = log_prob
         self._sampler = sample
         self.event_shape = as_shape(event_shape)

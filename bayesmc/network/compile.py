@@ -19,6 +19,7 @@ from bayesmc.errors import (
     ModelError,
     PlateError,
     ShapeError,
+    StateError,
 )
 from bayesmc.network.align import Aligner
 from bayesmc.network.domain import Domain, domain_with_states, states_domain
@@ -137,8 +138,8 @@ def _call_batched(
     try:
         return call(declaration, arguments, lead, links)
     except BayesmcError as error:
-        if not links or declaration.source == "table" or isinstance(error.__cause__, IndexError):
-            raise  # an index out of range is a fault of its own, not of broadcasting
+        if not links or declaration.source == "table" or _is_plain(error):
+            raise
         try:
             one, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
             call(declaration, one, lead[len(lead) - len(declaration.plates) :], links)
@@ -149,6 +150,11 @@ def _call_batched(
             f"{str(error).removeprefix(f'node {declaration.name!r}: ')}; write it with NumPy "
             "(np.where for if, axis=-1 for components), or declare vectorize=True (slow)"
         ) from error
+
+
+def _is_plain(error: BayesmcError) -> bool:
+    """A fault of its own, which an unbatched call may only have missed."""
+    return isinstance(error, StateError) or isinstance(error.__cause__, IndexError)
 
 
 def _discover_stochastic(

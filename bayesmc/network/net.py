@@ -233,6 +233,7 @@ class BayesNet:
                 f"node {name!r}: probs has {table.ndim} axes, but {len(parents)} parents and the node "
                 f"itself make {len(parents) + 1}"
             )
+        states = None if states is None else _states(states)
         if states is not None and len(states) != table.shape[-1]:
             raise ModelError(
                 f"node {name!r}: states= has {len(states)} entries, but the last axis of probs has "
@@ -245,7 +246,7 @@ class BayesNet:
                 "table",
                 tuple(parents),
                 self._node_plates(name, plates),
-                None if states is None else _states(states),
+                states,
                 probs=table,
             ),
             replace,

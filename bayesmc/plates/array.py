@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
-from bayesmc.errors import PlateError
+from bayesmc.errors import PlateError, StateError
 from bayesmc.plates.gathered import Gathered
 from bayesmc.shapes import Shape, broadcast_shapes
 
@@ -230,6 +230,12 @@ class PlateArray(NDArrayOperatorsMixin):
             raise TypeError("use np.vecdot(X, v) or np.matvec(A, v) instead of @ on plates")
         cores, core_out = _core_ndims(ufunc)
         aligned, names, event = align(inputs, cores)
+        labels = [x for x in aligned if isinstance(x, str)]
+        if labels and not any(hasattr(x, "states") for x in aligned):
+            raise StateError(
+                f"numbers in plate {self.plates[0]!r} are compared with the label {labels[0]!r}: the node "
+                "has no labels; declare it with states="
+            )
         try:
             result = ufunc(*aligned, **kwargs)
         except ValueError as error:

@@ -114,7 +114,7 @@ class DrawsPosterior(Posterior):
         if self._is_circular(name):  # an order needs a cut: opposite the mean
             mean = self.mean(name)
             values = mean + np.remainder(values - mean + np.pi, 2 * np.pi) - np.pi
-        flat = values.reshape((-1, *values.shape[2:]))
+        flat = values.reshape((math.prod(self._shape), *values.shape[2:]))
         levels = np.asarray(q, dtype=float)
         if not ((levels >= 0) & (levels <= 1)).all():
             raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
@@ -212,7 +212,7 @@ class DrawsPosterior(Posterior):
             picked = self.probabilities(name)[index if isinstance(index, tuple) else (index,)]
             return Marginal(name, np.asarray(values), picked, node.domain.states)
         draws = self._full(name, "marginal")
-        flat = draws.reshape((-1, *draws.shape[2:]))
+        flat = draws.reshape((math.prod(self._shape), *draws.shape[2:]))
         flat = flat[(slice(None), *(index if isinstance(index, tuple) else (index,)))]
         weights = (
             np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()

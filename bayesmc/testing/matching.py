@@ -7,7 +7,7 @@ false-alarm rate; answers without Monte Carlo error must agree to a tolerance.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -59,12 +59,15 @@ class Match:
         The least likely one.
     rejected : tuple of Comparison
         Those that do not match, worst first; empty when all is well.
+    alpha : float
+        Family-wise false-alarm rate of the decision.
     """
 
     comparisons: int
     skipped: int
     worst: Comparison | None
-    rejected: tuple[Comparison, ...] = field(default=())
+    rejected: tuple[Comparison, ...]
+    alpha: float
 
 
 def compare(
@@ -76,32 +79,7 @@ def compare(
     min_count: float = 10.0,
     names: Sequence[str] | None = None,
 ) -> Match:
-    """What `assert_matches` asserts, as a value."""
-    table = _Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
-    _compare_evidence(table, posterior, exact)
-    for name in names if names is not None else exact.names:
-        node = posterior.model[name]
-        if node.kind == "input":
-            continue
-        if node.domain is not None:
-            _compare_states(table, posterior, exact, name, node)
-        else:
-            _compare_mean(table, posterior, exact, name, node)
-    found = sorted(table.comparisons, key=lambda c: (c.p_value, -c.errors))
-    rejected = _holm(found, alpha)
-    return Match(len(found), table.skipped, found[0] if found else None, rejected)
-
-
-def assert_matches(
-    posterior: Any,
-    exact: Any,
-    alpha: float = 1e-3,
-    *,
-    rtol: float = 1e-9,
-    min_count: float = 10.0,
-    names: Sequence[str] | None = None,
-) -> Match:
-    """Raise unless a posterior matches an exact one.
+    """What differs between a posterior and an exact one, and whether chance explains it.
 
     Compared are the probability of every state of every element of finite nodes, the means of all other
     nodes, and the log evidence. A probability is judged by binomial tails at its effective count
@@ -137,11 +115,57 @@ def assert_matches(
     Raises
     ------
     AssertionError
-        Naming nodes, elements, states, both values and the number of standard errors.
+        Where the two do not even have the same shapes.
 
     References
     ----------
     Holm (1979), Scand. J. Statist. 6.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.testing import compare, enumerate_posterior
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.3))
+    >>> found = bmc.infer(net, engine=bmc.LikelihoodWeighting(5000), rng=0)
+    >>> compare(found, enumerate_posterior(net)).rejected
+    ()
+    """
+    table = _Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
+    _compare_evidence(table, posterior, exact)
+    for name in names if names is not None else exact.names:
+        node = posterior.model[name]
+        if node.kind == "input":
+            continue
+        if node.domain is not None:
+            _compare_states(table, posterior, exact, name, node)
+        else:
+            _compare_mean(table, posterior, exact, name, node)
+    found = sorted(table.comparisons, key=lambda c: (c.p_value, -c.errors))
+    rejected = _holm(found, alpha)
+    return Match(len(found), table.skipped, found[0] if found else None, rejected, alpha)
+
+
+def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
+    """Raise unless a posterior matches an exact one.
+
+    Parameters
+    ----------
+    posterior, exact
+        As `compare` takes them; there stands what is compared, and what cannot be seen.
+    **options
+        Of `compare`: ``alpha`` (family-wise false-alarm rate, 1e-3), ``rtol`` (tolerance without
+        Monte Carlo error, 1e-9), ``min_count`` (rarer states are not compared, 10), ``names``
+        (nodes to compare, all).
+
+    Returns
+    -------
+    Match
+
+    Raises
+    ------
+    AssertionError
+        Naming nodes, elements, states, both values and the number of standard errors.
 
     Examples
     --------
@@ -154,13 +178,14 @@ def assert_matches(
     >>> assert_matches(weighted, enumerate_posterior(net, {"x": 1.5})).comparisons
     4
     """
-    match = compare(posterior, exact, alpha, rtol=rtol, min_count=min_count, names=names)
+    match = compare(posterior, exact, **options)
     if match.rejected:
         shown = "\n  ".join(map(str, match.rejected[:10]))
         more = f"\n  ... and {len(match.rejected) - 10} more" if len(match.rejected) > 10 else ""
         raise AssertionError(
-            f"assert_matches: {len(match.rejected)} of {match.comparisons} figures of {posterior!r} differ "
-            f"from the exact ones (Holm, false-alarm rate {alpha:g}):\n  {shown}{more}"
+            f"assert_matches: {len(match.rejected)} of {match.comparisons} figures of "
+            f"{posterior!r} differ from the exact ones (Holm, false-alarm rate {match.alpha:g}):"
+            f"\n  {shown}{more}"
         )
     return match
 

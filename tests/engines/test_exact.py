@@ -210,6 +210,35 @@ def test_resample_draws_from_the_posterior() -> None:
     np.testing.assert_array_equal(drawn["s0"], again["s0"])
 
 
+@pytest.mark.parametrize("keep", ["exact", "draws", "summaries"])
+def test_plates_of_size_zero(keep: str) -> None:
+    """An empty plate has no elements and no influence; its figures are empty arrays."""
+    net = bmc.BayesNet(plates={"p": None, "q": 2})
+    net.add("h", bmc.Bernoulli(0.3))
+    net.add("x", lambda h: bmc.Bernoulli(0.5 + 0.1 * h), plates="p")
+    net.add("w", lambda h: bmc.Categorical([0.2, 0.5, 0.3]), plates=("p", "q"))
+    net.add("total", lambda x: x.sum("p"))
+    engine = EXACT if keep == "exact" else bmc.LikelihoodWeighting(2000)
+    posterior = bmc.infer(
+        net, {"x": []}, engine=engine, rng=0, keep="draws" if keep == "exact" else keep
+    )
+    assert posterior.mean("h") == pytest.approx(0.3, abs=0.05)  # 4.9 standard errors of 0.0102
+    assert posterior.log_marginal_likelihood == pytest.approx(0.0, abs=1e-12)
+    assert posterior.mean("total") == 0
+    for figure in ("mean", "std", "mcse", "ess"):
+        assert getattr(posterior, figure)("x").shape == (0,)
+        assert getattr(posterior, figure)("w").shape == (0, 2)
+    assert posterior.probabilities("x").shape == (0, 2)
+    assert posterior.probabilities("w").shape == (0, 2, 3)
+    assert not any(n.startswith(("x", "w")) for n in posterior.summary().names)
+    if keep != "summaries":
+        assert posterior.probabilities("h", "x").shape == (0, 2, 2)
+        assert posterior.resample(5, rng=0)["w"].shape == (1, 5, 0, 2)
+        assert posterior.expectation(lambda h, x: h + x.sum(axis=-1)) == pytest.approx(
+            float(posterior.mean("h"))
+        )
+
+
 def test_resume_is_refused() -> None:
     posterior = bmc.infer(chain(), engine=EXACT)
     with pytest.raises(UnsupportedError, match="resume"):

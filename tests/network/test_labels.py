@@ -69,7 +69,6 @@ COMPUTING = {
     "max": lambda a, b: bmc.stack([a, b]).max(axis=-1) == "yes",
     "sort": lambda a, b: np.sort(bmc.stack([a, b]), axis=-1)[..., 0] == "yes",
     "select": lambda a, b: np.select([a == "no"], [a], b) == "yes",
-    "codes": lambda a, b: a.codes == "yes",
     "astype": lambda a, b: a.astype(int) == "yes",
     "array of labels": lambda a, b: (a * 1) == np.array(["yes"]),
 }
@@ -80,7 +79,7 @@ COMPUTING = {
 def test_labels_lost_in_a_function_are_heard_of(how: str, vectorize: bool) -> None:
     net = two()
     net.add("d", COMPUTING[how], vectorize=vectorize)
-    with pytest.raises(StateError, match=r"node 'd'.*compared with the label 'yes'.*states="):
+    with pytest.raises(StateError, match=r"node 'd'.*compared with .*'yes'.*states="):
         net.validate()
 
 
@@ -89,7 +88,7 @@ def test_labels_lost_in_a_function_are_heard_of(how: str, vectorize: bool) -> No
 def test_labels_lost_in_a_query_are_heard_of(how: str, engine) -> None:
     posterior = bmc.infer(two(), engine=engine, rng=0)
     for ask in (posterior.probability, posterior.expectation):
-        with pytest.raises(StateError, match=r"compared with the label 'yes'.*states="):
+        with pytest.raises(StateError, match=r"compared with .*'yes'.*states="):
             ask(COMPUTING[how])
 
 

@@ -139,7 +139,8 @@ def test_potentials_multiply_the_density():
         net = hybrid()
         net.potential("bad", lambda m, v=value: m + v)
         with pytest.raises(
-            DensityError, match="potential 'bad' is NaN or plus infinity; a log factor must be finite"
+            DensityError,
+            match="potential 'bad' is NaN or plus infinity; a log factor must be finite",
         ):
             net.log_prob(draws)
     net = hybrid()

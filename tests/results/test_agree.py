@@ -216,6 +216,26 @@ def test_every_posterior_pickles_without_its_functions(answers, kind):
     assert "Posterior" in repr(twin)
 
 
+@pytest.mark.parametrize("kind", ["exact", "draws"])
+def test_pickled_posteriors_still_take_queries(answers, kind):
+    """Tables and draws answer without the net's own functions, which a pickle does not carry."""
+    p = answers[kind]
+    twin = pickle.loads(pickle.dumps(p))
+    for query in (
+        lambda rain: rain == "yes",
+        lambda level, g: level * g.max(axis=-1),
+        lambda g: g.max(axis=-1),
+    ):
+        expected = p.expectation(query)
+        np.testing.assert_allclose(twin.expectation(query), expected, rtol=1e-12)
+    by_element = twin.expectation(lambda g, level: g * level, plates="p")
+    np.testing.assert_allclose(by_element, p.expectation(lambda g, level: g * level, plates="p"))
+    assert twin.probability(lambda rain: rain == "yes") == pytest.approx(p.probabilities("rain")[1])
+    if kind == "exact":  # a sum over a plate is no table, and needs its function
+        with pytest.raises(UnsupportedError, match="was unpickled.*call infer again"):
+            twin.expectation(lambda total: total)
+
+
 def test_a_uniform_posterior_has_no_weights():
     p = bmc.infer(the_net(), engine=bmc.LikelihoodWeighting(500), rng=0)
     assert p.weights is None and p.weight_ess is None and p.log_marginal_likelihood == 0.0

@@ -5,7 +5,6 @@ What the words mean is the reader's business.
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Any, NoReturn
 
@@ -34,7 +33,7 @@ class Cursor:
 
     def keyword(self, inside: str) -> str | None:
         """The next word or punctuation mark; at the end of the text, None outside any block."""
-        self.at = start = _after_gap(self.text, self.at)
+        self.at = start = after_gap(self.text, self.at)
         if start == len(self.text):
             if not inside:
                 return None
@@ -43,12 +42,13 @@ class Cursor:
         if match is None:
             self.fail(f"cannot read {self.text[start : start + 20]!r}")
         if self.text[start] not in "{}()[];,|":
-            self.at = _after_gap(self.text, match.end())
+            self.at = after_gap(self.text, match.end())
         elif match[0] == "}" and inside:
             self.at = match.end()
         return match[0]
 
     def name_before_brace(self, at: int) -> str:
+        """The name between a keyword at ``at`` and its block's opening brace."""
         match = _HEAD.match(self.text, self.at)
         if match is None or not self.text.startswith("{", match.end()):
             self.fail("expected 'variable name {'", at)
@@ -56,6 +56,7 @@ class Cursor:
         return match[1] if match[1] is not None else match[2]
 
     def property_text(self) -> str:
+        """What stands between ``property`` and its semicolon."""
         match = _PROPERTY.match(self.text, self.at)
         if match is None:
             self.fail("this property is not closed by ';'")
@@ -63,6 +64,7 @@ class Cursor:
         return match[1].strip()
 
     def names(self, text: str, at: int) -> tuple[str, ...]:
+        """The names in a part of the text that starts at ``at``."""
         if '"' not in text:  # the common case, by string methods: five times faster
             return tuple(text.replace(",", " ").replace("|", " ").split())
         found, end = [], 0
@@ -73,23 +75,34 @@ class Cursor:
             self.fail(f"cannot read the names in ({text.strip()})", at + end)
         return tuple(found)
 
-    def number_list(self, text: str, at: int, what: str) -> list[float]:
-        """The numbers of ``text``, which starts at ``at`` and belongs to ``what``."""
-@@NUMBERS@@
-
-    def skip_gap(self) -> int:
-        """Move to the next thing that is not white space; its offset."""
-        self.at = _after_gap(self.text, self.at)
-        return self.at
+    def numbers(self, text: str, at: int, inside: str) -> list[float]:
+        """The numbers in a part of the text that starts at ``at``."""
+        words = text.replace(",", " ").split()
+        try:
+            values = list(map(float, words))
+        except ValueError:
+            values = []
+        if not values or "_" in text:  # float() would take 0_5 for 5
+            for k, word in enumerate(words):
+                if not _is_number(word):
+                    self.fail(f"{inside}: {word!r} is not a number", at + word_offset(text, k))
+        return values
 
     def fail(self, message: str, at: int | None = None) -> NoReturn:
+        """Raise, naming the line of offset ``at``; by default the one where the cursor stands."""
         at = self.at if at is None else at
         raise FileFormatError(message, self.path, self.text.count("\n", 0, at) + 1)
 
 
-def _after_gap(text: str, at: int) -> int:
+def after_gap(text: str, at: int) -> int:
+    """Where the next thing that is not white space starts."""
     match = _GAP.match(text, at)
     return match.end() if match else at
+
+
+def word_offset(text: str, index: int) -> int:
+    """Where the word number ``index`` of a list of numbers starts."""
+    return list(re.finditer(r"[^\s,]+", text))[index].start()
 
 
 def _blank_comment(match: re.Match[str]) -> str:
@@ -97,11 +110,6 @@ def _blank_comment(match: re.Match[str]) -> str:
     if found[0] == '"':
         return found
     return re.sub(r"[^\n]", " ", found)
-
-
-def _word_offset(text: str, index: int) -> int:
-    """Where the word number ``index`` of a list of numbers starts."""
-    return list(re.finditer(r"[^\s,]+", text))[index].start()
 
 
 def _is_number(word: str) -> bool:

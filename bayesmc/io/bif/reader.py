@@ -1,7 +1,6 @@
-"""Reading and writing the Bayesian Interchange Format (BIF) as plain records.
+"""From BIF text to records: the blocks of the file, and the tables in them.
 
-Text becomes a list of `BifNode` and back. This room knows the file format only: it builds no
-network and checks no cycle; `bayesmc.io` turns the records into nets.
+It builds no net and checks no cycle.
 
 The grammar is that of the "Interchange Format for Bayesian Networks" (UAI, 1998), as the bnlearn
 repository and JavaBayes write it, comments and ``property`` lines included.
@@ -13,42 +12,20 @@ import gzip
 import math
 import re
 import zlib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from os import PathLike
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import FileFormatError
+from bayesmc.errors import FileFormatError
+from bayesmc.io.bif.cursor import NAME, Cursor, after_gap, word_offset
+from bayesmc.io.bif.record import BifNode
 
 ROW_TOLERANCE = 1e-6
 """Rows whose sum differs from 1 by at most this are rounding, and are renormalised."""
-
-
-@dataclass(frozen=True, eq=False)
-class BifNode:
-    """One variable of a BIF file with its conditional probability table.
-
-    Attributes
-    ----------
-    name : str
-    states : tuple of str
-        In file order.
-    parents : tuple of str
-        In the order of the ``probability`` block.
-    probs : ndarray, shape (card(parent_1), ..., card(parent_n), card(name))
-        Read-only; every row sums to 1.
-    properties : tuple of str
-        The texts of the variable's ``property`` lines.
-    """
-
-    name: str
-    states: tuple[str, ...]
-    parents: tuple[str, ...]
-    probs: np.ndarray
-    properties: tuple[str, ...] = ()
 
 
 def parse_bif(text: str, path: Any = None) -> list[BifNode]:
@@ -75,6 +52,7 @@ def parse_bif(text: str, path: Any = None) -> list[BifNode]:
 
     Examples
     --------
+    >>> from bayesmc.io.bif import parse_bif
     >>> text = '''network tiny { }
     ... variable age { type discrete [ 2 ] { <5, 5-12 }; }
     ... variable ill { type discrete [ 2 ] { yes, no }; }
@@ -87,46 +65,6 @@ def parse_bif(text: str, path: Any = None) -> list[BifNode]:
     array([0.3, 0.7])
     """
     return _Reader(text, path).nodes()
-
-
-def format_bif(nodes: Iterable[BifNode], name: str = "unknown") -> str:
-    """The text of a BIF file; `parse_bif` of it gives equal names, states and tables.
-
-    Names that would not read back as one word are quoted. Numbers are written with the digits
-    that identify the float.
-
-    Raises
-    ------
-    ValueError
-        If a name holds a double quote or a line break, for which the format has no spelling.
-
-    Examples
-    --------
-    >>> print(format_bif([BifNode("coin", ("heads", "tails"), (), np.array([0.5, 0.5]))]))
-    network unknown {
-    }
-    variable coin {
-      type discrete [ 2 ] { heads, tails };
-    }
-    probability ( coin ) {
-      table 0.5, 0.5;
-    }
-    <BLANKLINE>
-    """
-    nodes = list(nodes)
-    states = {node.name: node.states for node in nodes}
-    lines = [f"network {_spell(name)} {{", "}"]
-    for node in nodes:
-        listed = ", ".join(map(_spell, node.states))
-        lines += [
-            f"variable {_spell(node.name)} {{",
-            f"  type discrete [ {len(node.states)} ] {{ {listed} }};",
-            *(f"  property {text};" for text in node.properties),
-            "}",
-        ]
-    for node in nodes:
-        lines += _probability_block(node, states)
-    return "\n".join(lines) + "\n"
 
 
 def read_text(path: str | PathLike[str]) -> str:
@@ -148,18 +86,9 @@ def read_text(path: str | PathLike[str]) -> str:
         raise FileFormatError(f"not readable as (gzipped) UTF-8 text: {error}", path) from error
 
 
-# A word ends at white space, at the format's punctuation, or where a comment starts.
-_WORD = r'(?:[^\s{}()\[\];,|"/]|/(?![/*]))+'
-_NAME = rf'(?:"([^"\n]*)"|({_WORD}))'
-_COMMENT_OR_QUOTED = re.compile(r'"[^"\n]*"|//[^\n]*|/\*.*?\*/', re.S)
-_NAMES = re.compile(rf"[\s,|]*{_NAME}")
-_TOKEN = re.compile(rf"{_NAME}|[{{}}()\[\];,|]")
-_GAP = re.compile(r"\s*")
-_HEAD = re.compile(rf"{_NAME}\s*")
 # Possessive, as backtracking into an unclosed block would take exponential time.
 _TO_CLOSING_BRACE = re.compile(r'(?:[^"{}]++|"[^"\n]*+")*+\}')
-_NETWORK_HEAD = re.compile(rf"(?:{_NAME})?[^{{}}]*\{{")
-_PROPERTY = re.compile(r'((?:"[^"\n]*"|[^";])*);')
+_NETWORK_HEAD = re.compile(rf"(?:{NAME})?[^{{}}]*\{{")
 _TYPE = re.compile(r'discrete\s*\[\s*(\d+)\s*\]\s*\{((?:"[^"\n]*"|[^"{};])*)\}\s*;')
 _SCOPE = re.compile(r'\(((?:"[^"\n]*"|[^"(){};])*)\)\s*\{')
 _ROW = re.compile(r'\(((?:"[^"\n]*"|[^"();])*)\)([^;{}()"]*);')
@@ -192,14 +121,11 @@ class _Entries:
     table: _Row | None = None
 
 
-class _Reader:
-    """A cursor over the text; offsets are kept so that an error can name its line."""
+class _Reader(Cursor):
+    """What is known of the file so far; blocks may come in any order."""
 
     def __init__(self, text: str, path: Any) -> None:
-        self.path = path
-        self.at = 0
-        # Comments become blanks of the same length, so that offsets and lines stay true.
-        self.text = _COMMENT_OR_QUOTED.sub(_blank_comment, text)
+        super().__init__(text, path)
         self.variables: dict[str, _Variable] = {}
         self.tables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
 
@@ -319,13 +245,13 @@ class _Reader:
         codes = [self.variables[p].codes for p in parents]
         found = _Entries()
         while True:
-            self.at = start = _after_gap(self.text, self.at)
+            self.at = start = after_gap(self.text, self.at)
             row = _ROW.match(self.text, start)
             if row is not None:
                 index = self.row_index(row[1], row.start(1), child, parents, codes)
                 if index in found.rows:
                     self.fail(f"probability of {child!r}: row ({row[1].strip()}) is given twice")
-                numbers = self.numbers(row[2], row.start(2), size, child)
+                numbers = self.probabilities(row[2], row.start(2), size, child)
                 found.rows[index] = _Row(start, numbers)
                 self.at = row.end()
                 continue
@@ -339,10 +265,10 @@ class _Reader:
                 continue
             match = _NUMBERS.match(self.text, self.at)
             if keyword == "table" and match and found.table is None:
-                numbers = self.numbers(match[1], match.start(1), size * count, child)
+                numbers = self.probabilities(match[1], match.start(1), size * count, child)
                 found.table = _Row(start, numbers)
             elif keyword == "default" and match and found.default is None:
-                numbers = self.numbers(match[1], match.start(1), size, child)
+                numbers = self.probabilities(match[1], match.start(1), size, child)
                 found.default = _Row(start, numbers)
             else:
                 self.fail(
@@ -387,27 +313,20 @@ class _Reader:
             index = index * len(code) + code[name]
         return index
 
-    def numbers(self, text: str, at: int, count: int, child: str) -> list[float]:
-        words = text.replace(",", " ").split()
-        try:
-            values = list(map(float, words))
-        except ValueError:
-            values = []
-        if not values or "_" in text:  # float() would take 0_5 for 5
-            for k, word in enumerate(words):
-                if not _is_number(word):
-                    where = at + _word_offset(text, k)
-                    self.fail(f"probability of {child!r}: {word!r} is not a number", where)
+    def probabilities(self, text: str, at: int, count: int, child: str) -> list[float]:
+        inside = f"probability of {child!r}"
+        values = self.numbers(text, at, inside)
         if len(values) != count:
-            self.fail(f"probability of {child!r}: expected {count} numbers, found {len(values)}")
+            self.fail(f"{inside}: expected {count} numbers, found {len(values)}")
         # Written so that NaN fails; sums of allowed entries are judged in `normalise`.
         if not (
             min(values) >= 0.0 and max(values) <= 1.0 + ROW_TOLERANCE and sum(values) < math.inf
         ):
+            words = text.replace(",", " ").split()
             for k, value in enumerate(values):
                 if not 0.0 <= value <= 1.0 + ROW_TOLERANCE:
-                    where = at + _word_offset(text, k)
-                    self.fail(f"probability of {child!r}: {words[k]} is not a probability", where)
+                    where = at + word_offset(text, k)
+                    self.fail(f"{inside}: {words[k]} is not a probability", where)
         return values
 
     def normalise(self, table: np.ndarray, lines: list[int], child: str) -> None:
@@ -423,98 +342,3 @@ class _Reader:
             )
         rounded = off > 1e-12  # dividing exact rows as well would change their last digit
         table[rounded] /= sums[rounded, None]
-
-    def names(self, text: str, at: int) -> tuple[str, ...]:
-        if '"' not in text:  # the common case, by string methods: five times faster
-            return tuple(text.replace(",", " ").replace("|", " ").split())
-        found, end = [], 0
-        while (match := _NAMES.match(text, end)) is not None:
-            found.append(match[1] if match[1] is not None else match[2])
-            end = match.end()
-        if text[end:].strip(" \t\r\n,|"):
-            self.fail(f"cannot read the names in ({text.strip()})", at + end)
-        return tuple(found)
-
-    def keyword(self, inside: str) -> str | None:
-        """The next word or punctuation mark; at the end of the text, None outside any block."""
-        self.at = start = _after_gap(self.text, self.at)
-        if start == len(self.text):
-            if not inside:
-                return None
-            self.fail(f"the file ends inside {inside}; it looks truncated")
-        match = _TOKEN.match(self.text, start)
-        if match is None:
-            self.fail(f"cannot read {self.text[start : start + 20]!r}")
-        if self.text[start] not in "{}()[];,|":
-            self.at = _after_gap(self.text, match.end())
-        elif match[0] == "}" and inside:
-            self.at = match.end()
-        return match[0]
-
-    def name_before_brace(self, at: int) -> str:
-        match = _HEAD.match(self.text, self.at)
-        if match is None or not self.text.startswith("{", match.end()):
-            self.fail("expected 'variable name {'", at)
-        self.at = match.end() + 1
-        return match[1] if match[1] is not None else match[2]
-
-    def property_text(self) -> str:
-        match = _PROPERTY.match(self.text, self.at)
-        if match is None:
-            self.fail("this property is not closed by ';'")
-        self.at = match.end()
-        return match[1].strip()
-
-    def fail(self, message: str, at: int | None = None) -> NoReturn:
-        at = self.at if at is None else at
-        raise FileFormatError(message, self.path, self.text.count("\n", 0, at) + 1)
-
-
-def _after_gap(text: str, at: int) -> int:
-    match = _GAP.match(text, at)
-    return match.end() if match else at
-
-
-def _blank_comment(match: re.Match[str]) -> str:
-    found = match[0]
-    if found[0] == '"':
-        return found
-    return re.sub(r"[^\n]", " ", found)
-
-
-def _word_offset(text: str, index: int) -> int:
-    """Where the word number ``index`` of a list of numbers starts."""
-    return list(re.finditer(r"[^\s,]+", text))[index].start()
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return "_" not in word
-
-
-def _spell(name: str) -> str:
-    if re.fullmatch(_WORD, name):
-        return name
-    if '"' in name or "\n" in name or "\r" in name:
-        raise ValueError(f"format_bif: BIF has no spelling for the name {name!r}; rename it")
-    return f'"{name}"'
-
-
-def _probability_block(node: BifNode, states: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
-    if not node.parents:
-        yield f"probability ( {_spell(node.name)} ) {{"
-        yield f"  table {_row_text(node.probs)};"
-    else:
-        parents = ", ".join(map(_spell, node.parents))
-        yield f"probability ( {_spell(node.name)} | {parents} ) {{"
-        for index in np.ndindex(node.probs.shape[:-1]):
-            names = (states[p][k] for p, k in zip(node.parents, index, strict=True))
-            yield f"  ({', '.join(map(_spell, names))}) {_row_text(node.probs[index])};"
-    yield "}"
-
-
-def _row_text(row: np.ndarray) -> str:
-    return ", ".join(map(repr, row.tolist()))
