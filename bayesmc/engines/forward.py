@@ -23,7 +23,7 @@ from bayesmc.randomness import Purpose, stream
 from bayesmc.structure import Table, constants_of, tabulate
 
 #: draws per chunk of a net whose largest node is a scalar
-CHUNK = 16384
+CHUNK = 32768
 #: array elements per node and chunk that larger nodes are cut to
 _CHUNK_ELEMENTS = 1 << 20
 #: table entries up to which a function, or a declared table, is turned into a step
@@ -42,9 +42,7 @@ def forward_chunks(
     """Passes that together make ``draws`` draws; chunk ``k`` uses random stream ``first + k``."""
     model = problem.model
     steps = fast_steps(model, problem.observed, problem.inputs)
-    size = chunk_size(model)
-    for number, start in enumerate(range(0, draws, size)):
-        count = min(size, draws - start)
+    for number, count in enumerate(chunk_sizes(model, draws)):
         rng = stream(seed, Purpose.INFER, first + number)
         with marking_invalid(), np.errstate(all="ignore"):
             state = run(steps, Pass(rng, (count,), dict(problem.inputs)))
@@ -52,10 +50,12 @@ def forward_chunks(
         progress.advance(count)
 
 
-def chunk_size(model: Model) -> int:
-    """Draws per chunk, so that one node's values stay near the size of the cache."""
+def chunk_sizes(model: Model, draws: int) -> list[int]:
+    """Draws in each chunk: about ``CHUNK``, fewer for plated nodes, and all about the same."""
     largest = max((math.prod(n.value_shape) for n in model.nodes.values()), default=1)
-    return max(1, min(CHUNK, _CHUNK_ELEMENTS // max(largest, 1)))
+    size = max(1, min(CHUNK, _CHUNK_ELEMENTS // max(largest, 1)))
+    count = max(1, round(draws / size))
+    return [draws // count + (k < draws % count) for k in range(count)]
 
 
 def fast_steps(

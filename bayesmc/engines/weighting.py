@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.engines.base import Engine
-from bayesmc.engines.forward import chunk_size, forward_chunks
+from bayesmc.engines.forward import chunk_sizes, forward_chunks
 from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import refuse_unsampled
@@ -131,7 +131,7 @@ class LikelihoodWeighting(Engine):
             (1, total),
             log_weights if weighted else None,
             independent=True,
-            streams=before + -(-self.draws // chunk_size(problem.model)),
+            streams=before + len(chunk_sizes(problem.model, self.draws)),
         )
         _set_evidence(posterior, float(diagnostics.log_sum_exp(log_weights)), total, weighted)
         return posterior
