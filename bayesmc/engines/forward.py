@@ -17,7 +17,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, ParameterError
 from bayesmc.network import CompiledNode, Model, Observed, Problem
 from bayesmc.network.align import Aligner
-from bayesmc.network.forward import Pass, Step, run, step_for, steps_for
+from bayesmc.network.forward import Pass, Step, run, step_for, with_potentials
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.structure import Table, constants_of, tabulate
@@ -64,15 +64,13 @@ def fast_steps(
     """One step per node: from a table where there is one, else by the node's function."""
     constants = constants_of(model, inputs)
     kept: dict[str, _Tabulated] = {} if inputs else model.cache.setdefault("tables", {})
-    steps: list[Step] = []
-    for node in model.nodes.values():
-        seen = observed.get(node.name)
-        if node.name not in kept:
-            kept[node.name] = _Tabulated(model, node, constants)
-        step = kept[node.name].step(seen)
-        steps.append(step if step is not None else step_for(model, node, observed))
-    plain = steps_for(model, observed)
-    return steps + plain[len(model.nodes) :]
+    steps: dict[str, Step] = {}
+    for name, node in model.nodes.items():
+        if name not in kept:
+            kept[name] = _Tabulated(model, node, constants)
+        step = kept[name].step(observed.get(name))
+        steps[name] = step if step is not None else step_for(model, node, observed)
+    return with_potentials(model, steps)
 
 
 class _Tabulated:

@@ -54,9 +54,24 @@ def run(steps: Sequence[Step], start: Pass) -> Pass:
 
 def steps_for(model: Model, observed: Mapping[str, Observed]) -> list[Step]:
     """The plain steps of every node and potential of a model."""
-    steps: list[Step] = [step_for(model, node, observed) for node in model.nodes.values()]
-    steps.extend(Potential(model, name) for name in model.potentials)
-    return steps
+    steps = {name: step_for(model, node, observed) for name, node in model.nodes.items()}
+    return with_potentials(model, steps)
+
+
+def with_potentials(model: Model, steps: Mapping[str, Step]) -> list[Step]:
+    """The nodes' steps with every potential right after the last node it needs.
+
+    So a configuration that a potential excludes has no weight left when later nodes are evaluated.
+    """
+    after: dict[str | None, list[Step]] = {}
+    order = {name: k for k, name in enumerate(steps)}
+    for name, (potential, _) in model.potentials.items():
+        last = max(potential.parents, key=order.__getitem__, default=None)
+        after.setdefault(last, []).append(Potential(model, name))
+    result = list(after.get(None, []))
+    for name, step in steps.items():
+        result += [step, *after.get(name, [])]
+    return result
 
 
 def step_for(model: Model, node: CompiledNode, observed: Mapping[str, Observed]) -> Step:
