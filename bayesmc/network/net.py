@@ -6,7 +6,6 @@ It wraps a networkx graph (``net.graph``) and is not one, and it knows no engine
 from __future__ import annotations
 
 import copy
-import difflib
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from typing import TYPE_CHECKING, Any
 
@@ -14,33 +13,25 @@ import numpy as np
 
 from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.errors import (
-    DensityError,
     DuplicateNodeError,
     EvidenceError,
     ModelError,
-    ParameterError,
     PlateError,
     UnknownNodeError,
 )
-from bayesmc.network.compile import compile_model
 from bayesmc.network.evidence import plate_sizes, read_inputs
 from bayesmc.network.intervene import fixed
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model
 from bayesmc.network.node import Declaration, Node, Potential, bind, checked_rows
-from bayesmc.network.ordering import topological_order
-from bayesmc.network.validate import validate_model
+from bayesmc.network.store import ModelStore, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
-from bayesmc.shapes import as_shape, owned, unused_sizes
+from bayesmc.shapes import as_shape
 
 if TYPE_CHECKING:
     import networkx
 
 Parents = Sequence[str] | Mapping[str, str] | None
-#: bytes of inputs up to which a compiled model is kept for the next call with the same inputs
-_KEEP_INPUTS = 1 << 20
-#: compiled models kept for other plate sizes and inputs
-_KEEP_MODELS = 8
 
 
 class BayesNet:
@@ -93,8 +84,7 @@ class BayesNet:
             self._sizes[plate] = _plate_size(plate, size)
             if size is not None and not isinstance(size, (int, np.integer)):
                 self._labels[plate] = tuple(size)
-        self._models: dict[Any, Model] = {}
-        self._valid = False
+        self._kept_store: ModelStore | None = None
 
     # ---- declaring --------------------------------------------------------------------------
 
@@ -299,9 +289,9 @@ class BayesNet:
         chosen = {**(mapping or {}), **values}
         for name in chosen:
             if name not in self._declarations:
-                raise UnknownNodeError(f"do({name}=...): {self._unknown(name)}")
+                raise UnknownNodeError(f"do({name}=...): {unknown(self._declarations, name)}")
         sizes = plate_sizes(self._sizes, self._declarations, chosen)
-        model = self._probe_model(sizes)
+        model = self._store.probe(sizes)
         other = self.copy()
         for name, value in chosen.items():
             other._declarations[name] = fixed(name, model[name], value, model)
@@ -320,15 +310,15 @@ class BayesNet:
     def snapshot(self) -> BayesNet:
         """A copy that shares what is compiled already; what holds it never sees later declarations."""
         other = self.copy()
-        other._models, other._valid = self._models, self._valid
+        other._kept_store = self._store
         return other
 
     # ---- asking -----------------------------------------------------------------------------
 
     def __getitem__(self, name: str) -> Node:
         if name not in self._declarations:
-            raise UnknownNodeError(self._unknown(name))
-        return self._probe_model(self._sizes)[name].record()
+            raise UnknownNodeError(unknown(self._declarations, name))
+        return self._store.probe(self._sizes)[name].record()
 
     def __contains__(self, name: object) -> bool:
         return name in self._declarations
@@ -366,7 +356,7 @@ class BayesNet:
         for name, declaration in self._declarations.items():
             graph.add_node(name, plates=declaration.plates, source=declaration.source)
         for name, declaration in self._declarations.items():
-            self._known_parents(name, declaration.parents)
+            check_parents(self._declarations, name, declaration.parents)
             graph.add_edges_from((parent, name) for parent in declaration.parents)
         return graph
 
@@ -385,8 +375,8 @@ class BayesNet:
         if inputs is not None:
             self.model(inputs=inputs)
             return
-        model = self._probe_model(self._sizes)
-        self._validate(model)
+        model = self._store.probe(self._sizes)
+        self._store.validate(model)
 
     def log_prob(
         self, values: Mapping[str, Any], *, inputs: Mapping[str, Any] | None = None
@@ -405,9 +395,9 @@ class BayesNet:
             )
         trimmed = {n: self._unbatched(n, v) for n, v in values.items() if n in self._declarations}
         model = self.model(trimmed, inputs)
-        unknown = [n for n in values if n not in model.nodes]
-        if unknown:
-            raise EvidenceError(f"log_prob: {self._unknown(unknown[0])}")
+        strange = [n for n in values if n not in model.nodes]
+        if strange:
+            raise EvidenceError(f"log_prob: {unknown(self._declarations, strange[0])}")
         given = read_inputs(self._declarations, model.sizes, inputs)
         return joint_log_prob(model, values, given)
 
@@ -468,8 +458,8 @@ class BayesNet:
             )
         settled = {p: n if n is not None else 0 for p, n in sizes.items()}
         given = read_inputs(self._declarations, settled, inputs)
-        model = self._compile(settled, given)
-        self._validate(model)
+        model = self._store.model(settled, given)
+        self._store.validate(model)
         return model
 
     # ---- private ----------------------------------------------------------------------------
@@ -506,8 +496,15 @@ class BayesNet:
         self._changed()
 
     def _changed(self) -> None:
-        self._models = {}
-        self._valid = False
+        self._kept_store = None
+
+    @property
+    def _store(self) -> ModelStore:
+        if self._kept_store is None:
+            self._kept_store = ModelStore(
+                self.name, self._declarations, self._potentials, self._labels
+            )
+        return self._kept_store
 
     def _node_plates(self, name: str, plates: str | Sequence[str]) -> tuple[str, ...]:
         names = (plates,) if isinstance(plates, str) else tuple(plates)
@@ -521,77 +518,15 @@ class BayesNet:
             raise PlateError(f"node {name!r}: plates={names} names a plate twice")
         return names
 
-    def _validate(self, model: Model) -> None:
-        """Once for a net, and again while a plate has been too small to show mixing."""
-        if self._valid:
-            return
-        if not model.cache.get("valid"):
-            validate_model(model)
-            model.cache["valid"] = True
-        used = {p for d in self._declarations.values() for p in d.plates}
-        self._valid = all(model.sizes[p] > 1 for p in used)
-
-    def _known_parents(self, name: str, parents: Sequence[str], what: str = "node") -> None:
-        for parent in parents:
-            if parent not in self._declarations:
-                raise UnknownNodeError(
-                    f"{what} {name!r} has the parent {parent!r}: {self._unknown(parent)}. Declare it, give "
-                    "the argument a default if it is no parent, or name the parents with parents="
-                )
-
-    def _unknown(self, name: str) -> str:
-        near = difflib.get_close_matches(str(name), self._declarations, n=1)
-        hint = f" (did you mean {near[0]!r}?)" if near else ""
-        return f"the net has no node {name!r}{hint}"
-
     def _uses(self, plate: str) -> bool:
         return any(plate in d.plates for d in self._declarations.values())
-
-    def _probe_model(self, sizes: Mapping[str, int | None]) -> Model:
-        """A compiled model when nobody has given data: open plates and inputs get stand-ins."""
-        open_ = [p for p, n in sizes.items() if n is None]
-        stand_in = unused_sizes([n for n in sizes.values() if n is not None], len(open_) + 2)[2:]
-        settled = {p: n for p, n in sizes.items() if n is not None}
-        settled.update(zip(open_, stand_in, strict=True))
-        try:
-            return self._compile(settled, {})
-        except (ModelError, ParameterError, DensityError):  # inputs may have to be integers
-            zeros = {
-                n: owned(np.zeros(tuple(settled[p] for p in d.plates) + d.event_shape, dtype=int))
-                for n, d in self._declarations.items()
-                if d.source == "input"
-            }
-            if not zeros:
-                raise
-            return self._compile(settled, zeros)
-
-    def _compile(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Model:
-        small = sum(v.nbytes for v in inputs.values()) <= _KEEP_INPUTS
-        key = (tuple(sizes.items()), tuple((n, v.tobytes()) for n, v in inputs.items() if small))
-        model = self._models.get(key) if small else None
-        if model is None:
-            parents = {n: d.parents for n, d in self._declarations.items()}
-            for name, above in parents.items():
-                self._known_parents(name, above)
-            for name, potential in self._potentials.items():
-                self._known_parents(name, potential.parents, "potential")
-            order = topological_order(parents)
-            labels = {p: names for p, names in self._labels.items() if len(names) == sizes[p]}
-            model = compile_model(
-                self.name, self._declarations, self._potentials, sizes, labels, inputs, order
-            )
-            if small:
-                while len(self._models) >= _KEEP_MODELS:
-                    del self._models[next(iter(self._models))]
-                self._models[key] = model
-        return model
 
     def _unbatched(self, name: str, value: Any) -> Any:
         """A stand-in with the value's plate axes in front, for reading plate sizes off it."""
         declaration = self._declarations[name]
         if not declaration.plates or all(self._sizes[p] is not None for p in declaration.plates):
             return None
-        event = len(self._probe_model(self._sizes)[name].event_shape)
+        event = len(self._store.probe(self._sizes)[name].event_shape)
         shape = np.shape(value)
         lead = len(shape) - event - len(declaration.plates)
         return np.empty(shape[lead:], dtype=bool) if lead >= 0 else None
