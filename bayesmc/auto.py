@@ -139,7 +139,7 @@ def explain(
     >>> net.add("a", bmc.Bernoulli(0.2))
     >>> _ = bmc.explain(net)
     engine: Exact(max_bytes=2147483648.0)
-      because all hidden nodes are finite: induced width 0, about ... bytes
+      because hidden nodes are finite or linear-Gaussian: induced width 0, largest table 2 entries, about ... bytes
       a  eliminated
     """
     problem = pose(net, evidence, inputs)
@@ -163,10 +163,10 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
     why_not = exact.refusal(problem)
     if why_not is None:
         cost = exact.cost(problem)
-        width, size = cost.induced_width, cost.bytes
+        size = readable_bytes(cost.bytes)
         return (
             Exact(),
-            (f"all hidden nodes are finite: induced width {width}, about {readable_bytes(size)}",),
+            (f"hidden nodes are finite or linear-Gaussian: {cost.words}, about {size}",),
             {},
         )
     weighting = LikelihoodWeighting()

@@ -75,6 +75,23 @@ class DensityError(BayesmcError, ValueError):
     """A log density came out NaN or plus infinity."""
 
 
+class EnvelopeError(BayesmcError, ValueError):
+    """A density rises above the envelope or the box that must hold it.
+
+    Attributes
+    ----------
+    point : ndarray
+        Where it does.
+    ratio : float
+        The density there over what the envelope allows.
+    """
+
+    def __init__(self, message: str, point: Any = None, ratio: float = float("nan")) -> None:
+        super().__init__(message)
+        self.point = point
+        self.ratio = ratio
+
+
 class EvidenceError(BayesmcError, ValueError):
     """Evidence or inputs that the net cannot take."""
 

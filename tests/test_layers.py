@@ -27,7 +27,7 @@ engines
 kernels
 dbn | structure | results
 network
-factors
+factors | montecarlo
 distributions
 resampling | gaussian | diagnostics | tracing | plates | states | randomness | progress
 errors | shapes

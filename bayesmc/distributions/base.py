@@ -7,6 +7,8 @@ log probability the broadcast of the value's and the distribution's batch. A fam
 
 from __future__ import annotations
 
+import functools
+import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -16,8 +18,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.distributions.support import Support
+from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import BayesmcError, ParameterError, ShapeError, UnsupportedError
 from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
+from bayesmc.tracing import TracedCall, is_traced
 
 _mark_invalid: ContextVar[bool] = ContextVar("mark_invalid", default=False)
 
@@ -49,6 +53,14 @@ class Distribution:
     #: batch elements with parameters out of range (only while these are marked), else None
     invalid: np.ndarray | None = None
     problem: ParameterError | None = None
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Any:
+        """A new distribution; of traced parameters, a record of the call in its place."""
+        if args and any(map(is_traced, args)) or kwargs and any(map(is_traced, kwargs.values())):
+            bound = _signature(cls).bind(*args, **kwargs)
+            bound.apply_defaults()
+            return TracedCall(cls, dict(bound.arguments))
+        return super().__new__(cls)
 
     def sample(self, rng: Any = None, sample_shape: int | Shape = ()) -> np.ndarray:
         """Independent draws, shape ``sample_shape + batch_shape + event_shape``.
@@ -93,6 +105,81 @@ class Distribution:
     def support(self) -> Support:
         """Where the mass lies."""
         raise NotImplementedError
+
+    @property
+    def transform(self) -> Transform:
+        """The map between unconstrained numbers and values, for samplers that move freely.
+
+        Raises
+        ------
+        UnsupportedError
+            Discrete values have no unconstrained space.
+        """
+        if self.is_discrete:
+            raise UnsupportedError(
+                f"{type(self).__name__}: discrete values ({self.support.describe()}) have no "
+                "unconstrained space; enumerate them or update them by Gibbs sampling"
+            )
+        return transform_of(self.support, self.event_shape)
+
+    def constrain(self, u: Any) -> np.ndarray:
+        """The value at unconstrained ``u``, always inside the support.
+
+        Parameters
+        ----------
+        u : array_like, shape (..., *transform.unconstrained_shape)
+
+        Returns
+        -------
+        ndarray, shape (..., *event_shape)
+            ``...`` broadcast with the batch of bounds that depend on parents.
+
+        References
+        ----------
+        Stan Reference Manual, version 2.36, chapter "Constraint Transforms".
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> rate = bmc.Gamma(2.0, 1.0)
+        >>> rate.constrain(0.0).tolist(), rate.unconstrain(1.0).tolist()
+        (1.0, 0.0)
+
+        The density of ``u`` is that of the value times the volume that the map stretches:
+
+        >>> float((rate.log_prob(rate.constrain(0.5)) + rate.log_abs_det_jacobian(0.5)).round(4))
+        -0.6487
+        """
+        return self.transform.constrain(u)
+
+    def unconstrain(self, x: Any) -> np.ndarray:
+        """The unconstrained numbers behind ``x``: the inverse of ``constrain``.
+
+        Outside the open support the numbers are not finite: infinite or NaN at a bound, NaN beyond.
+
+        Parameters
+        ----------
+        x : array_like, shape (..., *event_shape)
+
+        Returns
+        -------
+        ndarray, shape (..., *transform.unconstrained_shape)
+        """
+        return self.transform.unconstrain(x)
+
+    def log_abs_det_jacobian(self, u: Any) -> np.ndarray:
+        """``log |det dx/du|`` at ``u``, summed over the event.
+
+        Parameters
+        ----------
+        u : array_like, shape (..., *transform.unconstrained_shape)
+
+        Returns
+        -------
+        ndarray, shape (...)
+            ``...`` broadcast with the batch of bounds that depend on parents.
+        """
+        return self.transform.log_abs_det_jacobian(u)
 
     def cdf(self, x: Any) -> np.ndarray:
         """Probability of a value at most ``x``."""
@@ -216,6 +303,11 @@ def marking_invalid() -> Iterator[None]:
         yield
     finally:
         _mark_invalid.reset(token)
+
+
+@functools.cache
+def _signature(family: type) -> inspect.Signature:
+    return inspect.signature(family)
 
 
 def as_float(value: Any) -> np.ndarray:

@@ -23,7 +23,8 @@ class Density(Distribution):
         batch of whatever parameters it closes over. Asked only inside the support to any effect.
     sample : callable, optional
         ``sample(rng, sample_shape)`` returns ``sample_shape + batch_shape + event_shape`` draws.
-        Without it, engines that sample forwards refuse.
+        Without it, engines that sample forwards refuse; ``InverseCdf(density)`` makes any
+        density of one number samplable.
     event_shape : tuple of int
         Shape of one value.
     support : str, tuple or Support
@@ -105,7 +106,8 @@ class Density(Distribution):
         if self._sampler is None:
             raise UnsupportedError(
                 "Density.sample: this density was given without a way to sample it; pass "
-                "sample=function(rng, sample_shape), or use an engine that needs only log_prob"
+                "sample=function(rng, sample_shape), wrap it as InverseCdf(density) if its values are "
+                "single numbers, or use an engine that needs only log_prob"
             )
         return draw_to(
             lambda lead: self._draw(rng, lead), self.batch_shape, shape, self.event_shape

@@ -6,15 +6,16 @@ any families.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.adapt import as_distribution
 from bayesmc.distributions.base import Distribution, as_float, as_quantile
 from bayesmc.distributions.categorical import Categorical
 from bayesmc.distributions.discrete import whole_ppf
-from bayesmc.distributions.support import Support
+from bayesmc.distributions.support import Support, product, real, real_vector
 from bayesmc.errors import ShapeError, UnsupportedError
 from bayesmc.shapes import Shape, broadcast_shapes
 
@@ -29,8 +30,8 @@ class Mixture(Distribution):
     weights : array_like, shape (..., K)
         Mixing probabilities; a row off one by at most 1e-6 is renormalised.
     components : Distribution or sequence of Distribution
-        One distribution whose last batch axis has length K, or K distributions with one event
-        shape, all discrete or all continuous.
+        One distribution whose last batch axis has length K, or K distributions of any families
+        (frozen ``scipy.stats`` ones, too) with one event shape and supports of one kind.
 
     Raises
     ------
@@ -53,7 +54,7 @@ class Mixture(Distribution):
     (-1.4189, 0.0, 2.0)
     """
 
-    def __init__(self, weights: Any, components: Distribution | Sequence[Distribution]) -> None:
+    def __init__(self, weights: Any, components: Any) -> None:
         weights = as_float(weights)
         if weights.ndim < 1:
             raise ShapeError("Mixture: weights must have shape (..., K); got a scalar")
@@ -97,10 +98,16 @@ class Mixture(Distribution):
 
     @property
     def mean(self) -> np.ndarray:
+        """Mean; on the circle the mean direction."""
+        if self.support.kind == "circle":
+            return np.angle(self._resultant())
         return self._average(self._parts.moments("mean"))
 
     @property
     def var(self) -> np.ndarray:
+        """Variance of each component; on the circle ``-2 log R`` of the mean resultant length R."""
+        if self.support.kind == "circle":
+            return -2 * np.log(np.abs(self._resultant()))
         means = self._parts.moments("mean")
         axis = -1 - len(self.event_shape)
         with np.errstate(invalid="ignore"):
@@ -128,7 +135,7 @@ class Mixture(Distribution):
             return np.where(
                 q == 0, low, np.where(q == 1, high, whole_ppf(self.cdf, inner, start, stop))
             )
-        return _bisect(self.cdf, q, low, high)
+        return bisect(self.cdf, q, low, high)
 
     def _average(self, values: np.ndarray) -> np.ndarray:
         """Weighted sum of ``(..., K, *event)`` over the components, in full batch shape."""
@@ -138,6 +145,13 @@ class Mixture(Distribution):
             terms = np.where(weights > 0, weights * values, 0.0)
         total = terms.sum(axis=-1 - extra)
         return np.broadcast_to(total, self.batch_shape + self.event_shape)
+
+    def _resultant(self) -> np.ndarray:
+        """Mean of ``exp(i x)``."""
+        length = np.exp(-0.5 * self._parts.moments("var"))
+        direction = self._parts.moments("mean")
+        real, imaginary = length * np.cos(direction), length * np.sin(direction)
+        return self._average(real) + 1j * self._average(imaginary)
 
     def _weigh(self, values: np.ndarray) -> np.ndarray:
         return np.where(self.weights > 0, self.weights * values, 0.0).sum(axis=-1)
@@ -166,12 +180,17 @@ class _Stacked:
 
     @property
     def support(self) -> Support:
-        support = self.part.support
+        return self._joined(self.part.support)
+
+    def _joined(self, support: Support) -> Support:
+        """The support of any component, from that with bounds for each."""
         if support.is_constant:
             return support
+        if support.parts:
+            return product([(self._joined(part), size) for part, size in support.parts])
         low = np.broadcast_to(support.low, self.part.batch_shape).min(axis=-1)
         high = np.broadcast_to(support.high, self.part.batch_shape).max(axis=-1)
-        return Support(support.kind, low, high, support.open_low, support.open_high)
+        return _bounded(support.kind, low, high, support.open_low, support.open_high)
 
     def marked(self) -> list[tuple[Distribution, Any]]:
         invalid = self.part.invalid
@@ -208,8 +227,9 @@ class _Listed:
     """Components as a list of distributions of any families."""
 
     def __init__(self, parts: Sequence[Distribution]) -> None:
-        parts = tuple(parts)
-        if not parts or not all(isinstance(part, Distribution) for part in parts):
+        found = [as_distribution(part) for part in parts]
+        parts = tuple(part for part in found if part is not None)
+        if not parts or len(parts) < len(found):
             raise ShapeError(
                 "Mixture: components must be a Distribution or a list of Distributions"
             )
@@ -252,10 +272,13 @@ class _Listed:
         return draws
 
 
-def _parts(components: Distribution | Sequence[Distribution]) -> _Stacked | _Listed:
-    if isinstance(components, Distribution):
-        return _Stacked(components)
-    return _Listed(components)
+def _parts(components: Any) -> _Stacked | _Listed:
+    alone = None if isinstance(components, (list, tuple)) else as_distribution(components)
+    if alone is not None:
+        return _Stacked(alone)
+    if not isinstance(components, Iterable):
+        raise ShapeError("Mixture: components must be a Distribution or a list of Distributions")
+    return _Listed(list(components))
 
 
 def _hull(supports: Sequence[Support]) -> Support:
@@ -263,10 +286,10 @@ def _hull(supports: Sequence[Support]) -> Support:
     kinds = {support.kind for support in supports}
     if kinds <= {"real", "interval"} and "real" in kinds:
         return next(support for support in supports if support.kind == "real")
+    if kinds <= {"real vector", "product"} and "product" in kinds:
+        return _hull_of_products(supports)
     if len(kinds) > 1:
-        raise UnsupportedError(
-            f"Mixture: components with supports {', '.join(sorted(kinds))} cannot be mixed"
-        )
+        raise _not_mixed(supports)
     first = supports[0]
     if first.kind not in ("interval", "integers"):
         return first
@@ -275,10 +298,37 @@ def _hull(supports: Sequence[Support]) -> Support:
         low, high = np.minimum(low, support.low), np.maximum(high, support.high)
     open_low = all(support.open_low for support in supports)
     open_high = all(support.open_high for support in supports)
-    return Support(first.kind, low, high, open_low, open_high)
+    return _bounded(first.kind, low, high, open_low, open_high)
 
 
-def _bisect(
+def _hull_of_products(supports: Sequence[Support]) -> Support:
+    """Part by part where all are cut alike; otherwise the real vectors, if all parts fill a volume."""
+    sizes = [[size for _, size in support.parts] for support in supports]
+    if all(size == sizes[0] for size in sizes):
+        columns = zip(*(support.parts for support in supports), strict=True)
+        return product([(_hull([part for part, _ in column]), column[0][1]) for column in columns])
+    if all(
+        part.kind in ("real", "real vector", "interval") for s in supports for part, _ in s.parts
+    ):
+        return real_vector
+    raise _not_mixed(supports)
+
+
+def _bounded(kind: str, low: Any, high: Any, open_low: bool, open_high: bool) -> Support:
+    if kind == "interval" and np.all(np.isneginf(low)) and np.all(np.isposinf(high)):
+        return real
+    return Support(kind, low, high, open_low, open_high)
+
+
+def _not_mixed(supports: Sequence[Support]) -> UnsupportedError:
+    found = "; ".join(dict.fromkeys(support.describe() for support in supports))
+    return UnsupportedError(
+        f"Mixture: components on different supports cannot be mixed ({found}); use families whose "
+        "values lie in one kind of space"
+    )
+
+
+def bisect(
     cdf: Callable[[np.ndarray], np.ndarray], q: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """Where ``cdf`` crosses ``q`` between ``low`` and ``high``, to the last bit."""

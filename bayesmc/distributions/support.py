@@ -1,17 +1,21 @@
 """Supports: where a distribution puts its mass, as a small value that can be asked.
 
-Engines read it to refuse evidence that cannot happen, to enumerate finite nodes and, later, to map
-bounded values to the whole line. It holds no parameters beyond the bounds.
+Engines read it to refuse evidence that cannot happen and to enumerate finite nodes; ``transforms``
+maps it to the whole line. It holds no parameters beyond the bounds.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-_EVENT_NDIM = {"simplex": 1, "real vector": 1, "positive definite": 2, "counts": 1}
+from bayesmc.errors import ShapeError, UnsupportedError
+from bayesmc.gaussian import try_cholesky
+
+_EVENT_NDIM = {"simplex": 1, "real vector": 1, "positive definite": 2, "counts": 1, "product": 1}
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,12 +26,18 @@ class Support:
     ----------
     kind : str
         ``"real"``, ``"interval"``, ``"circle"``, ``"integers"``, ``"simplex"``, ``"real vector"``,
-        ``"counts"`` or ``"positive definite"``.
+        ``"counts"``, ``"positive definite"`` or ``"product"``.
     low, high : float or array
         Bounds of an interval or of integers (inclusive), possibly infinite; arrays when they
         depend on parents.
     open_low, open_high : bool
         Whether the bound itself is excluded.
+    parts : tuple of (Support, int)
+        Of a product: each part's support and how many components it takes (0: one number).
+
+    Notes
+    -----
+    Two supports are equal when kind, bounds (their shapes, too), openness and parts are.
 
     Examples
     --------
@@ -43,6 +53,19 @@ class Support:
     high: Any = np.inf
     open_low: bool = False
     open_high: bool = False
+    parts: tuple[tuple[Support, int], ...] = ()
+
+    def __eq__(self, other: object) -> bool:
+        if self is other or not isinstance(other, Support):
+            return self is other
+        return (
+            self._tag() == other._tag()
+            and _same(self.low, other.low)
+            and _same(self.high, other.high)
+        )
+
+    def __hash__(self) -> int:
+        return hash(self._tag())
 
     @property
     def is_discrete(self) -> bool:
@@ -55,7 +78,14 @@ class Support:
     @property
     def is_constant(self) -> bool:
         """Whether the bounds are the same for every batch element."""
-        return _constant(self.low) and _constant(self.high)
+        parts_are = all(part.is_constant for part, _ in self.parts)
+        return parts_are and _constant(self.low) and _constant(self.high)
+
+    @property
+    def is_single(self) -> bool:
+        """Whether each bound is one number, and no array that may differ for other parents."""
+        parts_are = all(part.is_single for part, _ in self.parts)
+        return parts_are and np.size(self.low) == 1 and np.size(self.high) == 1
 
     @property
     def size(self) -> int | None:
@@ -87,7 +117,10 @@ class Support:
         if self.kind == "counts":
             return ((x >= 0) & (x == np.floor(x))).all(axis=-1)
         if self.kind == "positive definite":
-            return np.linalg.eigvalsh(x)[..., 0] > 0
+            bad = try_cholesky(x)[1]
+            return np.ones(x.shape[:-2], dtype=bool) if bad is None else ~bad
+        if self.kind == "product":
+            return self._parts_contain(x)
         above = x > self.low if self.open_low else x >= self.low
         below = x < self.high if self.open_high else x <= self.high
         inside = above & below & np.isfinite(x)
@@ -117,7 +150,25 @@ class Support:
             "real vector": "real vectors",
             "counts": "vectors of counts",
             "positive definite": "positive definite matrices",
+            "product": f"vectors whose parts are {'; '.join(_part(*part) for part in self.parts)}",
         }[self.kind]
+
+    def _tag(self) -> tuple[Any, ...]:
+        return self.kind, self.open_low, self.open_high, self.parts
+
+    def _parts_contain(self, x: np.ndarray) -> np.ndarray:
+        size = sum(max(count, 1) for _, count in self.parts)
+        if x.shape[-1:] != (size,):
+            raise ShapeError(f"{self!r} has {size} components; got values of shape {x.shape}")
+        inside: Any = True
+        start = 0
+        for part, count in self.parts:
+            here = part.contains(x[..., start : start + count] if count else x[..., start])
+            if count and not part.event_ndim:  # a support of numbers, several components
+                here = np.asarray(here.all(axis=-1))
+            inside = inside & here
+            start += max(count, 1)
+        return np.asarray(inside)
 
     def __repr__(self) -> str:
         return f"<support: {self.describe()}>"
@@ -127,8 +178,10 @@ real = Support("real")
 positive = Support("interval", 0.0, np.inf, open_low=True)
 nonnegative = Support("interval", 0.0, np.inf)
 unit_interval = Support("interval", 0.0, 1.0)
+circle = Support("circle")
 simplex = Support("simplex")
 real_vector = Support("real vector")
+positive_definite = Support("positive definite")
 
 
 def interval(low: Any, high: Any, open_low: bool = False, open_high: bool = False) -> Support:
@@ -139,6 +192,37 @@ def interval(low: Any, high: Any, open_low: bool = False, open_high: bool = Fals
 def integers(low: Any, high: Any = np.inf) -> Support:
     """The integers ``low .. high``, both included."""
     return Support("integers", low, high)
+
+
+def product(parts: Iterable[tuple[Support, int]]) -> Support:
+    """Vectors whose components, in order, lie in supports of their own.
+
+    Parameters
+    ----------
+    parts : sequence of (Support, int)
+        A support and the number of components it takes; 0 for a single number.
+
+    Raises
+    ------
+    UnsupportedError
+        A part is discrete, or takes matrices.
+
+    Examples
+    --------
+    >>> from bayesmc.distributions.support import positive, product, simplex
+    >>> both = product([(positive, 0), (simplex, 2)])
+    >>> both.contains([[1.0, 0.5, 0.5], [-1.0, 0.5, 0.5]]).tolist()
+    [True, False]
+    """
+    parts = tuple((part, int(count)) for part, count in parts)
+    for part, count in parts:
+        if part.is_discrete or part.event_ndim > 1:
+            raise UnsupportedError(
+                f"product: {part.describe()} cannot be components of a real vector"
+            )
+        if part.event_ndim and not count:
+            raise ShapeError(f"product: {part.describe()} take a number of components, not 0")
+    return Support("product", parts=parts)
 
 
 def as_support(spec: Any) -> Support:
@@ -162,14 +246,14 @@ _NAMED = {
     "nonnegative": nonnegative,
     "unit": unit_interval,
     "unit interval": unit_interval,
-    "circle": Support("circle"),
+    "circle": circle,
     "simplex": simplex,
     "real vector": real_vector,
     "integer": Support("integers"),
     "integers": Support("integers"),
     "nonnegative integer": integers(0),
     "counts": Support("counts"),
-    "positive definite": Support("positive definite"),
+    "positive definite": positive_definite,
 }
 
 
@@ -180,3 +264,11 @@ def _constant(bound: Any) -> bool:
 
 def _first(bound: Any) -> Any:
     return np.asarray(bound).flat[0]
+
+
+def _same(a: Any, b: Any) -> bool:
+    return np.shape(a) == np.shape(b) and bool(np.all(np.asarray(a) == np.asarray(b)))
+
+
+def _part(part: Support, count: int) -> str:
+    return part.describe() + (f" ({count} components)" if count else "")

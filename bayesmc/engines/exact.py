@@ -1,7 +1,7 @@
-"""Exact answers on nets whose hidden nodes are finite: a clique tree along a good elimination order.
+"""Exact answers: hidden nodes that are finite, or linear-Gaussian given the finite ones, are eliminated.
 
-The plan (variables, tables, tree) belongs to the net and is kept with its compiled model; evidence only
-enters it. The cost is known, and refused if too high, before any large table exists.
+The plan is made elsewhere; here stand the options, the refusals and what is wrong with impossible evidence.
+The cost is known, and refused if too high, before any large table exists.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
+from bayesmc.engines.exact_plan import Cost, Plan, plan_for, why_no_plan
 from bayesmc.engines.exact_posterior import ExactPosterior
 from bayesmc.errors import (
     BudgetError,
@@ -22,25 +22,25 @@ from bayesmc.errors import (
     UnsupportedError,
     ZeroProbabilityError,
 )
-from bayesmc.factors import BoundTree, Calibrated, CliqueTree
+from bayesmc.factors import Calibrated
 from bayesmc.network import Model, Problem
 from bayesmc.results import Posterior
-from bayesmc.structure import (
-    DiscreteNet,
-    InvalidRows,
-    Variable,
-    discrete_net,
-    why_not_discrete,
-)
+from bayesmc.structure import InvalidRows, Variable
+
+#: what to name where this engine refuses
+_OTHERS = "LikelihoodWeighting(draws)"
 
 
 @dataclass(frozen=True)
 class Exact(Engine):
     """Variable elimination in both directions: all marginals and the evidence's probability at once.
 
-    It takes nets whose hidden nodes have finitely many values; continuous nodes may be observed.
-    Elimination orders are searched for (min-fill and others), because the order matters more than
-    the arithmetic.
+    It takes nets whose hidden nodes have finitely many values, and conditional linear-Gaussian ones: hidden
+    continuous nodes that are Normal or MvNormal with a mean affine in other continuous nodes, where finite
+    nodes may switch coefficients and scales. Observed continuous nodes may be of any family and enter any
+    function, as long as what they depend on is finite or linear-Gaussian. Continuous nodes are integrated
+    out first, one at a time, then finite ones are summed out, in orders that are searched for: the order
+    matters more than the arithmetic.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ class Exact(Engine):
 
     References
     ----------
-    Lauritzen and Spiegelhalter (1988); Koller and Friedman (2009), ch. 9 and 10.
+    Lauritzen and Spiegelhalter (1988); Koller and Friedman (2009), ch. 9, 10 and 14.2; Lauritzen (1992).
 
     Examples
     --------
@@ -60,6 +60,8 @@ class Exact(Engine):
     >>> posterior = bmc.infer(net, {"x": 2.0}, engine=bmc.Exact())
     >>> float(posterior.mean("a").round(4))
     0.8808
+    >>> float(bmc.infer(net, {"a": 1}, engine=bmc.Exact()).mean("x"))
+    2.0
     """
 
     max_bytes: float = 2.0 * 2**30
@@ -74,9 +76,9 @@ class Exact(Engine):
         error = self._why_not(problem)
         return None if error is None else str(error)
 
-    def cost(self, problem: Problem) -> Any:
-        """Induced width, largest table and bytes, known before any large table exists."""
-        return _prepared(problem).tree.cost
+    def cost(self, problem: Problem) -> Cost:
+        """Bytes and the figures behind them, known before any large table exists."""
+        return plan_for(problem).cost
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return {name: _treatment(problem, name) for name in problem.model.nodes}
@@ -96,75 +98,39 @@ class Exact(Engine):
         error = self._why_not(problem)
         if error is not None:
             raise error
-        prepared = _prepared(problem)
+        plan = plan_for(problem)
         states = _states(problem)
-        bound, invalid = prepared.bound(problem)
-        calibrated = bound.calibrate(states)
-        if calibrated.log_z == -np.inf:
-            raise ZeroProbabilityError(_impossible(prepared, problem, states))
-        _refuse_invalid(problem.model, invalid, calibrated)
-        return ExactPosterior(problem, self, prepared.net, calibrated)
+        solved = plan.solve(problem, states)
+        if solved.calibrated.log_z == -np.inf:
+            raise ZeroProbabilityError(_impossible(plan, problem, states))
+        _refuse_invalid(problem.model, solved.invalid, solved.calibrated)
+        return ExactPosterior(problem, self, solved)
 
     def _why_not(self, problem: Problem) -> UnsupportedError | None:
-        reason = why_not_discrete(problem.model, problem.observed)
+        reason = why_no_plan(problem)
         if reason is not None:
             return UnsupportedError(
-                f"Exact needs every hidden node to have finitely many values, but {reason}; use "
-                "LikelihoodWeighting(draws)"
+                "Exact needs every hidden node to have finitely many values or to be linear-Gaussian given "
+                f"those, but {reason}; use {_OTHERS}"
             )
         try:
-            cost = _prepared(problem).tree.cost
+            cost = plan_for(problem).cost
         except BudgetError as error:
-            return BudgetError(f"Exact: {error}; use LikelihoodWeighting(draws)", error.bytes)
+            return BudgetError(f"Exact: {error}; use {_OTHERS}", error.bytes)
+        except UnsupportedError as error:
+            return UnsupportedError(f"Exact: {error}; use {_OTHERS}")
         except ModelError as error:
             return UnsupportedError(
                 f"Exact evaluates functions on all configurations of their parents, also impossible ones, "
-                f"and one of them fails there: {error}; use LikelihoodWeighting(draws)"
+                f"and one of them fails there: {error}; use {_OTHERS}"
             )
         if cost.bytes > self.max_bytes:
             return BudgetError(
-                f"Exact would need about {readable_bytes(cost.bytes)} (induced width "
-                f"{cost.induced_width}, largest table {cost.largest_entries:.3g} entries), above "
-                f"max_bytes={readable_bytes(self.max_bytes)}; use LikelihoodWeighting(draws), or raise "
-                "Exact(max_bytes=)",
-                int(cost.bytes),
+                f"Exact would need about {readable_bytes(cost.bytes)} ({cost.words}), above "
+                f"max_bytes={readable_bytes(self.max_bytes)}; use {_OTHERS}, or raise Exact(max_bytes=)",
+                int(min(cost.bytes, 2**62)),
             )
         return None
-
-
-class _Prepared:
-    """The plan of one net: its variables, factors and clique tree."""
-
-    def __init__(self, problem: Problem) -> None:
-        self.net: DiscreteNet = discrete_net(problem.model, problem.observed, problem.inputs)
-        self.tree = CliqueTree(self.net.cards, self.net.scopes)
-        self._static: BoundTree | None = None
-
-    def bound(self, problem: Problem) -> tuple[BoundTree, list[InvalidRows]]:
-        """The tree with its tables (kept between calls when none depends on the evidence), and the
-        configurations with bad parameters."""
-        if self._static is not None:
-            return self._static, self.net.invalid
-        with marking_invalid(), np.errstate(all="ignore"):
-            extra, invalid = self.net.evidence_factors(problem.observed)
-        bound = self.tree.bind([*self.net.static, *extra])
-        if not self.net.evidence_sources:
-            self._static = bound
-        return bound, self.net.invalid + invalid
-
-
-def _prepared(problem: Problem) -> _Prepared:
-    """The plan, kept as long as the compiled model lives; inputs are part of a model's identity."""
-    plans: dict[Any, _Prepared] = problem.model.cache.setdefault("exact plans", {})
-    key = (
-        tuple(sorted((n, v.tobytes()) for n, v in problem.inputs.items())),
-        frozenset(n for n in problem.observed if problem.model[n].domain is None),
-    )
-    if key not in plans:
-        if len(plans) > 8:
-            plans.clear()
-        plans[key] = _Prepared(problem)
-    return plans[key]
 
 
 def _states(problem: Problem) -> dict[Variable, int]:
@@ -182,15 +148,14 @@ def _states(problem: Problem) -> dict[Variable, int]:
     return states
 
 
-def _impossible(prepared: _Prepared, problem: Problem, states: Mapping[Variable, int]) -> str:
+def _impossible(plan: Plan, problem: Problem, states: Mapping[Variable, int]) -> str:
     """Say which piece of evidence first makes the rest impossible."""
-    bound, _ = prepared.bound(problem)
     entered: dict[Variable, int] = {}
-    if bound.calibrate({}).log_z == -np.inf:
+    if plan.solve(problem, {}).calibrated.log_z == -np.inf:
         return "the evidence has probability zero: no configuration of the hidden nodes explains it"
     for variable, state in states.items():
         entered[variable] = state
-        if bound.calibrate(entered).log_z == -np.inf:
+        if plan.solve(problem, entered).calibrated.log_z == -np.inf:
             before = ", ".join(
                 f"{_name(problem, v)}={_label(problem, v, s)!r}"
                 for v, s in list(entered.items())[:-1]
@@ -250,7 +215,7 @@ def _treatment(problem: Problem, name: str) -> str:
         )
     if not node.is_stochastic and node.domain is None:
         return "passed through to the finite nodes above it"
-    return "eliminated"
+    return "eliminated" if node.domain is not None else "integrated out: linear-Gaussian"
 
 
 def readable_bytes(count: float) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from bayesmc.distributions import Density, Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
+from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import (
     BayesmcError,
     BroadcastError,
@@ -170,7 +171,7 @@ def _discover_stochastic(
     fit(declaration, dist, batch, plates)
     support = dist.support
     domain = None
-    constant = np.size(support.low) == 1 and np.size(support.high) == 1
+    constant = support.is_single
     small = support.size is not None and support.size <= _DOMAIN_SIZE
     if small and constant and not dist.event_shape:
         assert support.size is not None
@@ -219,24 +220,24 @@ def _reachable(
     try:
         return np.asarray(dist.sample_to(rng, lead))
     except BayesmcError:
-        return _point_in(dist.support, lead + dist.event_shape, rng)
+        return _point_in(dist.support, lead, dist.event_shape, rng)
 
 
-def _point_in(support: Support, shape: Shape, rng: np.random.Generator) -> np.ndarray:
+def _point_in(
+    support: Support, lead: Shape, event: Shape, rng: np.random.Generator
+) -> np.ndarray:
     """Some points of a support, for densities that cannot be sampled from."""
-    u = 0.2 + 0.6 * rng.random(shape)
-    if support.kind == "simplex":
-        return u / u.sum(axis=-1, keepdims=True)
-    if support.kind not in ("interval", "integers"):
-        return u
+    shape = lead + event
+    if not support.is_discrete:
+        transform = transform_of(support, event)
+        free = rng.uniform(-1.0, 1.0, lead + transform.unconstrained_shape)
+        return np.broadcast_to(transform.constrain(free), shape)
     low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
-    both = np.isfinite(low) & np.isfinite(high)
+    u = 0.2 + 0.6 * rng.random(shape)
     with np.errstate(invalid="ignore"):
-        value = np.where(
-            both, low + u * (high - low), np.where(np.isfinite(low), low + u, high - u)
-        )
-    value = np.where(np.isfinite(value), value, u)
-    return np.broadcast_to(np.floor(value) if support.is_discrete else value, shape)
+        value = np.where(np.isfinite(low), low + u, np.where(np.isfinite(high), high - u, u))
+        value = np.where(np.isfinite(low) & np.isfinite(high), low + u * (high - low), value)
+    return np.broadcast_to(np.floor(value), shape)
 
 
 def _discover_deterministic(

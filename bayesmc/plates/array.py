@@ -109,7 +109,7 @@ class PlateArray(NDArrayOperatorsMixin):
         table, lead = self._table(gathered, kept, extra)
         rows = self._rows(indices, gathered, extra, lead)
         names = tuple(self.plates[k] for k in kept)
-        if not kept and not extra and self.event_ndim:
+        if not kept and not extra and self.event_ndim and isinstance(table, np.ndarray):
             return Gathered(table, rows)
         values = np.take(table, rows, axis=0)
         if hasattr(table, "states"):  # labels survive, also where NumPy makes a bare scalar
@@ -207,7 +207,7 @@ class PlateArray(NDArrayOperatorsMixin):
                 f".{function.__name__}() of labels {self.array.states} means nothing; compare them first, as "
                 f"in (v == {self.array.states[0]!r}).any({self.plates[0]!r})"
             )
-        result = function(np.asarray(self.array), axis=axes)
+        result = function(_plain(self.array), axis=axes)
         left = tuple(name for name in self.plates if name not in chosen)
         return PlateArray(result, left, self.own, self.event_ndim) if left else result
 
@@ -325,7 +325,7 @@ def stack(arrays: Sequence[Any], axis: int = -1) -> Any:
         aligned, names, event = align(tuple(arrays), (0,) * len(arrays))
         own = next(a.own for a in arrays if isinstance(a, PlateArray))
         return PlateArray(np.stack(np.broadcast_arrays(*aligned), -1), names, own, event + 1)
-    return np.stack(np.broadcast_arrays(*(np.asanyarray(a) for a in arrays)), axis=axis)
+    return np.stack(np.broadcast_arrays(*(_array_like(a) for a in arrays)), axis=axis)
 
 
 def align(operands: Sequence[Any], cores: Sequence[int]) -> tuple[list[Any], tuple[str, ...], int]:
@@ -350,7 +350,7 @@ def align(operands: Sequence[Any], cores: Sequence[int]) -> tuple[list[Any], tup
         elif isinstance(x, PlateArray):
             aligned.append(_expand(x, names, event, core))
         else:
-            array = np.asanyarray(x)
+            array = _array_like(x)
             outer = array.ndim - core
             if outer > event:
                 split = outer - event
@@ -398,6 +398,16 @@ def _as_index(key: Any, plate: str, size: int) -> PlateArray:
     if foreign is None:
         return PlateArray(array, ())
     return PlateArray(array, foreign.plates, foreign.own, foreign.event_ndim)
+
+
+def _array_like(value: Any) -> Any:
+    """An array, or what stands for one (it has a shape of its own) as it is."""
+    return value if hasattr(value, "reshape") else np.asanyarray(value)
+
+
+def _plain(array: Any) -> Any:
+    """An array without labels; what stands for an array as it is."""
+    return np.asarray(array) if isinstance(array, np.ndarray) else array
 
 
 def _union(names: Sequence[tuple[str, ...]]) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions import Distribution, Mixture
 from bayesmc.errors import UnsupportedError
 
 
@@ -18,11 +19,15 @@ class Marginal:
     ----------
     name : str
     values : ndarray, shape (draws, *plates, *event)
-        Draws, or the node's possible values where it is answered from a table.
+        Draws; the node's possible values where it is answered from a table, the means of the components
+        where it is a mixture of Gaussians.
     weights : ndarray, shape (draws,) or (*plates, states)
         Weights that sum to 1.
     states : tuple or None
         For a finite discrete node.
+    distribution : Distribution or None
+        The marginal itself, where it is known exactly: of a continuous node a ``Mixture`` of Gaussians, with
+        the node's plates as batch.
 
     Examples
     --------
@@ -40,6 +45,7 @@ class Marginal:
     values: np.ndarray
     weights: np.ndarray
     states: tuple[Any, ...] | None = None
+    distribution: Distribution | None = None
 
     @property
     def probabilities(self) -> np.ndarray:
@@ -53,11 +59,12 @@ class Marginal:
     def histogram(self, bins: Any = 40, range: Any = None, density: bool = True) -> tuple[Any, Any]:  # noqa: A002
         """Weighted histogram of a scalar node: ``(heights, edges)`` as ``np.histogram`` gives them."""
         values = self._scalar("histogram")
+        if self.distribution is not None:
+            return self._exact_histogram(bins, range, density)
         return np.histogram(values, bins=bins, range=range, weights=self.weights, density=density)
 
     def density(self, points: Any, bandwidth: str | float = "scott") -> np.ndarray:
-        """Kernel density estimate at ``points``, Gaussian kernels on weighted draws.
-
+        """Density at ``points``: exact where it is known, else a kernel estimate on weighted draws.
         Parameters
         ----------
         points : array_like
@@ -70,6 +77,8 @@ class Marginal:
         """
         values = self._scalar("density")
         points = np.asarray(points, dtype=float)
+        if self.distribution is not None:
+            return np.exp(self.distribution.log_prob(points))
         h = self._bandwidth(values, bandwidth)
         flat = points.ravel()
         total = np.zeros(flat.shape)
@@ -78,6 +87,16 @@ class Marginal:
             z = (flat[:, None] - values[None, start : start + step]) / h
             total += np.exp(-0.5 * z * z) @ self.weights[start : start + step]
         return (total / (h * np.sqrt(2 * np.pi))).reshape(points.shape)
+
+    def _exact_histogram(self, bins: Any, limits: Any, density: bool) -> tuple[Any, Any]:
+        """Probabilities of bins, between the 0.1 % and 99.9 % quantiles where no range is given."""
+        assert self.distribution is not None
+        if np.ndim(bins) == 0:
+            low, high = self.distribution.ppf([0.001, 0.999]) if limits is None else limits
+            bins = np.linspace(low, high, int(bins) + 1)
+        edges = np.asarray(bins, dtype=float)
+        mass = np.diff(self.distribution.cdf(edges))
+        return (mass / np.diff(edges) / mass.sum() if density else mass), edges
 
     def _scalar(self, what: str) -> np.ndarray:
         if self.states is not None:
@@ -105,3 +124,10 @@ class Marginal:
         if rule == "silverman":
             return float(spread * (0.75 * ess) ** (-1 / 5))
         raise ValueError(f"bandwidth={rule!r} is not 'scott', 'silverman' or a number")
+
+
+def gaussian_marginal(name: str, mixture: Mixture) -> Marginal:
+    """The marginal of a continuous node that is a mixture of Gaussians."""
+    means = np.asarray(mixture.components.mean)  # type: ignore[union-attr]
+    axis = len(mixture.batch_shape)
+    return Marginal(name, np.moveaxis(means, axis, 0), mixture.weights, distribution=mixture)

@@ -80,10 +80,11 @@ class Query:
             self._check_plates(stored, batch)
         return values
 
-    def _evaluate(self, stored: Mapping[str, np.ndarray], batch: Shape) -> np.ndarray:
+    def raw(self, stored: Mapping[str, Any]) -> Any:
+        """What the function itself returns; stored values may be traced."""
         arguments = [self._argument(name, stored[name]) for name in self.nodes]
         try:
-            result = self.function(*arguments)
+            return self.function(*arguments)
         except BayesmcError:
             raise
         except Exception as error:
@@ -93,6 +94,9 @@ class Query:
                 "it gets all draws at once, so write it with NumPy (& for and, np.where for if, "
                 "np.maximum for max)"
             ) from error
+
+    def fitted(self, result: Any, batch: Shape) -> np.ndarray:
+        """A result of the function, checked and broadcast to batch and plates."""
         if isinstance(result, PlateArray):
             raise result.ungathered()
         if isinstance(result, StateArray):
@@ -101,6 +105,9 @@ class Query:
                 f"in {self.nodes[0]} == {result.states[0]!r}"
             )
         return self._fitted(np.asarray(result), batch)
+
+    def _evaluate(self, stored: Mapping[str, np.ndarray], batch: Shape) -> np.ndarray:
+        return self.fitted(self.raw(stored), batch)
 
     def _argument(self, name: str, value: np.ndarray) -> Any:
         node = self.model.nodes[name]

@@ -4,6 +4,13 @@ Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for 
 ``evidence_for`` only.
 """
 
+from bayesmc.testing.gaussians import (
+    ConditionalGaussian,
+    GaussianAnswer,
+    GaussianOptions,
+    gaussian_evidence,
+    random_gaussian_net,
+)
 from bayesmc.testing.matching import Comparison, Match, assert_matches, compare
 from bayesmc.testing.nets import NetOptions, random_net
 from bayesmc.testing.observing import random_evidence
@@ -12,7 +19,10 @@ from bayesmc.testing.strategies import bayes_nets, evidence_for
 
 __all__ = [
     "Comparison",
+    "ConditionalGaussian",
     "Enumerated",
+    "GaussianAnswer",
+    "GaussianOptions",
     "Match",
     "NetOptions",
     "assert_matches",
@@ -20,6 +30,8 @@ __all__ = [
     "compare",
     "enumerate_posterior",
     "evidence_for",
+    "gaussian_evidence",
     "random_evidence",
+    "random_gaussian_net",
     "random_net",
 ]

@@ -28,6 +28,8 @@ def signed(high: float) -> st.SearchStrategy[float]:
     return st.builds(lambda s, m: s * m, st.sampled_from([-1.0, 0.0, 1.0]), magnitudes(1e-6, high))
 
 
+#: whose complement is exact, for families that SciPy gives the complement
+DYADIC = st.integers(1, 255).map(lambda k: k / 256)
 PROBABILITY = st.floats(0, 1) | magnitudes(1e-12, 1.0) | magnitudes(1e-12, 1.0).map(lambda v: 1 - v)
 
 
@@ -83,6 +85,38 @@ FAMILIES = {
         (magnitudes(1e-8, 1e8),),
         ((1.0,), (20.0,)),
     ),
+    "Laplace": Family(
+        d.Laplace, stats.laplace, (signed(1e6), magnitudes(1e-6, 1e6)), ((0.0, 1.0), (-3.0, 0.1))
+    ),
+    # no moderate parameters for the Cauchy families: their draws have no mean to test
+    "Cauchy": Family(d.Cauchy, stats.cauchy, (signed(1e4), magnitudes(1e-4, 1e4)), ()),
+    "HalfNormal": Family(
+        d.HalfNormal,
+        lambda scale: stats.halfnorm(scale=scale),
+        (magnitudes(1e-6, 1e6),),
+        ((1.0,), (20.0,)),
+    ),
+    "HalfCauchy": Family(
+        d.HalfCauchy, lambda scale: stats.halfcauchy(scale=scale), (magnitudes(1e-6, 1e6),), ()
+    ),
+    "LogNormal": Family(
+        d.LogNormal,
+        lambda loc, scale: stats.lognorm(scale, scale=np.exp(loc)),
+        (signed(20.0), magnitudes(0.01, 5.0)),
+        ((0.0, 0.25), (3.0, 0.5)),
+    ),
+    "InverseGamma": Family(
+        d.InverseGamma,
+        lambda a, scale: stats.invgamma(a, scale=scale),
+        (magnitudes(0.02, 1e5), magnitudes(1e-5, 1e5)),
+        ((20.0, 3.0), (50.0, 0.1)),
+    ),
+    "Weibull": Family(
+        d.Weibull,
+        lambda c, scale: stats.weibull_min(c, scale=scale),
+        (magnitudes(0.05, 1e3), magnitudes(1e-5, 1e5)),
+        ((2.0, 3.0), (1.0, 0.1), (8.0, 1.0)),
+    ),
     "Bernoulli": Family(d.Bernoulli, stats.bernoulli, (PROBABILITY,), ((0.3,), (0.95,))),
     "Bernoulli logits": Family(
         lambda logits: d.Bernoulli(logits=logits),
@@ -103,6 +137,31 @@ FAMILIES = {
         ((12, 0.3),),
     ),
     "Poisson": Family(d.Poisson, stats.poisson, (magnitudes(1e-6, 1e5),), ((3.5,), (200.0,))),
+    "Geometric": Family(
+        d.Geometric,
+        lambda p: stats.geom(p, loc=-1),
+        # nearer one SciPy's mean, 1 / p - 1, loses digits
+        (magnitudes(1e-9, 0.9) | magnitudes(1e-4, 0.9).map(lambda v: 1 - v),),
+        ((0.3,), (0.9,)),
+    ),
+    "Geometric logits": Family(
+        lambda logits: d.Geometric(logits=logits),
+        lambda logits: stats.geom(special.expit(logits), loc=-1),
+        (st.floats(-9, 5),),  # further out SciPy loses digits in 1 - p
+        ((-1.0,),),
+    ),
+    "NegativeBinomial": Family(
+        d.NegativeBinomial,
+        lambda n, p: stats.nbinom(n, 1 - np.asarray(p)),
+        (magnitudes(0.05, 50.0), DYADIC),
+        ((5.5, 0.4), (40.0, 0.9)),
+    ),
+    "NegativeBinomial logits": Family(
+        lambda n, logits: d.NegativeBinomial(n, logits=logits),
+        lambda n, logits: stats.nbinom(n, special.expit(-np.asarray(logits))),
+        (magnitudes(0.5, 50.0), st.floats(-3, 5)),
+        ((3.0, 0.5),),
+    ),
     "DiscreteUniform": Family(
         _discrete_uniform,
         lambda low, width: stats.randint(low, np.asarray(low) + np.asarray(width) + 1),

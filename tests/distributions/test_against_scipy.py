@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import stats
+from scipy import special, stats
 
 import bayesmc.distributions as d
 from tests.distributions.families import (
@@ -149,6 +149,18 @@ BOUNDARIES = [
     (d.Binomial(0, 0.5), stats.binom(0, 0.5), [0, 1]),
     (d.Bernoulli(0.0), stats.bernoulli(0.0), [0, 1, 2, -1]),
     (d.Bernoulli(1.0), stats.bernoulli(1.0), [0, 1]),
+    (d.Laplace(0.0, 1.0), stats.laplace(), [np.inf, -np.inf, 0.0, -700.0]),
+    (d.Cauchy(1.0, 2.0), stats.cauchy(1.0, 2.0), [np.inf, -np.inf, 1e200, -1e308]),
+    (d.HalfNormal(2.0), stats.halfnorm(scale=2.0), [0.0, -1e-300, -np.inf, np.inf]),
+    (d.HalfCauchy(2.0), stats.halfcauchy(scale=2.0), [0.0, -1e-300, -np.inf, np.inf]),
+    (d.LogNormal(0.0, 2.0), stats.lognorm(2.0), [0.0, -1.0, -np.inf, np.inf, 1e-300, 1e300]),
+    (d.InverseGamma(2.0, 3.0), stats.invgamma(2.0, scale=3.0), [-1.0, -np.inf, np.inf, 1e-300]),
+    (d.InverseGamma(1e-3, 3.0), stats.invgamma(1e-3, scale=3.0), [1e-300, 1e300]),
+    (d.Weibull(0.5, 2.0), stats.weibull_min(0.5, scale=2.0), [0.0, -1.0, -np.inf, 1e-300]),
+    (d.Weibull(1.0, 2.0), stats.weibull_min(1.0, scale=2.0), [0.0, -1.0]),
+    (d.Weibull(2.0, 2.0), stats.weibull_min(2.0, scale=2.0), [0.0, 1e300]),
+    (d.Geometric(0.25), stats.geom(0.25, loc=-1), [0, -1, 10_000]),
+    (d.NegativeBinomial(2.5, 0.25), stats.nbinom(2.5, 0.75), [0, -1, 1000]),
 ]
 
 
@@ -165,6 +177,9 @@ def test_boundaries_equal_scipys(
 def test_outside_is_minus_infinity_where_scipy_gives_nan() -> None:
     assert d.Gamma(3.0, 1.0).log_prob(np.inf) == -np.inf
     assert d.Poisson(3.0).log_prob(np.inf) == -np.inf
+    assert d.InverseGamma(3.0, 1.0).log_prob(0.0) == -np.inf
+    assert d.InverseGamma(3.0, 1e100).log_prob(1e-300) == -np.inf
+    assert d.Weibull(3.0, 1.0).log_prob(np.inf) == -np.inf
     assert (
         d.Dirichlet([2.0, 3.0]).log_prob([[0.5, 0.6], [-0.1, 1.1], [1.0, 0.0]]) == -np.inf
     ).all()
@@ -179,6 +194,10 @@ DISCRETE = [
     d.Binomial(5, 0.4),
     d.Poisson(2.0),
     d.DiscreteUniform(-1, 4),
+    d.Geometric(0.4),
+    d.Geometric(logits=0.4),
+    d.NegativeBinomial(2.5, 0.4),
+    d.NegativeBinomial(2.5, logits=0.4),
 ]
 
 
@@ -197,7 +216,9 @@ def test_codes_of_any_type_read_alike(dist: d.Distribution, code: type) -> None:
 
 CONTINUOUS = [
     d.Normal(0, 1), d.StudentT(3, 0, 1), d.Uniform(0, 1), d.Beta(0.5, 2), d.Gamma(2, 1),
-    d.Exponential(1), d.Mixture([0.5, 0.5], [d.Normal(0, 1), d.Gamma(2, 1)]),
+    d.Exponential(1), d.Laplace(0, 1), d.Cauchy(0, 1), d.HalfNormal(1), d.HalfCauchy(1),
+    d.LogNormal(0, 1), d.InverseGamma(2, 1), d.Weibull(2, 1), d.VonMises(1, 2), d.VonMises(1, 99),
+    d.WrappedNormal(1, 0.5), d.WrappedNormal(1, 2), d.Mixture([0.5, 0.5], [d.Normal(0, 1), d.Gamma(2, 1)]),
 ]  # fmt: skip
 
 
@@ -223,6 +244,74 @@ def test_students_tail_survives_overflow(x: float) -> None:
     near = d.StudentT(df, 0.0, 1.0).log_prob(1e100)
     expected = near - (df + 1) * (np.log(abs(x)) - np.log(1e100))
     np.testing.assert_allclose(d.StudentT(df, 0.0, 1.0).log_prob(x), expected, rtol=1e-12)
+
+
+#: values computed with 50 digits from the definitions
+GOLDEN = [
+    (d.Laplace(1.0, 2.0), -3.0, -3.386294361119891),
+    (d.Laplace(0.0, 1.0), 1e4, -10000.69314718056),  # SciPy's density underflows
+    (d.Cauchy(1.0, 2.0), 1e180, -829.3822161831459),
+    (d.LogNormal(1.0, 0.5), 1e-300, -956416.212261159),
+    (d.InverseGamma(2.5, 3.0), 0.01, -281.4200564978443),
+    (d.InverseGamma(1e-3, 1e-200), 1e200, -468.3452315213906),  # x / scale overflows
+    (d.Weibull(1e-3, 1e200), 1e-200, 452.2901221120759),  # and underflows
+    (d.Geometric(1e-12), 1e13, -37.63102111593355),
+    (d.Geometric(logits=-60.0), 1e26, -60.875651076269655),
+    (d.NegativeBinomial(1e8, 0.5), 100_000_000, -10.475852496710829),
+    (d.NegativeBinomial(1e8, 0.5), 100_020_000, -11.475902495877369),
+    (d.NegativeBinomial(1e15, 1e-12), 3000, -1300.7590160951381),
+    (d.NegativeBinomial(0.001, 0.999999), 12_345_678, -35.57916635285407),
+    (d.NegativeBinomial(1e-10, 0.5), 1, -23.718998110569718),
+    (d.NegativeBinomial(1e5, 1e-9), 0, -0.00010000000005000001),
+    (d.NegativeBinomial(1e4, 0.2), 2600, -6.541078145452522),
+    (d.NegativeBinomial(1e8, 1e-300), 100_000_000, -68938923364.18523),
+    (d.NegativeBinomial(2.0, logits=50.0), 1e22, -51.27187780209491),
+    (d.NegativeBinomial(2.0, logits=-800.0), 1, -799.3068528194401),
+    (d.NegativeBinomial(1e5, logits=30.0), 1e18, -252.21780445028196),
+]
+
+
+@pytest.mark.parametrize(("dist", "x", "expected"), GOLDEN)
+def test_golden_values(dist: d.Distribution, x: float, expected: float) -> None:
+    # a count of 10^8 carries the rounding of its expectation, of relative size 10^-16, times the
+    # distance from it in standard deviations: 10^-12 leaves a margin
+    np.testing.assert_allclose(dist.log_prob(x), expected, rtol=1e-12)
+
+
+def test_the_textbook_formula_would_miss_the_golden_value_of_a_large_count() -> None:
+    # negative control: log factorials of 10^8 cancel to seven digits
+    n, k = 1e8, 100_020_000
+    direct = special.gammaln(n + k) - special.gammaln(k + 1) - special.gammaln(n)
+    direct += (n + k) * np.log(0.5)
+    assert abs(direct + 11.475902495877369) > 1e-9
+
+
+def test_certain_counts() -> None:
+    sure = d.Geometric([1.0, 0.5])
+    assert sure.log_prob([0, 0]).tolist() == [0.0, np.log(0.5)]
+    assert sure.log_prob(3)[0] == -np.inf
+    assert sure.cdf([-1, 0]).tolist() == [0.0, 0.5]
+    assert sure.ppf([0.7, 0.5]).tolist() == [0.0, 0.0]
+    assert d.Geometric(1.0).ppf([0.0, 0.5, 1.0]).tolist() == [-1.0, 0.0, np.inf]
+    assert (d.Geometric(1.0).sample(0, 100) == 0).all()
+    assert d.Geometric(1.0).mean == d.Geometric(1.0).var == 0.0
+    assert d.Geometric(logits=np.inf).log_prob([0, 1]).tolist() == [0.0, -np.inf]
+    for none in (d.NegativeBinomial(2.5, 0.0), d.NegativeBinomial(1e6, 0.0)):
+        assert none.log_prob([0, 1]).tolist() == [0.0, -np.inf]
+        assert none.cdf([-1, 0, 5]).tolist() == [0.0, 1.0, 1.0]
+        assert (none.sample(0, 100) == 0).all()
+        assert none.mean == none.var == 0.0
+
+
+def test_means_of_rare_and_near_certain_trials_keep_their_digits() -> None:
+    assert d.Geometric(logits=50.0).mean == pytest.approx(np.exp(-50.0), rel=1e-14)
+    assert d.Geometric(1e-300).mean == pytest.approx(1e300, rel=1e-14)
+    dist = d.NegativeBinomial(2.0, logits=50.0)  # whose probs rounds to one
+    assert dist.mean == pytest.approx(2 * np.exp(50.0), rel=1e-14)
+    assert dist.cdf(1e22) == pytest.approx(stats.gamma(2).cdf(1e22 * np.exp(-50.0)), rel=1e-9)
+    far = d.NegativeBinomial(2.0, logits=35.0)  # 10^4 draws: the mean's standard error is 0.7 %
+    assert far.sample(0, 10_000).mean() == pytest.approx(2 * np.exp(35.0), rel=0.05)
+    assert d.Weibull(1e6, 1.0).var == pytest.approx(np.pi**2 / 6e12, rel=1e-5)
 
 
 def test_logits_keep_tails_that_probabilities_lose() -> None:

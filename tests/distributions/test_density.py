@@ -43,7 +43,9 @@ def test_the_function_is_not_called_before_it_is_needed() -> None:
 def test_without_a_sampler_sampling_is_refused_with_the_remedy() -> None:
     dist = d.Density(lambda x: -(x**2))
     assert not dist.can_sample
-    with pytest.raises(UnsupportedError, match=r"pass sample=function\(rng, sample_shape\)"):
+    with pytest.raises(
+        UnsupportedError, match=r"pass sample=function\(rng, sample_shape\), wrap it as InverseCdf"
+    ):
         dist.sample(0)
 
 

@@ -124,3 +124,106 @@ def test_components_that_do_not_mix_are_refused(
 ) -> None:
     with pytest.raises(error, match=message):
         d.Mixture([0.5, 0.5], components)
+
+
+def _over(components: object, weights: tuple[float, ...] = (0.3, 0.7)) -> d.Mixture:
+    return d.Mixture(list(weights), components)
+
+
+#: the same two components stacked, listed, and (for the truth) alone
+ANY_FAMILY = {
+    "Truncated": (
+        lambda: d.Truncated(d.Normal([0.0, 1.0], 1.0), 0.0, [2.0, np.inf]),
+        lambda: [d.Truncated(d.Normal(0.0, 1.0), 0.0, 2.0), d.Truncated(d.Normal(1.0, 1.0), 0.0)],
+    ),
+    "Truncated counts": (
+        lambda: d.Truncated(d.Poisson([3.0, 4.0]), [1, 2], [7, np.inf]),
+        lambda: [d.Truncated(d.Poisson(3.0), 1, 7), d.Truncated(d.Poisson(4.0), 2)],
+    ),
+    "KernelDensity": (
+        lambda: d.KernelDensity([[0.0, 1.0, 2.0], [3.0, 4.0, 5.5]]),
+        lambda: [d.KernelDensity([0.0, 1.0, 2.0]), d.KernelDensity([3.0, 4.0, 5.5])],
+    ),
+    "Affine": (
+        lambda: d.Affine(d.Exponential(1.0), 0.0, [-1.0, 2.0]),
+        lambda: [d.Affine(d.Exponential(1.0), 0.0, -1.0), d.Exponential(0.5)],
+    ),
+    "InverseCdf": (
+        lambda: d.InverseCdf(d.Density(lambda x: -((x - np.array([0.0, 4.0])) ** 4))),
+        lambda: [d.InverseCdf(lambda x: -(x**4)), d.InverseCdf(lambda x: -((x - 4.0) ** 4))],
+    ),
+    "VonMises": (
+        lambda: d.VonMises([0.0, 2.0], [1.0, 3.0]),
+        lambda: [d.VonMises(0.0, 1.0), d.VonMises(2.0, 3.0)],
+    ),
+    "Geometric": (
+        lambda: d.Geometric([0.2, 0.4]),
+        lambda: [d.Geometric(0.2), d.Geometric(0.4)],
+    ),
+    "NegativeBinomial": (
+        lambda: d.NegativeBinomial([3.0, 2.5], 0.4),
+        lambda: [d.NegativeBinomial(3.0, 0.4), d.NegativeBinomial(2.5, 0.4)],
+    ),
+    "Multinomial": (
+        lambda: d.Multinomial(5, [[0.2, 0.8], [0.5, 0.5]]),
+        lambda: [d.Multinomial(5, [0.2, 0.8]), d.Multinomial(5, [0.5, 0.5])],
+    ),
+    "Wishart": (
+        lambda: d.Wishart([4.0, 5.0], np.eye(2)),
+        lambda: [d.Wishart(4.0, np.eye(2)), d.Wishart(5.0, np.eye(2))],
+    ),
+    "Joint": (
+        lambda: d.Joint(d.Uniform(0.0, [1.0, 3.0]), d.Gamma([2.0, 3.0], 1.0)),
+        lambda: [
+            d.Joint(d.Uniform(0.0, 1.0), d.Gamma(2.0, 1.0)),
+            d.Joint(d.Uniform(0.0, 3.0), d.Gamma(3.0, 1.0)),
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", ANY_FAMILY)
+def test_a_mixture_over_any_family_stacked_or_listed(name: str) -> None:
+    stacked, listed = (_over(make()) for make in ANY_FAMILY[name])
+    alone = ANY_FAMILY[name][1]()
+    for dist in (stacked, listed):
+        x = dist.sample(0, 20_000)
+        assert x.shape == (20_000, *dist.event_shape)
+        assert x.dtype == (np.int64 if dist.is_discrete else float)
+        inside = dist.support.contains(x)
+        assert inside.all()
+        expected = np.logaddexp(
+            np.log(0.3) + alone[0].log_prob(x), np.log(0.7) + alone[1].log_prob(x)
+        )
+        np.testing.assert_allclose(dist.log_prob(x), expected, rtol=1e-9, atol=1e-12)
+        if dist.support.kind == "circle":
+            resultant = np.exp(1j * x).mean()
+            assert abs(np.angle(resultant) - dist.mean) < 0.05
+            assert abs(np.abs(resultant) - np.exp(-0.5 * dist.var)) < 0.03
+            continue
+        # 5.5 standard errors over at most four components and two forms
+        error = x.std(axis=0) / np.sqrt(len(x))
+        assert (np.abs(x.mean(axis=0) - dist.mean) < 5.5 * error).all()
+        np.testing.assert_allclose(x.var(axis=0), dist.var, rtol=0.15)
+    if not stacked.event_shape:
+        q = np.array([0.01, 0.4, 0.9])
+        np.testing.assert_allclose(stacked.ppf(q), listed.ppf(q), rtol=1e-8)
+
+
+def test_supports_of_products_are_joined_part_by_part() -> None:
+    stacked, listed = (_over(make()) for make in ANY_FAMILY["Joint"])
+    for dist in (stacked, listed):
+        assert dist.support.contains([[2.5, 1.0], [3.5, 1.0], [1.0, -1.0]]).tolist() == [1, 0, 0]
+    free = _over([d.Joint(d.Normal(), d.Gamma(1.0, 1.0)), d.MvNormal([0, 1], np.eye(2))])
+    assert free.support.kind == "real vector"
+    both = _over([d.Affine(d.Exponential(1.0), 0.0, -1.0), d.Exponential(1.0)])
+    assert both.support.kind == "real"
+    frozen = _over([stats.gumbel_r(0, 1), d.Normal()])
+    np.testing.assert_allclose(
+        np.exp(frozen.log_prob(1.0)), 0.3 * stats.gumbel_r.pdf(1.0) + 0.7 * stats.norm.pdf(1.0)
+    )
+
+
+def test_angles_and_numbers_do_not_mix() -> None:
+    with pytest.raises(UnsupportedError, match="angles in radians.*one kind of space"):
+        _over([d.VonMises(), d.Normal()])

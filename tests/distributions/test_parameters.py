@@ -60,6 +60,56 @@ FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
     ),
     (lambda: d.Binomial(3, [0.5, NAN]), (1,), "Binomial: probs must be between 0 and 1"),
     (lambda: d.Poisson([1.0, -1.0]), (1,), "Poisson: rate must be nonnegative and finite"),
+    (lambda: d.Laplace([0.0, NAN], 1.0), (1,), "Laplace: loc must be finite; got nan at index 1"),
+    (lambda: d.Laplace(0.0, [1.0, -1.0]), (1,), "scale must be positive and finite"),
+    (lambda: d.Cauchy(INF, 1.0), (), "Cauchy: loc must be finite"),
+    (lambda: d.Cauchy(0.0, 0.0), (), "Cauchy: scale must be positive"),
+    (lambda: d.HalfNormal([1.0, -1.0]), (1,), "HalfNormal: scale must be positive"),
+    (lambda: d.HalfCauchy(NAN), (), "HalfCauchy: scale must be positive"),
+    (lambda: d.LogNormal(0.0, [[1.0, 0.0]]), (0, 1), "LogNormal: scale must be positive"),
+    (lambda: d.LogNormal([INF, 0.0], 1.0), (0,), "LogNormal: loc must be finite"),
+    (lambda: d.InverseGamma([1.0, 0.0], 1.0), (1,), "InverseGamma: concentration must be positive"),
+    (lambda: d.InverseGamma(1.0, -1.0), (), "InverseGamma: scale must be positive"),
+    (lambda: d.Weibull(NAN, 1.0), (), "Weibull: concentration must be positive"),
+    (lambda: d.Weibull(1.0, [2.0, INF]), (1,), "Weibull: scale must be positive"),
+    (lambda: d.VonMises([0.0, INF], 1.0), (1,), "VonMises: loc must be finite"),
+    (
+        lambda: d.VonMises(0.0, [1.0, -0.5]),
+        (1,),
+        "VonMises: concentration must be nonnegative and finite; got -0.5 at index 1",
+    ),
+    (lambda: d.VonMises(0.0, INF), (), "concentration must be nonnegative and finite"),
+    (lambda: d.WrappedNormal(NAN, 1.0), (), "WrappedNormal: loc must be finite"),
+    (lambda: d.WrappedNormal(0.0, [0.0, 1.0]), (0,), "WrappedNormal: scale must be positive"),
+    (lambda: d.Geometric([0.5, 1.5]), (1,), "Geometric: probs must be between 0 and 1"),
+    (
+        lambda: d.Geometric([0.5, 0.0]),
+        (1,),
+        "Geometric: probs must be above 0, for with 0 no success ever comes; got 0. at index 1",
+    ),
+    (lambda: d.Geometric(logits=[0.0, -INF]), (1,), "logits must be above minus infinity"),
+    (lambda: d.Geometric(logits=NAN), (), "Geometric: logits must be a number"),
+    (lambda: d.NegativeBinomial([2.0, 0.0], 0.5), (1,), "total_count must be positive and finite"),
+    (lambda: d.NegativeBinomial(2.0, [NAN, 0.5]), (0,), "probs must be between 0 and 1"),
+    (
+        lambda: d.NegativeBinomial(2.0, [0.5, 1.0]),
+        (1,),
+        "NegativeBinomial: probs must be below 1, for with 1 no failure ever comes; got 1.",
+    ),
+    (lambda: d.NegativeBinomial(2.0, logits=INF), (), "logits must be below infinity"),
+    (
+        lambda: d.Multinomial([3, -1], [0.5, 0.5]),
+        (1,),
+        "Multinomial: total_count must be a nonnegative whole number; got -1",
+    ),
+    (lambda: d.Multinomial(2.5, [0.5, 0.5]), (), "Multinomial: total_count must be a nonneg"),
+    (
+        lambda: d.Multinomial(3, [[0.5, 0.5], [0.5, 0.4]]),
+        (1,),
+        "Multinomial: probs must be nonnegative and sum to 1 within 1e-06 (this row sums to 0.9); "
+        "got [0.5 0.4] at index 1",
+    ),
+    (lambda: d.Multinomial(3, logits=[[0.0, INF]]), (0,), "Multinomial: logits must be below inf"),
     (lambda: d.DiscreteUniform(0.5, 3), (), "DiscreteUniform: low must be a whole number; got 0.5"),
     (lambda: d.DiscreteUniform(0, [3, NAN]), (1,), "high must be a whole number"),
     (lambda: d.DiscreteUniform([0, 4], 3), (1,), "high must be at least low; got 3 at index 1"),
@@ -181,6 +231,13 @@ def test_a_linear_map_adopts_the_marks_of_its_gaussian() -> None:
         (lambda: d.Dirichlet(1.0), r"shape \(..., K\)"),
         (lambda: d.Categorical(0.5), r"shape \(..., K\)"),
         (lambda: d.Categorical(np.zeros((2, 0))), "K at least 1"),
+        (lambda: d.Multinomial(3, 0.5), r"Multinomial: probs must have shape \(..., K\)"),
+        (
+            lambda: d.Multinomial(3, logits=np.zeros((2, 0))),
+            "logits must have shape .* K at least 1",
+        ),
+        (lambda: d.Multinomial([3, 4], np.full((3, 2), 0.5)), "do not broadcast"),
+        (lambda: d.Multinomial(3, [0.5, 0.5]).log_prob([1, 1, 1]), r"not \(..., 2\)"),
         (lambda: d.Mixture([0.5, 0.5], d.Normal(0, 1)), "must count the components"),
         (lambda: d.Mixture([0.5, 0.5], d.Normal([0, 1, 2], 1)), "2 weights for 3 components"),
         (lambda: d.Mixture(1.0, d.Normal([0], 1)), "got a scalar"),
@@ -193,8 +250,18 @@ def test_shapes_that_do_not_fit_are_refused(call: Callable, message: str) -> Non
         call()
 
 
-@pytest.mark.parametrize("family", [d.Bernoulli, d.Categorical])
-def test_probs_and_logits_exclude_each_other(family: type[d.Distribution]) -> None:
+def _negative_binomial(probs: object = None, *, logits: object = None) -> d.Distribution:
+    return d.NegativeBinomial(3.0, probs, logits=logits)
+
+
+def _multinomial(probs: object = None, *, logits: object = None) -> d.Distribution:
+    return d.Multinomial(3, probs, logits=logits)
+
+
+@pytest.mark.parametrize(
+    "family", [d.Bernoulli, d.Categorical, d.Geometric, _negative_binomial, _multinomial]
+)
+def test_probs_and_logits_exclude_each_other(family: Callable[..., d.Distribution]) -> None:
     with pytest.raises(ParameterError, match="exactly one of probs and logits"):
         family([0.5, 0.5], logits=[0.0, 0.0])
     with pytest.raises(ParameterError, match="exactly one of probs and logits"):

@@ -86,7 +86,8 @@ def test_observed_continuous_parents() -> None:
         assert_matches(posterior, enumerate_posterior(net, evidence))
         assert posterior.mean("double") == pytest.approx(2 * x)
         assert type(bmc.infer(net, evidence).engine) is bmc.Exact
-    with pytest.raises(UnsupportedError, match="'y'"):
+    net.add("z", lambda x: bmc.StudentT(5.0, x, 1.0))
+    with pytest.raises(UnsupportedError, match="'z' is StudentT"):
         bmc.infer(net, {"x": 0.3}, engine=EXACT)
 
 
@@ -135,12 +136,12 @@ def test_impossible_evidence_names_the_culprit() -> None:
 def test_refuses_hidden_continuous_and_infinite_nodes() -> None:
     net = bmc.BayesNet()
     net.add("a", bmc.Bernoulli(0.5))
-    net.add("x", lambda a: bmc.Normal(a, 1.0))
+    net.add("x", lambda a: bmc.Gamma(2.0 + a, 1.0))
     net.add("n", lambda a: bmc.Poisson(1.0 + a))
-    assert "'x' is continuous" in EXACT.unsupported(net, {"n": 2})
-    assert "'n' has infinitely many values" in EXACT.unsupported(net, {"x": 0.2})
+    assert "'x' is Gamma, not Normal" in EXACT.unsupported(net, {"n": 2})
+    assert "'n' is discrete with too many values" in EXACT.unsupported(net, {"x": 0.2})
     assert EXACT.unsupported(net, {"x": 0.2, "n": 1}) is None
-    with pytest.raises(UnsupportedError, match="'x' is continuous.*LikelihoodWeighting"):
+    with pytest.raises(UnsupportedError, match="'x' is Gamma.*LikelihoodWeighting"):
         bmc.infer(net, {"n": 2}, engine=EXACT)
 
 
@@ -256,8 +257,10 @@ def test_explain(capsys: pytest.CaptureFixture) -> None:
     assert found.nodes["x"] == "observed: a likelihood factor"
     assert found.nodes["a"] == "eliminated"
     assert str(found) in capsys.readouterr().out
+    assert bmc.explain(net).nodes["x"] == "integrated out: linear-Gaussian"
+    net.add("y", lambda x: bmc.Gamma(1.0 + x**2, 1.0))
     refused = bmc.explain(net, engine=EXACT)
-    assert "'x' is continuous" in refused.refused["Exact"]
+    assert "'y' is Gamma" in refused.refused["Exact"]
     other = bmc.explain(net)
     assert isinstance(other.engine, bmc.LikelihoodWeighting)
-    assert "'x' is continuous" in other.refused["Exact"]
+    assert "'y' is Gamma" in other.refused["Exact"]

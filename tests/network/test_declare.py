@@ -320,7 +320,7 @@ def test_plates_by_labels_and_from_data():
     net.add("m", bmc.Normal(0.0, 1.0), plates="site")
     net.add("x", lambda m: bmc.Normal(m, 1.0), plates=("day", "site"))
     assert net.plates == {"site": 2, "day": None}
-    posterior = bmc.infer(net, {"x": np.zeros((5, 2))}, rng=0)
+    posterior = bmc.infer(net, {"x": np.zeros((5, 2))}, rng=0).resample(50, rng=0)
     assert posterior["x"].shape[2:] == (5, 2)
     assert posterior.summary().names[:2] == ("m[north]", "m[south]")
     assert net.sample(3, rng=0, plates={"day": 4})["x"].shape == (3, 4, 2)

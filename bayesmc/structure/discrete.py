@@ -1,15 +1,10 @@
-"""Structure read off a net: tables of finite nodes, and the net as discrete variables and factors.
-
-Functions of discrete parents are evaluated once on all configurations. Deterministic nodes without a
-finite domain are passed through: what depends on them depends on the finite nodes above.
-"""
+"""A net whose hidden nodes are finite, as discrete variables and factors."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -17,77 +12,14 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BudgetError
 from bayesmc.factors import FactorLike, LogTable
-from bayesmc.network import CompiledNode, Model, Observed
+from bayesmc.network import Model, Observed
 from bayesmc.shapes import Shape
-
-#: table entries up to which a function is evaluated on all configurations of its parents
-TABLE_ENTRIES = 1 << 24
+from bayesmc.structure.tables import TABLE_ENTRIES, configure, constants_of
 
 #: one element of a finite node
 Variable = tuple[str, int]
 #: node, element, scope and the configurations of it at which the parameters are bad
 InvalidRows = tuple[str, int, tuple[Variable, ...], np.ndarray]
-
-
-@dataclass(frozen=True, eq=False)
-class Table:
-    """A finite node's probabilities over all configurations of its finite parents.
-
-    Attributes
-    ----------
-    parents : tuple of str
-        Parents that vary, in axis order (fixed nodes and inputs are constants).
-    probs : ndarray, shape (*cards, *plates or ones, states)
-    invalid : ndarray of bool or None, shape (*cards, *plates or ones)
-        Configurations at which the function gives bad parameters.
-    """
-
-    parents: tuple[str, ...]
-    probs: np.ndarray
-    invalid: np.ndarray | None = None
-
-
-def tabulate(
-    model: Model,
-    node: CompiledNode,
-    constants: Mapping[str, np.ndarray],
-    limit: int = TABLE_ENTRIES,
-) -> Table | None:
-    """The table of a finite node whose parents are finite and in its own plates; None if there is none.
-
-    ``constants`` are the stored values of inputs and fixed nodes.
-    """
-    if not node.is_stochastic or node.domain is None or node.has_foreign_parents:
-        return None
-    varying = tuple(dict.fromkeys(p for p in node.parents if p not in constants))
-    if any(model[p].domain is None for p in varying):
-        return None
-    cards = tuple(model[p].domain.size for p in varying)  # type: ignore[union-attr]
-    if float(math.prod(cards)) * node.domain.size * math.prod(node.plate_shape) > limit:
-        return None
-    values = dict(constants)
-    for axis, (parent, card) in enumerate(zip(varying, cards, strict=True)):
-        values[parent] = _along(axis, card, len(cards), model[parent].plate_shape)
-    with marking_invalid(), np.errstate(all="ignore"):
-        dist, _ = model.evaluate(node.name, values)
-        probs = dist.probs_table
-    ones = (1,) * len(node.plates)
-    lead = probs.shape[:-1]
-    full = np.broadcast_to(probs, np.broadcast_shapes(lead, cards + ones) + probs.shape[-1:])
-    invalid = None
-    if dist.invalid is not None and dist.invalid.any():
-        invalid = np.broadcast_to(dist.invalid, full.shape[:-1])
-    return Table(varying, full, invalid)
-
-
-def constants_of(model: Model, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Stored values that never vary: inputs and nodes fixed by ``do``."""
-    fixed = {
-        name: node.declaration.value
-        for name, node in model.nodes.items()
-        if node.declaration.value is not None
-    }
-    return {**inputs, **fixed}
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,9 +116,17 @@ def why_not_discrete(model: Model, observed: Mapping[str, Observed]) -> str | No
 
 
 def discrete_net(
-    model: Model, observed: Mapping[str, Observed], inputs: Mapping[str, np.ndarray]
+    model: Model,
+    observed: Mapping[str, Observed],
+    inputs: Mapping[str, np.ndarray],
+    without: Container[str] = (),
 ) -> DiscreteNet:
-    """Variables, scopes and static tables of a net whose hidden nodes are all finite.
+    """Variables, scopes and static tables of a net whose hidden nodes are finite, but for some left out.
+
+    Parameters
+    ----------
+    without : container of str
+        Nodes whose conditional densities somebody else turns into factors.
 
     Raises
     ------
@@ -204,7 +144,9 @@ def discrete_net(
     sources = [
         _source(model, name, node.parents, node.plates, continuous)
         for name, node in model.nodes.items()
-        if node.kind not in ("input", "fixed") and (node.domain is not None or node.is_stochastic)
+        if node.kind not in ("input", "fixed")
+        and (node.domain is not None or node.is_stochastic)
+        and name not in without
     ]
     sources += [
         _source(model, name, potential.parents, potential.plates, continuous, is_potential=True)
@@ -221,50 +163,7 @@ def discrete_net(
     return net
 
 
-def configure(
-    model: Model,
-    known: Mapping[str, np.ndarray],
-    alone: Sequence[str],
-    whole: Sequence[str],
-    names: Sequence[str],
-) -> tuple[dict[str, np.ndarray], Shape]:
-    """Stored values of ``names`` and what they need, over all configurations of the variables.
-
-    Axis k of the batch runs over the k-th of: nodes ``alone`` (one axis each, all plate elements alike),
-    then every element of the nodes ``whole``.
-    """
-    sizes = [model[n].domain.size for n in alone]  # type: ignore[union-attr]
-    for name in whole:
-        node = model[name]
-        sizes += [node.domain.size] * math.prod(node.plate_shape)  # type: ignore[union-attr]
-    values = dict(known)
-    for axis, name in enumerate(alone):
-        values[name] = _along(axis, sizes[axis], len(sizes), model[name].plate_shape)
-    axis = len(alone)
-    for name in whole:
-        node = model[name]
-        count = math.prod(node.plate_shape)
-        batch = (1,) * axis + tuple(sizes[axis : axis + count]) + (1,) * (len(sizes) - axis - count)
-        value = np.empty((*batch, count), dtype=np.intp)
-        for element in range(count):
-            value[..., element] = _along(axis + element, sizes[axis + element], len(sizes), ())
-        values[name] = value.reshape(batch + node.plate_shape)
-        axis += count
-    needed = _between(model, names, values)
-    for name in model.nodes:
-        if name in needed:
-            values[name], _ = model.evaluate(name, values)
-    return values, tuple(sizes)
-
-
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _along(axis: int, card: int, ndim: int, plates: Shape) -> np.ndarray:
-    """All positions along one batch axis, the same in every plate element."""
-    shape = (1,) * axis + (card,) + (1,) * (ndim - 1 - axis)
-    values = np.arange(card).reshape(shape + (1,) * len(plates))
-    return np.broadcast_to(values, shape + plates)
 
 
 def _source(
@@ -388,15 +287,3 @@ def _parents_of(model: Model, source: FactorSource) -> tuple[str, ...]:
     if source.is_potential:
         return model.potentials[source.name][0].parents
     return model[source.name].parents
-
-
-def _between(model: Model, names: Sequence[str], known: Mapping[str, Any]) -> set[str]:
-    """Deterministic nodes to compute on the way from known values to ``names``."""
-    needed: set[str] = set()
-    todo = [n for n in names if n not in known]
-    while todo:
-        name = todo.pop()
-        if name not in needed:
-            needed.add(name)
-            todo += [p for p in model[name].parents if p not in known]
-    return needed

@@ -1,0 +1,435 @@
+"""Maps between a support and unconstrained numbers, with their Jacobians.
+
+A sampler that moves freely on the real line needs three things of a bounded value: where a free
+point lands, where a value came from, and by how much volume is stretched on the way. A
+``Transform`` is made from a ``Support`` alone; it knows neither densities nor samplers, and
+discrete supports have none.
+
+The maps are those of the Stan Reference Manual (version 2.36, chapter "Constraint Transforms").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from bayesmc.distributions.support import Support
+from bayesmc.errors import ShapeError, UnsupportedError
+from bayesmc.gaussian import try_cholesky
+from bayesmc.shapes import Shape
+
+_TINY = np.finfo(float).tiny
+_LOG_ROOT = (
+    354.0  # exp(2 * 354) is near the largest double, exp(-2 * 354) near the least normal one
+)
+
+
+def transform_of(support: Support, event_shape: Shape = ()) -> Transform:
+    """The map between unconstrained numbers and values of a support.
+
+    Parameters
+    ----------
+    support : Support
+        Its bounds may be arrays that broadcast with the values (one per batch element, say);
+        some may be infinite.
+    event_shape : tuple of int
+        Shape of one value. A support of numbers with a longer event shape applies to each number.
+
+    Returns
+    -------
+    Transform
+
+    Raises
+    ------
+    UnsupportedError
+        The support is discrete.
+    ShapeError
+        ``event_shape`` does not fit the support.
+
+    References
+    ----------
+    Stan Reference Manual, version 2.36, chapter "Constraint Transforms".
+
+    Examples
+    --------
+    >>> from bayesmc.distributions.support import positive, simplex
+    >>> from bayesmc.distributions.transforms import transform_of
+    >>> transform_of(positive).constrain([-1000.0, 0.0]).tolist()
+    [5e-324, 1.0]
+    >>> sticks = transform_of(simplex, (4,))
+    >>> sticks.unconstrained_shape, sticks.constrain([0.0, 0.0, 0.0]).round(6).tolist()
+    ((3,), [0.25, 0.25, 0.25, 0.25])
+    """
+    if support.is_discrete:
+        raise UnsupportedError(
+            f"transform: discrete values ({support.describe()}) have no unconstrained space; "
+            "enumerate them or update them by Gibbs sampling"
+        )
+    _check_event(support, event_shape)
+    kind = support.kind
+    if kind in ("real", "real vector"):
+        return Identity(event_shape)
+    if kind == "interval":
+        low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
+        if support.is_constant and low.size and high.size:
+            low, high = low.flat[0], high.flat[0]
+        return Bounded(event_shape, np.asarray(low), np.asarray(high))
+    if kind == "product":
+        return _side_by_side(support, event_shape)
+    return {"circle": Wrapped, "simplex": StickBreaking, "positive definite": LogCholesky}[kind](
+        event_shape
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """A map ``u -> x`` from unconstrained numbers to the values of a support.
+
+    Made by ``transform_of``. Arrays have any leading axes, which broadcast with those of the bounds.
+
+    Attributes
+    ----------
+    event_shape : tuple of int
+        Shape of one value x.
+    unconstrained_shape : tuple of int
+        Shape of the numbers u behind one value.
+
+    Notes
+    -----
+    ``constrain`` takes every finite u to a finite x, inside the open support as far as floating
+    point can tell. ``unconstrain`` raises for no value: a bound that the open support excludes
+    gives infinite or NaN numbers, a value beyond it NaN.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> logit = bmc.Beta(2.0, 3.0).transform
+    >>> logit.constrain(0.0).tolist(), logit.unconstrain([0.5, 0.0, 2.0]).tolist()
+    (0.5, [0.0, -inf, nan])
+    """
+
+    event_shape: Shape
+
+    @property
+    def unconstrained_shape(self) -> Shape:
+        """Shape of the unconstrained numbers behind one value."""
+        return self.event_shape
+
+    def constrain(self, u: Any) -> np.ndarray:
+        """The value at ``u``, shape ``(..., *event_shape)`` from ``(..., *unconstrained_shape)``."""
+        with np.errstate(all="ignore"):
+            return np.asarray(self._constrain(_checked(self, u, self.unconstrained_shape)))
+
+    def unconstrain(self, x: Any) -> np.ndarray:
+        """The numbers behind ``x``, shape ``(..., *unconstrained_shape)``."""
+        with np.errstate(all="ignore"):
+            return np.asarray(self._unconstrain(_checked(self, x, self.event_shape)))
+
+    def log_abs_det_jacobian(self, u: Any) -> np.ndarray:
+        """``log |det dx/du|`` at ``u``, summed over the event.
+
+        For dependent coordinates the volume is that of the first K - 1 components of a simplex and
+        of the lower triangle of a symmetric matrix. The shape is the broadcast of the leading axes
+        of ``u`` and of the bounds.
+        """
+        with np.errstate(all="ignore"):
+            return np.asarray(self._log_det(_checked(self, u, self.unconstrained_shape)))
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        raise NotImplementedError
+
+    def _summed(self, terms: np.ndarray) -> np.ndarray:
+        """``terms`` of single numbers, added over the event axes."""
+        axes = tuple(range(terms.ndim - len(self.event_shape), terms.ndim))
+        return terms.sum(axis=axes) if axes else terms
+
+
+class Identity(Transform):
+    """Unbounded numbers and vectors: ``x = u``."""
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        return u.copy()
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        return x.copy()
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        return np.zeros(u.shape[: u.ndim - len(self.event_shape)])
+
+
+class Wrapped(Transform):
+    """Angles: ``x`` is ``u`` wrapped to [-pi, pi).
+
+    A covering of the circle, not a bijection: u and u + 2 pi are one angle, of Jacobian one.
+    """
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        # an angle already in range keeps all its digits
+        x = u - 2 * np.pi * np.floor((u + np.pi) / (2 * np.pi))
+        return np.where(x >= np.pi, -np.pi, np.maximum(x, -np.pi))
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        return self._constrain(x)
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        return np.zeros(u.shape[: u.ndim - len(self.event_shape)])
+
+
+@dataclass(frozen=True, eq=False)
+class Bounded(Transform):
+    """Numbers with bounds, each finite or not.
+
+    ``low + exp(u)``, ``high - exp(u)`` or ``low + (high - low) expit(u)``; ``u`` where there is no
+    bound.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+    @cached_property
+    def _inside(self) -> tuple[np.ndarray, np.ndarray]:
+        """The least and the greatest number between the bounds."""
+        return np.nextafter(self.low, np.inf), np.nextafter(self.high, -np.inf)
+
+    @cached_property
+    def _bounds(self) -> tuple[np.ndarray, list[int], Shape]:
+        """Which bounds each element has (0 none, 1 low, 2 high, 3 both), those found, the shape."""
+        has = np.asarray(np.isfinite(self.low) + 2 * np.isfinite(self.high))
+        return has, [int(k) for k in np.unique(has)], has.shape
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        # far out exp and expit round onto a bound, or overflow
+        least, greatest = self._inside
+        return np.minimum(np.maximum(self._piecewise("constrain", u), least), greatest)
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        return self._piecewise("unconstrain", x)
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        return self._summed(self._piecewise("log_det", u))
+
+    def _piecewise(self, what: str, value: np.ndarray) -> np.ndarray:
+        """Each element by the formula for the bounds that it has."""
+        has, found, shape = self._bounds
+        full = np.broadcast_shapes(value.shape, shape)
+        if not found:
+            return np.empty(full)
+        parts = [_PIECES[what][k](value, self.low, self.high) for k in found]
+        result = parts[0]
+        for k, part in zip(found[1:], parts[1:], strict=True):
+            result = np.where(has == k, part, result)
+        if result.shape != full:  # the Jacobian of one bound does not depend on it: of its batch
+            result = np.array(np.broadcast_to(result, full))
+        return result
+
+
+class StickBreaking(Transform):
+    """Vectors of K probabilities, from K - 1 numbers; zeros are the uniform vector.
+
+    Component k takes the share ``expit(u_k - log(K - k))`` of what the components before it left.
+    """
+
+    @property
+    def unconstrained_shape(self) -> Shape:
+        return (self.event_shape[0] - 1,)
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        log_share, log_left = self._sticks(u)
+        logs = np.concatenate([log_share, np.zeros((*u.shape[:-1], 1))], axis=-1)
+        logs[..., 1:] += log_left
+        return np.maximum(np.exp(logs), _TINY)
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        # the tail is added up from its end, which keeps the digits that 1 - (sum so far) would lose
+        after = np.flip(np.cumsum(np.flip(x, axis=-1), axis=-1), axis=-1)[..., 1:]
+        u = np.log(x[..., :-1]) - np.log(after) + self._centre()
+        outside = ~(np.abs(x.sum(axis=-1, keepdims=True) - 1) <= 1e-6)
+        return np.where(outside | (x < 0).any(axis=-1, keepdims=True), np.nan, u)
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        log_share, log_left = self._sticks(u)
+        # d x_k / d u_k = z_k (1 - z_k) (what is left before k): a triangular matrix
+        return (log_share + log_left).sum(axis=-1)
+
+    def _sticks(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Logarithms of each share of the remainder, and of what remains after it."""
+        shifted = u - self._centre()
+        return special.log_expit(shifted), np.cumsum(special.log_expit(-shifted), axis=-1)
+
+    def _centre(self) -> np.ndarray:
+        return np.log(np.arange(self.event_shape[0] - 1, 0, -1))
+
+
+class LogCholesky(Transform):
+    """Positive definite matrices ``L L'``, from the lower triangle of L with logs on its diagonal.
+
+    The d (d + 1) / 2 numbers go row by row. Beyond 354 logs on the diagonal count as 354, for the
+    squares of larger ones are no doubles.
+    """
+
+    @property
+    def unconstrained_shape(self) -> Shape:
+        d = self.event_shape[0]
+        return (d * (d + 1) // 2,)
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        d = self.event_shape[0]
+        i = np.arange(d)
+        factor = np.zeros(u.shape[:-1] + self.event_shape)
+        factor[..., *np.tril_indices(d)] = u
+        factor[..., i, i] = np.exp(np.clip(factor[..., i, i], -_LOG_ROOT, _LOG_ROOT))
+        x = np.tril(factor @ np.matrix_transpose(factor))
+        return x + np.matrix_transpose(np.tril(x, -1))  # symmetric to the last bit
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        d = self.event_shape[0]
+        i = np.arange(d)
+        factor, bad = try_cholesky(x)
+        factor = np.array(factor)
+        factor[..., i, i] = np.log(factor[..., i, i])
+        u = factor[..., *np.tril_indices(d)]
+        return u if bad is None else np.where(bad[..., None], np.nan, u)
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        d = self.event_shape[0]
+        row, column = np.tril_indices(d)
+        # L -> L L' stretches by 2^d prod L_ii^(d - i), i from 0; the logarithm adds one L_ii each
+        return d * math.log(2.0) + u[..., row == column] @ np.arange(d + 1.0, 1.0, -1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SideBySide(Transform):
+    """A vector whose parts have maps of their own; the numbers behind them follow in order."""
+
+    parts: tuple[Transform, ...]
+
+    @property
+    def unconstrained_shape(self) -> Shape:
+        return (sum(_width(part.unconstrained_shape) for part in self.parts),)
+
+    def _constrain(self, u: np.ndarray) -> np.ndarray:
+        pieces = self._cut(u, lambda part: part.unconstrained_shape)
+        values = [part.constrain(piece) for part, piece in zip(self.parts, pieces, strict=True)]
+        return _joined(values, [part.event_shape for part in self.parts])
+
+    def _unconstrain(self, x: np.ndarray) -> np.ndarray:
+        pieces = self._cut(x, lambda part: part.event_shape)
+        values = [part.unconstrain(piece) for part, piece in zip(self.parts, pieces, strict=True)]
+        return _joined(values, [part.unconstrained_shape for part in self.parts])
+
+    def _log_det(self, u: np.ndarray) -> np.ndarray:
+        pieces = self._cut(u, lambda part: part.unconstrained_shape)
+        total = np.zeros(u.shape[:-1])
+        for part, piece in zip(self.parts, pieces, strict=True):
+            total = total + part.log_abs_det_jacobian(piece)
+        return total
+
+    def _cut(self, vector: np.ndarray, shape_of: Callable[[Transform], Shape]) -> list[np.ndarray]:
+        pieces, start = [], 0
+        for part in self.parts:
+            shape = shape_of(part)
+            stop = start + _width(shape)
+            pieces.append(vector[..., start:stop] if shape else vector[..., start])
+            start = stop
+        return pieces
+
+
+def _free(value: Any, low: Any, high: Any) -> Any:
+    return +value
+
+
+def _above(u: Any, low: Any, high: Any) -> Any:
+    return low + np.exp(u)
+
+
+def _above_inverse(x: Any, low: Any, high: Any) -> Any:
+    return np.log(x - low)
+
+
+def _exp_log_det(u: Any, low: Any, high: Any) -> Any:
+    return +u
+
+
+def _below(u: Any, low: Any, high: Any) -> Any:
+    return high - np.exp(u)
+
+
+def _below_inverse(x: Any, low: Any, high: Any) -> Any:
+    return np.log(high - x)
+
+
+def _between(u: Any, low: Any, high: Any) -> Any:
+    # an average rather than low + (high - low) z: next to a bound of zero it keeps its digits
+    return low * special.expit(-u) + high * special.expit(u)
+
+
+def _between_inverse(x: Any, low: Any, high: Any) -> Any:
+    return np.log(x - low) - np.log(high - x)
+
+
+def _between_log_det(u: Any, low: Any, high: Any) -> Any:
+    width = np.log(0.5 * high - 0.5 * low) + math.log(2.0)  # high - low itself may overflow
+    return width + special.log_expit(u) + special.log_expit(-u)
+
+
+def _no_log_det(u: Any, low: Any, high: Any) -> Any:
+    return np.zeros_like(u)
+
+
+#: formulas for no bound, a lower one, an upper one, both
+_PIECES: dict[str, tuple[Callable[..., Any], ...]] = {
+    "constrain": (_free, _above, _below, _between),
+    "unconstrain": (_free, _above_inverse, _below_inverse, _between_inverse),
+    "log_det": (_no_log_det, _exp_log_det, _exp_log_det, _between_log_det),
+}
+
+
+def _check_event(support: Support, event_shape: Shape) -> None:
+    axes = support.event_ndim
+    fits = not axes or len(event_shape) == axes
+    if support.kind == "simplex":
+        fits = fits and event_shape[0] > 0
+    elif support.kind == "positive definite":
+        fits = fits and event_shape[0] == event_shape[1]
+    elif support.kind == "product":
+        fits = fits and event_shape[0] == sum(max(count, 1) for _, count in support.parts)
+    if not fits:
+        raise ShapeError(f"transform: {support.describe()} have no event shape {event_shape}")
+
+
+def _side_by_side(support: Support, event_shape: Shape) -> Transform:
+    parts = [transform_of(part, (count,) if count else ()) for part, count in support.parts]
+    return SideBySide(event_shape, tuple(parts))
+
+
+def _checked(transform: Transform, value: Any, shape: Shape) -> np.ndarray:
+    value = np.asarray(value, dtype=float)
+    cut = value.ndim - len(shape)
+    if cut < 0 or value.shape[cut:] != shape:
+        raise ShapeError(
+            f"{type(transform).__name__}: the values have shape {value.shape}, not (..., *{shape})"
+        )
+    return value
+
+
+def _width(shape: Shape) -> int:
+    return shape[0] if shape else 1
+
+
+def _joined(values: list[np.ndarray], shapes: list[Shape]) -> np.ndarray:
+    """Parts along the last axis, their leading axes broadcast; a part of shape () is one column."""
+    rows = [v if shape else v[..., None] for v, shape in zip(values, shapes, strict=True)]
+    lead = np.broadcast_shapes(*(row.shape[:-1] for row in rows))
+    return np.concatenate([np.broadcast_to(row, lead + row.shape[-1:]) for row in rows], axis=-1)

@@ -1,0 +1,157 @@
+"""What an exact posterior says of continuous nodes: the mixtures of Gaussians that they are.
+
+Values of a node are put together from its elements: hidden ones from their moments, observed ones as seen.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Mixture, MvNormal, Normal
+from bayesmc.factors.moments import Components, Moments
+from bayesmc.network import Model, Observed
+from bayesmc.structure import Variable
+
+#: below this a standard deviation is none: what is computed without noise
+_NO_SPREAD = 1e-150
+
+
+class GaussianAnswers:
+    """Means, covariances, mixtures and draws of continuous nodes.
+
+    Parameters
+    ----------
+    model : Model
+    observed : mapping
+        For nodes of which only some elements are hidden.
+    moments : Moments
+    """
+
+    def __init__(self, model: Model, observed: Mapping[str, Observed], moments: Moments) -> None:
+        self.model, self._moments = model, moments
+        self._nodes = {block[0] for block in moments.scopes}  # type: ignore[index]
+        self._seen = {
+            name: seen.value
+            for name, seen in observed.items()
+            if seen.mask is not None and model[name].domain is None
+        }
+
+    def holds(self, name: str) -> bool:
+        """Whether a node is one of those answered here."""
+        return name in self._nodes or name in self._seen
+
+    def mean(self, name: str) -> np.ndarray:
+        """Posterior mean, shape ``(*plates, *event)``."""
+        parts = [self._own(name, e)[0] for e in self._elements(name)]
+        return np.reshape(np.array(parts), self.model[name].value_shape)
+
+    def var(self, name: str) -> np.ndarray:
+        """Posterior variance, shape ``(*plates, *event)``."""
+        parts = [np.diagonal(self._own(name, e)[1]) for e in self._elements(name)]
+        return np.reshape(np.array(parts), self.model[name].value_shape)
+
+    def components(
+        self, names: Sequence[str], extra: Sequence[Hashable] = ()
+    ) -> tuple[Components, dict[str, list[int]]]:
+        """The joint mixture of all hidden elements of some nodes, and each node's columns (-1: observed)."""
+        blocks: list[Variable] = []
+        columns: dict[str, list[int]] = {}
+        width = 0
+        for name in names:
+            columns[name] = []
+            for e in self._elements(name):
+                d = self._size(name)
+                if (name, e) not in self._moments.scopes:
+                    columns[name] += [-1] * d
+                    continue
+                blocks.append((name, e))
+                columns[name] += range(width, width + d)
+                width += d
+        return self._moments.components(blocks, extra), columns
+
+    def values(self, name: str, means: np.ndarray, columns: Sequence[int]) -> np.ndarray:
+        """Values of a node in every component, ``(components, *plates, *event)``, from the blocks' means."""
+        picked = np.array(columns, dtype=int)
+        shape = self.model[name].value_shape
+        if not means.shape[-1]:
+            full = np.zeros((len(means), len(picked)))
+        else:
+            full = means[:, np.maximum(picked, 0)]
+        if name in self._seen:
+            full = np.where(picked < 0, self._seen[name].reshape(-1), full)
+        return full.reshape((len(means), *shape))
+
+    def distribution(self, name: str, index: tuple[Any, ...] = ()) -> Mixture:
+        """The posterior of a node, or of the part at an index, as a mixture of Gaussians.
+
+        Plates that the index leaves are batch axes; where elements have mixtures of different lengths, the
+        shorter are filled up with components of weight zero.
+        """
+        node = self.model[name]
+        plates, event = index[: len(node.plates)], index[len(node.plates) :]
+        elements = np.arange(math.prod(node.plate_shape)).reshape(node.plate_shape)[plates]
+        parts = [self._part(name, int(e)) for e in np.ravel(elements)]
+        most = max((len(w) for w, _, _ in parts), default=1)
+        weights = np.zeros((len(parts), most))
+        d = self._size(name)
+        means = np.zeros((len(parts), most, d))
+        covs = np.broadcast_to(np.eye(d), (len(parts), most, d, d)).copy()
+        for k, (w, mean, cov) in enumerate(parts):
+            weights[k, : len(w)], means[k, : len(w)], covs[k, : len(w)] = w, mean, cov
+        lead = np.shape(elements)
+        weights = weights.reshape((*lead, most))
+        shape = (*lead, most, *node.event_shape)
+        if event or not node.event_shape:
+            spread = np.sqrt(np.maximum(np.diagonal(covs, axis1=-2, axis2=-1), _NO_SPREAD**2))
+            at = (..., *event)
+            return Mixture(weights, Normal(means.reshape(shape)[at], spread.reshape(shape)[at]))
+        return Mixture(weights, MvNormal(means.reshape(shape), covs.reshape((*shape, d))))
+
+    def draw(
+        self, rng: np.random.Generator, codes: Mapping[Variable, np.ndarray], draws: int
+    ) -> dict[str, np.ndarray]:
+        """Draws of the hidden nodes given draws of the finite ones, ``(draws, *plates, *event)``."""
+        blocks = self._moments.sample(rng, codes, draws)
+        found = {}
+        for name, node in self.model.nodes.items():
+            if not node.is_stochastic or not self.holds(name):
+                continue
+            seen = self._seen.get(name)
+            values = np.empty((draws, math.prod(node.plate_shape), self._size(name)))
+            for e in self._elements(name):
+                if (name, e) in blocks:
+                    values[:, e] = blocks[(name, e)]
+                else:
+                    assert seen is not None
+                    values[:, e] = seen.reshape(values.shape[1:])[e]
+            found[name] = values.reshape((draws, *node.value_shape))
+        return found
+
+    # ---- private -----------------------------------------------------------------------------
+
+    def _elements(self, name: str) -> range:
+        return range(math.prod(self.model[name].plate_shape))
+
+    def _size(self, name: str) -> int:
+        return math.prod(self.model[name].event_shape)
+
+    def _own(self, name: str, e: int) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and covariance of one element."""
+        if (name, e) in self._moments.scopes:
+            return self._moments.moments((name, e))
+        return self._fixed(name, e), np.zeros((self._size(name), self._size(name)))
+
+    def _part(self, name: str, e: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Weights, means and covariances of one element's components."""
+        if (name, e) not in self._moments.scopes:
+            mean, cov = self._own(name, e)
+            return np.ones(1), mean[None], cov[None]
+        found = self._moments.components([(name, e)])
+        return found.weights, found.mean, found.cov
+
+    def _fixed(self, name: str, e: int) -> np.ndarray:
+        return self._seen[name].reshape(-1, self._size(name))[e]

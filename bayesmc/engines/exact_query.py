@@ -1,0 +1,245 @@
+"""Averages of a user's function under an exact posterior.
+
+Functions of finite nodes are averaged over their joint table. Of continuous nodes, functions that tracing
+proves affine are exact at the components' means, and an event that compares affine values is a normal
+probability in every component; anything else is refused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy import special
+
+from bayesmc.engines.exact_gaussian import GaussianAnswers
+from bayesmc.engines.exact_tables import TableAnswers
+from bayesmc.errors import BayesmcError, BudgetError, UnsupportedError
+from bayesmc.factors.moments import Components
+from bayesmc.results.query import Query
+from bayesmc.shapes import Shape
+from bayesmc.structure import Variable, configure
+from bayesmc.tracing import Tracer
+
+#: configurations up to which a function is averaged over a joint table
+_ENTRIES = 1 << 22
+#: components of continuous nodes that an event may depend on
+_DIRECTIONS = 256
+
+
+def average(tables: TableAnswers, query: Query, events: bool) -> np.ndarray:
+    """The mean of a function of finite nodes, and of what is computed from them, by their joint table."""
+    model = tables.model
+    if 0 in query.plate_shape:
+        return np.zeros(query.plate_shape)
+    finite = tables.above(query.nodes)
+    alone = tuple(n for n in finite if set(model[n].plates) <= set(query.plates))
+    if any(set(model[n].plates) - set(query.plates) for n in _passed(tables, query.nodes)):
+        alone = ()
+    whole = tuple(n for n in finite if n not in alone)
+    variables = [tables.element(n, query.plates, (0,) * len(query.plates)) for n in alone]
+    rest = [v for n in whole for v in tables.elements(n)]
+    entries = float(math.prod([tables.card(v) for v in [*variables, *rest]]))
+    if entries > _ENTRIES:
+        raise _too_many(len(variables) + len(rest), entries)
+    with np.errstate(all="ignore"):
+        missing = tables.missing(query.nodes)
+        values, cards = configure(model, tables.known_values, alone, whole, missing)
+    flat = {n: _flat(values[n], cards, model[n].value_shape) for n in query.nodes}
+    results = query(flat, (math.prod(cards),))
+    if events:
+        _check_boolean(results)
+    sizes = query.plate_shape
+    out = np.empty(sizes + results.shape[1 + len(sizes) :])
+    for at in np.ndindex(sizes):
+        table = tables.joint([tables.element(n, query.plates, at) for n in alone] + rest).ravel()
+        part = results[(slice(None), *at)].astype(float)
+        possible = table > 0  # elsewhere the function may give anything
+        out[at] = np.tensordot(table[possible], part[possible], axes=1)
+    return out
+
+
+def gaussian_average(
+    tables: TableAnswers, gaussian: GaussianAnswers, query: Query, events: bool
+) -> np.ndarray:
+    """The mean of a function, or the probability of an event, of continuous and finite nodes."""
+    continuous = [n for n in dict.fromkeys(query.nodes) if gaussian.holds(n)]
+    others = [n for n in dict.fromkeys(query.nodes) if n not in continuous]
+    extra = [v for n in tables.above(others) for v in tables.elements(n)]
+    found, columns = gaussian.components(continuous, extra)
+    count = len(found.weights)
+    stored = _finite_values(tables, others, found)
+
+    def at(means: np.ndarray, traced: bool = True) -> dict[str, Any]:
+        values = {n: gaussian.values(n, means, columns[n]) for n in continuous}
+        if traced:
+            return {**stored, **{n: Tracer(v, [n]) for n, v in values.items()}}
+        return {**stored, **values}
+
+    plain = query(
+        at(found.mean, traced=False), (count,)
+    )  # with the checks that it acts draw by draw
+    if events:
+        _check_boolean(plain)
+    try:
+        result = query.raw(at(found.mean))
+    except BayesmcError as error:
+        raise _beyond(continuous, str(error.__cause__ or error)) from error
+    if not isinstance(result, Tracer):
+        return np.tensordot(found.weights, plain.astype(float), axes=1)
+    if result.is_affine and not events:
+        return np.tensordot(found.weights, plain, axes=1)
+    if result.margin is None:
+        raise _beyond(continuous, f"after {result.reason}")
+    chance = _chances(query, result.margin, found, at, plain)
+    return np.tensordot(found.weights, chance, axes=1)
+
+
+def covariance(
+    tables: TableAnswers, gaussian: GaussianAnswers | None, names: Sequence[str]
+) -> np.ndarray:
+    """Covariance matrix of all scalars of some nodes, in order, from their joint mixture."""
+    continuous = [n for n in dict.fromkeys(names) if gaussian is not None and gaussian.holds(n)]
+    others = [n for n in dict.fromkeys(names) if n not in continuous]
+    extra = [v for n in tables.above(others) for v in tables.elements(n)]
+    if gaussian is not None:
+        found, columns = gaussian.components(continuous, extra)
+    else:
+        found, columns = _table_components(tables, extra), {}
+    stored = _finite_values(tables, others, found)
+    parts: list[np.ndarray] = []
+    where: list[int] = []
+    for name in names:
+        if gaussian is not None and name in continuous:
+            values = gaussian.values(name, found.mean, columns[name])
+            where += columns[name]
+        else:
+            domain = tables.model[name].domain
+            values = stored[name] if domain is None else np.asarray(domain.numbers)[stored[name]]
+            where += [-1] * math.prod(tables.model[name].value_shape)
+        parts.append(values.reshape(len(found.weights), -1))
+    means = np.concatenate(parts, axis=1).astype(float)
+    spread = means - found.weights @ means
+    within = np.zeros((len(where), len(where)))
+    at = np.array(where)
+    rows = np.flatnonzero(at >= 0)
+    if len(rows):
+        inside = np.tensordot(found.weights, found.cov, axes=1)
+        within[np.ix_(rows, rows)] = inside[np.ix_(at[rows], at[rows])]
+    return within + (spread * found.weights[:, None]).T @ spread
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _chances(
+    query: Query, margin: Tracer, found: Components, at: Any, plain: np.ndarray
+) -> np.ndarray:
+    """In every component the probability that an affine margin of the blocks is positive."""
+    count, width = found.mean.shape
+    if width > _DIRECTIONS:
+        raise BudgetError(
+            f"probability: the event depends on {width} continuous components; draw from the posterior "
+            "with resample(draws)",
+            8 * count * width**2,
+        )
+    centre = query.fitted(margin.example, (count,))
+    spread = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
+    scale = np.where(spread > 0, spread, 1.0)
+    slopes = np.empty((width, *centre.shape))
+    with np.errstate(invalid="ignore"):
+        for k in range(width):
+            moved = found.mean.copy()
+            moved[:, k] += scale[:, k]
+            here = query.raw(at(moved)).margin
+            slopes[k] = query.fitted(here.example, (count,)) - centre
+    slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    correlation = found.cov / (scale[:, :, None] * scale[:, None, :])
+    var = np.einsum("kn...,nkl,ln...->n...", slopes, correlation, slopes)
+    sd = np.sqrt(np.maximum(var, 0.0))
+    with np.errstate(all="ignore"):
+        chance = special.ndtr(centre / sd)
+    return np.where(sd > 0, chance, plain)
+
+
+def _table_components(tables: TableAnswers, variables: Sequence[Variable]) -> Components:
+    """The configurations of some variables as components without continuous blocks."""
+    entries = float(math.prod(tables.card(v) for v in variables))
+    if entries > _ENTRIES:
+        raise _too_many(len(variables), entries)
+    table = tables.joint(variables)
+    at = np.unravel_index(np.flatnonzero(table), table.shape) if variables else ()
+    weights = table[table > 0]
+    states = dict(zip(variables, at, strict=True))
+    empty = np.zeros((len(weights), 0))
+    return Components(states, weights / weights.sum(), empty, empty[:, :, None])
+
+
+def _finite_values(
+    tables: TableAnswers, names: Sequence[str], found: Components
+) -> dict[str, np.ndarray]:
+    """Stored values of nodes that are no Gaussians, in every component."""
+    model, count = tables.model, len(found.weights)
+    values: dict[str, np.ndarray] = {
+        n: np.broadcast_to(v, (count, *v.shape)) for n, v in tables.known_values.items()
+    }
+    for name in tables.above(names):
+        node = model[name]
+        codes = [found.states[v] for v in tables.elements(name)]
+        empty = np.zeros((count, 0))
+        stacked = np.stack(codes, axis=-1) if codes else empty
+        values[name] = stacked.reshape((count, *node.plate_shape)).astype(node.domain.dtype)  # type: ignore[union-attr]
+    for name in model.nodes:
+        if name not in values and _is_computed(model, name, values):
+            values[name], _ = model.evaluate(name, values)
+    lacking = [n for n in names if n not in values]
+    if lacking:
+        raise _beyond(lacking, "it is no affine function of Gaussians")
+    return {n: np.broadcast_to(values[n], (count, *model[n].value_shape)) for n in names}
+
+
+def _is_computed(model: Any, name: str, values: Mapping[str, Any]) -> bool:
+    node = model[name]
+    return node.kind == "deterministic" and all(p in values for p in node.parents)
+
+
+def _passed(tables: TableAnswers, nodes: Sequence[str]) -> tuple[str, ...]:
+    """Deterministic nodes without a domain on the way to the finite ones."""
+    model = tables.model
+    found: list[str] = []
+    todo = tables.missing(nodes)
+    while todo:
+        name = todo.pop()
+        found.append(name)
+        todo += [p for p in model[name].parents if model[p].domain is None]
+    return tuple(n for n in found if not model[n].is_stochastic)
+
+
+def _flat(values: np.ndarray, cards: tuple[int, ...], shape: Shape) -> np.ndarray:
+    """Values over all configurations, with one batch axis."""
+    return np.broadcast_to(values, cards + shape).reshape((math.prod(cards), *shape))
+
+
+def _check_boolean(results: np.ndarray) -> None:
+    if results.dtype.kind != "b":
+        raise UnsupportedError(
+            f"probability: the function returns {results.dtype} values, not booleans; use expectation"
+        )
+
+
+def _too_many(count: int, entries: float) -> BudgetError:
+    return BudgetError(
+        f"expectation: the function needs the joint table of {count} nodes ({entries:.3g} entries); draw "
+        "from the posterior with resample(draws)",
+        int(min(8 * entries, 2**62)),
+    )
+
+
+def _beyond(names: Sequence[str], why: str) -> UnsupportedError:
+    return UnsupportedError(
+        f"an exact posterior averages functions that are affine in continuous nodes, and events that compare "
+        f"such values once; this one of {', '.join(map(repr, names))} is neither ({why}): draw with "
+        "resample(draws) and ask there"
+    )

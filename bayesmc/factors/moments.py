@@ -1,0 +1,283 @@
+"""Moments and draws of continuous blocks, from each block's distribution given others and discrete variables.
+
+Conditionals come from both directions: blocks that were integrated out, given those integrated after them;
+and blocks nothing observed depends on, given their parents. A block's distribution is a mixture with one
+Gaussian for every configuration of the discrete variables that switch it or any block above it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from .gaussian import Conditional
+
+Scope = tuple[Hashable, ...]
+#: configurations worked on at a time
+_CHUNK = 1 << 14
+
+
+@dataclass(frozen=True, eq=False)
+class Components:
+    """The joint distribution of some blocks, as the mixture that it is.
+
+    Attributes
+    ----------
+    states : dict
+        Discrete variable -> its state in every component, shape ``(components,)``.
+    weights : ndarray, shape (components,)
+        Positive; they sum to 1.
+    mean : ndarray, shape (components, n)
+    cov : ndarray, shape (components, n, n)
+    """
+
+    states: dict[Hashable, np.ndarray]
+    weights: np.ndarray
+    mean: np.ndarray
+    cov: np.ndarray
+
+    def collapsed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and covariance of the whole mixture."""
+        mean = self.weights @ self.mean
+        spread = self.mean - mean
+        within = np.tensordot(self.weights, self.cov, axes=1)
+        return mean, within + (spread * self.weights[:, None]).T @ spread
+
+
+class Moments:
+    """Answers about blocks.
+
+    Parameters
+    ----------
+    conditionals : sequence of Conditional
+        One for each block, in any order without cycles.
+    dims, cards : mapping
+    joint : callable
+        Discrete variables -> the table of their joint probabilities.
+    """
+
+    def __init__(
+        self,
+        conditionals: Sequence[Conditional],
+        dims: Mapping[Any, int],
+        cards: Mapping[Any, int],
+        joint: Callable[[Scope], np.ndarray],
+    ) -> None:
+        self._of = {c.block: c for c in conditionals}
+        self._dims, self._cards, self._joint = dims, cards, joint
+        self.scopes = mixture_scopes({c.block: (c.scope, c.parents) for c in conditionals})
+        self._order = {b: k for k, b in enumerate(self.scopes)}
+        self._collapsed: dict[Hashable, tuple[np.ndarray, np.ndarray]] = {}
+
+    def moments(self, block: Hashable) -> tuple[np.ndarray, np.ndarray]:
+        """Mean ``(d,)`` and covariance ``(d, d)`` of one block; all that share its scope come along."""
+        if block not in self._collapsed:
+            scope = self.scopes[block]
+            group = [b for b, s in self.scopes.items() if s == scope]
+            self._collapsed.update(self._collapse(group, tuple(scope)))
+        return self._collapsed[block]
+
+    def components(self, blocks: Sequence[Hashable], extra: Sequence[Hashable] = ()) -> Components:
+        """The mixture of some blocks jointly, split by further discrete variables, too.
+
+        Configurations of probability zero are left out.
+        """
+        scope = tuple(dict.fromkeys([*(v for b in blocks for v in self.scopes[b]), *extra]))
+        states, weights = self._configurations(scope)
+        parts = [
+            self._descend(list(blocks), {v: s[rows] for v, s in states.items()}, blocks)
+            for rows in _chunks(len(weights))
+        ]
+        n = sum(self._dims[b] for b in blocks)
+        means, covs = [], []
+        for part in parts:
+            *_, (mean, cov) = part
+            means.append(mean)
+            covs.append(cov)
+        rows_of = slice(len(weights))
+        mean = np.broadcast_to(np.concatenate(means), (len(weights), n))[rows_of]
+        return Components(states, weights, mean, np.concatenate(covs))
+
+    def sample(
+        self, rng: np.random.Generator, codes: Mapping[Any, np.ndarray], draws: int
+    ) -> dict[Hashable, np.ndarray]:
+        """Draws of every block, shape ``(draws, d)``, given draws of the discrete variables."""
+        drawn: dict[Hashable, np.ndarray] = {}
+        for block in self.scopes:
+            given = self._of[block]
+            at = _rows(given.scope, self._cards, codes, draws)
+            noise = rng.standard_normal((draws, self._dims[block]))
+            value = _flat(given.offset, given)[at] + np.matvec(_flat(given.root, given)[at], noise)
+            if given.parents:
+                above = np.concatenate([drawn[p] for p in given.parents], axis=-1)
+                value = value + np.matvec(_flat(given.gain, given)[at], above)
+            drawn[block] = value
+        return drawn
+
+    def _collapse(
+        self, group: Sequence[Hashable], scope: Scope
+    ) -> dict[Hashable, tuple[np.ndarray, np.ndarray]]:
+        """Moments of the whole mixture, for every block of a group with one scope."""
+        states, weights = self._configurations(scope)
+        sums: dict[Hashable, tuple[float, np.ndarray, np.ndarray]] = {}
+        for rows in _chunks(len(weights)):
+            here = {v: s[rows] for v, s in states.items()}
+            w = weights[rows]
+            for block, (mean, cov) in zip(
+                self._visits(group), self._descend(group, here, ()), strict=False
+            ):
+                part = Components(here, w / w.sum(), mean, cov).collapsed()
+                sums[block] = _merged(sums.get(block), (float(w.sum()), *part))
+        return {block: sums[block][1:] for block in group}
+
+    def _configurations(self, scope: Scope) -> tuple[dict[Hashable, np.ndarray], np.ndarray]:
+        """The possible configurations of a scope, and their probabilities."""
+        if not scope:
+            return {}, np.ones(1)
+        table = self._joint(scope)
+        at = np.nonzero(table)
+        weights = table[at]
+        return dict(zip(scope, at, strict=True)), weights / weights.sum()
+
+    def _visits(self, blocks: Sequence[Hashable]) -> list[Hashable]:
+        """The blocks and all above them, parents first, each as soon as its parents are there."""
+        needed: set[Hashable] = set()
+        todo = list(blocks)
+        while todo:
+            b = todo.pop()
+            if b not in needed:
+                needed.add(b)
+                todo += self._of[b].parents
+        pending = {b: len(self._of[b].parents) for b in needed}
+        below: dict[Hashable, list[Hashable]] = {b: [] for b in needed}
+        for b in sorted(needed, key=self._order.__getitem__):
+            for p in self._of[b].parents:
+                below[p].append(b)
+        ready = [b for b in sorted(needed, key=self._order.__getitem__) if not pending[b]][::-1]
+        order = []
+        while ready:
+            b = ready.pop()  # last in, first out: a branch is finished before the next is begun
+            order.append(b)
+            for c in below[b]:
+                pending[c] -= 1
+                if not pending[c]:
+                    ready.append(c)
+        return order
+
+    def _descend(
+        self, blocks: Sequence[Hashable], codes: Mapping[Any, np.ndarray], keep: Sequence[Hashable]
+    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Mean and covariance of each visited block in turn; last of all, jointly of those to ``keep``.
+
+        Only blocks that a later one needs stay in the joint covariance.
+        """
+        order = self._visits(blocks)
+        last = {p: k for k, b in enumerate(order) for p in self._of[b].parents}
+        last.update(dict.fromkeys(keep, len(order)))
+        count = len(next(iter(codes.values()))) if codes else 1
+        live: list[Hashable] = []
+        mean, cov = np.zeros((count, 0)), np.zeros((count, 0, 0))
+        for k, block in enumerate(order):
+            given = self._of[block]
+            at = _rows(given.scope, self._cards, codes, count)
+            own = _flat(given.offset, given)[at]
+            root = _flat(given.root, given)[at]
+            inside = root @ np.matrix_transpose(root)
+            columns = self._columns(live, given.parents)
+            cross = np.zeros((count, self._dims[block], mean.shape[1]))
+            if columns:
+                gain = _flat(given.gain, given)[at]
+                own = own + np.matvec(gain, mean[:, columns])
+                cross = gain @ cov[:, columns, :]
+                inside = inside + cross[:, :, columns] @ np.matrix_transpose(gain)
+            own = np.broadcast_to(own, (count, self._dims[block]))
+            inside = np.broadcast_to(inside, (count, *inside.shape[1:]))
+            yield own, inside
+            stays = [b for b in live if last.get(b, -1) > k]
+            columns = self._columns(live, stays)
+            joins = last.get(block, -1) > k
+            if not joins:
+                if len(stays) < len(live):
+                    mean, cov = mean[:, columns], cov[:, columns][:, :, columns]
+                live = stays
+                continue
+            cross = cross[:, :, columns]
+            mean = np.concatenate([mean[:, columns], own], axis=1)
+            above = np.concatenate(
+                [cov[:, columns][:, :, columns], np.matrix_transpose(cross)], axis=2
+            )
+            cov = np.concatenate([above, np.concatenate([cross, inside], axis=2)], axis=1)
+            live = [*stays, block]
+        columns = self._columns(live, keep)
+        yield mean[:, columns], cov[:, columns][:, :, columns]
+
+    def _columns(self, live: Sequence[Hashable], wanted: Sequence[Hashable]) -> list[int]:
+        start, first = {}, 0
+        for b in live:
+            start[b] = first
+            first += self._dims[b]
+        return [start[b] + k for b in wanted for k in range(self._dims[b])]
+
+
+def mixture_scopes(
+    blocks: Mapping[Any, tuple[Scope, Sequence[Hashable]]],
+) -> dict[Hashable, frozenset[Hashable]]:
+    """For every block the discrete variables that its mixture runs over, parents before children.
+
+    ``blocks`` maps each block to its own discrete scope and its parent blocks.
+    """
+    scopes: dict[Hashable, frozenset[Hashable]] = {}
+    todo = list(blocks)
+    while todo:
+        block = todo[-1]
+        own, parents = blocks[block]
+        missing = [p for p in parents if p not in scopes]
+        if missing and block not in scopes:
+            todo += missing
+            continue
+        todo.pop()
+        if block not in scopes:
+            scopes[block] = frozenset(own).union(*(scopes[p] for p in parents))
+    return scopes
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _flat(array: np.ndarray, given: Conditional) -> np.ndarray:
+    """An array of a conditional with its discrete axes as one."""
+    return array.reshape((-1, *array.shape[len(given.scope) :]))
+
+
+def _rows(
+    scope: Scope, cards: Mapping[Any, int], codes: Mapping[Any, np.ndarray], count: int
+) -> Any:
+    """Row of every configuration among those of a scope."""
+    if not scope:
+        return np.zeros(1 if count > 1 else count, dtype=np.intp)
+    row: Any = 0
+    for v in scope:
+        row = row * cards[v] + codes[v].astype(np.intp)
+    return row
+
+
+def _chunks(count: int) -> Iterator[slice]:
+    return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))
+
+
+def _merged(
+    before: tuple[float, np.ndarray, np.ndarray] | None,
+    new: tuple[float, np.ndarray, np.ndarray],
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Weight, mean and covariance of two parts together (Chan, Golub and LeVeque 1983)."""
+    if before is None:
+        return new
+    weight = before[0] + new[0]
+    share = new[0] / weight
+    shift = new[1] - before[1]
+    mean = before[1] + share * shift
+    cov = (1 - share) * before[2] + share * new[2]
+    return weight, mean, cov + share * (1 - share) * np.multiply.outer(shift, shift)
