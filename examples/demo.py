@@ -1,6 +1,7 @@
 """The demonstration behind ``make demo``: two nets, and every engine that can answer about them.
 
-It prints one table per question and writes pictures to ``out/``. ``--fast`` takes few draws.
+It prints one table per question and writes pictures to ``out/``, then does what the scripts of the
+figures do, each of which also runs by itself. ``--fast`` takes few draws.
 """
 
 from __future__ import annotations
@@ -16,8 +17,19 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from examples import diagnosis, old_faithful
+from examples import (
+    central_limit,
+    diagnosis,
+    expectation_and_marginal,
+    old_faithful,
+    parzen,
+    pushforward,
+    rejection_and_importance,
+)
 
+FIGURES = (
+    parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal
+)  # fmt: skip
 SEED = 1
 EXACT = "exact"
 
@@ -55,6 +67,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     for path in draw_pictures(options.out, 20_000 if options.fast else 50_000):
         print(f"wrote {path}")
+    for figure in FIGURES:
+        print()
+        figure.main([*(["--fast"] if options.fast else []), "--out", str(options.out)])
 
 
 def questions(draws: int) -> Iterator[Table]:
@@ -107,7 +122,7 @@ def which_kind(draws: int) -> Table:
 
 
 def how_long(draws: int) -> Table:
-    """The same when nobody timed it: the duration is hidden, too, and elimination has to refuse."""
+    """The same when nobody timed it: the duration is hidden, too, and is integrated out."""
     net = old_faithful.two_kinds(1)
     evidence = {"waiting": [66.0]}
 
@@ -167,6 +182,7 @@ def typical_wait(draws: int) -> Table:
     mean, _, log_p = old_faithful.typical_given(old_faithful.FIRST_LONG_WAITS)
     rows = (
         Row("closed form", (mean, log_p), EXACT),
+        infer(net, evidence, bmc.Exact(), ask),
         infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
     )
     question = "Old Faithful: the typical wait after a long eruption, from eight of them"

@@ -3,12 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import bayesmc as bmc
-from examples import data_faithful, demo, diagnosis, old_faithful
+from examples import (
+    central_limit,
+    data_faithful,
+    demo,
+    diagnosis,
+    expectation_and_marginal,
+    old_faithful,
+    parzen,
+    pushforward,
+    rejection_and_importance,
+)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +35,7 @@ def test_demo_prints_tables_and_writes_pictures(
     for figure in ("Monte Carlo error", "ESS", "seconds"):
         assert printed.count(figure) >= 6
     pictures = list((tmp_path / "out").iterdir())
-    assert len(pictures) == 4
+    assert len(pictures) == 4 + len(demo.FIGURES)
     for path in pictures:
         assert path.read_bytes().startswith(b"\x89PNG")
         assert str(path) in printed
@@ -49,10 +60,17 @@ def test_demo_engines_agree(tables: list[demo.Table]) -> None:
     assert checked == 8
 
 
-def test_demo_says_what_does_not_work(tables: list[demo.Table]) -> None:
-    refusals = [row.refusal for table in tables for row in table.rows if row.refusal]
-    assert len(refusals) == 1
-    assert "duration" in refusals[0]
+def test_demo_says_what_does_not_work(
+    tables: list[demo.Table], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert [row.engine for table in tables for row in table.rows if row.refusal] == []
+    squared = bmc.BayesNet()
+    squared.add("x", bmc.Normal(0.0, 1.0))
+    squared.add("y", lambda x: bmc.Normal(x**2, 1.0))
+    refused = demo.infer(squared, {"y": 1.0}, bmc.Exact(), lambda posterior: [])
+    demo.print_table(demo.Table("a square", ("x",), (refused,)))
+    assert "'x'" in refused.refusal
+    assert f"refuses: {refused.refusal}" in capsys.readouterr().out
     (warned,) = (table for table in tables if table.warned)
     assert min(row.ess for row in warned.rows if row.ess is not None) < 100
 
@@ -112,3 +130,83 @@ def test_closed_forms_hold_by_quadrature() -> None:
     sd = np.sqrt(mass @ (grid - mean) ** 2)
     log_p = np.log(joint.sum() * (grid[1] - grid[0]))
     assert old_faithful.typical_given(waits) == pytest.approx((mean, sd, log_p))
+
+
+@pytest.mark.parametrize("figure", demo.FIGURES, ids=lambda figure: figure.__name__.split(".")[1])
+def test_figures_run_by_themselves(
+    figure: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twice the same figures and the same picture."""
+    printed = []
+    for folder in ("one", "two"):
+        figure.main(["--fast", "--out", str(tmp_path / folder)])
+        printed.append(capsys.readouterr().out.replace(folder, ""))
+    assert printed[0] == printed[1]
+    first, second = (next((tmp_path / folder).iterdir()) for folder in ("one", "two"))
+    assert first.name == figure.__name__.split(".")[1] + ".png"
+    assert first.read_bytes() == second.read_bytes()
+
+
+def test_parzen_improves_with_samples_if_the_window_is_narrow() -> None:
+    found = parzen.approximations()
+    errors = {key: parzen.error(estimate) for key, estimate in found.items()}
+    assert errors[20, 0.15] > 2 * errors[200, 0.15] > 4 * errors[2000, 0.15]
+    assert errors[20, "silverman"] > errors[200, "silverman"] > errors[2000, "silverman"] > 0.1
+    assert errors[2000, 1.5] > 0.9 * errors[20, 1.5]  # more samples do not mend a wide window
+    assert parzen.error(parzen.TRUTH) == 0
+    assert np.trapezoid(parzen.TRUTH, parzen.GRID) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("terms", central_limit.TERMS)
+def test_sums_of_uniforms_follow_irwin_and_hall(terms: int) -> None:
+    """Kolmogorov-Smirnov at 1e-3; the Gaussian is told from up to four terms, as a control."""
+    z = np.sort(central_limit.scaled_sum(terms).sample(100_000, rng=5)["z"])
+    cdf = central_limit.exact(terms, z, terms)
+    ranks = np.arange(1, len(z) + 1) / len(z)
+    bound = 1.95 / np.sqrt(len(z))
+    assert np.abs(cdf - ranks).max() < bound
+    assert terms > 4 or np.abs(central_limit.GAUSSIAN.cdf(z) - ranks).max() > bound
+    grid = np.linspace(-3, 3, 2001)
+    slope = np.gradient(central_limit.exact(terms, grid, terms), grid)
+    off = np.abs(slope - central_limit.exact(terms, grid, terms - 1))
+    assert np.sort(off)[-5] < 1e-3  # but for the corners of the uniform and the triangle
+
+
+def test_bearing_has_the_density_of_the_change_of_variables() -> None:
+    """Kolmogorov-Smirnov at 1e-3; the linearised Gaussian fails it by far."""
+    angle = np.sort(pushforward.net.sample(100_000, rng=5)["bearing"])
+    ranks = np.arange(1, len(angle) + 1) / len(angle)
+    density = pushforward.exact_density(pushforward.GRID)
+    cdf = np.cumsum(density) * (pushforward.GRID[1] - pushforward.GRID[0])
+    assert cdf[-1] == pytest.approx(1.0, abs=1e-6)
+    bound = 1.95 / np.sqrt(len(angle))
+    middle = pushforward.GRID + 0.5 * (pushforward.GRID[1] - pushforward.GRID[0])
+    assert np.abs(np.interp(angle, middle, cdf) - ranks).max() < bound
+    assert np.abs(pushforward.LINEARISED.cdf(angle) - ranks).max() > 20 * bound
+
+
+def test_envelope_covers_the_target_and_its_moments_are_right() -> None:
+    z = np.linspace(-30.0, 30.0, 60_001)
+    density = np.exp(rejection_and_importance.target(z))
+    cover = rejection_and_importance.K * np.exp(rejection_and_importance.PROPOSAL.log_prob(z))
+    assert np.all(cover >= density) and (density / cover).max() > 0.95
+    integral = np.trapezoid(density, z)
+    assert pytest.approx(integral) == rejection_and_importance.INTEGRAL
+    mean = np.trapezoid(z * density, z) / integral
+    assert pytest.approx(mean) == rejection_and_importance.MEAN
+
+
+def test_mean_distance_lies_in_its_band() -> None:
+    """Within 4.5 standard errors of the sum on the grid (false alarms below 1e-5)."""
+    banana = expectation_and_marginal
+    assert np.trapezoid(banana.MARGINAL_Y, banana.Y) == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(
+        banana.MARGINAL_X, np.exp(bmc.Normal(0.0, 1.0).log_prob(banana.X)), atol=1e-8
+    )
+    samples = banana.net.sample(200_000, rng=6)
+    values = banana.distance(samples["x"], samples["y"])
+    mean, error = banana.running_mean(values)
+    assert abs(mean[-1] - banana.EXACT) < 4.5 * error[-1]
+    assert abs(mean[-1] + 0.02 - banana.EXACT) > 4.5 * error[-1]  # such a slip would show
+    assert mean[99] == pytest.approx(values[:100].mean())
+    assert error[99] == pytest.approx(values[:100].std(ddof=1) / 10)

@@ -1,35 +1,53 @@
-"""Reading and writing nets in the formats other programs speak.
+"""Reading and writing nets in the formats other programs speak, and taking over their nets.
 
-``read`` and ``write`` choose the format by the file's name; each format's text lives in a module of its
-own that knows no nets.
+``read`` and ``write`` choose the format by the file's name; each format's text lives in a room of its
+own that knows no nets. ``from_pgmpy``, ``from_pyagrum`` and ``to_networkx`` translate objects.
 """
 
 from __future__ import annotations
 
-import gzip
+from collections.abc import Callable, Iterable
 from os import PathLike
 from pathlib import Path
+from typing import Any, NamedTuple
 
-import numpy as np
+from bayesmc.errors import FileFormatError
+from bayesmc.io.adapters import from_pgmpy, from_pyagrum, to_networkx
+from bayesmc.io.bif import format_bif, parse_bif
+from bayesmc.io.content import read_bytes, read_text, write_bytes
+from bayesmc.io.record import TableNode
+from bayesmc.io.tables import records
+from bayesmc.io.xmlbif import format_xmlbif, parse_xmlbif
+from bayesmc.network import BayesNet
 
-from bayesmc.errors import FileFormatError, UnsupportedError
-from bayesmc.io.bif import BifNode, format_bif, parse_bif, read_text
-from bayesmc.network import BayesNet, Model
-from bayesmc.structure import tabulate
+__all__ = ["from_pgmpy", "from_pyagrum", "read", "to_networkx", "write"]
 
-__all__ = ["read", "write"]
+
+class _Format(NamedTuple):
+    """How a format is called, and its two directions between content and records."""
+
+    name: str
+    content: Callable[[str | PathLike[str]], Any]
+    parse: Callable[[Any, Any], list[TableNode]]
+    format: Callable[[Iterable[TableNode], str], str]
+
+
+_BIF = _Format("BIF", read_text, parse_bif, format_bif)
+_XMLBIF = _Format("XMLBIF", read_bytes, parse_xmlbif, format_xmlbif)
+_FORMATS = {".bif": _BIF, ".xmlbif": _XMLBIF, ".bifxml": _XMLBIF, ".xml": _XMLBIF}
 
 
 def read(path: str | PathLike[str]) -> BayesNet:
-    """A discrete net from a BIF file (``.bif``, or ``.bif.gz``).
+    """A discrete net from a BIF file (``.bif``) or an XMLBIF file (``.xmlbif``, ``.bifxml``, ``.xml``).
 
-    Node names, states and their order are the file's. Rows off by rounding (at most 1e-6) are
-    renormalised.
+    Either may be compressed (``.gz`` added to the name). Node names, states and their order are the
+    file's; states are strings. Rows off by rounding (at most 1e-6, or 5e-7 for each entry) are
+    renormalised. The net is named after the file.
 
     Raises
     ------
     FileFormatError
-        With file and line, where the text is not BIF or a row is no probability vector.
+        With file and line, where the text is not of the format or a row is no probability vector.
     OSError
         If the file cannot be opened.
 
@@ -39,64 +57,59 @@ def read(path: str | PathLike[str]) -> BayesNet:
     >>> import bayesmc as bmc
     >>> net = bmc.BayesNet("coin")
     >>> net.table("toss", probs=[0.5, 0.5], states=("heads", "tails"))
-    >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.bif"
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "coin.xmlbif"
     >>> bmc.io.write(net, path)
     >>> bmc.io.read(path)["toss"].states
     ('heads', 'tails')
     """
-    _check_suffix(path)
+    chosen = _format_of(path)
     net = BayesNet(Path(path).name.split(".")[0])
-    for node in parse_bif(read_text(path), path):
+    for node in chosen.parse(chosen.content(path), path):
         net.table(node.name, node.parents, node.probs, states=node.states)
     return net
 
 
 def write(net: BayesNet, path: str | PathLike[str]) -> None:
-    """Write a discrete net without plates as BIF; a name ending in ``.gz`` is compressed.
+    """Write a discrete net without plates in the format of the file's name, as ``read`` knows them.
 
-    Functions of discrete parents are written as the tables they make.
+    A name ending in ``.gz`` is compressed. Functions of discrete parents are written as the tables
+    they make, states that are numbers as their text.
 
     Raises
     ------
     UnsupportedError
-        The net has a node that BIF cannot hold: continuous, plated, an input, or with a potential.
+        The net has a node that the format cannot hold: continuous, plated, an input, or with a
+        potential.
+    ValueError
+        A name for which the format has no spelling.
+
+    Examples
+    --------
+    >>> import tempfile, pathlib
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet("rain")
+    >>> net.add("rain", bmc.Bernoulli(0.2), states=("no", "yes"))
+    >>> net.add("wet", lambda rain: bmc.Bernoulli(0.25 + 0.5 * (rain == "yes")))
+    >>> path = pathlib.Path(tempfile.mkdtemp()) / "rain.bif"
+    >>> bmc.io.write(net, path)
+    >>> print(path.read_text().partition("wet | ")[2])
+    rain ) {
+      (no) 0.75, 0.25;
+      (yes) 0.25, 0.75;
+    }
+    <BLANKLINE>
     """
-    _check_suffix(path)
-    model = net.model()
-    if model.potentials:
-        raise UnsupportedError(
-            f"write: BIF has no potentials, but the net has {list(model.potentials)}"
-        )
-    text = format_bif([_bif_node(model, name) for name in model.nodes], net.name or "unknown")
-    data = text.encode()
-    Path(path).write_bytes(gzip.compress(data, mtime=0) if str(path).endswith(".gz") else data)
+    chosen = _format_of(path)
+    text = chosen.format(records(net.model(), chosen.name), net.name or "unknown")
+    write_bytes(path, text.encode())
 
 
-def _bif_node(model: Model, name: str) -> BifNode:
-    node = model[name]
-    if node.domain is None or node.plates:
-        why = "is in a plate" if node.plates else f"is {node.kind} without a finite set of states"
-        raise UnsupportedError(f"write: BIF holds discrete nodes only, but {name!r} {why}")
-    states = tuple(str(s) for s in node.domain.states)
-    if node.kind == "fixed":
-        assert node.declaration.value is not None
-        return BifNode(name, states, (), np.eye(len(states))[int(node.declaration.value)])
-    if node.table is not None:
-        return BifNode(name, states, node.parents, np.eye(len(states))[node.table])
-    parents = tuple(dict.fromkeys(node.parents))
-    table = tabulate(model, node, {})
-    if table is None:
-        fixed = [p for p in parents if model[p].kind == "fixed"]
-        raise UnsupportedError(
-            f"write: {name!r} is no table of discrete parents"
-            + (f" (fixed: {fixed})" if fixed else "")
-        )
-    return BifNode(name, states, table.parents, table.probs)
-
-
-def _check_suffix(path: str | PathLike[str]) -> None:
-    name = str(path).removesuffix(".gz")
-    if not name.lower().endswith(".bif"):
-        raise FileFormatError(
-            "the name does not end in .bif or .bif.gz, the formats known here", path
-        )
+def _format_of(path: str | PathLike[str]) -> _Format:
+    name = str(path).lower().removesuffix(".gz")
+    for suffix, chosen in _FORMATS.items():
+        if name.endswith(suffix):
+            return chosen
+    known = ", ".join(_FORMATS)
+    raise FileFormatError(
+        f"the name ends in none of the formats known here: {known}, or one of these and .gz", path
+    )

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bayesmc.errors import FileFormatError
-from bayesmc.io.bif import BifNode, format_bif, parse_bif, read_text
+from bayesmc.io.bif import TableNode, format_bif, parse_bif, read_text
 
 NAMES = ["alarm", "asia", "cancer", "earthquake", "hepar2", "mildew", "munin1", "pigs", "sachs",
          "survey", "water"]  # fmt: skip
@@ -233,7 +233,7 @@ def bif_nodes(draw):
         parents = [node for node in nodes[:k] if draw(st.booleans())]
         shape = [len(p.states) for p in parents] + [len(states)]
         probs = rng.dirichlet(np.full(len(states), 0.3), size=shape[:-1])
-        nodes.append(BifNode(name, states, tuple(p.name for p in parents), probs))
+        nodes.append(TableNode(name, states, tuple(p.name for p in parents), probs))
     return nodes
 
 
@@ -249,7 +249,7 @@ def test_round_trip_keeps_properties():
 @pytest.mark.parametrize("name", ['a"b', "a\nb"])
 def test_names_without_a_spelling_are_refused(name):
     with pytest.raises(ValueError, match="no spelling for the name"):
-        format_bif([BifNode(name, ("a",), (), np.ones(1))])
+        format_bif([TableNode(name, ("a",), (), np.ones(1))])
 
 
 def test_read_text_takes_plain_and_gzipped_files(tmp_path):

@@ -8,33 +8,26 @@ repository and JavaBayes write it, comments and ``property`` lines included.
 
 from __future__ import annotations
 
-import gzip
 import math
 import re
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from os import PathLike
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.errors import FileFormatError
 from bayesmc.io.bif.cursor import NAME, Cursor, after_gap, word_offset
-from bayesmc.io.bif.record import BifNode
-
-ROW_TOLERANCE = 1e-6
-"""Rows whose sum differs from 1 by at most this are rounding, and are renormalised."""
+from bayesmc.io.record import TableNode
+from bayesmc.io.rows import first_improbable, renormalised, sum_fault
 
 
-def parse_bif(text: str, path: Any = None) -> list[BifNode]:
+def parse_bif(text: str, path: Any = None) -> list[TableNode]:
     """The variables of a BIF file, in the order in which the file declares them.
 
     Rows ``(states of the parents) numbers;`` may come in any order; ``default numbers;`` fills the
     rows not given. A ``table`` with parents lists its numbers with the child slowest and the last
-    parent fastest, as the format's definition does. Rows whose sum is off by at most 1e-6 are
-    renormalised.
+    parent fastest, as the format's definition does. Rows whose sum is off by rounding
+    (at most 1e-6, or 5e-7 for each entry) are renormalised.
 
     Parameters
     ----------
@@ -65,25 +58,6 @@ def parse_bif(text: str, path: Any = None) -> list[BifNode]:
     array([0.3, 0.7])
     """
     return _Reader(text, path).nodes()
-
-
-def read_text(path: str | PathLike[str]) -> str:
-    """The content of a text file, decompressed where its first bytes say gzip.
-
-    Raises
-    ------
-    FileFormatError
-        If the file is not UTF-8 text, or its gzip stream is damaged.
-    OSError
-        If it cannot be opened.
-    """
-    data = Path(path).read_bytes()
-    try:
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
-        return data.decode("utf-8-sig")
-    except (OSError, EOFError, ValueError, zlib.error) as error:
-        raise FileFormatError(f"not readable as (gzipped) UTF-8 text: {error}", path) from error
 
 
 # Possessive, as backtracking into an unclosed block would take exponential time.
@@ -129,7 +103,7 @@ class _Reader(Cursor):
         self.variables: dict[str, _Variable] = {}
         self.tables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
 
-    def nodes(self) -> list[BifNode]:
+    def nodes(self) -> list[TableNode]:
         blocks: list[int] = []  # probability blocks wait: they may precede their variables
         while (keyword := self.keyword("")) is not None:
             at = self.at
@@ -147,12 +121,12 @@ class _Reader(Cursor):
             self.read_probability(at)
         return [self.node(name, variable) for name, variable in self.variables.items()]
 
-    def node(self, name: str, variable: _Variable) -> BifNode:
+    def node(self, name: str, variable: _Variable) -> TableNode:
         if name not in self.tables:
             self.fail(f"variable {name!r} has no probability block; add one", variable.at)
         parents, probs = self.tables[name]
         probs.flags.writeable = False
-        return BifNode(name, variable.states, parents, probs, variable.properties)
+        return TableNode(name, variable.states, parents, probs, variable.properties)
 
     def skip_network(self, at: int) -> None:
         match = _NETWORK_HEAD.match(self.text, self.at)
@@ -237,8 +211,10 @@ class _Reader(Cursor):
             rows = self.completed(entries, child, parents, shape[:-1], at)
             table = np.array([row.numbers for row in rows])
             lines = [row.at for row in rows]
-        self.normalise(table, lines, child)
-        return table.reshape(shape)
+        normal, bad = renormalised(table)
+        if bad is not None:
+            self.fail(f"probability of {child!r}: {sum_fault(table[bad])}", lines[bad])
+        return normal.reshape(shape)
 
     def read_entries(self, child: str, parents: list[str], size: int, count: int) -> _Entries:
         """Everything up to the block's closing brace."""
@@ -318,27 +294,8 @@ class _Reader(Cursor):
         values = self.numbers(text, at, inside)
         if len(values) != count:
             self.fail(f"{inside}: expected {count} numbers, found {len(values)}")
-        # Written so that NaN fails; sums of allowed entries are judged in `normalise`.
-        if not (
-            min(values) >= 0.0 and max(values) <= 1.0 + ROW_TOLERANCE and sum(values) < math.inf
-        ):
-            words = text.replace(",", " ").split()
-            for k, value in enumerate(values):
-                if not 0.0 <= value <= 1.0 + ROW_TOLERANCE:
-                    where = at + word_offset(text, k)
-                    self.fail(f"{inside}: {words[k]} is not a probability", where)
+        bad = first_improbable(values)
+        if bad is not None:
+            word = text.replace(",", " ").split()[bad]
+            self.fail(f"{inside}: {word} is not a probability", at + word_offset(text, bad))
         return values
-
-    def normalise(self, table: np.ndarray, lines: list[int], child: str) -> None:
-        """Divide the rows that are off by rounding; refuse those that are off by more."""
-        sums = table.sum(axis=1)
-        off = np.abs(sums - 1.0)
-        worst = int(np.argmax(off))
-        if off[worst] > ROW_TOLERANCE * (1 + 1e-9):  # 0.999999 differs from 1 by 1.00000000003e-6
-            self.fail(
-                f"probability of {child!r}: a row sums to {sums[worst]:.9g}, not 1 (differences up "
-                f"to {ROW_TOLERANCE:g} are taken for rounding)",
-                lines[worst],
-            )
-        rounded = off > 1e-12  # dividing exact rows as well would change their last digit
-        table[rounded] /= sums[rounded, None]

@@ -8,10 +8,10 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 
 from bayesmc.io.bif.cursor import WORD
-from bayesmc.io.bif.record import BifNode
+from bayesmc.io.record import TableNode
 
 
-def format_bif(nodes: Iterable[BifNode], name: str = "unknown") -> str:
+def format_bif(nodes: Iterable[TableNode], name: str = "unknown") -> str:
     """The text of a BIF file; `parse_bif` of it gives equal names, states and tables.
 
     Names that would not read back as one word are quoted. Numbers are written with the digits
@@ -24,8 +24,8 @@ def format_bif(nodes: Iterable[BifNode], name: str = "unknown") -> str:
 
     Examples
     --------
-    >>> from bayesmc.io.bif import BifNode, format_bif
-    >>> print(format_bif([BifNode("coin", ("heads", "tails"), (), np.array([0.5, 0.5]))]))
+    >>> from bayesmc.io.bif import TableNode, format_bif
+    >>> print(format_bif([TableNode("coin", ("heads", "tails"), (), np.array([0.5, 0.5]))]))
     network unknown {
     }
     variable coin {
@@ -52,7 +52,7 @@ def format_bif(nodes: Iterable[BifNode], name: str = "unknown") -> str:
     return "\n".join(lines) + "\n"
 
 
-def _probability_block(node: BifNode, states: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+def _probability_block(node: TableNode, states: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
     if not node.parents:
         yield f"probability ( {_spell(node.name)} ) {{"
         yield f"  table {_row_text(node.probs)};"

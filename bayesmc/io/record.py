@@ -1,4 +1,4 @@
-"""One variable of a BIF file, as the reader gives it and the writer takes it."""
+"""One discrete variable as a file has it: what readers of all formats give and writers take."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 
 
 @dataclass(frozen=True, eq=False)
-class BifNode:
-    """One variable of a BIF file with its conditional probability table.
+class TableNode:
+    """One variable of a file with its conditional probability table.
 
     Attributes
     ----------
@@ -17,11 +17,11 @@ class BifNode:
     states : tuple of str
         In file order.
     parents : tuple of str
-        In the order of the ``probability`` block.
+        In the order in which the file conditions on them.
     probs : ndarray, shape (card(parent_1), ..., card(parent_n), card(name))
         Read-only; every row sums to 1.
     properties : tuple of str
-        The texts of the variable's ``property`` lines.
+        The texts of the variable's ``property`` lines or elements.
     """
 
     name: str
