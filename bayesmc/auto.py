@@ -139,7 +139,7 @@ def explain(
     >>> net.add("a", bmc.Bernoulli(0.2))
     >>> _ = bmc.explain(net)
     engine: Exact(max_bytes=2147483648.0)
-      because hidden nodes are finite or linear-Gaussian: induced width 0, largest table 2 entries, about ... bytes
+      because hidden nodes are finite or linear-Gaussian: induced width 0, ...bytes
       a  eliminated
     """
     problem = pose(net, evidence, inputs)

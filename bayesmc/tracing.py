@@ -114,11 +114,11 @@ class Tracer(NDArrayOperatorsMixin):
 
     @property
     def T(self) -> Any:  # noqa: N802
-        return np.transpose(self)  # type: ignore[arg-type]
+        return np.transpose(self)
 
     @property
     def mT(self) -> Any:  # noqa: N802
-        return np.matrix_transpose(self)  # type: ignore[arg-type]
+        return np.matrix_transpose(self)
 
     def __repr__(self) -> str:
         state = "affine" if self.is_affine else f"not affine after {self.reason}"
@@ -168,32 +168,32 @@ class Tracer(NDArrayOperatorsMixin):
 
     def transpose(self, *axes: Any) -> Any:
         order = axes[0] if len(axes) == 1 and not isinstance(axes[0], int) else axes or None
-        return np.transpose(self, order)  # type: ignore[arg-type]
+        return np.transpose(self, order)
 
     def reshape(self, *shape: Any) -> Any:
         wanted = shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape
-        return np.reshape(self, wanted)  # type: ignore[arg-type]
+        return np.reshape(self, wanted)
 
     def sum(self, *args: Any, **kwargs: Any) -> Any:
-        return np.sum(self, *args, **kwargs)  # type: ignore[call-overload]
+        return np.sum(self, *args, **kwargs)
 
     def mean(self, *args: Any, **kwargs: Any) -> Any:
-        return np.mean(self, *args, **kwargs)  # type: ignore[call-overload]
+        return np.mean(self, *args, **kwargs)
 
     def cumsum(self, *args: Any, **kwargs: Any) -> Any:
-        return np.cumsum(self, *args, **kwargs)  # type: ignore[call-overload]
+        return np.cumsum(self, *args, **kwargs)
 
     def dot(self, other: Any) -> Any:
-        return np.dot(self, other)  # type: ignore[arg-type]
+        return np.dot(self, other)
 
     def take(self, indices: Any, axis: int | None = None) -> Any:
-        return np.take(self, indices, axis=axis)  # type: ignore[call-overload]
+        return np.take(self, indices, axis=axis)
 
     def squeeze(self, axis: Any = None) -> Any:
-        return np.squeeze(self, axis=axis)  # type: ignore[call-overload]
+        return np.squeeze(self, axis=axis)
 
     def swapaxes(self, first: int, second: int) -> Any:
-        return np.swapaxes(self, first, second)  # type: ignore[type-var]
+        return np.swapaxes(self, first, second)
 
     def ravel(self) -> Any:
         return self.reshape(-1)

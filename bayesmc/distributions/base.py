@@ -57,7 +57,7 @@ class Distribution:
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """A new distribution; of traced parameters, a record of the call in its place."""
         if args and any(map(is_traced, args)) or kwargs and any(map(is_traced, kwargs.values())):
-            bound = _signature(cls).bind(*args, **kwargs)
+            bound = _signature(cls).bind(*args, **kwargs)  # type: ignore[arg-type]
             bound.apply_defaults()
             return TracedCall(cls, dict(bound.arguments))
         return super().__new__(cls)

@@ -6,7 +6,7 @@ Values of a node are put together from its elements: hidden ones from their mome
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ class GaussianAnswers:
 
     def __init__(self, model: Model, observed: Mapping[str, Observed], moments: Moments) -> None:
         self.model, self._moments = model, moments
-        self._nodes = {block[0] for block in moments.scopes}  # type: ignore[index]
+        self._nodes = {block[0] for block in moments.scopes}
         self._seen = {
             name: seen.value
             for name, seen in observed.items()
@@ -55,7 +55,7 @@ class GaussianAnswers:
         return np.reshape(np.array(parts), self.model[name].value_shape)
 
     def components(
-        self, names: Sequence[str], extra: Sequence[Hashable] = ()
+        self, names: Sequence[str], extra: Sequence[Any] = ()
     ) -> tuple[Components, dict[str, list[int]]]:
         """The joint mixture of all hidden elements of some nodes, and each node's columns (-1: observed)."""
         blocks: list[Variable] = []
@@ -112,7 +112,7 @@ class GaussianAnswers:
         return Mixture(weights, MvNormal(means.reshape(shape), covs.reshape((*shape, d))))
 
     def draw(
-        self, rng: np.random.Generator, codes: Mapping[Variable, np.ndarray], draws: int
+        self, rng: np.random.Generator, codes: Mapping[Any, np.ndarray], draws: int
     ) -> dict[str, np.ndarray]:
         """Draws of the hidden nodes given draws of the finite ones, ``(draws, *plates, *event)``."""
         blocks = self._moments.sample(rng, codes, draws)

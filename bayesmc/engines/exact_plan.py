@@ -108,16 +108,22 @@ class HybridPlan:
         self.part: LinearGaussian = linear_gaussian(model, observed, inputs)
         self.net: DiscreteNet = discrete_net(model, observed, inputs, self.part.nodes)
         self.barren, self.informed = _split(self.part)
-        dims, cards = self.part.dims, self.net.cards
+        dims = self.part.dims
         shapes = [(f.scope, f.blocks, f.rows.shape[-2]) for f in self.part.likelihoods]
         shapes += [(c.scope, (c.block, *c.parents), dims[c.block]) for c in self.informed]
         blocks = {c.block: dims[c.block] for c in self.informed}
-        self.strong: StrongPlan = strong_plan(blocks, cards, shapes)
-        links = {s.block: (s.scope, s.parents) for s in self.strong.steps}
+        key = (tuple(shapes), tuple(s for s, _ in self.part.tables), frozenset(self.part.nodes))
+        kept = model.cache.setdefault("exact hybrid plans", {})
+        if key not in kept:
+            if len(kept) > 8:
+                kept.clear()
+            kept[key] = self._planned(blocks, shapes)
+        self.strong: StrongPlan
+        self.tree: CliqueTree
+        self.strong, self.tree = kept[key]
+        links: dict[Any, Any] = {s.block: (s.scope, s.parents) for s in self.strong.steps}
         links.update({c.block: (c.scope, c.parents) for c in self.barren})
         self.mixtures = mixture_scopes(links)
-        scopes = [*self.net.scopes, *(s for s, _ in self.part.tables), *self.strong.table_scopes]
-        self.tree = CliqueTree(cards, scopes)
         self.cost = self._cost()
 
     def solve(self, problem: Problem, states: Mapping[Variable, int]) -> Solved:
@@ -140,6 +146,13 @@ class HybridPlan:
         moments = Moments(read_off, dims, cards, calibrated.joint)
         return Solved(self.net, calibrated, moments, self.net.invalid + invalid + self.part.invalid)
 
+    def _planned(self, blocks: Any, shapes: Any) -> tuple[StrongPlan, CliqueTree]:
+        """How to integrate blocks out, and the clique tree of what that leaves."""
+        cards = self.net.cards
+        strong = strong_plan(blocks, cards, shapes)
+        scopes = [*self.net.scopes, *(s for s, _ in self.part.tables), *strong.table_scopes]
+        return strong, CliqueTree(cards, scopes)
+
     def _cost(self) -> Cost:
         cards = self.net.cards
         dims = self.part.dims
@@ -148,14 +161,15 @@ class HybridPlan:
             f"induced width {self.tree.cost.induced_width}, "
             f"largest table {self.tree.cost.largest_entries:.3g} entries"
         )
-        widest, most = None, 1.0
+        widest: Variable | None = None
+        most = 1.0
         for block, scope in self.mixtures.items():
-            count = math.prod(float(cards[v]) for v in scope)  # type: ignore[index]
+            count = math.prod([float(cards[v]) for v in scope])
             if count > most:
                 widest, most = block, count
         if widest is not None:
-            size += 32.0 * most * (1 + dims[widest] ** 2)  # type: ignore[index]
-            name, element = widest  # type: ignore[misc]
+            size += 32.0 * most * (1 + dims[widest] ** 2)
+            name, element = widest
             where = f"[{element}]" if self._count(name) > 1 else ""
             switches = len(self.mixtures[widest])
             words += (
@@ -214,7 +228,7 @@ def _split(part: LinearGaussian) -> tuple[list[Conditional], list[Conditional]]:
     of = {c.block: c for c in part.conditionals}
     todo = list(needed)
     while todo:
-        for parent in of[todo.pop()].parents:  # type: ignore[index]
+        for parent in of[todo.pop()].parents:
             if parent not in needed:
                 needed.add(parent)
                 todo.append(parent)

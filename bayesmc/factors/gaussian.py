@@ -13,7 +13,7 @@ square-root information: Bierman (1977), Factorization Methods for Discrete Sequ
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,8 +37,8 @@ class GaussianFactor:
     log_scale : ndarray, shape (*cards,)
     """
 
-    scope: tuple[Hashable, ...]
-    blocks: tuple[Hashable, ...]
+    scope: tuple[Any, ...]
+    blocks: tuple[Any, ...]
     rows: np.ndarray
     log_scale: np.ndarray
 
@@ -60,9 +60,9 @@ class Conditional:
         A square root of the conditional covariance (``root @ root'``).
     """
 
-    block: Hashable
-    scope: tuple[Hashable, ...]
-    parents: tuple[Hashable, ...]
+    block: Any
+    scope: tuple[Any, ...]
+    parents: tuple[Any, ...]
     offset: np.ndarray
     gain: np.ndarray
     root: np.ndarray
@@ -110,7 +110,7 @@ def compressed(rows: np.ndarray, log_scale: np.ndarray) -> tuple[np.ndarray, np.
     """The same factor in at most n rows; what does not depend on x moves to the log scale."""
     columns = rows.shape[-1]
     if rows.shape[-2] >= columns:
-        rows = np.linalg.qr(rows, mode="r")
+        rows = np.asarray(np.linalg.qr(rows, mode="r"))
     if rows.shape[-2] == columns:
         log_scale = log_scale - 0.5 * rows[..., -1, -1] ** 2
         rows = rows[..., :-1, :]
@@ -119,7 +119,7 @@ def compressed(rows: np.ndarray, log_scale: np.ndarray) -> tuple[np.ndarray, np.
 
 def eliminate(
     factors: Sequence[GaussianFactor],
-    block: Hashable,
+    block: Any,
     dims: Mapping[Any, int],
     cards: Mapping[Any, int],
 ) -> tuple[Conditional, GaussianFactor]:
@@ -146,7 +146,7 @@ def eliminate(
     # large rows first: otherwise rounding of theirs would swamp small ones (Powell and Reid 1969)
     order = np.argsort(-np.abs(rows[..., :-1]).max(axis=-1), axis=-1)
     rows = np.take_along_axis(rows, order[..., None], axis=-2)
-    upper = np.linalg.qr(rows, mode="r")
+    upper = np.asarray(np.linalg.qr(rows, mode="r"))
     own = upper[..., :d, :d]
     pivots = np.linalg.diagonal(own)
     log_scale = log_scale + 0.5 * d * _LOG_2PI - np.log(np.abs(pivots)).sum(axis=-1)
@@ -165,8 +165,8 @@ def eliminate(
 
 
 def union_of(
-    factors: Sequence[GaussianFactor], block: Hashable
-) -> tuple[tuple[Hashable, ...], tuple[Hashable, ...]]:
+    factors: Sequence[GaussianFactor], block: Any
+) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
     """Discrete scope and blocks of a product, ``block`` first."""
     scope = tuple(dict.fromkeys(v for f in factors for v in f.scope))
     return scope, tuple(dict.fromkeys([block, *(b for f in factors for b in f.blocks)]))
@@ -177,8 +177,8 @@ def union_of(
 
 def _product(
     factors: Sequence[GaussianFactor],
-    scope: tuple[Hashable, ...],
-    blocks: tuple[Hashable, ...],
+    scope: tuple[Any, ...],
+    blocks: tuple[Any, ...],
     dims: Mapping[Any, int],
     cards: Mapping[Any, int],
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -201,8 +201,10 @@ def _product(
     return rows, log_scale
 
 
-def along(array: np.ndarray, scope: Sequence[Hashable], wanted: Sequence[Hashable]) -> np.ndarray:
+def along(array: np.ndarray, scope: Sequence[Any], wanted: Sequence[Any]) -> np.ndarray:
     """An array whose leading axes follow ``scope``, with those of ``wanted`` instead (size 1 where new)."""
+    if scope == wanted:
+        return array
     order = sorted(range(len(scope)), key=lambda k: wanted.index(scope[k]))
     moved = array.transpose([*order, *range(len(scope), array.ndim)])
     held = set(scope)

@@ -7,7 +7,7 @@ Gaussian for every configuration of the discrete variables that switch it or any
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from .gaussian import Conditional
 
-Scope = tuple[Hashable, ...]
+Scope = tuple[Any, ...]
 #: configurations worked on at a time
 _CHUNK = 1 << 14
 
@@ -34,7 +34,7 @@ class Components:
     cov : ndarray, shape (components, n, n)
     """
 
-    states: dict[Hashable, np.ndarray]
+    states: dict[Any, np.ndarray]
     weights: np.ndarray
     mean: np.ndarray
     cov: np.ndarray
@@ -70,9 +70,9 @@ class Moments:
         self._dims, self._cards, self._joint = dims, cards, joint
         self.scopes = mixture_scopes({c.block: (c.scope, c.parents) for c in conditionals})
         self._order = {b: k for k, b in enumerate(self.scopes)}
-        self._collapsed: dict[Hashable, tuple[np.ndarray, np.ndarray]] = {}
+        self._collapsed: dict[Any, tuple[np.ndarray, np.ndarray]] = {}
 
-    def moments(self, block: Hashable) -> tuple[np.ndarray, np.ndarray]:
+    def moments(self, block: Any) -> tuple[np.ndarray, np.ndarray]:
         """Mean ``(d,)`` and covariance ``(d, d)`` of one block; all that share its scope come along."""
         if block not in self._collapsed:
             scope = self.scopes[block]
@@ -80,7 +80,7 @@ class Moments:
             self._collapsed.update(self._collapse(group, tuple(scope)))
         return self._collapsed[block]
 
-    def components(self, blocks: Sequence[Hashable], extra: Sequence[Hashable] = ()) -> Components:
+    def components(self, blocks: Sequence[Any], extra: Sequence[Any] = ()) -> Components:
         """The mixture of some blocks jointly, split by further discrete variables, too.
 
         Configurations of probability zero are left out.
@@ -103,9 +103,9 @@ class Moments:
 
     def sample(
         self, rng: np.random.Generator, codes: Mapping[Any, np.ndarray], draws: int
-    ) -> dict[Hashable, np.ndarray]:
+    ) -> dict[Any, np.ndarray]:
         """Draws of every block, shape ``(draws, d)``, given draws of the discrete variables."""
-        drawn: dict[Hashable, np.ndarray] = {}
+        drawn: dict[Any, np.ndarray] = {}
         for block in self.scopes:
             given = self._of[block]
             at = _rows(given.scope, self._cards, codes, draws)
@@ -118,11 +118,11 @@ class Moments:
         return drawn
 
     def _collapse(
-        self, group: Sequence[Hashable], scope: Scope
-    ) -> dict[Hashable, tuple[np.ndarray, np.ndarray]]:
+        self, group: Sequence[Any], scope: Scope
+    ) -> dict[Any, tuple[np.ndarray, np.ndarray]]:
         """Moments of the whole mixture, for every block of a group with one scope."""
         states, weights = self._configurations(scope)
-        sums: dict[Hashable, tuple[float, np.ndarray, np.ndarray]] = {}
+        sums: dict[Any, tuple[float, np.ndarray, np.ndarray]] = {}
         for rows in _chunks(len(weights)):
             here = {v: s[rows] for v, s in states.items()}
             w = weights[rows]
@@ -133,7 +133,7 @@ class Moments:
                 sums[block] = _merged(sums.get(block), (float(w.sum()), *part))
         return {block: sums[block][1:] for block in group}
 
-    def _configurations(self, scope: Scope) -> tuple[dict[Hashable, np.ndarray], np.ndarray]:
+    def _configurations(self, scope: Scope) -> tuple[dict[Any, np.ndarray], np.ndarray]:
         """The possible configurations of a scope, and their probabilities."""
         if not scope:
             return {}, np.ones(1)
@@ -142,9 +142,9 @@ class Moments:
         weights = table[at]
         return dict(zip(scope, at, strict=True)), weights / weights.sum()
 
-    def _visits(self, blocks: Sequence[Hashable]) -> list[Hashable]:
+    def _visits(self, blocks: Sequence[Any]) -> list[Any]:
         """The blocks and all above them, parents first, each as soon as its parents are there."""
-        needed: set[Hashable] = set()
+        needed: set[Any] = set()
         todo = list(blocks)
         while todo:
             b = todo.pop()
@@ -152,7 +152,7 @@ class Moments:
                 needed.add(b)
                 todo += self._of[b].parents
         pending = {b: len(self._of[b].parents) for b in needed}
-        below: dict[Hashable, list[Hashable]] = {b: [] for b in needed}
+        below: dict[Any, list[Any]] = {b: [] for b in needed}
         for b in sorted(needed, key=self._order.__getitem__):
             for p in self._of[b].parents:
                 below[p].append(b)
@@ -168,7 +168,7 @@ class Moments:
         return order
 
     def _descend(
-        self, blocks: Sequence[Hashable], codes: Mapping[Any, np.ndarray], keep: Sequence[Hashable]
+        self, blocks: Sequence[Any], codes: Mapping[Any, np.ndarray], keep: Sequence[Any]
     ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """Mean and covariance of each visited block in turn; last of all, jointly of those to ``keep``.
 
@@ -178,7 +178,7 @@ class Moments:
         last = {p: k for k, b in enumerate(order) for p in self._of[b].parents}
         last.update(dict.fromkeys(keep, len(order)))
         count = len(next(iter(codes.values()))) if codes else 1
-        live: list[Hashable] = []
+        live: list[Any] = []
         mean, cov = np.zeros((count, 0)), np.zeros((count, 0, 0))
         for k, block in enumerate(order):
             given = self._of[block]
@@ -214,7 +214,7 @@ class Moments:
         columns = self._columns(live, keep)
         yield mean[:, columns], cov[:, columns][:, :, columns]
 
-    def _columns(self, live: Sequence[Hashable], wanted: Sequence[Hashable]) -> list[int]:
+    def _columns(self, live: Sequence[Any], wanted: Sequence[Any]) -> list[int]:
         start, first = {}, 0
         for b in live:
             start[b] = first
@@ -223,13 +223,13 @@ class Moments:
 
 
 def mixture_scopes(
-    blocks: Mapping[Any, tuple[Scope, Sequence[Hashable]]],
-) -> dict[Hashable, frozenset[Hashable]]:
+    blocks: Mapping[Any, tuple[Scope, Sequence[Any]]],
+) -> dict[Any, frozenset[Any]]:
     """For every block the discrete variables that its mixture runs over, parents before children.
 
     ``blocks`` maps each block to its own discrete scope and its parent blocks.
     """
-    scopes: dict[Hashable, frozenset[Hashable]] = {}
+    scopes: dict[Any, frozenset[Any]] = {}
     todo = list(blocks)
     while todo:
         block = todo[-1]

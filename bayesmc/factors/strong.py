@@ -13,7 +13,7 @@ distributions; strong triangulation: Leimer (1989).
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy as np
 from .elimination import elimination_order
 from .gaussian import Conditional, GaussianFactor, eliminate
 
-Scope = tuple[Hashable, ...]
+Scope = tuple[Any, ...]
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Step:
         Memory of the product.
     """
 
-    block: Hashable
+    block: Any
     sources: tuple[int, ...]
     scope: Scope
-    parents: tuple[Hashable, ...]
+    parents: tuple[Any, ...]
     bytes: float
 
 
@@ -97,7 +97,7 @@ def strong_plan(
     sizes = [2 ** min(dims[b], 1000) for b in names]
     order = elimination_order(sizes, graph, "min-fill").order if names else ()
     live: dict[int, tuple[Scope, Scope, int]] = dict(enumerate(factors))
-    holding: dict[Hashable, set[int]] = {b: set() for b in names}
+    holding: dict[Any, set[int]] = {b: set() for b in names}
     for k, (_, blocks, _) in live.items():
         for b in blocks:
             holding[b].add(k)

@@ -128,6 +128,6 @@ class Marginal:
 
 def gaussian_marginal(name: str, mixture: Mixture) -> Marginal:
     """The marginal of a continuous node that is a mixture of Gaussians."""
-    means = np.asarray(mixture.components.mean)  # type: ignore[union-attr]
+    means = np.asarray(mixture.components.mean)
     axis = len(mixture.batch_shape)
     return Marginal(name, np.moveaxis(means, axis, 0), mixture.weights, distribution=mixture)

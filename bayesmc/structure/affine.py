@@ -63,24 +63,11 @@ def why_not_linear(
     Discrete nodes must not depend on hidden continuous ones; hidden continuous nodes and whatever observed
     depends on them must be Normal or MvNormal, with a mean affine in them and a scale free of them.
     """
-    found = carried(model, observed)
-    values = _traced_values(model, observed, inputs)
-    for name, node in model.nodes.items():
-        above = reaching(node.parents, found)
-        why = None
-        if node.kind == "deterministic":
-            why = _pass_on(model, node, above, values)
-        elif node.is_stochastic and (node.is_discrete or node.domain is not None):
-            why = _why_not_discrete_child(node, above, name in observed)
-        elif is_hidden(node, observed) or (node.is_stochastic and above):
-            why = _why_not_gaussian(model, node, above, values)
-        if why is not None:
-            return f"node {name!r} {why}"
-    for name, (potential, _) in model.potentials.items():
-        above = reaching(potential.parents, found)
-        if above:
-            return f"potential {name!r} depends on the continuous {_nodes(above)}"
-    return None
+    kept = model.cache.setdefault("why not linear", {})
+    pattern = frozenset((name, seen.mask is None) for name, seen in observed.items())
+    if pattern not in kept:  # what tracing proves holds for all values
+        kept[pattern] = _find_reason(model, observed, inputs)
+    return kept[pattern]
 
 
 def affine_nodes(
@@ -99,6 +86,29 @@ def affine_nodes(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _find_reason(
+    model: Model, observed: Mapping[str, Observed], inputs: Mapping[str, np.ndarray]
+) -> str | None:
+    found = carried(model, observed)
+    values = _traced_values(model, observed, inputs)
+    for name, node in model.nodes.items():
+        above = reaching(node.parents, found)
+        why = None
+        if node.kind == "deterministic":
+            why = _pass_on(model, node, above, values)
+        elif node.is_stochastic and (node.is_discrete or node.domain is not None):
+            why = _why_not_discrete_child(node, above, name in observed)
+        elif is_hidden(node, observed) or (node.is_stochastic and above):
+            why = _why_not_gaussian(model, node, above, values)
+        if why is not None:
+            return f"node {name!r} {why}"
+    for name, (potential, _) in model.potentials.items():
+        above = reaching(potential.parents, found)
+        if above:
+            return f"potential {name!r} depends on the continuous {_nodes(above)}"
+    return None
 
 
 def _traced_values(
@@ -156,8 +166,10 @@ def _why_not_gaussian(
         dist = result if isinstance(result, TracedCall) else as_distribution(result)
     except Exception as error:
         return f"cannot be traced through its dependence on {_nodes(above)} ({error})"
+    family: Any
+    traced: dict[str, Any] = {}
     if isinstance(dist, Distribution):
-        family, traced = type(dist), {}
+        family = type(dist)
     elif isinstance(dist, TracedCall):
         family, traced = dist.function, dist.traced
     else:

@@ -1,34 +1,25 @@
 """The continuous part of a hybrid net as linear-Gaussian conditionals, one per plate element.
 
-That a mean is affine is proved elsewhere (``affine``); the coefficients come from the user's own function,
-called at a base point, one unit away from it along every direction, and at two more points that must agree.
+Readings of functions outlive the question: they are taken again only where what a function sees has changed.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import MvNormal, Normal
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.errors import BudgetError
 from bayesmc.factors import LogTable
-from bayesmc.factors.gaussian import Conditional, GaussianFactor, compressed, likelihood_rows
-from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.shapes import Shape
-from bayesmc.structure.affine import affine_nodes, gaussian_nodes, is_hidden
+from bayesmc.factors.gaussian import Conditional, GaussianFactor
+from bayesmc.network import Model, Observed
+from bayesmc.structure.affine import affine_nodes, gaussian_nodes
 from bayesmc.structure.discrete import InvalidRows, Variable, known_values
-from bayesmc.structure.tables import configure, constants_of
-
-#: entries up to which a function is evaluated on all configurations, directions and elements
-_ENTRIES = 1 << 26
-#: relative error of a prediction from the coefficients that rounding may explain
-_TOLERANCE = 1e-8
-_CHECKS = 2
+from bayesmc.structure.reading import Reading, hidden_elements
+from bayesmc.structure.tables import constants_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +67,7 @@ def linear_gaussian(
     dims = {
         (name, e): math.prod(model[name].event_shape)
         for name in names
-        for e in _hidden_elements(model[name], observed.get(name))
+        for e in hidden_elements(model[name], observed.get(name))
     }
     part = LinearGaussian(frozenset(names), dims)
     known = known_values(model, constants_of(model, inputs), observed)
@@ -89,335 +80,81 @@ def linear_gaussian(
         else:
             at = np.flatnonzero(seen.mask)
             states.update({(name, int(e)): int(seen.value.flat[e]) for e in at})
+    read = _Reader(model, observed, known)
     for name in names:
-        _Reading(model, name, observed, known, states).add_to(part)
+        _add(part, read(name), observed.get(name), states)
     for name in affine_nodes(model, observed, inputs):
         try:
-            computed = _Reading(model, name, observed, known, states)
+            reading = read(name)
         except BudgetError:
             continue  # nothing depends on reading it: it is what a question may ask for
-        part.computed.extend(computed.conditionals())
+        part.computed.extend(reading.conditional(e, states) for e in range(reading.count))
     return part
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _hidden_elements(node: CompiledNode, seen: Observed | None) -> list[int]:
-    count = math.prod(node.plate_shape)
-    if seen is None:
-        return list(range(count))
-    return [] if seen.mask is None else np.flatnonzero(~seen.mask).tolist()
-
-
-@dataclass(frozen=True)
-class _Parent:
-    """A node that a function varies with; ``whole``: with all its elements at once."""
-
-    name: str
-    whole: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Column:
-    """One direction in which hidden parents are moved: a component of one element, or of every own one."""
-
-    parent: str
-    element: int | None
-    component: int
-    step: float
-
-
-class _Reading:
-    """One node's function read off: offsets, coefficients and scales of all its elements."""
+class _Reader:
+    """Readings, kept with the model."""
 
     def __init__(
-        self,
-        model: Model,
-        name: str,
-        observed: Mapping[str, Observed],
-        known: Mapping[str, np.ndarray],
-        states: Mapping[Variable, int],
+        self, model: Model, observed: Mapping[str, Observed], known: Mapping[str, np.ndarray]
     ) -> None:
-        self.model, self.node, self.known, self.states = model, model[name], known, states
-        self.observed = observed
-        self.count = math.prod(self.node.plate_shape)
-        self.d = math.prod(self.node.event_shape)
-        self.finite, self.hidden = self._parents()
-        #: for every element of this node the parent's element that it reads
-        self.places = {p.name: self._projected(p.name) for p in (*self.finite, *self.hidden)}
-        self.columns = list(self._directions())
-        self.alone = [p.name for p in self.finite if not p.whole]
-        self.whole = [p.name for p in self.finite if p.whole]
-        self.cards = [self._card(n) for n in self.alone]
-        for n in self.whole:
-            self.cards += [self._card(n)] * math.prod(model[n].plate_shape)
-        self._check_size()
-        self._evaluate()
+        self.model, self.observed, self.known = model, observed, known
+        self.kept: dict[Any, Reading] = model.cache.setdefault("linear readings", {})
+        if len(self.kept) > 2 * len(model.nodes) + 64:
+            self.kept.clear()
 
-    def add_to(self, part: LinearGaussian) -> None:
-        """Append what this node says to the net's linear-Gaussian part."""
-        if not self.count:
-            return
-        seen = self.observed.get(self.node.name)
-        hidden = _hidden_elements(self.node, seen)
-        for e in np.flatnonzero(self.invalid.reshape(math.prod(self.cards), self.count).any(axis=0)).tolist():
-            scope = self._scope(e)
-            part.invalid.append((self.node.name, e, scope, self.invalid[..., e]))
-        part.conditionals.extend(self._conditional(e) for e in hidden)
-        rest = np.delete(np.arange(self.count), hidden)
-        if len(rest):
-            assert seen is not None
-            values = seen.value.reshape(self.count, self.d)
-            for group in self._alike(rest):
-                self._add_likelihood(part, group, values)
+    def __call__(self, name: str) -> Reading:
+        key = (name, tuple(self._seen(p) for p in self._boundary(name)))
+        if key not in self.kept:
+            self.kept[key] = Reading(self.model, name, self.observed, self.known)
+        return self.kept[key]
 
-    def conditionals(self) -> list[Conditional]:
-        """Every element given what it depends on."""
-        return [self._conditional(e) for e in range(self.count)]
-
-    # ---- what the function depends on --------------------------------------------------------
-
-    def _parents(self) -> tuple[list[_Parent], list[_Parent]]:
-        """The finite and the hidden continuous nodes that it varies with."""
-        finite: dict[str, bool] = {}
-        hidden: dict[str, bool] = {}
-
-        def visit(above: Sequence[str], own: tuple[str, ...], whole: bool) -> None:
-            for parent in above:
-                node = self.model[parent]
-                if parent in self.known or node.kind in ("input", "fixed"):
-                    continue
-                foreign = whole or any(p not in own for p in node.plates)
-                if node.domain is None and not node.is_stochastic:
-                    visit(node.parents, node.plates, foreign)
-                else:
-                    found = hidden if is_hidden(node, self.observed) else finite
-                    found[parent] = found.get(parent, False) or foreign
-
-        visit(self.node.parents, self.node.plates, False)
-        own = set(self.node.plates)
-        pairs = [
-            [_Parent(n, w or not set(self.model[n].plates) <= own) for n, w in found.items()]
-            for found in (finite, hidden)
-        ]
-        return pairs[0], pairs[1]
-
-    def _directions(self) -> Iterator[_Column]:
-        for parent in self.hidden:
-            node = self.model[parent.name]
-            steps = _typical(self.model.probe[parent.name], math.prod(node.event_shape))
-            elements: Sequence[int | None] = [None]
-            if parent.whole:
-                elements = _hidden_elements(node, self.observed.get(parent.name))
-            for e in elements:
-                for component, step in enumerate(steps):
-                    yield _Column(parent.name, e, component, step)
-
-    def _check_size(self) -> None:
-        points = 1 + len(self.columns) + _CHECKS
-        entries = float(math.prod(self.cards)) * points * self.count * self.d**2
-        if entries > _ENTRIES:
-            raise BudgetError(
-                f"node {self.node.name!r} depends on {len(self.cards)} discrete variables and "
-                f"{len(self.columns)} continuous components: {entries:.3g} entries to evaluate, above "
-                f"{_ENTRIES:.3g}",
-                int(min(8 * entries, 2**62)),
-            )
-
-    # ---- what it returns ---------------------------------------------------------------------
-
-    def _evaluate(self) -> None:
-        """Offsets, coefficients, Cholesky factors and bad configurations, element axis last but one."""
-        points, moved = self._points()
-        shape = (*self.cards, 1 + len(self.columns) + _CHECKS, *self.node.plate_shape)
-        with marking_invalid(), np.errstate(all="ignore"):
-            names = self.node.parents
-            values, _ = configure(self.model, self.known, self.alone, self.whole, names, points)
-            result, _ = self.model.evaluate(self.node.name, values)
-        axis = len(self.cards)
-        mean, tril, invalid = _parameters(result, shape, self.d)
-        loc = np.broadcast_to(mean, shape + self.node.event_shape)
-        loc = loc.reshape((*shape[: axis + 1], self.count, self.d))
-        first = (slice(None),) * axis + (0,)
-        self.tril = tril[first].reshape((*self.cards, self.count, self.d, self.d))
-        self.invalid = invalid.any(axis=axis).reshape((*self.cards, self.count))
-        self.offset = loc[first]
-        loc = np.moveaxis(loc, axis, -1)  # (*cards, elements, d, points)
-        steps = np.array([c.step for c in self.columns])
-        n = len(steps)
-        self.matrix = (loc[..., 1 : n + 1] - loc[..., :1]) / steps
-        self._check_affine(loc[..., n + 1 :], moved)
-        #: whether an element's mean varies along a column at all, shape (columns, elements)
-        moves = (self.matrix != 0).any(axis=-2)
-        self.used = moves.reshape(math.prod(self.cards), self.count, n).any(axis=0).T
-
-    def _points(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Values of the hidden parents at every point, and how far the last points moved each column."""
-        count = 1 + len(self.columns) + _CHECKS
-        points = {}
-        for parent in self.hidden:
-            node = self.model[parent.name]
-            seen = self.observed.get(parent.name)
-            base = np.zeros((math.prod(node.plate_shape), math.prod(node.event_shape)))
-            if seen is not None and seen.mask is not None:
-                known = seen.value.reshape(base.shape)
-                base = np.where(seen.mask.reshape(-1, 1), known, base)
-            points[parent.name] = np.repeat(base[None], count, axis=0)
-        moved = np.zeros((_CHECKS, len(self.columns), self.count))
-        for k, column in enumerate(self.columns):
-            node = self.model[column.parent]
-            free = _hidden_elements(node, self.observed.get(column.parent))
-            chosen = free if column.element is None else [column.element]
-            value = points[column.parent]
-            value[1 + k, chosen, column.component] += column.step
-            # unlike each other, and short in binary, so that what cancels does so without rounding
-            turns = np.round(256 * np.sin(1.0 + k + np.arange(_CHECKS * len(value[0])))) / 128
-            shifts = column.step * turns.reshape(_CHECKS, -1)
-            value[-_CHECKS:, chosen, column.component] += shifts[:, chosen]
-            kept = np.zeros_like(shifts)
-            kept[:, chosen] = shifts[:, chosen]
-            at = self.places[column.parent] if column.element is None else column.element
-            moved[:, k] = kept[:, at] if column.element is None else kept[:, at, None]
-        shaped = {n: v.reshape((count, *self.model[n].value_shape)) for n, v in points.items()}
-        return shaped, moved
-
-    def _check_affine(self, found: np.ndarray, moved: np.ndarray) -> None:
-        """What the function gives at further points must be what its coefficients say."""
-        spread = np.sqrt((self.tril**2).sum(axis=-1))  # what is far below the noise does not count
-        step = max((c.step for c in self.columns), default=0.0)
-        for check in range(_CHECKS):
-            expected = self.offset + np.matvec(self.matrix, moved[check].T)
-            size = np.abs(self.offset) + np.matvec(np.abs(self.matrix), np.abs(moved[check].T))
-            allowed = _TOLERANCE * (size + spread) + 1e-12 * step
-            wrong = np.abs(found[..., check] - expected) > allowed
-            if (wrong & ~self.invalid[..., None]).any():
-                raise UnsupportedError(
-                    f"node {self.node.name!r} has a mean that is not affine in "
-                    f"{', '.join(repr(p.name) for p in self.hidden)}"
-                )
-
-    # ---- one element, or elements that are alike -----------------------------------------------
-
-    def _conditional(self, e: int) -> Conditional:
-        blocks, columns = self._blocks(e)
-        scope, arrays = self._reduced(
-            self._scope(e),
-            [
-                self.offset[..., e, :],
-                self.matrix[..., e, :, :][..., columns],
-                self.tril[..., e, :, :],
-            ],
-        )
-        return Conditional((self.node.name, e), scope, blocks, *arrays)
-
-    def _add_likelihood(self, part: LinearGaussian, group: np.ndarray, values: np.ndarray) -> None:
-        e = int(group[0])
-        blocks, columns = self._blocks(e)
-        rows, log_scale = likelihood_rows(
-            self.matrix[..., group, :, :][..., columns],
-            values[group] - self.offset[..., group, :],
-            self.tril[..., group, :, :],
-        )
-        lead = rows.shape[: len(self.cards)]
-        rows = rows.reshape((*lead, -1, rows.shape[-1]))
-        log_scale = log_scale.sum(axis=-1)
-        if not blocks:
-            table = log_scale - 0.5 * (rows[..., 0] ** 2).sum(axis=-1)
-            scope, arrays = self._reduced(self._scope(e), [table])
-            part.tables.append((scope, LogTable(arrays[0])))
-            return
-        rows, log_scale = compressed(rows, log_scale)
-        scope, arrays = self._reduced(self._scope(e), [rows, log_scale])
-        part.likelihoods.append(GaussianFactor(scope, blocks, arrays[0], arrays[1]))
-
-    def _blocks(self, e: int) -> tuple[tuple[Variable, ...], list[int]]:
-        """The blocks that an element's mean varies with, and their columns."""
-        found: dict[Variable, list[int]] = {}
-        for k, column in enumerate(self.columns):
-            at = column.element
-            block = (column.parent, int(self.places[column.parent][e]) if at is None else at)
-            found.setdefault(block, []).append(k)
-        kept = {b: ks for b, ks in found.items() if self.used[ks, e].any()}
-        return tuple(kept), [k for ks in kept.values() for k in ks]
-
-    def _alike(self, elements: np.ndarray) -> Iterator[np.ndarray]:
-        """Groups of elements that depend on the same discrete variables and blocks."""
-        if len(elements) == 1:
-            yield elements
-            return
-        keys = [self.places[n][elements] for n in self.alone]
-        moved = [k for k, c in enumerate(self.columns) if c.element is not None]
-        for k, c in enumerate(self.columns):
-            if c.element is None:
-                keys.append(np.where(self.used[k][elements], self.places[c.parent][elements], -1))
-        bits = np.packbits(self.used[moved][:, elements], axis=0).T
-        numbers = np.stack([*keys, np.zeros(len(elements), dtype=np.intp)], axis=1)
-        packed = np.concatenate([np.ascontiguousarray(numbers).view(np.uint8), bits], axis=1)
-        rows = np.ascontiguousarray(packed).view(np.dtype((np.void, packed.shape[1]))).ravel()
-        _, group = np.unique(rows, return_inverse=True)
-        order = np.argsort(group, kind="stable")
-        for part in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
-            yield elements[part]
-
-    def _projected(self, parent: str) -> np.ndarray:
-        plates, own = self.model[parent].plates, self.node.plates
-        at = np.unravel_index(np.arange(self.count), self.node.plate_shape) if own else ()
-        picked = [at[own.index(p)] for p in plates if p in own]
-        if len(picked) < len(plates) or not plates:
-            return np.zeros(self.count, dtype=np.intp)
-        return np.ravel_multi_index(picked, self.model[parent].plate_shape)
-
-    def _scope(self, e: int) -> tuple[Variable, ...]:
-        scope = [(n, int(self.places[n][e])) for n in self.alone]
-        for n in self.whole:
-            scope += [(n, k) for k in range(math.prod(self.model[n].plate_shape))]
-        return tuple(scope)
-
-    def _reduced(
-        self, scope: tuple[Variable, ...], arrays: Sequence[np.ndarray]
-    ) -> tuple[tuple[Variable, ...], list[np.ndarray]]:
-        """Without the axes of observed variables, and of those that make no difference."""
-        kept = list(scope)
-        reduced = list(arrays)
-        for variable in scope:
-            axis = kept.index(variable)
-            if variable in self.states:
-                state = self.states[variable]
-            elif all(_constant_along(a, axis) for a in reduced):
-                state = 0
+    def _boundary(self, name: str) -> tuple[str, ...]:
+        """The nodes that a function depends on, directly or through deterministic ones."""
+        found: dict[str, None] = {}
+        todo = list(self.model[name].parents)
+        while todo:
+            parent = todo.pop()
+            node = self.model[parent]
+            if node.kind == "deterministic" and node.domain is None:
+                todo += node.parents
             else:
-                continue
-            reduced = [a.take(state, axis=axis) for a in reduced]
-            kept.remove(variable)
-        return tuple(kept), reduced
+                found[parent] = None
+        return tuple(found)
 
-    def _card(self, name: str) -> int:
-        domain = self.model[name].domain
-        assert domain is not None
-        return domain.size
-
-
-def _parameters(result: Any, shape: Shape, d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean, Cholesky factor ``(*shape, d, d)`` and bad places ``(*shape)`` of what a function returned."""
-    if isinstance(result, np.ndarray):
-        return result, np.broadcast_to(0.0, (*shape, d, d)), np.broadcast_to(False, shape)
-    assert isinstance(result, (Normal, MvNormal))
-    if isinstance(result, Normal):
-        tril = np.broadcast_to(result.scale, shape)[..., None, None]
-    else:
-        tril = np.broadcast_to(result.scale_tril, (*shape, d, d))
-    bad = False if result.invalid is None else result.invalid
-    return result.loc, tril, np.broadcast_to(bad, shape)
+    def _seen(self, name: str) -> Any:
+        """What evidence makes of a node, as far as a function of it goes."""
+        if name in self.known:
+            return self.known[name].tobytes()
+        seen = self.observed.get(name)
+        if seen is None or seen.mask is None:
+            return None
+        return seen.mask.tobytes(), seen.value.tobytes()
 
 
-def _typical(probe: np.ndarray, components: int) -> list[float]:
-    """A power of two near the size of each component's values, so that steps of it lose no digits."""
-    sizes = np.abs(probe).reshape(-1, components).max(axis=0, initial=0.0)
-    sizes = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
-    return (2.0 ** np.clip(np.round(np.log2(sizes)), -500, 500)).tolist()
-
-
-def _constant_along(array: np.ndarray, axis: int) -> bool:
-    first = array.take([0], axis=axis)
-    return bool((array == first).all())
+def _add(
+    part: LinearGaussian,
+    reading: Reading,
+    seen: Observed | None,
+    states: Mapping[Variable, int],
+) -> None:
+    """Append what one node says to the net's linear-Gaussian part."""
+    if not reading.count:
+        return
+    part.invalid.extend(reading.invalid_rows())
+    hidden = hidden_elements(reading.node, seen)
+    part.conditionals.extend(reading.conditional(e, states) for e in hidden)
+    rest = np.delete(np.arange(reading.count), hidden)
+    if not len(rest):
+        return
+    assert seen is not None
+    values = seen.value.reshape(reading.count, reading.d)
+    for group in reading.alike(rest):
+        factor = reading.likelihood(group, values[group], states)
+        if factor.blocks:
+            part.likelihoods.append(factor)
+        else:
+            part.tables.append((factor.scope, LogTable(factor.log_scale)))
