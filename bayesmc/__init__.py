@@ -7,7 +7,7 @@ distribution. See ``bayesmc.BayesNet`` and ``bayesmc.infer``.
 import importlib
 from typing import Any
 
-from bayesmc import errors, io
+from bayesmc import errors, io, montecarlo
 from bayesmc.auto import Explanation, explain, infer
 from bayesmc.distributions import (
     Affine,
@@ -106,6 +106,7 @@ __all__ = [
     "explain",
     "infer",
     "io",
+    "montecarlo",
     "stack",
 ]
 

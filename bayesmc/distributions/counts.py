@@ -110,7 +110,7 @@ class Geometric(_Odds):
     def ppf(self, q: Any) -> np.ndarray:
         q = as_quantile(q)
         with np.errstate(divide="ignore", invalid="ignore"):
-            k = np.ceil(np.log1p(-q) / self._log_zero()) - 1
+            k = np.ceil(np.log1p(-q) / self._log_zero() - 1)
         k = np.where((q > 0) & (q < 1), np.maximum(k, 0.0), 0.0)
         k = np.where((k > 0) & (self.cdf(k - 1) >= q), k - 1, k)  # the division was rounded
         k = np.where(self.cdf(k) < q, k + 1, k)

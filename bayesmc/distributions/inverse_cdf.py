@@ -144,8 +144,8 @@ class InverseCdf(Distribution):
         shape = np.broadcast_shapes(x.shape, self.batch_shape)
         with np.errstate(all="ignore"):
             inside = np.broadcast_to(np.clip(x, self.low, self.high), shape)
-            at = self._columns(self._map.back(inside))
-            value = self._panels.integral(at, self._table).reshape(shape)
+            at = np.broadcast_to(self._map.back(inside), shape).ravel()
+            value = self._panels.integral(at, self._elements(shape), self._table).reshape(shape)
         value = np.where(x <= self.low, 0.0, np.where(x >= self.high, 1.0, value))
         return np.where(np.isnan(x), np.nan, value)
 
@@ -158,8 +158,14 @@ class InverseCdf(Distribution):
     def _quantile(self, q: np.ndarray) -> np.ndarray:
         shape = np.broadcast_shapes(q.shape, self.batch_shape)
         with np.errstate(all="ignore"):
-            at = self._panels.inverse(self._columns(np.broadcast_to(q, shape)), self._table)
+            flat = np.broadcast_to(q, shape).ravel()
+            at = self._panels.inverse(flat, self._elements(shape), self._table)
             return np.clip(self._map.out(at.reshape(shape)), self.low, self.high)
+
+    def _elements(self, shape: Shape) -> np.ndarray:
+        """The batch element to which each entry of an array of ``shape`` belongs, raveled."""
+        elements = np.arange(int(np.prod(self.batch_shape))).reshape(self.batch_shape)
+        return np.broadcast_to(elements, shape).ravel()
 
     # ---- building ---------------------------------------------------------------------------
 
@@ -177,7 +183,8 @@ class InverseCdf(Distribution):
         usable = panels.total > 0
         safe = replace(panels, total=np.where(usable, panels.total, 1.0))
         table = safe.table()
-        places = [safe.inverse(np.full((1, len(usable)), q), table)[0] for q in (0.25, 0.5, 0.75)]
+        element = np.arange(len(usable))
+        places = [safe.inverse(np.full(len(usable), q), element, table) for q in (0.25, 0.5, 0.75)]
         left, middle, right = (self._map.out(at.reshape(self.batch_shape)) for at in places)
         spread = np.maximum(right - left, 64 * np.spacing(np.abs(middle)))
         good = usable.reshape(self.batch_shape) & np.isfinite(middle) & np.isfinite(spread)

@@ -184,7 +184,7 @@ class _Stacked:
 
     def _joined(self, support: Support) -> Support:
         """The support of any component, from that with bounds for each."""
-        if support.is_constant:
+        if support.is_single:
             return support
         if support.parts:
             return product([(self._joined(part), size) for part, size in support.parts])

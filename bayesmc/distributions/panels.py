@@ -83,22 +83,24 @@ class Panels:
         half = 0.5 * np.diff(self.edges, axis=0)
         return _K[:, None, None] * self.heights * half / self.total
 
-    def integral(self, at: np.ndarray, table: _Table) -> np.ndarray:
-        """Share of the integral left of ``at`` (shape (L, B))."""
-        panel = _locate(self.edges, at)
-        low, high, start, coefficients = table.of(panel)
+    def integral(self, at: np.ndarray, element: np.ndarray, table: _Table) -> np.ndarray:
+        """Share of the integral of batch ``element`` left of ``at`` (both of shape (N,))."""
+        panel = _locate(self.edges, at, element)
+        low, high, start, coefficients = table.of(panel, element)
         s = np.clip((at - low) / (0.5 * (high - low)) - 1.0, -1.0, 1.0)
         return np.clip(start + _series(coefficients, s), 0.0, 1.0)
 
-    def inverse(self, q: np.ndarray, table: _Table) -> np.ndarray:
-        """Where the share reaches ``q`` (shape (L, B)), by Newton's steps kept in a bracket."""
-        step = max(1, _AT_ONCE // max(1, q.shape[1]))  # blocks that stay in the cache
-        blocks = [self._inverse(q[i : i + step], table) for i in range(0, len(q), step)]
+    def inverse(self, q: np.ndarray, element: np.ndarray, table: _Table) -> np.ndarray:
+        """Where the share reaches ``q`` (both of shape (N,)), by Newton's steps kept in a bracket."""
+        cuts = range(0, len(q), _AT_ONCE)  # blocks that stay in the cache
+        blocks = [
+            self._inverse(q[i : i + _AT_ONCE], element[i : i + _AT_ONCE], table) for i in cuts
+        ]
         return np.concatenate(blocks) if blocks else q
 
-    def _inverse(self, q: np.ndarray, table: _Table) -> np.ndarray:
-        panel = _locate(table.cumulative, q)
-        low, high, start, coefficients = table.of(panel)
+    def _inverse(self, q: np.ndarray, element: np.ndarray, table: _Table) -> np.ndarray:
+        panel = _locate(table.cumulative, q, element)
+        low, high, start, coefficients = table.of(panel, element)
         wanted = q - start
         a, b = np.full(q.shape, -1.0), np.ones(q.shape)
         whole = _series(coefficients, b)
@@ -108,8 +110,8 @@ class Panels:
             a, b = np.where(missing < 0, s, a), np.where(missing < 0, b, s)
             step = s - missing / _slope(coefficients, s)
             step = np.where((step > a) & (step < b), step, 0.5 * (a + b))
-            done = (np.abs(step - s) <= 4e-16) | (missing == 0)
-            s = np.where(missing == 0, s, step)
+            done = np.abs(missing) <= 1e-15 * whole  # nothing is left of it beside the other panels
+            s = np.where(done, s, step)
             if done.all():
                 break
         return low + 0.5 * (high - low) * (s + 1.0)
@@ -129,9 +131,10 @@ class _Table:
     cumulative: np.ndarray
     coefficients: np.ndarray
 
-    def of(self, panel: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Bounds, mass before and coefficients of panels (shape (L, B))."""
-        element = np.arange(panel.shape[1])
+    def of(
+        self, panel: np.ndarray, element: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Bounds, mass before and coefficients of panels of batch elements (shape (N,))."""
         pick = (panel, element)
         return (
             self.edges[pick],
@@ -310,9 +313,8 @@ def _split(
     )
 
 
-def _locate(table: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Index of the panel that holds each ``at`` (shape (L, B)), by bisection in each column."""
-    element = np.arange(at.shape[1])
+def _locate(table: np.ndarray, at: np.ndarray, element: np.ndarray) -> np.ndarray:
+    """Index of the panel that holds each ``at``, by bisection in its batch element's column."""
     low = np.zeros(at.shape, dtype=np.intp)
     high = np.full(at.shape, len(table) - 1, dtype=np.intp)
     while (high - low > 1).any():
@@ -333,7 +335,7 @@ _INTEGRATE = _integration_matrix()
 
 
 def _series(coefficients: np.ndarray, s: np.ndarray) -> np.ndarray:
-    """Legendre series of coefficients (K, L, B) at ``s`` (L, B), by Clenshaw's recurrence."""
+    """Legendre series of coefficients (K, N) at ``s`` (N,), by Clenshaw's recurrence."""
     one, two = coefficients[-1], np.zeros_like(s)
     for k in range(len(coefficients) - 2, -1, -1):
         one, two = coefficients[k] + (2 * k + 1) / (k + 1) * s * one - (k + 1) / (k + 2) * two, one

@@ -181,12 +181,25 @@ class InverseGamma(Distribution):
         return positive
 
     def cdf(self, x: Any) -> np.ndarray:
+        a, x = self.concentration, np.maximum(x, 0.0)
         with np.errstate(divide="ignore", over="ignore"):
-            return special.gammaincc(self.concentration, self.scale / np.maximum(x, 0.0))
+            y = np.asarray(self.scale / x)
+            value = special.gammaincc(a, y)
+            lost = (y < _TINY) & (x < np.inf)
+            if lost.any():  # here 1 - y**a / Gamma(a + 1), and y need not be a number
+                log_y = np.log(self.scale) - np.log(np.maximum(x, _TINY))
+                value = np.where(lost, -np.expm1(a * log_y - special.gammaln(a + 1)), value)
+        return value
 
     def ppf(self, q: Any) -> np.ndarray:
+        a, q = self.concentration, as_quantile(q)
         with np.errstate(divide="ignore", over="ignore"):
-            return self.scale / special.gammainccinv(self.concentration, as_quantile(q))
+            y = np.asarray(special.gammainccinv(a, q))
+            value = self.scale / y
+            if (y < _TINY).any():
+                log_y = (np.log1p(-q) + special.gammaln(a + 1)) / a
+                value = np.where(y < _TINY, np.exp(np.log(self.scale) - log_y), value)
+        return value
 
 
 class Weibull(Distribution):
@@ -238,15 +251,12 @@ class Weibull(Distribution):
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         c, log_scale = self.concentration, np.log(self.scale)
-        y = np.asarray(x / self.scale)
-        power = special.xlogy(c - 1.0, y)
-        lost = ((y < _TINY) & (x > 0)) | np.isinf(y)
-        if lost.any():  # the ratio left the numbers, its logarithm need not
-            log_y = np.log(x) - log_scale
-            power = np.where(lost, (c - 1.0) * log_y, power)
-            y = np.where(lost, np.exp(np.minimum(c * log_y, 1000.0)), np.power(y, c))
-        else:
-            y = np.power(y, c)
+        ratio, lost = self._ratio(x)
+        power, y = special.xlogy(c - 1.0, ratio), np.power(ratio, c)
+        if lost is not None:
+            log_ratio = np.log(x) - log_scale
+            power = np.where(lost, (c - 1.0) * log_ratio, power)
+            y = np.where(lost, np.exp(c * log_ratio), y)
         density = np.log(c) + power - y - log_scale
         # towards infinity the exponential wins, however steep the power
         return np.where((x < 0) | np.isinf(y), -np.inf, density)
@@ -269,13 +279,33 @@ class Weibull(Distribution):
         return nonnegative
 
     def cdf(self, x: Any) -> np.ndarray:
-        with np.errstate(over="ignore"):
-            return -np.expm1(-np.power(np.maximum(x, 0.0) / self.scale, self.concentration))
+        with np.errstate(divide="ignore", over="ignore"):
+            x = np.maximum(x, 0.0)
+            ratio, lost = self._ratio(x)
+            y = np.power(ratio, self.concentration)
+            if lost is not None:
+                log_ratio = np.log(x) - np.log(self.scale)
+                y = np.where(lost, np.exp(self.concentration * log_ratio), y)
+            return -np.expm1(-y)
 
     def ppf(self, q: Any) -> np.ndarray:
         with np.errstate(divide="ignore", over="ignore"):
-            z = np.power(-np.log1p(-as_quantile(q)), 1 / self.concentration)
-            return self.scale * z
+            hazard = -np.log1p(-as_quantile(q))
+            z = np.asarray(np.power(hazard, 1 / self.concentration))
+            value = self.scale * z
+            lost = (z < _TINY) | np.isinf(z)
+            if lost.any():
+                log_z = np.log(hazard) / self.concentration
+                value = np.where(lost, np.exp(log_z + np.log(self.scale)), value)
+        return value
+
+    def _ratio(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """``x / scale``, and where it left the numbers (None: nowhere) though ``x`` did not."""
+        ratio = np.asarray(x / self.scale)
+        lost = (ratio < _TINY) | np.isinf(ratio)
+        if not lost.any():
+            return ratio, None
+        return ratio, lost & (x > 0) & (x < np.inf)
 
 
 def _exp_inside(logs: np.ndarray) -> np.ndarray:

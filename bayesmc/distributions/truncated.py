@@ -205,10 +205,11 @@ class Truncated(Distribution):
             self._doubtful = np.full(narrow.shape, -np.inf)
         elif self.is_discrete:
             few = self._greatest - self._least < _FEW
+            few = few & ((log_ratio > _LOG_HALF) | ~(self._log_mass > self._doubtful))
             if few.any():
-                k = np.where(few, self._least, 0.0)[..., None] + np.arange(_FEW)
-                terms = np.moveaxis(k, -1, 0)
-                terms = np.where(terms <= self._greatest, self.base.log_prob(terms), -np.inf)
+                steps = np.arange(float(_FEW)).reshape((-1,) + (1,) * len(self.batch_shape))
+                k = np.where(few, self._least, 0.0) + steps
+                terms = np.where(k <= self._greatest, self.base.log_prob(k), -np.inf)
                 self._log_mass = np.where(few, special.logsumexp(terms, axis=0), self._log_mass)
                 self._doubtful = np.where(few, -np.inf, self._doubtful)
 

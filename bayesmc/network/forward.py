@@ -63,11 +63,26 @@ def with_potentials(model: Model, steps: Mapping[str, Step]) -> list[Step]:
 
     So a configuration that a potential excludes has no weight left when later nodes are evaluated.
     """
+    return with_factors(steps, potential_factors(model))
+
+
+def potential_factors(model: Model) -> list[tuple[Sequence[str], Step]]:
+    """Every potential as a step, with the nodes it needs."""
+    return [
+        (potential.parents, Potential(model, name))
+        for name, (potential, _) in model.potentials.items()
+    ]
+
+
+def with_factors(
+    steps: Mapping[str, Step], factors: Iterable[tuple[Sequence[str], Step]]
+) -> list[Step]:
+    """The nodes' steps with every factor right after the last of the nodes it needs."""
     after: dict[str | None, list[Step]] = {}
     order = {name: k for k, name in enumerate(steps)}
-    for name, (potential, _) in model.potentials.items():
-        last = max(potential.parents, key=order.__getitem__, default=None)
-        after.setdefault(last, []).append(Potential(model, name))
+    for needed, factor in factors:
+        last = max(needed, key=order.__getitem__, default=None)
+        after.setdefault(last, []).append(factor)
     result = list(after.get(None, []))
     for name, step in steps.items():
         result += [step, *after.get(name, [])]
@@ -77,13 +92,17 @@ def with_potentials(model: Model, steps: Mapping[str, Step]) -> list[Step]:
 def step_for(model: Model, node: CompiledNode, observed: Mapping[str, Observed]) -> Step:
     """The plain step of one node."""
     if node.kind == "input":
-        return _nothing
+        return nothing
     if not node.is_stochastic:
         return Compute(model, node)
     seen = observed.get(node.name)
     if seen is None:
         return Draw(model, node)
     return Weigh(model, node, seen) if seen.mask is None else DrawAndWeigh(model, node, seen)
+
+
+def nothing(state: Pass) -> None:
+    """The step of a node whose value is in place already, such as an input."""
 
 
 class Compute:
@@ -114,17 +133,20 @@ class Weigh:
 
     def __init__(self, model: Model, node: CompiledNode, seen: Observed) -> None:
         self.model, self.node, self.seen = model, node, seen
-        self.plate_axes = tuple(range(-len(node.plates), 0))
 
     def __call__(self, state: Pass) -> None:
-        dist = _distribution(self.model, self.node, state)
-        log_density = self.model.log_density(self.node.name, dist, self.seen.value)
-        if self.plate_axes:
-            lead = log_density.shape[: max(log_density.ndim - len(self.plate_axes), 0)]
-            log_density = np.broadcast_to(log_density, lead + self.node.plate_shape)
-            log_density = log_density.sum(axis=self.plate_axes)
-        state.weigh(log_density)
+        _weigh_at(self.model, self.node, state, self.seen.value)
         state.values[self.node.name] = self.seen.value
+
+
+class WeighDrawn:
+    """A node drawn from elsewhere: its density given its parents is a factor of the weight."""
+
+    def __init__(self, model: Model, node: CompiledNode) -> None:
+        self.model, self.node = model, node
+
+    def __call__(self, state: Pass) -> None:
+        _weigh_at(self.model, self.node, state, state.values[self.node.name])
 
 
 class DrawAndWeigh:
@@ -173,6 +195,17 @@ def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None
     )
 
 
+def _weigh_at(model: Model, node: CompiledNode, state: Pass, value: np.ndarray) -> None:
+    """Weigh by a node's density at a value, all its plate elements together."""
+    dist = _distribution(model, node, state)
+    log_density = model.log_density(node.name, dist, value)
+    if node.plates:
+        lead = log_density.shape[: max(log_density.ndim - len(node.plates), 0)]
+        log_density = np.broadcast_to(log_density, lead + node.plate_shape)
+        log_density = log_density.sum(axis=tuple(range(-len(node.plates), 0)))
+    state.weigh(log_density)
+
+
 def _distribution(model: Model, node: CompiledNode, state: Pass) -> Distribution:
     """The node's distribution given its parents; bad parameters raise where the weight is positive."""
     dist, _ = model.evaluate(node.name, state.values)
@@ -182,7 +215,3 @@ def _distribution(model: Model, node: CompiledNode, state: Pass) -> Distribution
         if error is not None:
             raise error
     return dist
-
-
-def _nothing(state: Pass) -> None:
-    """Inputs are in place before the pass starts."""

@@ -4,13 +4,8 @@ Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for 
 ``evidence_for`` only.
 """
 
-from bayesmc.testing.gaussians import (
-    ConditionalGaussian,
-    GaussianAnswer,
-    GaussianOptions,
-    gaussian_evidence,
-    random_gaussian_net,
-)
+from bayesmc.testing.conditional_gaussian import ConditionalGaussian, GaussianAnswer
+from bayesmc.testing.gaussians import GaussianOptions, gaussian_evidence, random_gaussian_net
 from bayesmc.testing.matching import Comparison, Match, assert_matches, compare
 from bayesmc.testing.nets import NetOptions, random_net
 from bayesmc.testing.observing import random_evidence

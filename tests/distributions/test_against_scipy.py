@@ -263,6 +263,7 @@ GOLDEN = [
     (d.NegativeBinomial(0.001, 0.999999), 12_345_678, -35.57916635285407),
     (d.NegativeBinomial(1e-10, 0.5), 1, -23.718998110569718),
     (d.NegativeBinomial(1e5, 1e-9), 0, -0.00010000000005000001),
+    (d.NegativeBinomial(101, 0.99), 10_001, -7.827669972841719),  # Stirling's series at its start
     (d.NegativeBinomial(1e4, 0.2), 2600, -6.541078145452522),
     (d.NegativeBinomial(1e8, 1e-300), 100_000_000, -68938923364.18523),
     (d.NegativeBinomial(2.0, logits=50.0), 1e22, -51.27187780209491),
@@ -284,6 +285,24 @@ def test_the_textbook_formula_would_miss_the_golden_value_of_a_large_count() -> 
     direct = special.gammaln(n + k) - special.gammaln(k + 1) - special.gammaln(n)
     direct += (n + k) * np.log(0.5)
     assert abs(direct + 11.475902495877369) > 1e-9
+
+
+def test_inverse_gamma_reaches_beyond_the_ratio_of_doubles() -> None:
+    # scale / x is 1e-400: with 50 digits, the regularised incomplete gamma function of it
+    dist = d.InverseGamma(0.003, 1e-200)
+    assert dist.cdf(1e200) == pytest.approx(0.9367953785317273, rel=1e-13)
+    assert dist.ppf(0.9367953785317273) == pytest.approx(1e200, rel=1e-9)
+    assert dist.ppf([0.0, 1.0]).tolist() == [0.0, np.inf]
+    assert dist.cdf([-1.0, 0.0, np.inf]).tolist() == [0.0, 0.0, 1.0]
+
+
+def test_weibull_reaches_beyond_the_ratio_of_doubles() -> None:
+    # (1e-200 / 1e200)**0.002 = 10**-0.8
+    dist, mass = d.Weibull(0.002, 1e200), -np.expm1(-(10**-0.8))
+    assert dist.cdf(1e-200) == pytest.approx(mass, rel=1e-12)
+    assert dist.ppf(mass) == pytest.approx(1e-200, rel=1e-9)
+    assert dist.ppf([0.0, 1.0]).tolist() == [0.0, np.inf]
+    assert dist.cdf([-1.0, 0.0, np.inf]).tolist() == [0.0, 0.0, 1.0]
 
 
 def test_certain_counts() -> None:

@@ -217,6 +217,17 @@ def test_batches_draw_and_weigh_element_by_element() -> None:
             np.testing.assert_allclose(dist.ppf(0.3)[i, j], one.ppf(0.3), atol=1e-12)
 
 
+def test_a_draw_of_pi_is_turned_to_minus_pi() -> None:
+    class Edge:
+        """A source of random numbers that is at the end of its range, as chance may be."""
+
+        def vonmises(self, mu: np.ndarray, kappa: np.ndarray, shape: tuple) -> np.ndarray:
+            return np.full(shape, np.pi)
+
+    assert d.VonMises(0.0, 1.0).sample_to(Edge(), (2,)).tolist() == [-np.pi, -np.pi]
+    assert d.VonMises(0.0, 1.0).sample_to(Edge(), ()).tolist() == -np.pi
+
+
 def test_infinite_values_are_no_angles() -> None:
     for dist in (d.VonMises(1.0, 2.0), d.WrappedNormal(1.0, 0.5)):
         assert dist.log_prob([np.inf, -np.inf]).tolist() == [-np.inf, -np.inf]

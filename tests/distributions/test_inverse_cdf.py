@@ -108,6 +108,15 @@ def test_modes_far_apart_are_all_found(locs: list[float], scales: list[float]) -
     np.testing.assert_allclose(dist.var, mixture.var, rtol=1e-8)
 
 
+@pytest.mark.parametrize("support", [(0.0, 1.0), (0.0, np.inf), "real"])
+def test_narrow_modes_that_no_node_sees_are_climbed(support: object) -> None:
+    mixture = d.Mixture([0.2, 0.5, 0.3], d.Normal([0.2, 0.6180339, 0.8123], [1e-6, 2e-5, 1e-5]))
+    dist = d.InverseCdf(d.Density(mixture.log_prob, support=support))
+    np.testing.assert_allclose(dist.log_normalizer, 0.0, atol=1e-8)
+    np.testing.assert_allclose(dist.cdf([0.4, 0.7, 0.9]), [0.2, 0.7, 1.0], atol=1e-8)
+    np.testing.assert_allclose(dist.mean, mixture.mean, rtol=1e-8)
+
+
 def test_a_spike_on_wide_mass_is_found_at_1e_3_and_below_when_named() -> None:
     def spiked(width: float) -> d.Density:
         return d.Density(
@@ -137,6 +146,10 @@ def test_a_batch_is_its_elements() -> None:
     np.testing.assert_allclose(dist.mean, theirs.mean() + 0 * scale, atol=1e-8)
     np.testing.assert_allclose(dist.var, theirs.var() + 0 * loc, rtol=1e-8)
     np.testing.assert_allclose(dist.log_normalizer, np.log(scale * np.sqrt(2 * np.pi)) + 0 * loc)
+    column = d.InverseCdf(d.Density(lambda x: -((x - loc) ** 4)))
+    wide = column.sample_to(np.random.default_rng(0), (7, 5, 3))
+    assert wide.shape == (7, 5, 3) and len(np.unique(wide)) == wide.size
+    assert (np.abs(wide - loc) < 3).all()
     bounded = d.InverseCdf(lambda x: -x, low=[0.0, 1.0], high=[2.0, 1.5])
     np.testing.assert_allclose(bounded.cdf([1.0, 1.2]), [
         np.expm1(-1.0) / np.expm1(-2.0), np.expm1(-0.2) / np.expm1(-0.5)], atol=1e-10)  # fmt: skip

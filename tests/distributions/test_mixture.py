@@ -214,6 +214,8 @@ def test_supports_of_products_are_joined_part_by_part() -> None:
     stacked, listed = (_over(make()) for make in ANY_FAMILY["Joint"])
     for dist in (stacked, listed):
         assert dist.support.contains([[2.5, 1.0], [3.5, 1.0], [1.0, -1.0]]).tolist() == [1, 0, 0]
+    equal = _over(d.Uniform([0.0, 0.0], [2.0, 2.0]))
+    assert equal.support.contains([0.5, 1.0, 3.0]).tolist() == [True, True, False]
     free = _over([d.Joint(d.Normal(), d.Gamma(1.0, 1.0)), d.MvNormal([0, 1], np.eye(2))])
     assert free.support.kind == "real vector"
     both = _over([d.Affine(d.Exponential(1.0), 0.0, -1.0), d.Exponential(1.0)])

@@ -193,6 +193,21 @@ def test_mixture_draws_fit(weights: list[float], seed: int) -> None:
 
 
 @pytest.mark.parametrize(
+    "dist", [d.InverseGamma(0.003, 1e-200), d.Weibull(0.002, 1e200), d.LogNormal(-500.0, 700.0)]
+)
+def test_draws_fit_to_the_ends_of_the_numbers(dist: d.Distribution) -> None:
+    # what lies beyond the smallest and the largest number is an atom there, spread at random
+    rng = np.random.default_rng(4)
+    draws = dist.sample(rng, DRAWS)
+    low, high = np.finfo(float).tiny, np.finfo(float).max
+    random = rng.random(DRAWS)
+    u = np.where(draws == low, random * dist.cdf(low), dist.cdf(draws))
+    u = np.where(draws == high, 1 - random * (1 - dist.cdf(high)), u)
+    assert 10 < (draws == high).sum() < 0.9 * DRAWS
+    assert stats.kstest(u, "uniform").pvalue > ALARM
+
+
+@pytest.mark.parametrize(
     "dist",
     [
         d.Gamma([0.005, 0.02], 1.0),

@@ -41,9 +41,41 @@ COLUMNS = {
     "Mixture of vectors": d.Mixture([0.5, 0.5], d.MvNormal(np.zeros((2, 1, 2, 3)), np.eye(3))),
     "Mixture list": d.Mixture([0.5, 0.5], [d.Normal(COLUMN, 1.0), d.Gamma(COLUMN, 1.0)]),
     "Density": d.Density(lambda x: -np.abs(x) - 0 * COLUMN, _laplace),
+    "Laplace": d.Laplace(COLUMN, 1.0),
+    "Cauchy": d.Cauchy(COLUMN, 1.0),
+    "HalfNormal": d.HalfNormal(COLUMN),
+    "HalfCauchy": d.HalfCauchy(COLUMN),
+    "LogNormal": d.LogNormal(COLUMN, 0.5),
+    "InverseGamma": d.InverseGamma(2.0, COLUMN),
+    "Weibull": d.Weibull(1.5, COLUMN),
+    "VonMises": d.VonMises(COLUMN, 2.0),
+    "WrappedNormal": d.WrappedNormal(COLUMN, 0.5),
+    "Wishart": d.Wishart(5.0 + COLUMN, np.eye(3)),
+    "InverseWishart": d.InverseWishart(5.0, np.eye(3) * COLUMN[..., None, None]),
+    "KernelDensity": d.KernelDensity(COLUMN[..., None] + [0.0, 1.0, 3.0]),
+    "KernelDensity of vectors": d.KernelDensity(
+        COLUMN[..., None, None] + [[0.0, 1.0], [1.0, 0.0], [3.0, 2.0]], vectors=True
+    ),
+    "Truncated": d.Truncated(d.Normal(COLUMN, 1.0), 0.5, 3.0),
+    "Truncated integers": d.Truncated(d.Poisson(COLUMN), 1, 4),
+    "Affine": d.Affine(d.Gamma(2.0, 1.0), COLUMN, -2.0),
+    "Joint": d.Joint(d.Normal(COLUMN, 1.0), d.Gamma(COLUMN, 1.0)),
+    "InverseCdf": d.InverseCdf(d.Density(lambda x: -np.abs(x) - 0 * COLUMN)),
+    "Geometric": d.Geometric(COLUMN),
+    "NegativeBinomial": d.NegativeBinomial(3.0, COLUMN),
+    "Multinomial": d.Multinomial(4, np.full((2, 1, 3), 1 / 3)),
     "scipy continuous": d.as_distribution(stats.gumbel_r(COLUMN)),
     "scipy discrete": d.as_distribution(stats.nbinom(5, COLUMN)),
 }
+
+
+def test_every_family_is_here() -> None:
+    families = {
+        name
+        for name in d.__all__
+        if isinstance(getattr(d, name), type) and issubclass(getattr(d, name), d.Distribution)
+    }
+    assert families - {"Distribution"} <= {type(dist).__name__ for dist in COLUMNS.values()}
 
 
 @pytest.mark.parametrize("name", COLUMNS)

@@ -195,6 +195,18 @@ def test_draws_are_those_that_rejection_keeps(
     assert stats.ks_2samp(wrong + 2 * shift, kept).pvalue < ALARM
 
 
+def test_integers_of_a_batch_between_common_bounds() -> None:
+    base = d.Poisson([[3.0], [20.0]])
+    dist = d.Truncated(base, 4, [6, 6, 900])
+    assert dist.sample_to(np.random.default_rng(0), (5, 2, 3)).shape == (5, 2, 3)
+    k = np.arange(4, 7)[:, None, None]
+    total = np.exp(d.Truncated(base, 4, 6).log_prob(k)).sum(axis=0)
+    np.testing.assert_allclose(total, 1.0, rtol=1e-12)
+    narrow = d.Truncated(d.Mixture([0.5, 0.5], d.Poisson([[1.0, 2.0]] * 3)), 60, 62)
+    np.testing.assert_allclose(np.exp(narrow.log_prob(np.arange(60, 63)[:, None])).sum(0), 1.0)
+    assert d.Truncated(d.Poisson(np.empty(0)), 0, 3).sample(0, 2).shape == (2, 0)
+
+
 def test_bounds_may_depend_on_the_batch_and_nest() -> None:
     low = np.array([[-1.0], [0.0], [9.0]])
     dist = d.Truncated(d.Normal([0.0, 1.0], 1.0), low, low + 1)

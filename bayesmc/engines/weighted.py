@@ -1,0 +1,315 @@
+"""What engines that weight independent draws share: the loop over chunks, what is kept, and its error.
+
+Chunks are small enough for their arrays to stay in cache, and each draws from its own random stream. An
+engine supplies the steps of a pass; how a step samples or weighs is not known here.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc import diagnostics
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.base import Engine
+from bayesmc.engines.forward import chunk_sizes
+from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
+from bayesmc.network import Model, Problem
+from bayesmc.network.forward import Pass, Step, run
+from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, stream
+from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
+
+#: share of the draws above which weights are even enough to leave their tail unfitted
+_EVEN = 0.5
+
+
+class WeightedEngine(Engine):
+    """Independent weighted draws in one pass per chunk; a family supplies the steps.
+
+    Attributes
+    ----------
+    draws : int
+    """
+
+    draws: int
+    #: what the engine does, in warnings and beside the progress bar
+    label: ClassVar[str]
+    #: what helps where the weights are too uneven
+    remedy: ClassVar[str]
+
+    def steps(self, problem: Problem) -> list[Step]:
+        """The steps of one pass."""
+        raise NotImplementedError
+
+    def known(self, problem: Problem) -> dict[str, np.ndarray]:
+        """Stored values in place before a pass starts."""
+        return dict(problem.inputs)
+
+    def is_weighted(self, problem: Problem) -> bool:
+        """Whether the draws have weights at all."""
+        return bool(problem.observed or problem.model.potentials)
+
+    def continues(self, other: Any) -> bool:
+        """Whether draws of an ``other`` engine may be joined with this one's."""
+        return type(other) is type(self)
+
+    def run(
+        self,
+        problem: Problem,
+        seed: np.random.SeedSequence,
+        keep: Any = "draws",
+        progress: bool | None = None,
+        resume: Posterior | None = None,
+    ) -> Posterior:
+        names = tuple(n for n, c in problem.model.nodes.items() if c.kind != "input")
+        steps, known = self.steps(problem), self.known(problem)
+        with Progress(self.draws, self.label, progress) as bar:
+            first = resume.streams if isinstance(resume, DrawsPosterior) else 0
+            sizes = _sizes(problem.model, self.draws)
+            chunks = _counted(passes(steps, sizes, seed, known, first), bar)
+            if isinstance(keep, str) and keep == "summaries":
+                if resume is not None:
+                    raise UnsupportedError('infer: resume= continues draws; give keep="draws"')
+                return self._summaries(problem, chunks, names)
+            kept = names if isinstance(keep, str) else tuple(keep)
+            try:
+                return self._draws(problem, chunks, kept, resume)
+            except MemoryError as error:
+                raise no_memory(self, self.draws, kept) from error
+
+    def _summaries(
+        self, problem: Problem, chunks: Iterable[Pass], names: tuple[str, ...]
+    ) -> SumsPosterior:
+        sums = Sums(problem.model, names)
+        for chunk in chunks:
+            sums.add(chunk.values, chunk.log_weight, chunk.batch[0])
+        self._refuse_zero(sums.top, self.draws)
+        weighted = self.is_weighted(problem)
+        posterior = SumsPosterior(problem, self, sums, weighted)
+        log_total = sums.top + float(np.log(sums.weight[0]))
+        self._set_evidence(posterior, log_total, self.draws, weighted)
+        return posterior
+
+    def _draws(
+        self,
+        problem: Problem,
+        chunks: Iterable[Pass],
+        names: Sequence[str],
+        resume: Posterior | None,
+    ) -> DrawsPosterior:
+        kept = Kept(problem.model, names, self.draws)
+        log_weights = np.zeros((1, self.draws))
+        for chunk in chunks:
+            log_weights[0, kept.count : kept.count + chunk.batch[0]] = chunk.log_weight
+            kept.add(chunk.values, chunk.batch[0])
+        stored = kept.stored
+        if resume is not None:
+            stored, log_weights = self._joined(resume, stored, log_weights, problem)
+        total = log_weights.shape[1]
+        self._refuse_zero(float(log_weights.max()), total)
+        for array in stored.values():
+            array.flags.writeable = False
+        log_weights.flags.writeable = False
+        before = resume.streams if isinstance(resume, DrawsPosterior) else 0
+        weighted = self.is_weighted(problem)
+        posterior = DrawsPosterior(
+            problem,
+            self,
+            stored,
+            (1, total),
+            log_weights if weighted else None,
+            independent=True,
+            streams=before + len(chunk_sizes(problem.model, self.draws)),
+        )
+        log_total = float(diagnostics.log_sum_exp(log_weights))
+        self._set_evidence(posterior, log_total, total, weighted)
+        return posterior
+
+    def _joined(
+        self,
+        old: Posterior,
+        stored: dict[str, np.ndarray],
+        log_weights: np.ndarray,
+        problem: Problem,
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """Earlier draws of the same question and the new ones, end to end."""
+        if not isinstance(old, DrawsPosterior) or not self._asked_before(old, problem, set(stored)):
+            raise UnsupportedError(
+                f"infer: resume= takes an earlier {type(self).__name__} posterior of the same net, "
+                "evidence, inputs and keep=, as infer returned it; this one answers another question"
+            )
+        before = old._shape[1]
+        joined = {}
+        for name, new in stored.items():
+            tail = problem.model[name].value_shape
+            parts = [
+                np.broadcast_to(old._stored[name], (1, before, *tail)),
+                np.broadcast_to(new, (1, log_weights.shape[1], *tail)),
+            ]
+            constant = new.shape[1] == 1 == old._stored[name].shape[1]
+            joined[name] = new if constant else np.concatenate(parts, axis=1)
+        earlier = np.zeros((1, before)) if old.log_weights is None else old.log_weights
+        return joined, np.concatenate([earlier, log_weights], axis=1)
+
+    def _asked_before(self, old: DrawsPosterior, problem: Problem, names: set[str]) -> bool:
+        """Whether draws of ``old`` may be joined with new ones for ``problem``."""
+        if old.problem is None or set(old._stored) != names or not self.continues(old.engine):
+            return False
+        weighted = self.is_weighted(problem)
+        return (old.log_weights is not None) == weighted and _same_question(old.problem, problem)
+
+    def _refuse_zero(self, top: float, draws: int) -> None:
+        if top == -np.inf:
+            raise ZeroProbabilityError(
+                f"{type(self).__name__}: none of {draws} draws is compatible with the evidence, so its "
+                "probability is zero or far too small for this engine; check the evidence, or use Exact()"
+            )
+
+    def _set_evidence(self, posterior: Any, log_total: float, draws: int, weighted: bool) -> None:
+        """Log evidence, its error by the delta method, and a warning where it rests on too little."""
+        posterior.log_marginal_likelihood = log_total - float(np.log(draws)) if weighted else 0.0
+        posterior.log_marginal_likelihood_mcse = 0.0
+        if not weighted:
+            return
+        ess = posterior.weight_ess
+        posterior.log_marginal_likelihood_mcse = float(np.sqrt(max(1 / ess - 1 / draws, 0.0)))
+        if ess < min(diagnostics.MIN_WEIGHT_ESS, 0.9 * draws):
+            warnings.warn(
+                f"{self.label}: the {draws} draws are worth only {ess:.1f} equally weighted ones "
+                f"(weight_ess); answers and their error bars are unreliable: {self.remedy}",
+                LowEssWarning,
+                stacklevel=5,
+            )
+        elif ess < _EVEN * draws and posterior.pareto_k > diagnostics.MAX_PARETO_K:
+            warnings.warn(
+                f"{self.label}: the weights have a heavy tail (Pareto k = {posterior.pareto_k:.2f}, "
+                f"above {diagnostics.MAX_PARETO_K}); answers converge slowly: {self.remedy}",
+                LowEssWarning,
+                stacklevel=5,
+            )
+
+
+class Kept:
+    """Draws of some nodes put in place chunk by chunk.
+
+    Attributes
+    ----------
+    stored : dict
+        Node -> stored values, shape ``(1, draws, *plates, *event)``; what is the same for all draws has
+        one draw.
+    count : int
+        Draws in place so far.
+    """
+
+    def __init__(self, model: Model, names: Iterable[str], draws: int) -> None:
+        self.model = model
+        self.names = tuple(names)
+        self.draws = draws
+        self.stored: dict[str, np.ndarray] = {}
+        self.count = 0
+
+    def add(self, values: Mapping[str, np.ndarray], count: int) -> None:
+        """Take in the values of ``count`` more draws."""
+        for name in self.names:
+            value = values[name]
+            if value.ndim == len(self.model[name].value_shape):
+                self.stored.setdefault(name, np.array(value)[None, None])
+                continue
+            if name not in self.stored:
+                self.stored[name] = np.empty((1, self.draws, *value.shape[1:]), dtype=value.dtype)
+            self.stored[name][0, self.count : self.count + count] = value
+        self.count += count
+
+
+def passes(
+    steps: Sequence[Step],
+    sizes: Iterable[int],
+    seed: np.random.SeedSequence,
+    known: Mapping[str, np.ndarray],
+    first: int = 0,
+) -> Iterator[Pass]:
+    """One pass per chunk; chunk ``k`` of ``sizes[k]`` draws uses random stream ``first + k``.
+
+    ``known`` are stored values in place before a pass starts.
+    """
+    for number, count in enumerate(sizes):
+        rng = stream(seed, Purpose.INFER, first + number)
+        with marking_invalid(), np.errstate(all="ignore"):
+            state = run(steps, Pass(rng, (count,), dict(known)))
+        yield state
+
+
+def check_count(engine: Any, field: str, value: Any, example: str) -> None:
+    """Refuse an option that is not a whole number of 1 or more."""
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+        raise ValueError(
+            f"{type(engine).__name__}({field}={value!r}): {field} is a whole number, 1 or more, such as "
+            f"{example}"
+        )
+
+
+def no_memory(engine: Any, draws: int, kept: Sequence[str]) -> BudgetError:
+    """The error for draws that do not fit in memory."""
+    return BudgetError(
+        f"{type(engine).__name__}: {draws} draws of {len(kept)} nodes do not fit in memory; "
+        'ask for keep="summaries", or name the nodes to keep'
+    )
+
+
+def treatment(problem: Problem, name: str) -> str:
+    """What a forward pass does to a node, in words."""
+    node = problem.model[name]
+    if node.kind in ("input", "fixed"):
+        return "given"
+    slow = ", element by element (vectorize=True): slow" if node.declaration.vectorize else ""
+    if not node.is_stochastic:
+        return "computed from its parents" + slow
+    seen = problem.observed.get(name)
+    if seen is None:
+        return "sampled given its parents" + slow
+    partly = " (missing elements sampled)" if seen.mask is not None else ""
+    return "weights the draws" + partly + slow
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _sizes(model: Model, draws: int) -> Iterator[int]:
+    """Sizes of chunks, not listed before there is memory for the draws."""
+    yield from chunk_sizes(model, draws)
+
+
+def _counted(chunks: Iterable[Pass], bar: Progress) -> Iterator[Pass]:
+    for chunk in chunks:
+        yield chunk
+        bar.advance(chunk.batch[0])
+
+
+def _same_question(was: Problem, now: Problem) -> bool:
+    """Whether two problems are the same net with the same evidence and inputs."""
+    old, new = was.model, now.model
+    same_net = (
+        list(old.nodes) == list(new.nodes)
+        and all(old[n].declaration is c.declaration for n, c in new.nodes.items())
+        and list(old.potentials) == list(new.potentials)
+        and all(old.potentials[n][0] is v[0] for n, v in new.potentials.items())
+        and old.sizes == new.sizes
+    )
+    return (
+        same_net
+        and was.observed.keys() == now.observed.keys()
+        and all(
+            np.array_equal(o.value, now.observed[n].value)
+            and _same_mask(o.mask, now.observed[n].mask)
+            for n, o in was.observed.items()
+        )
+        and all(np.array_equal(v, now.inputs[n]) for n, v in was.inputs.items())
+    )
+
+
+def _same_mask(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
