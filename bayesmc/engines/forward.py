@@ -8,18 +8,15 @@ stay in cache; each draws from its own random stream, so results do not depend o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, ParameterError
-from bayesmc.network import CompiledNode, Model, Observed, Problem
+from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.align import Aligner
-from bayesmc.network.forward import Pass, Step, run, step_for, with_potentials
-from bayesmc.progress import Progress
-from bayesmc.randomness import Purpose, stream
+from bayesmc.network.forward import Pass, Step, step_for, with_potentials
 from bayesmc.structure import Table, constants_of, tabulate
 
 #: draws per chunk of a net whose largest node is a scalar
@@ -30,24 +27,6 @@ _CHUNK_ELEMENTS = 1 << 20
 _FUNCTION_ENTRIES = 1 << 20
 _TABLE_ENTRIES = 1 << 26
 _BITS = 31
-
-
-def forward_chunks(
-    problem: Problem,
-    draws: int,
-    seed: np.random.SeedSequence,
-    progress: Progress,
-    first: int = 0,
-) -> Iterator[Pass]:
-    """Passes that together make ``draws`` draws; chunk ``k`` uses random stream ``first + k``."""
-    model = problem.model
-    steps = fast_steps(model, problem.observed, problem.inputs)
-    for number, count in enumerate(chunk_sizes(model, draws)):
-        rng = stream(seed, Purpose.INFER, first + number)
-        with marking_invalid(), np.errstate(all="ignore"):
-            state = run(steps, Pass(rng, (count,), dict(problem.inputs)))
-        yield state
-        progress.advance(count)
 
 
 def chunk_sizes(model: Model, draws: int) -> list[int]:

@@ -110,7 +110,9 @@ def test_inner_axes_of_size_one_get_independent_draws(name: str) -> None:
     dist = COLUMNS[name]
     draws = dist.sample_to(np.random.default_rng(2), (3000, 2, 400)).astype(float)
     if dist.event_shape:
-        draws = draws[..., 0]
+        draws = draws.reshape((3000, 2, 400, -1))[..., 0]
+    if not isinstance(dist, d.Density) and not np.isfinite(dist.var).all():
+        draws = np.arctan(draws)  # Cauchy's have no variance
     for row in range(2):
         for axis in (0, 1):
             means = draws[:, row].mean(axis=axis)
@@ -139,7 +141,7 @@ def test_parameters_tell_distributions_apart(name: str) -> None:
     dist = COLUMNS[name]
     for value, extra in dist.parameters():
         assert np.broadcast_shapes(value.shape[: value.ndim - extra], (2, 1)) in ((2, 1), (2, 2))
-        assert np.isfinite(value).all()
+        assert not np.isnan(value).any()
 
 
 @pytest.mark.parametrize("name", COLUMNS)
@@ -160,7 +162,7 @@ def test_finite_tables_sum_to_one_and_equal_log_prob() -> None:
         np.testing.assert_allclose(table.sum(axis=-1), 1.0, rtol=1e-12)
         for k, value in enumerate(dist.support.values):
             np.testing.assert_allclose(table[..., k], np.exp(dist.log_prob(value)), rtol=1e-12)
-    assert tables == 6
+    assert tables == 7
 
 
 def test_bounds_that_depend_on_the_batch_have_no_common_size() -> None:

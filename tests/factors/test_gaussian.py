@@ -115,7 +115,9 @@ def test_a_block_is_integrated_out(layout: str, d: int) -> None:
         for states in configurations(scope):
             values = {b: rng.normal(size=dims[b]) for b in blocks[1:]}
             wanted = quadrature(factors, "x", d, states, values)
-            found = log_value(left, states, values) if blocks[1:] else left.log_scale[*states.values()]
+            found = (
+                log_value(left, states, values) if blocks[1:] else left.log_scale[*states.values()]
+            )
             assert found == pytest.approx(wanted, rel=1e-8, abs=1e-8)
             check_conditional(given, factors, states, values)
 
@@ -216,7 +218,8 @@ def exact_means(rows: np.ndarray) -> list[Fraction]:
     exact = [[Fraction(float(v)) for v in row] for row in rows]
     n = len(exact[0]) - 1
     system = [
-        [sum((row[i] * row[j] for row in exact), Fraction(0)) for j in range(n + 1)] for i in range(n)
+        [sum((row[i] * row[j] for row in exact), Fraction(0)) for j in range(n + 1)]
+        for i in range(n)
     ]
     for i in range(n):
         pivot = next(k for k in range(i, n) if system[k][i])
@@ -246,7 +249,9 @@ def chain(rng: np.random.Generator, steps: int, low: float, high: float) -> list
     return factors
 
 
-def means_by_elimination(factors: Sequence[GaussianFactor], order: Sequence[Any]) -> dict[Any, float]:
+def means_by_elimination(
+    factors: Sequence[GaussianFactor], order: Sequence[Any]
+) -> dict[Any, float]:
     dims = dict.fromkeys(order, 1)
     live = list(factors)
     conditionals = []
@@ -315,7 +320,30 @@ def test_log_scales_of_extreme_noise() -> None:
         sd = np.hypot(prior, error)
         exact = -0.5 * np.log(2 * np.pi) - np.log(sd) - 0.5 * (error / sd) ** 2
         assert float(left.log_scale) == pytest.approx(exact, rel=1e-10)
-        spread = prior * (error / sd)
-        mean = prior / sd * spread
+        spread = min(prior, error) * (max(prior, error) / sd)
+        mean = spread * (prior / sd)
         assert abs(float(given.root[0, 0])) == pytest.approx(spread, rel=1e-9)
         assert float(given.offset[0]) == pytest.approx(mean, rel=1e-9, abs=1e-9 * spread)
+
+
+@pytest.mark.parametrize("squeeze", [False, True], ids=["as they are", "compressed first"])
+@pytest.mark.parametrize("width", [2, 4, 8])
+def test_stiff_rows_survive_compression(width: int, squeeze: bool) -> None:
+    """Dense rows of scales far apart in any order, as many observations of one block give them."""
+    dims = {"a": 2, "b": 2}
+    checked = 0
+    for seed in range(60):
+        rng = np.random.default_rng([seed, width])
+        count = int(rng.integers(5, 9))
+        rows = rng.normal(size=(count, 5)) * 10.0 ** rng.uniform(-width, width, size=(count, 1))
+        if not is_well_posed(rows):
+            continue
+        checked += 1
+        exact = np.array(list(map(float, exact_means(rows))))
+        short = compressed(rows, np.zeros(()))[0] if squeeze else rows
+        factor = GaussianFactor((), ("a", "b"), short, np.zeros(()))
+        first, left = eliminate([factor], "a", dims, {})
+        last, _ = eliminate([left], "b", dims, {})
+        found = np.concatenate([first.offset + first.gain @ last.offset, last.offset])
+        np.testing.assert_allclose(found, exact, rtol=1e-6, atol=1e-6 * np.abs(exact).max())
+    assert checked > 30

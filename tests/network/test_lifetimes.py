@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.forward import forward_chunks
+from bayesmc.engines.forward import fast_steps
+from bayesmc.engines.weighted import passes
 from bayesmc.errors import ParameterError
 from bayesmc.network import pose
-from bayesmc.progress import Progress
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import sums
 
@@ -142,7 +142,8 @@ def test_a_suspended_pass_leaves_no_check_switched_off() -> None:
     net = bmc.BayesNet()
     net.add("x", bmc.Normal(0.0, 1.0))
     before = np.geterr()
-    chunks = forward_chunks(pose(net, {}), 40_000, seed_sequence(0), Progress(40_000, "", False))
+    steps = fast_steps(pose(net, {}).model, {}, {})
+    chunks = passes(steps, [20_000, 20_000], seed_sequence(0), {})
     next(chunks)
     with pytest.raises(ParameterError, match="scale must be positive"):
         bmc.Normal(0.0, -1.0)
