@@ -1,8 +1,7 @@
-"""Fast steps of the forward pass for finite nodes, and the loop over chunks that all forward engines share.
+"""Fast steps of the forward pass for finite nodes, and how many draws make a chunk.
 
 A finite node whose parents are finite is a table: its draws are integer codes picked by comparing
-random bits with cumulative rows, its density a row of logs. Chunks are small enough for their arrays to
-stay in cache; each draws from its own random stream, so results do not depend on how work is cut.
+random bits with cumulative rows, its density a row of logs.
 """
 
 from __future__ import annotations
