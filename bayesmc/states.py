@@ -106,7 +106,7 @@ class StateArray(np.ndarray):
             inputs = _comparable(*inputs)
             return getattr(ufunc, method)(*(_bare(x) for x in inputs), **kwargs)
         result = getattr(ufunc, method)(*(_bare(x) for x in inputs), **kwargs)
-        return as_numbers(np.asarray(result))
+        return _numbers_too(result)
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if func is np.isin and isinstance(args[0], StateArray):

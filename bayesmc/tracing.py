@@ -39,6 +39,10 @@ _LINEAR_FUNCTIONS = frozenset(
     )
 )  # fmt: skip
 _BILINEAR_FUNCTIONS = frozenset((np.dot, np.inner, np.outer, np.tensordot, np.kron, np.convolve))
+#: functions that hand numbers to callbacks or files
+_SHOWING = frozenset(
+    (np.apply_along_axis, np.apply_over_axes, np.piecewise, np.save, np.savez, np.savetxt)
+)
 #: functions of an array's shape alone
 _SHAPE_FUNCTIONS = frozenset((np.shape, np.ndim, np.size, np.zeros_like, np.ones_like))
 
@@ -75,7 +79,7 @@ class Tracer(NDArrayOperatorsMixin):
         reason: str | None = None,
         margin: Tracer | None = None,
     ) -> None:
-        self._value = np.asarray(value)
+        self._value = _locked(np.asarray(value))
         self.sources = frozenset(sources)
         self.reason = reason
         self.margin = margin
@@ -129,10 +133,10 @@ class Tracer(NDArrayOperatorsMixin):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if any(_is_foreign(x) for x in inputs):
             return NotImplemented
-        if "out" in kwargs or isinstance(kwargs.get("where", True), Tracer):
+        if method == "at" or "out" in kwargs or isinstance(kwargs.get("where", True), Tracer):
             raise TypeError("a traced value is read-only: no out=, no in-place operation")
         values = [_bare(x) for x in inputs]
-        traced = [x for x in inputs if isinstance(x, Tracer)]
+        traced = [x for x in _leaves(list(inputs)) if isinstance(x, Tracer)]
         with np.errstate(all="ignore"):
             result = getattr(ufunc, method)(*values, **kwargs)
         reason = next((t.reason for t in traced if t.reason), None)
@@ -146,6 +150,8 @@ class Tracer(NDArrayOperatorsMixin):
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         if any(_is_foreign(x) for x in _leaves([args, list(kwargs.values())])):
             return NotImplemented
+        if func in _SHOWING:
+            raise self._refuse(f"np.{func.__name__}")
         with np.errstate(all="ignore"):
             result = func(*_bare(args), **{k: _bare(v) for k, v in kwargs.items()})
         if func in _SHAPE_FUNCTIONS:
@@ -206,7 +212,7 @@ class Tracer(NDArrayOperatorsMixin):
     view = copy
 
     def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> Any:
-        kept = np.issubdtype(np.dtype(dtype), np.floating)
+        kept = np.dtype(dtype) == np.float64
         reason = self.reason or (None if kept else f"astype({np.dtype(dtype).name})")
         return Tracer(self._value.astype(dtype), self.sources, reason)
 
@@ -276,9 +282,10 @@ def is_traced(value: Any) -> bool:
 
 def _exceeds(larger: Any, smaller: Any) -> Tracer | None:
     """The margin of ``larger > smaller``."""
-    if any(isinstance(x, Tracer) and not x.is_affine for x in (larger, smaller)):
+    if any(isinstance(x, Tracer) and not x.is_affine for x in _leaves([larger, smaller])):
         return None
-    return np.subtract(larger, smaller)
+    margin = np.subtract(larger, smaller)
+    return margin if margin.is_affine else None
 
 
 def _both(first: Any, second: Any, otherwise: float = -np.inf) -> Tracer | None:
@@ -316,12 +323,12 @@ def _keeps_affine(ufunc: Any, method: str, inputs: Any, kwargs: Any) -> bool:
     if set(kwargs) - {"axis", "axes", "keepdims", "dtype", "initial"} or _narrows(kwargs):
         return False
     if method in ("reduce", "accumulate", "reduceat"):
-        return ufunc is np.add and not any(isinstance(x, Tracer) for x in inputs[1:])
+        return ufunc is np.add and not is_traced(inputs[1:])
     if method not in ("__call__", "outer"):
         return False
     if ufunc in _ADDITIVE:
         return method == "__call__"
-    traced = [isinstance(x, Tracer) for x in inputs]
+    traced = [is_traced(x) for x in inputs]
     if ufunc in _BILINEAR:
         return sum(traced) == 1
     return ufunc is np.true_divide and traced == [True, False]
@@ -330,12 +337,14 @@ def _keeps_affine(ufunc: Any, method: str, inputs: Any, kwargs: Any) -> bool:
 def _function_keeps_affine(func: Any, args: Any, kwargs: Any) -> bool:
     if any(isinstance(x, Tracer) for x in _leaves(list(kwargs.values()))) or _narrows(kwargs):
         return False
+    if any(isinstance(x, (type, np.dtype)) for x in args):
+        return False  # a type by place
     if func is np.where:
-        return len(args) == 3 and not isinstance(args[0], Tracer)
+        return len(args) == 3 and not is_traced(args[0])
     if func is np.broadcast_arrays:
         return True
     if func is np.einsum:
-        return sum(isinstance(x, Tracer) for x in args) == 1
+        return sum(map(is_traced, args)) == 1
     if func in _BILINEAR_FUNCTIONS:
         return sum(isinstance(x, Tracer) for x in _leaves(list(args[:2]))) == 1
     rest = [x for x in _leaves(list(args[1:])) if isinstance(x, Tracer)]
@@ -352,15 +361,27 @@ def _wrapped(result: Any, traced: Any, reason: str | None) -> Any:
     sources = frozenset().union(*(t.sources for t in traced))
     if isinstance(result, (list, tuple)):
         return type(result)(_wrapped(r, traced, reason) for r in result)
+    if reason is None and np.asarray(result).dtype.kind not in "fc":
+        reason = "numbers that are no floats"  # integers wrap, booleans saturate, objects may be anything
     return Tracer(result, sources, reason)
 
 
 def _bare(value: Any) -> Any:
+    """Numbers in place of what stands for them; arrays of others can be read only, not written to."""
     if isinstance(value, Tracer):
         return value._value
+    if isinstance(value, np.ndarray):
+        return _locked(value)
     if isinstance(value, (list, tuple)):
         return type(value)(_bare(v) for v in value)
     return value
+
+
+def _locked(array: np.ndarray) -> np.ndarray:
+    """A view that refuses to be written to (asking a broadcast array whether it does makes NumPy warn)."""
+    view = array.view()
+    view.flags.writeable = False
+    return view
 
 
 def _leaves(value: Any) -> list[Any]:

@@ -111,6 +111,11 @@ GENTLE: dict[str, Operation] = {
     "swapaxes": lambda p, r: np.swapaxes(v := some(p, r), axis(v, r), axis(v, r)),
     "reshape": lambda p, r: some(p, r).reshape(-1),
     "broadcast": lambda p, r: np.broadcast_to(v := some(p, r), (2, *v.shape)),
+    "broadcast arrays": lambda p, r: (
+        np.broadcast_arrays(v := some(p, r), np.ones((2, *v.shape)))[0]
+        + np.broadcast_arrays(np.ones(v.shape), v)[0]
+    ),
+    "broadcast constant": lambda p, r: some(p, r) * np.broadcast_arrays(2.0, np.ones(3))[0],
     "flip": lambda p, r: np.flip(some(p, r), -1),
     "roll": lambda p, r: np.roll(some(p, r), 1),
     "diff": lambda p, r: np.diff(some(p, r)),
@@ -330,6 +335,16 @@ def test_no_operation_lies_alone(name: str) -> None:
             program = valid([(number, seed)] if first is None else [(first, seed), (number, seed)])
             claim = lie(program)
             assert claim is None, f"{words(program)} is not {claim}"
+
+
+@pytest.mark.parametrize("name", GENTLE)
+def test_every_gentle_operation_is_recognised(name: str) -> None:
+    for seed in range(3):
+        program = valid([(NAMES.index(name), seed)])
+        assert program
+        x, z = (Tracer(value, [name]) for name, value in zip(SHAPES, points(0), strict=True))
+        result = run(program, x, z)[-1]
+        assert not isinstance(result, Tracer) or result.is_affine
 
 
 def test_most_affine_programs_are_recognised() -> None:

@@ -110,7 +110,7 @@ def compressed(rows: np.ndarray, log_scale: np.ndarray) -> tuple[np.ndarray, np.
     """The same factor in at most n rows; what does not depend on x moves to the log scale."""
     columns = rows.shape[-1]
     if rows.shape[-2] >= columns:
-        rows = np.asarray(np.linalg.qr(rows, mode="r"))
+        rows = _triangle(rows)
     if rows.shape[-2] == columns:
         log_scale = log_scale - 0.5 * rows[..., -1, -1] ** 2
         rows = rows[..., :-1, :]
@@ -143,10 +143,7 @@ def eliminate(
     scope, blocks = union_of(factors, block)
     rows, log_scale = _product(factors, scope, blocks, dims, cards)
     d = dims[block]
-    # large rows first: otherwise rounding of theirs would swamp small ones (Powell and Reid 1969)
-    order = np.argsort(-np.abs(rows[..., :-1]).max(axis=-1), axis=-1)
-    rows = np.take_along_axis(rows, order[..., None], axis=-2)
-    upper = np.asarray(np.linalg.qr(rows, mode="r"))
+    upper = _triangle(rows)
     own = upper[..., :d, :d]
     pivots = np.linalg.diagonal(own)
     log_scale = log_scale + 0.5 * d * _LOG_2PI - np.log(np.abs(pivots)).sum(axis=-1)
@@ -173,6 +170,14 @@ def union_of(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _triangle(rows: np.ndarray) -> np.ndarray:
+    """The triangular factor of the rows."""
+    # large rows first: otherwise rounding of theirs would swamp small ones (Powell and Reid 1969)
+    order = np.argsort(-np.abs(rows[..., :-1]).max(axis=-1, initial=0.0), axis=-1)
+    rows = np.take_along_axis(rows, order[..., None], axis=-2)
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def _product(

@@ -175,7 +175,8 @@ def _why_not_gaussian(
     else:
         return f"returns {type(result).__name__}"
     if family not in _GAUSSIAN:
-        return f"is {family.__name__}, not Normal or MvNormal"
+        on = f" (it depends on the continuous {_nodes(above)})" if above else ""
+        return f"is {family.__name__}, not Normal or MvNormal{on}"
     for key, value in traced.items():
         if key != "loc" or not isinstance(value, Tracer):
             return f"has a {key} that depends on the continuous {_nodes(above)}"

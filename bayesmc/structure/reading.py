@@ -216,6 +216,8 @@ class Reading:
             # unlike each other, and short in binary, so that what cancels does so without rounding
             turns = np.round(256 * np.sin(1.0 + k + np.arange(_CHECKS * len(value[0])))) / 128
             shifts = column.step * turns.reshape(_CHECKS, -1)
+            # to both sides of the base, as every step goes to one only
+            shifts = np.abs(shifts) * (-1.0) ** np.arange(_CHECKS)[:, None]
             value[-_CHECKS:, chosen, column.component] += shifts[:, chosen]
             kept = np.zeros_like(shifts)
             kept[:, chosen] = shifts[:, chosen]
@@ -226,7 +228,7 @@ class Reading:
 
     def _check_affine(self, found: np.ndarray, moved: np.ndarray) -> None:
         """What the function gives at further points must be what its coefficients say."""
-        spread = np.sqrt((self.tril**2).sum(axis=-1))  # what is far below the noise does not count
+        spread = np.abs(self.tril).sum(axis=-1)  # what is far below the noise does not count
         step = max((c.step for c in self.columns), default=0.0)
         for check in range(_CHECKS):
             expected = self.offset + np.matvec(self.matrix, moved[check].T)
@@ -329,7 +331,7 @@ def _typical(probe: np.ndarray, components: int) -> list[float]:
     """A power of two near the size of each component's values, so that steps of it lose no digits."""
     sizes = np.abs(probe).reshape(-1, components).max(axis=0, initial=0.0)
     sizes = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
-    return (2.0 ** np.clip(np.round(np.log2(sizes)), -500, 500)).tolist()
+    return (2.0 ** np.clip(np.round(np.log2(sizes)), -1000, 1000)).tolist()
 
 
 def _constant_along(array: np.ndarray, axis: int) -> bool:
