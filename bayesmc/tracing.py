@@ -361,8 +361,8 @@ def _wrapped(result: Any, traced: Any, reason: str | None) -> Any:
     sources = frozenset().union(*(t.sources for t in traced))
     if isinstance(result, (list, tuple)):
         return type(result)(_wrapped(r, traced, reason) for r in result)
-    if reason is None and np.asarray(result).dtype.kind not in "fc":
-        reason = "numbers that are no floats"  # integers wrap, booleans saturate, objects may be anything
+    if reason is None and np.asarray(result).dtype not in (np.float64, np.complex128):
+        reason = "numbers that round or wrap"
     return Tracer(result, sources, reason)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from benchmarks import bench_exact, bench_scale, bench_weighting
+from benchmarks import bench_exact, bench_gaussian, bench_scale, bench_weighting
 from benchmarks.harness import data_folder, peer_python
 
 if __name__ == "__main__":
@@ -13,5 +13,6 @@ if __name__ == "__main__":
     if data_folder().exists():
         bench_weighting.main()
         bench_exact.main()
+        bench_gaussian.main()
     else:
         print(f"no networks at {data_folder()}: set BAYESMC_DATA to time them")

@@ -12,12 +12,16 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Mixture, MvNormal, Normal
+from bayesmc.errors import UnsupportedError
 from bayesmc.factors.moments import Components, Moments
+from bayesmc.gaussian import try_cholesky
 from bayesmc.network import Model, Observed
-from bayesmc.structure import Variable
+from bayesmc.structure import Variable, is_hidden
 
 #: below this a standard deviation is none: what is computed without noise
 _NO_SPREAD = 1e-150
+#: share of a component's variance, given those before it, that is nothing but rounding
+_ROUNDING = 1e-13
 
 
 class GaussianAnswers:
@@ -33,7 +37,8 @@ class GaussianAnswers:
 
     def __init__(self, model: Model, observed: Mapping[str, Observed], moments: Moments) -> None:
         self.model, self._moments = model, moments
-        self._nodes = {block[0] for block in moments.scopes}
+        hidden = {n for n in model.nodes if is_hidden(model[n], observed)}
+        self._nodes = hidden | {block[0] for block in moments.scopes}
         self._seen = {
             name: seen.value
             for name, seen in observed.items()
@@ -55,7 +60,7 @@ class GaussianAnswers:
         return np.reshape(np.array(parts), self.model[name].value_shape)
 
     def components(
-        self, names: Sequence[str], extra: Sequence[Any] = ()
+        self, names: Sequence[str], extra: Sequence[Any] = (), spread: bool = True
     ) -> tuple[Components, dict[str, list[int]]]:
         """The joint mixture of all hidden elements of some nodes, and each node's columns (-1: observed)."""
         blocks: list[Variable] = []
@@ -71,7 +76,7 @@ class GaussianAnswers:
                 blocks.append((name, e))
                 columns[name] += range(width, width + d)
                 width += d
-        return self._moments.components(blocks, extra), columns
+        return self._moments.components(blocks, extra, spread), columns
 
     def values(self, name: str, means: np.ndarray, columns: Sequence[int]) -> np.ndarray:
         """Values of a node in every component, ``(components, *plates, *event)``, from the blocks' means."""
@@ -90,6 +95,11 @@ class GaussianAnswers:
 
         Plates that the index leaves are batch axes; where elements have mixtures of different lengths, the
         shorter are filled up with components of weight zero.
+
+        Raises
+        ------
+        UnsupportedError
+            Of a whole vector with a singular covariance.
         """
         node = self.model[name]
         plates, event = index[: len(node.plates)], index[len(node.plates) :]
@@ -109,6 +119,12 @@ class GaussianAnswers:
             spread = np.sqrt(np.maximum(np.diagonal(covs, axis1=-2, axis2=-1), _NO_SPREAD**2))
             at = (..., *event)
             return Mixture(weights, Normal(means.reshape(shape)[at], spread.reshape(shape)[at]))
+        if _is_singular(covs):
+            raise UnsupportedError(
+                f"marginal({name!r}): the covariance of the whole vector is singular (an element is seen, or "
+                "components that follow from each other), so it has no density; ask for one component, "
+                f"marginal({name!r}, index)"
+            )
         return Mixture(weights, MvNormal(means.reshape(shape), covs.reshape((*shape, d))))
 
     def draw(
@@ -155,3 +171,10 @@ class GaussianAnswers:
 
     def _fixed(self, name: str, e: int) -> np.ndarray:
         return self._seen[name].reshape(-1, self._size(name))[e]
+
+
+def _is_singular(covs: np.ndarray) -> bool:
+    """Whether some covariance is singular up to rounding."""
+    tril, bad = try_cholesky(covs)
+    pivots = np.linalg.diagonal(tril) ** 2
+    return bad is not None or bool((pivots <= _ROUNDING * np.linalg.diagonal(covs)).any())

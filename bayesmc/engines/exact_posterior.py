@@ -125,17 +125,13 @@ class ExactPosterior(Posterior):
         if not ((levels >= 0) & (levels <= 1)).all():
             raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
         if self._gaussian is not None and self._is_gaussian(name):
-            found = self._gaussian.distribution(name)
-            spread = levels.reshape(levels.shape + (1,) * len(node.value_shape))
-            if not node.event_shape:
-                return found.ppf(spread)
+            everywhere = tuple(slice(None) for _ in node.plates)
+            spread = levels.reshape(levels.shape + (1,) * len(node.plates))
             parts = [
-                self._gaussian.distribution(name, (*(slice(None) for _ in node.plates), *at))
+                self._gaussian.distribution(name, (*everywhere, *at)).ppf(spread)
                 for at in np.ndindex(node.event_shape)
             ]
-            levels_of = levels.reshape(levels.shape + (1,) * len(node.plates))
-            stacked = np.stack([part.ppf(levels_of) for part in parts], axis=-1)
-            return stacked.reshape(levels.shape + node.value_shape)
+            return np.stack(parts, axis=-1).reshape(levels.shape + node.value_shape)
         if node.domain is None:
             seen = self._tables.known(name)
             if seen is None:

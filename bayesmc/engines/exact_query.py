@@ -68,7 +68,7 @@ def gaussian_average(
     continuous = [n for n in dict.fromkeys(query.nodes) if gaussian.holds(n)]
     others = [n for n in dict.fromkeys(query.nodes) if n not in continuous]
     extra = [v for n in tables.above(others) for v in tables.elements(n)]
-    found, columns = gaussian.components(continuous, extra)
+    found, columns = gaussian.components(continuous, extra, spread=events)
     count = len(found.weights)
     stored = _finite_values(tables, others, found)
 
@@ -78,9 +78,8 @@ def gaussian_average(
             return {**stored, **{n: Tracer(v, [n]) for n, v in values.items()}}
         return {**stored, **values}
 
-    plain = query(
-        at(found.mean, traced=False), (count,)
-    )  # with the checks that it acts draw by draw
+    # with the checks that it acts draw by draw
+    plain = query(at(found.mean, traced=False), (count,))
     if events:
         _check_boolean(plain)
     try:
@@ -156,6 +155,9 @@ def _chances(
             here = query.raw(at(moved)).margin
             slopes[k] = query.fitted(here.example, (count,)) - centre
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
+    unit = np.abs(slopes).max(axis=0, initial=0.0)  # the sign is all that counts, in any unit
+    unit = np.where(unit > 0, unit, 1.0)
+    slopes, centre = slopes / unit, centre / unit
     correlation = found.cov / (scale[:, :, None] * scale[:, None, :])
     var = np.einsum("kn...,nkl,ln...->n...", slopes, correlation, slopes)
     sd = np.sqrt(np.maximum(var, 0.0))

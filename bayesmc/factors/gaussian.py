@@ -19,6 +19,8 @@ from typing import Any
 
 import numpy as np
 
+#: ratio of rows above which their order matters
+_STIFF = 100.0
 _LOG_2PI = float(np.log(2 * np.pi))
 
 
@@ -174,9 +176,11 @@ def union_of(
 
 def _triangle(rows: np.ndarray) -> np.ndarray:
     """The triangular factor of the rows."""
-    # large rows first: otherwise rounding of theirs would swamp small ones (Powell and Reid 1969)
-    order = np.argsort(-np.abs(rows[..., :-1]).max(axis=-1, initial=0.0), axis=-1)
-    rows = np.take_along_axis(rows, order[..., None], axis=-2)
+    sizes = np.abs(rows[..., :-1]).max(axis=-1, initial=0.0)
+    if sizes.max(initial=0.0) > _STIFF * sizes.min(initial=np.inf, where=sizes > 0):
+        # large rows first: otherwise rounding of theirs would swamp small ones (Powell and Reid 1969)
+        order = np.argsort(-sizes, axis=-1)
+        rows = np.take_along_axis(rows, order[..., None], axis=-2)
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 

@@ -7,6 +7,7 @@ Gaussian for every configuration of the discrete variables that switch it or any
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -18,6 +19,8 @@ from .gaussian import Conditional
 Scope = tuple[Any, ...]
 #: configurations worked on at a time
 _CHUNK = 1 << 14
+#: entries of a joint covariance held at a time
+_ENTRIES = 1 << 24
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,26 +83,23 @@ class Moments:
             self._collapsed.update(self._collapse(group, tuple(scope)))
         return self._collapsed[block]
 
-    def components(self, blocks: Sequence[Any], extra: Sequence[Any] = ()) -> Components:
+    def components(
+        self, blocks: Sequence[Any], extra: Sequence[Any] = (), spread: bool = True
+    ) -> Components:
         """The mixture of some blocks jointly, split by further discrete variables, too.
 
-        Configurations of probability zero are left out.
+        Configurations of probability zero are left out. Without ``spread`` only means are worked out, and
+        covariances are empty.
         """
         scope = tuple(dict.fromkeys([*(v for b in blocks for v in self.scopes[b]), *extra]))
         states, weights = self._configurations(scope)
-        parts = [
-            self._descend(list(blocks), {v: s[rows] for v, s in states.items()}, blocks)
-            for rows in _chunks(len(weights))
-        ]
-        n = sum(self._dims[b] for b in blocks)
+        passed = _Descent(self._of, self._dims, self._cards, self._visits(blocks), blocks, spread)
         means, covs = [], []
-        for part in parts:
-            *_, (mean, cov) = part
+        for rows in passed.chunks(len(weights)):
+            *_, (mean, cov) = passed.run({v: s[rows] for v, s in states.items()})
             means.append(mean)
             covs.append(cov)
-        rows_of = slice(len(weights))
-        mean = np.broadcast_to(np.concatenate(means), (len(weights), n))[rows_of]
-        return Components(states, weights, mean, np.concatenate(covs))
+        return Components(states, weights, np.concatenate(means), np.concatenate(covs))
 
     def sample(
         self, rng: np.random.Generator, codes: Mapping[Any, np.ndarray], draws: int
@@ -123,14 +123,15 @@ class Moments:
         """Moments of the whole mixture, for every block of a group with one scope."""
         states, weights = self._configurations(scope)
         sums: dict[Any, tuple[float, np.ndarray, np.ndarray]] = {}
-        for rows in _chunks(len(weights)):
+        passed = _Descent(self._of, self._dims, self._cards, self._visits(group), ())
+        wanted = set(group)
+        for rows in passed.chunks(len(weights)):
             here = {v: s[rows] for v, s in states.items()}
             w = weights[rows]
-            for block, (mean, cov) in zip(
-                self._visits(group), self._descend(group, here, ()), strict=False
-            ):
-                part = Components(here, w / w.sum(), mean, cov).collapsed()
-                sums[block] = _merged(sums.get(block), (float(w.sum()), *part))
+            for block, (mean, cov) in zip(passed.order, passed.run(here), strict=False):
+                if block in wanted:
+                    part = Components(here, w / w.sum(), mean, cov).collapsed()
+                    sums[block] = _merged(sums.get(block), (float(w.sum()), *part))
         return {block: sums[block][1:] for block in group}
 
     def _configurations(self, scope: Scope) -> tuple[dict[Any, np.ndarray], np.ndarray]:
@@ -167,60 +168,6 @@ class Moments:
                     ready.append(c)
         return order
 
-    def _descend(
-        self, blocks: Sequence[Any], codes: Mapping[Any, np.ndarray], keep: Sequence[Any]
-    ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Mean and covariance of each visited block in turn; last of all, jointly of those to ``keep``.
-
-        Only blocks that a later one needs stay in the joint covariance.
-        """
-        order = self._visits(blocks)
-        last = {p: k for k, b in enumerate(order) for p in self._of[b].parents}
-        last.update(dict.fromkeys(keep, len(order)))
-        count = len(next(iter(codes.values()))) if codes else 1
-        live: list[Any] = []
-        mean, cov = np.zeros((count, 0)), np.zeros((count, 0, 0))
-        for k, block in enumerate(order):
-            given = self._of[block]
-            at = _rows(given.scope, self._cards, codes, count)
-            own = _flat(given.offset, given)[at]
-            root = _flat(given.root, given)[at]
-            inside = root @ np.matrix_transpose(root)
-            columns = self._columns(live, given.parents)
-            cross = np.zeros((count, self._dims[block], mean.shape[1]))
-            if columns:
-                gain = _flat(given.gain, given)[at]
-                own = own + np.matvec(gain, mean[:, columns])
-                cross = gain @ cov[:, columns, :]
-                inside = inside + cross[:, :, columns] @ np.matrix_transpose(gain)
-            own = np.broadcast_to(own, (count, self._dims[block]))
-            inside = np.broadcast_to(inside, (count, *inside.shape[1:]))
-            yield own, inside
-            stays = [b for b in live if last.get(b, -1) > k]
-            columns = self._columns(live, stays)
-            joins = last.get(block, -1) > k
-            if not joins:
-                if len(stays) < len(live):
-                    mean, cov = mean[:, columns], cov[:, columns][:, :, columns]
-                live = stays
-                continue
-            cross = cross[:, :, columns]
-            mean = np.concatenate([mean[:, columns], own], axis=1)
-            above = np.concatenate(
-                [cov[:, columns][:, :, columns], np.matrix_transpose(cross)], axis=2
-            )
-            cov = np.concatenate([above, np.concatenate([cross, inside], axis=2)], axis=1)
-            live = [*stays, block]
-        columns = self._columns(live, keep)
-        yield mean[:, columns], cov[:, columns][:, :, columns]
-
-    def _columns(self, live: Sequence[Any], wanted: Sequence[Any]) -> list[int]:
-        start, first = {}, 0
-        for b in live:
-            start[b] = first
-            first += self._dims[b]
-        return [start[b] + k for b in wanted for k in range(self._dims[b])]
-
 
 def mixture_scopes(
     blocks: Mapping[Any, tuple[Scope, Sequence[Any]]],
@@ -247,9 +194,112 @@ def mixture_scopes(
 # ---- private ------------------------------------------------------------------------------------
 
 
+class _Descent:
+    """Means and covariances of blocks in turn, parents first.
+
+    Of each block only what later ones need stays, in columns that are given out again when it goes.
+
+    Parameters
+    ----------
+    order : sequence
+        The blocks to visit, each after its parents.
+    keep : sequence
+        Blocks whose joint distribution is wanted in the end.
+    spread : bool
+        Whether covariances are wanted at all.
+    """
+
+    def __init__(
+        self,
+        of: Mapping[Any, Conditional],
+        dims: Mapping[Any, int],
+        cards: Mapping[Any, int],
+        order: Sequence[Any],
+        keep: Sequence[Any],
+        spread: bool = True,
+    ) -> None:
+        self.of, self.dims, self.cards = of, dims, cards
+        self.order, self.keep, self.spread = order, keep, spread
+        last = {p: k for k, b in enumerate(order) for p in of[b].parents}
+        last.update(dict.fromkeys(keep, len(order)))
+        self.last = last
+        self.places: dict[Any, np.ndarray] = {}
+        #: the columns in use by others when a block is put in its place
+        self.beside: dict[Any, np.ndarray] = {}
+        self.width = 0
+        self._lay_out()
+
+    def chunks(self, count: int) -> Iterator[slice]:
+        """Configurations in parts that keep covariances small."""
+        size = max(1, min(_CHUNK, _ENTRIES // max(self.width, 1) ** 2))
+        return (slice(k, k + size) for k in range(0, count, size))
+
+    def run(self, codes: Mapping[Any, np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Mean and covariance of each visited block; last of all, jointly of those to keep."""
+        count = len(next(iter(codes.values()))) if codes else 1
+        mean = np.zeros((count, self.width))
+        cov = np.zeros((count, self.width, self.width) if self.spread else (count, 0, 0))
+        for block in self.order:
+            given, d = self.of[block], self.dims[block]
+            at = _rows(given.scope, self.cards, codes, count)
+            above = self._columns(given.parents)
+            own = _flat(given.offset, given)[at]
+            gain = _flat(given.gain, given)[at]
+            if len(above):
+                own = own + np.matvec(gain, mean[:, above])
+            own = np.broadcast_to(own, (count, d))
+            inside = np.zeros((count, 0, 0))
+            if self.spread:
+                root = _flat(given.root, given)[at]
+                inside = root @ np.matrix_transpose(root)
+                if len(above):
+                    inside = inside + gain @ _block(cov, above, above) @ np.matrix_transpose(gain)
+                inside = np.broadcast_to(inside, (count, d, d))
+            yield own, inside
+            if block not in self.places:
+                continue
+            mine, others = self.places[block], self.beside[block]
+            mean[:, mine] = own
+            if self.spread:
+                # read before writing: columns of a parent may be taken over
+                cross = gain @ _block(cov, above, others)
+                cov[:, mine[:, None], others] = cross
+                cov[:, others[:, None], mine] = np.matrix_transpose(cross)
+                cov[:, mine[:, None], mine] = inside
+        columns = self._columns(self.keep)
+        yield mean[:, columns], _block(cov, columns, columns) if self.spread else cov
+
+    def _lay_out(self) -> None:
+        """Give every block that stays for a while its columns."""
+        free: list[int] = []
+        live: list[Any] = []
+        for k, block in enumerate(self.order):
+            gone = [b for b in live if self.last[b] <= k]
+            live = [b for b in live if self.last[b] > k]
+            free += [c for b in gone for c in self.places[b].tolist()]
+            if self.last.get(block, -1) <= k:
+                continue
+            missing = self.dims[block] - len(free)
+            if missing > 0:
+                free += range(self.width, self.width + missing)
+                self.width += missing
+            self.beside[block] = self._columns(live)
+            self.places[block] = np.array([free.pop() for _ in range(self.dims[block])], dtype=int)
+            live.append(block)
+
+    def _columns(self, blocks: Sequence[Any]) -> np.ndarray:
+        parts = [self.places[b] for b in blocks]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=int)
+
+
+def _block(cov: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    return cov[:, rows[:, None], columns]
+
+
 def _flat(array: np.ndarray, given: Conditional) -> np.ndarray:
     """An array of a conditional with its discrete axes as one."""
-    return array.reshape((-1, *array.shape[len(given.scope) :]))
+    axes = len(given.scope)
+    return array.reshape((math.prod(array.shape[:axes]), *array.shape[axes:]))
 
 
 def _rows(
@@ -262,10 +312,6 @@ def _rows(
     for v in scope:
         row = row * cards[v] + codes[v].astype(np.intp)
     return row
-
-
-def _chunks(count: int) -> Iterator[slice]:
-    return (slice(k, k + _CHUNK) for k in range(0, count, _CHUNK))
 
 
 def _merged(

@@ -223,9 +223,7 @@ def _reachable(
         return _point_in(dist.support, lead, dist.event_shape, rng)
 
 
-def _point_in(
-    support: Support, lead: Shape, event: Shape, rng: np.random.Generator
-) -> np.ndarray:
+def _point_in(support: Support, lead: Shape, event: Shape, rng: np.random.Generator) -> np.ndarray:
     """Some points of a support, for densities that cannot be sampled from."""
     shape = lead + event
     if not support.is_discrete:

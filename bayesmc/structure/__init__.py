@@ -1,6 +1,6 @@
 """Structure read off a net: tables of finite nodes, discrete factors, linear-Gaussian conditionals."""
 
-from bayesmc.structure.affine import why_not_linear
+from bayesmc.structure.affine import is_hidden, why_not_linear
 from bayesmc.structure.discrete import (
     DiscreteNet,
     FactorSource,
@@ -24,6 +24,7 @@ __all__ = [
     "configure",
     "constants_of",
     "discrete_net",
+    "is_hidden",
     "known_values",
     "linear_gaussian",
     "tabulate",

@@ -78,17 +78,22 @@ class Reading:
         self.cards = [self._card(n) for n in self.alone]
         for n in self.whole:
             self.cards += [self._card(n)] * math.prod(model[n].plate_shape)
+        self._kept: dict[Any, Conditional] = {}
         self._check_size()
         self._evaluate()
         del self.known, self.observed  # it outlives the question
 
     def conditional(self, e: int, states: Mapping[Variable, int]) -> Conditional:
         """One element given the discrete variables and blocks it depends on."""
-        blocks, columns = self._blocks(e)
-        matrix = self.matrix[..., e, :, :][..., columns]
-        arrays = [self.offset[..., e, :], matrix, self.tril[..., e, :, :]]
-        scope, arrays = _reduced(self.scope(e), arrays, states)
-        return Conditional((self.node.name, e), scope, blocks, *arrays)
+        scope = self.scope(e)
+        key = (e, tuple(states.get(v) for v in scope))
+        if key not in self._kept:
+            blocks, columns = self._blocks(e)
+            matrix = self.matrix[..., e, :, :][..., columns]
+            arrays = [self.offset[..., e, :], matrix, self.tril[..., e, :, :]]
+            scope, arrays = _reduced(scope, arrays, states)
+            self._kept[key] = Conditional((self.node.name, e), scope, blocks, *arrays)
+        return self._kept[key]
 
     def likelihood(
         self, group: np.ndarray, values: np.ndarray, states: Mapping[Variable, int]

@@ -828,3 +828,43 @@ def smoother(
         smoothed.append((m + gain * (m_next - m_ahead), p + gain**2 * (p_next - p_ahead)))
     means, variances = zip(*reversed(smoothed), strict=True)
     return total, np.array(means), np.array(variances)
+
+
+# ---- corners ------------------------------------------------------------------------------------
+
+
+def test_an_empty_plate_has_empty_answers() -> None:
+    net = bmc.BayesNet(plates={"p": 0})
+    net.add("m", bmc.Normal(1.0, 1.0))
+    net.add("x", lambda m: bmc.Normal(m, 1.0), plates="p")
+    posterior = bmc.infer(net, engine=EXACT)
+    assert posterior.mean("x").shape == posterior.quantile("x", 0.5).shape == (0,)
+    assert posterior.mean("m") == pytest.approx(1.0)
+    assert len(posterior.summary().columns["mean"]) == 1
+
+
+def test_vectors_without_spread_are_summed_up_by_component() -> None:
+    net = bmc.BayesNet(plates={"p": 2})
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("x", lambda m: bmc.MvNormal(bmc.stack([m, 2 * m]), np.eye(2)), plates="p")
+    net.add("both", lambda m: bmc.stack([m, 3 * m]))
+    posterior = bmc.infer(net, {"x": [[1.0, 2.0], [np.nan, np.nan]]}, engine=EXACT)
+    np.testing.assert_allclose(posterior.quantile("x", 0.5)[0], [1.0, 2.0])
+    np.testing.assert_allclose(posterior.var("x")[0], 0.0)
+    np.testing.assert_allclose(posterior.cov("both")[0, 1], 3 * posterior.var("m"))
+    assert posterior.marginal("x", (1,)).distribution.event_shape == (2,)
+    with pytest.raises(UnsupportedError, match=r"singular.*one component"):
+        posterior.marginal("x")
+    with pytest.raises(UnsupportedError, match=r"singular.*one component"):
+        posterior.marginal("both")
+    assert posterior.marginal("both", (1,)).distribution.mean == pytest.approx(2.5)
+    assert "x[0, 1]" in str(posterior.summary())
+
+
+@pytest.mark.parametrize("unit", [1e-300, 1.0, 1e300])
+def test_events_have_no_favourite_unit(unit: float) -> None:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    posterior = bmc.infer(net, engine=EXACT)
+    above = posterior.probability(lambda x: x * unit > unit)
+    assert above == pytest.approx(0.15865525393145707)
