@@ -169,6 +169,12 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
             (f"hidden nodes are finite or linear-Gaussian: {cost.words}, about {size}",),
             {},
         )
+    if Exact().refusal(problem) is None:
+        cost = Exact().cost(problem)
+        why_not = (
+            f"it would take about {readable_bytes(cost.bytes)} ({cost.words}), more than counts as cheap; "
+            "engine=bmc.Exact() answers all the same"
+        )
     weighting = LikelihoodWeighting()
     why = weighting.refusal(problem)
     if why is not None:

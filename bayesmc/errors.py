@@ -134,6 +134,10 @@ class LowEssWarning(BayesmcWarning):
     """Importance weights rest on too few draws for the answer to be trusted."""
 
 
+class SupportWarning(BayesmcWarning):
+    """A proposal that cannot reach values that have mass."""
+
+
 def missing_extra(package: str, extra: str) -> MissingExtraError:
     """The error for an absent optional ``package`` that ``bayesmc[extra]`` installs."""
     return MissingExtraError(

@@ -134,7 +134,7 @@ class Tracer(NDArrayOperatorsMixin):
         if any(_is_foreign(x) for x in inputs):
             return NotImplemented
         if method == "at" or "out" in kwargs or isinstance(kwargs.get("where", True), Tracer):
-            raise TypeError("a traced value is read-only: no out=, no in-place operation")
+            raise TypeError("a parent is read-only: write x = x + 1, not x += 1, and use no out=")
         values = [_bare(x) for x in inputs]
         traced = [x for x in _leaves(list(inputs)) if isinstance(x, Tracer)]
         with np.errstate(all="ignore"):
@@ -220,7 +220,7 @@ class Tracer(NDArrayOperatorsMixin):
 
     def _refuse(self, what: str) -> TypeError:
         names = ", ".join(sorted(self.sources))
-        return TypeError(f"{what} of a value that varies with {names}")
+        return TypeError(f"it asks for {what} of {names}, where only NumPy operations can be followed")
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         raise self._refuse("a plain array")

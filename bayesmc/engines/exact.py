@@ -28,7 +28,7 @@ from bayesmc.results import Posterior
 from bayesmc.structure import InvalidRows, Variable
 
 #: what to name where this engine refuses
-_OTHERS = "LikelihoodWeighting(draws)"
+_OTHERS = "LikelihoodWeighting(draws) or Importance(draws, proposal=...)"
 
 
 @dataclass(frozen=True)
@@ -214,7 +214,7 @@ def _treatment(problem: Problem, name: str) -> str:
             else "observed: its axis is sliced"
         )
     if not node.is_stochastic and node.domain is None:
-        return "passed through to the finite nodes above it"
+        return "computed: follows the nodes above it"
     return "eliminated" if node.domain is not None else "integrated out: linear-Gaussian"
 
 

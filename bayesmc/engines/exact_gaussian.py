@@ -6,13 +6,14 @@ Values of a node are put together from its elements: hidden ones from their mome
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import Mixture, MvNormal, Normal
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors.moments import Components, Moments
 from bayesmc.gaussian import try_cholesky
 from bayesmc.network import Model, Observed
@@ -60,9 +61,16 @@ class GaussianAnswers:
         return np.reshape(np.array(parts), self.model[name].value_shape)
 
     def components(
-        self, names: Sequence[str], extra: Sequence[Any] = (), spread: bool = True
+        self,
+        names: Sequence[str],
+        extra: Sequence[Any] = (),
+        spread: bool = True,
+        only: Mapping[str, int] | None = None,
     ) -> tuple[Components, dict[str, list[int]]]:
-        """The joint mixture of all hidden elements of some nodes, and each node's columns (-1: observed)."""
+        """The joint mixture of all hidden elements of some nodes (of each ``only`` one, where that is said).
+
+        With it come each node's columns in the blocks' means, -1 for what is observed or left out.
+        """
         blocks: list[Variable] = []
         columns: dict[str, list[int]] = {}
         width = 0
@@ -70,13 +78,15 @@ class GaussianAnswers:
             columns[name] = []
             for e in self._elements(name):
                 d = self._size(name)
-                if (name, e) not in self._moments.scopes:
+                left_out = only is not None and only[name] != e
+                if left_out or (name, e) not in self._moments.scopes:
                     columns[name] += [-1] * d
                     continue
                 blocks.append((name, e))
                 columns[name] += range(width, width + d)
                 width += d
-        return self._moments.components(blocks, extra, spread), columns
+        with _naming(*names):
+            return self._moments.components(blocks, extra, spread), columns
 
     def values(self, name: str, means: np.ndarray, columns: Sequence[int]) -> np.ndarray:
         """Values of a node in every component, ``(components, *plates, *event)``, from the blocks' means."""
@@ -158,7 +168,8 @@ class GaussianAnswers:
     def _own(self, name: str, e: int) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of one element."""
         if (name, e) in self._moments.scopes:
-            return self._moments.moments((name, e))
+            with _naming(name):
+                return self._moments.moments((name, e))
         return self._fixed(name, e), np.zeros((self._size(name), self._size(name)))
 
     def _part(self, name: str, e: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -166,11 +177,24 @@ class GaussianAnswers:
         if (name, e) not in self._moments.scopes:
             mean, cov = self._own(name, e)
             return np.ones(1), mean[None], cov[None]
-        found = self._moments.components([(name, e)])
+        with _naming(name):
+            found = self._moments.components([(name, e)])
         return found.weights, found.mean, found.cov
 
     def _fixed(self, name: str, e: int) -> np.ndarray:
         return self._seen[name].reshape(-1, self._size(name))[e]
+
+
+@contextmanager
+def _naming(*names: str) -> Iterator[None]:
+    """Say of which nodes a mixture is too large."""
+    try:
+        yield
+    except BudgetError as error:
+        whose = "joint posterior" if len(names) > 1 else "posterior"
+        raise BudgetError(
+            f"{', '.join(map(repr, names))}: of the {whose}, {error}", error.bytes
+        ) from None
 
 
 def _is_singular(covs: np.ndarray) -> bool:

@@ -114,13 +114,14 @@ class HybridPlan:
         blocks = {c.block: dims[c.block] for c in self.informed}
         key = (tuple(shapes), tuple(s for s, _ in self.part.tables), frozenset(self.part.nodes))
         kept = model.cache.setdefault("exact hybrid plans", {})
-        if key not in kept:
+        found = kept.get(key)
+        if found is None:
             if len(kept) > 8:
                 kept.clear()
-            kept[key] = self._planned(blocks, shapes)
+            found = kept[key] = self._planned(blocks, shapes)
         self.strong: StrongPlan
         self.tree: CliqueTree
-        self.strong, self.tree = kept[key]
+        self.strong, self.tree = found
         links: dict[Any, Any] = {s.block: (s.scope, s.parents) for s in self.strong.steps}
         links.update({c.block: (c.scope, c.parents) for c in self.barren})
         self.mixtures = mixture_scopes(links)
@@ -157,13 +158,16 @@ class HybridPlan:
         cards = self.net.cards
         dims = self.part.dims
         size = self.tree.cost.bytes + self.strong.bytes
-        words = (
-            f"induced width {self.tree.cost.induced_width}, "
-            f"largest table {self.tree.cost.largest_entries:.3g} entries"
-        )
+        words = f"{len(self.informed)} continuous elements integrated out"
+        if cards:
+            words += (
+                f", induced width {self.tree.cost.induced_width}, "
+                f"largest table {self.tree.cost.largest_entries:.3g} entries"
+            )
         widest: Variable | None = None
         most = 1.0
-        for block, scope in self.mixtures.items():
+        for block in (c.block for c in self.informed):
+            scope = self.mixtures[block]
             count = math.prod([float(cards[v]) for v in scope])
             if count > most:
                 widest, most = block, count
@@ -212,11 +216,12 @@ def plan_for(problem: Problem) -> Plan:
         tuple(sorted((n, v.tobytes()) for n, v in problem.inputs.items())),
         frozenset(n for n in problem.observed if problem.model[n].domain is None),
     )
-    if key not in plans:
+    plan = plans.get(key)
+    if plan is None:
         if len(plans) > 8:
             plans.clear()
-        plans[key] = DiscretePlan(problem)
-    return plans[key]
+        plan = plans[key] = DiscretePlan(problem)
+    return plan
 
 
 # ---- private ------------------------------------------------------------------------------------

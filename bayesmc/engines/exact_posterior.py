@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from bayesmc.engines.exact_gaussian import GaussianAnswers
 from bayesmc.engines.exact_plan import Solved
 from bayesmc.engines.exact_query import average, covariance, gaussian_average
 from bayesmc.engines.exact_tables import TableAnswers
-from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.network.forward import Compute, Pass, run
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -69,6 +70,7 @@ class ExactPosterior(Posterior):
             return self._tables.table(name) @ np.asarray(node.domain.numbers, dtype=float)
         if self._gaussian is not None and self._is_gaussian(name):
             return self._gaussian.mean(name)
+        self._refuse_beyond(name, "mean")
         return self._moment(name, lambda x: x)
 
     def var(self, name: str) -> np.ndarray:
@@ -78,6 +80,7 @@ class ExactPosterior(Posterior):
             return table_variance(self._tables.table(name), numbers)
         if self._gaussian is not None and self._is_gaussian(name):
             return self._gaussian.var(name)
+        self._refuse_beyond(name, "var")
         mean = self.mean(name)
         return self._moment(name, lambda x: (x - mean) ** 2)
 
@@ -86,7 +89,7 @@ class ExactPosterior(Posterior):
         seen = self._tables.known(name)
         if seen is not None:
             return np.asarray(power(seen), dtype=float)
-        return self.expectation(lambda x: power(x), names={"x": name})
+        return self.expectation(lambda value: power(value), names={"value": name})
 
     def cov(self, *names: str) -> np.ndarray:
         if not names:
@@ -121,9 +124,12 @@ class ExactPosterior(Posterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         node = self._numeric(name, "quantile")
-        levels = np.asarray(q, dtype=float)
+        try:
+            levels = np.asarray(q, dtype=float)
+        except (TypeError, ValueError):
+            raise QueryError(f"quantile({name!r}, {q!r}): quantiles are numbers") from None
         if not ((levels >= 0) & (levels <= 1)).all():
-            raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+            raise QueryError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
         if self._gaussian is not None and self._is_gaussian(name):
             everywhere = tuple(slice(None) for _ in node.plates)
             spread = levels.reshape(levels.shape + (1,) * len(node.plates))
@@ -133,9 +139,10 @@ class ExactPosterior(Posterior):
             ]
             return np.stack(parts, axis=-1).reshape(levels.shape + node.value_shape)
         if node.domain is None:
+            self._refuse_beyond(name, "quantile")
             seen = self._tables.known(name)
             if seen is None:
-                raise self._cannot(f"quantile of {name!r}, which has no finite set of values,")
+                raise self._cannot(f"quantile of {name!r}, which has no finite set of values")
             return np.broadcast_to(seen, levels.shape + seen.shape).copy()
         numbers = np.asarray(node.domain.numbers)
         order = np.argsort(numbers)
@@ -149,7 +156,8 @@ class ExactPosterior(Posterior):
             self.problem is not None or self._has_marginal(name)
         )
         if answered:
-            return super()._figures(name)
+            with suppress(BudgetError):  # too large a mixture says so when it is asked for
+                return super()._figures(name)
         # a function of Gaussians that is not affine, or one that stayed behind in a pickle
         empty = np.full(node.value_shape, np.nan)
         columns = ("mean", "sd", *self._quantile_names(), "mcse", "ess", "rhat")
@@ -157,7 +165,8 @@ class ExactPosterior(Posterior):
 
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         if self._has_marginal(name):
-            return super()._quantile_columns(name)
+            with suppress(BudgetError):
+                return super()._quantile_columns(name)
         empty = np.full(self.model[name].value_shape, np.nan)
         return dict.fromkeys(self._quantile_names(), empty)
 
@@ -169,7 +178,10 @@ class ExactPosterior(Posterior):
 
     def _refuse_beyond(self, name: str, what: str) -> None:
         if self._is_beyond(name):
-            raise self._cannot(f"{what} of {name!r}, which is not affine in Gaussian nodes")
+            raise UnsupportedError(
+                f"{what} of {name!r}: it is computed from continuous nodes in a way that is not affine, so "
+                "it is no mixture of Gaussians; draw with resample(draws) and ask there"
+            )
 
     def _is_beyond(self, name: str) -> bool:
         """Whether a node is computed from continuous ones in a way that is not affine."""
@@ -208,11 +220,8 @@ class ExactPosterior(Posterior):
         gaussian = [n for n in query.nodes if self._is_gaussian(n)]
         if set(self._tables.missing(query.nodes)) - set(gaussian):
             self._live("expectation of a deterministic node")
-        beyond = [n for n in query.nodes if self._is_beyond(n)]
-        if beyond:
-            raise self._cannot(
-                f"an average of {beyond[0]!r}, which is not affine in Gaussian nodes,"
-            )
+        for name in query.nodes:
+            self._refuse_beyond(name, "probability" if events else "expectation")
         if gaussian:
             assert self._gaussian is not None
             return gaussian_average(self._tables, self._gaussian, query, events)
@@ -242,6 +251,8 @@ class ExactPosterior(Posterior):
         if self._gaussian is not None and self._is_gaussian(name):
             self._node(name)
             return gaussian_marginal(name, self._gaussian.distribution(name, at))
+        self._node(name)
+        self._refuse_beyond(name, "marginal")
         node = self._finite(name)
         assert node.domain is not None
         values = np.arange(node.domain.size) if node.domain.labels else node.domain.numbers

@@ -8,7 +8,7 @@ probability in every component; anything else is refused.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -65,35 +65,74 @@ def gaussian_average(
     tables: TableAnswers, gaussian: GaussianAnswers, query: Query, events: bool
 ) -> np.ndarray:
     """The mean of a function, or the probability of an event, of continuous and finite nodes."""
+    model = tables.model
+    names = list(dict.fromkeys(query.nodes))
+    others = [n for n in names if not gaussian.holds(n)]
+    inside = all(set(model[n].plates) <= set(query.plates) for n in names)
+    alone = query.plates and inside and (others or events)
+    if not alone or _passed(tables, others):
+        return _joint_average(tables, gaussian, query, events)
+    sizes = query.plate_shape
+    parts = []
+    for at in np.ndindex(sizes):  # element by element: each needs no other one's configurations
+        where = {n: tables.element(n, query.plates, at) for n in names}
+        parts.append(_joint_average(tables, gaussian, query, events, where)[at])
+    if not parts:
+        return np.zeros(sizes)
+    return np.stack(parts).reshape(sizes + np.shape(parts[0]))
+
+
+def _joint_average(
+    tables: TableAnswers,
+    gaussian: GaussianAnswers,
+    query: Query,
+    events: bool,
+    where: Mapping[str, Variable] | None = None,
+) -> np.ndarray:
+    """The average over the joint mixture of all that the function names, or of one element of each."""
     continuous = [n for n in dict.fromkeys(query.nodes) if gaussian.holds(n)]
     others = [n for n in dict.fromkeys(query.nodes) if n not in continuous]
-    extra = [v for n in tables.above(others) for v in tables.elements(n)]
-    found, columns = gaussian.components(continuous, extra, spread=events)
-    count = len(found.weights)
-    stored = _finite_values(tables, others, found)
+    if where is None:
+        extra = [v for n in tables.above(others) for v in tables.elements(n)]
+    else:
+        extra = [where[n] for n in tables.above(others)]
+    if not events and not others:
+        # an affine function alone: its mean is its value at the mean
+        means = {n: gaussian.mean(n)[None] for n in continuous}
+        found, columns = None, {}
+        weights = np.ones(1)
+    else:
+        only = None if where is None else {n: where[n][1] for n in continuous}
+        found, columns = gaussian.components(continuous, extra, spread=events, only=only)
+        weights = found.weights
+        means = {n: gaussian.values(n, found.mean, columns[n]) for n in continuous}
+    count = len(weights)
+    stored = _finite_values(tables, others, found, count)
 
-    def at(means: np.ndarray, traced: bool = True) -> dict[str, Any]:
-        values = {n: gaussian.values(n, means, columns[n]) for n in continuous}
-        if traced:
-            return {**stored, **{n: Tracer(v, [n]) for n, v in values.items()}}
-        return {**stored, **values}
+    def at(values: Mapping[str, np.ndarray]) -> dict[str, Any]:
+        return {**stored, **{n: Tracer(v, [n]) for n, v in values.items()}}
 
     # with the checks that it acts draw by draw
-    plain = query(at(found.mean, traced=False), (count,))
+    plain = query({**stored, **means}, (count,))
     if events:
         _check_boolean(plain)
     try:
-        result = query.raw(at(found.mean))
+        result = query.raw(at(means))
     except BayesmcError as error:
         raise _beyond(continuous, str(error.__cause__ or error)) from error
     if not isinstance(result, Tracer):
-        return np.tensordot(found.weights, plain.astype(float), axes=1)
+        return np.tensordot(weights, plain.astype(float), axes=1)
     if result.is_affine and not events:
-        return np.tensordot(found.weights, plain, axes=1)
-    if result.margin is None:
+        return np.tensordot(weights, plain, axes=1)
+    if result.margin is None or found is None:
         raise _beyond(continuous, f"after {result.reason}")
-    chance = _chances(query, result.margin, found, at, plain)
-    return np.tensordot(found.weights, chance, axes=1)
+
+    def moved(blocks: np.ndarray) -> Tracer:
+        shifted = {n: gaussian.values(n, blocks, columns[n]) for n in continuous}
+        return query.raw(at(shifted)).margin
+
+    chance = _chances(query, result.margin, found, moved, plain)
+    return np.tensordot(weights, chance, axes=1)
 
 
 def covariance(
@@ -107,7 +146,7 @@ def covariance(
         found, columns = gaussian.components(continuous, extra)
     else:
         found, columns = _table_components(tables, extra), {}
-    stored = _finite_values(tables, others, found)
+    stored = _finite_values(tables, others, found, len(found.weights))
     parts: list[np.ndarray] = []
     where: list[int] = []
     for name in names:
@@ -134,7 +173,11 @@ def covariance(
 
 
 def _chances(
-    query: Query, margin: Tracer, found: Components, at: Any, plain: np.ndarray
+    query: Query,
+    margin: Tracer,
+    found: Components,
+    margin_at: Callable[[np.ndarray], Tracer],
+    plain: np.ndarray,
 ) -> np.ndarray:
     """In every component the probability that an affine margin of the blocks is positive."""
     count, width = found.mean.shape
@@ -152,8 +195,7 @@ def _chances(
         for k in range(width):
             moved = found.mean.copy()
             moved[:, k] += scale[:, k]
-            here = query.raw(at(moved)).margin
-            slopes[k] = query.fitted(here.example, (count,)) - centre
+            slopes[k] = query.fitted(margin_at(moved).example, (count,)) - centre
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     unit = np.abs(slopes).max(axis=0, initial=0.0)  # the sign is all that counts, in any unit
     unit = np.where(unit > 0, unit, 1.0)
@@ -180,16 +222,21 @@ def _table_components(tables: TableAnswers, variables: Sequence[Variable]) -> Co
 
 
 def _finite_values(
-    tables: TableAnswers, names: Sequence[str], found: Components
+    tables: TableAnswers, names: Sequence[str], found: Components | None, count: int
 ) -> dict[str, np.ndarray]:
-    """Stored values of nodes that are no Gaussians, in every component."""
-    model, count = tables.model, len(found.weights)
+    """Stored values of nodes that are no Gaussians, in every component.
+
+    Elements that the components say nothing of are given their first state.
+    """
+    model = tables.model
     values: dict[str, np.ndarray] = {
         n: np.broadcast_to(v, (count, *v.shape)) for n, v in tables.known_values.items()
     }
     for name in tables.above(names):
         node = model[name]
-        codes = [found.states[v] for v in tables.elements(name)]
+        assert found is not None
+        zero = np.zeros(count, dtype=np.intp)
+        codes = [found.states.get(v, zero) for v in tables.elements(name)]
         empty = np.zeros((count, 0))
         stacked = np.stack(codes, axis=-1) if codes else empty
         values[name] = stacked.reshape((count, *node.plate_shape)).astype(node.domain.dtype)  # type: ignore[union-attr]
@@ -243,5 +290,5 @@ def _beyond(names: Sequence[str], why: str) -> UnsupportedError:
     return UnsupportedError(
         f"an exact posterior averages functions that are affine in continuous nodes, and events that compare "
         f"such values once; this one of {', '.join(map(repr, names))} is neither ({why}): draw with "
-        "resample(draws) and ask there"
+        f"resample(draws) and ask there (an interval: marginal({names[0]!r}).distribution.cdf)"
     )

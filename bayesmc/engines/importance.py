@@ -44,7 +44,8 @@ class Importance(WeightedEngine):
     Notes
     -----
     The proposal must be able to draw whatever the posterior allows: a region it never visits is missing
-    from every answer, and neither ``weight_ess`` nor ``pareto_k`` can tell. Heavier tails than the
+    from every answer, and neither ``weight_ess`` nor ``pareto_k`` can tell. Where supports tell, there is a
+    ``SupportWarning``. Heavier tails than the
     target's are safe, lighter ones show as a large ``pareto_k``. A partly observed node has its missing
     elements proposed, the others weigh by p. A finite node's proposal speaks the values of its support
     (0, 1, ... for a Categorical), as its conditional density does.
@@ -113,6 +114,14 @@ class Importance(WeightedEngine):
 
     def is_weighted(self, problem: Problem) -> bool:
         return bool(self.proposal) or super().is_weighted(problem)
+
+    @property
+    def zero_remedy(self) -> str:
+        """What to check where no draw is possible."""
+        if not self.proposal:
+            return super().zero_remedy
+        given = ", ".join(map(repr, self.proposal))
+        return f"check the evidence, and whether the proposals of {given} reach what it allows"
 
     def continues(self, other: Any) -> bool:
         return isinstance(other, Importance) and dict(other.proposal) == dict(self.proposal)

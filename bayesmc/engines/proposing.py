@@ -8,6 +8,7 @@ needs itself.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
@@ -21,6 +22,7 @@ from bayesmc.errors import (
     DensityError,
     ModelError,
     ShapeError,
+    SupportWarning,
     UnsupportedError,
 )
 from bayesmc.network import CompiledNode, Problem
@@ -56,7 +58,9 @@ def proposal_steps(
         ordered.update(dict.fromkeys(proposal.names, nothing))
         ordered[name] = Propose(problem, proposal)
     factors: list[tuple[Sequence[str], Step]] = [
-        ((name, *model[name].parents), WeighDrawn(model, model[name])) for name in by_target
+        ((name, *model[name].parents), WeighDrawn(model, model[name]))
+        for name in model.nodes  # parents first: a parent of probability zero excuses its children
+        if name in by_target
     ]
     return with_factors(ordered, [*factors, *potential_factors(model)])
 
@@ -69,6 +73,7 @@ class Propose:
         self.model = problem.model
         self.nodes = [problem.model[name] for name in proposal.names]
         self.observed = problem.observed
+        self._compared: set[str] = set()
 
     def __call__(self, state: Pass) -> None:
         with _blaming(self.proposal):
@@ -97,6 +102,9 @@ class Propose:
         """Draw a node whose distribution has its batch and plates."""
         _check_kind(node.name, node.is_discrete, node.event_shape, dist)
         fit(node.declaration, dist, batch, node.plate_shape)
+        if node.name not in self._compared:
+            self._compared.add(node.name)
+            self._warn_of_gaps(node, dist)
         alive = _alive(state)
         error = invalid_error(node, dist, alive, state.batch)
         if error is not None:
@@ -120,6 +128,18 @@ class Propose:
         self._divide(log_q, outside, alive, state)
         values.flags.writeable = False
         state.values[node.name] = values
+
+    def _warn_of_gaps(self, node: CompiledNode, dist: Distribution) -> None:
+        """Warn where the proposal never reaches what its target may be, as far as supports tell."""
+        never = _never_proposed(node, dist)
+        if never is not None:
+            warnings.warn(
+                f"importance sampling: {self.proposal.what} is on {dist.support.describe()} and never gives "
+                f"{never}, which {node.name!r} may take; what is never proposed is missing from all answers, "
+                "and no weight shows it: propose from a distribution that covers the node's support",
+                SupportWarning,
+                stacklevel=2,
+            )
 
     def _draw_split(self, dist: Distribution, batch: Shape, state: Pass) -> None:
         """Draw a block as one vector and split it in order."""
@@ -191,6 +211,23 @@ def _blaming(proposal: Proposal) -> Iterator[None]:
         rest = text.removeprefix(node) if text.startswith(node) else f": {text}"
         error.args = (f"Importance: {proposal.what}{rest}", *error.args[1:])
         raise
+
+
+def _never_proposed(node: CompiledNode, dist: Distribution) -> str | None:
+    """Values of a target, in words, that no draw of its proposal can have; None if none is known."""
+    if node.domain is None:
+        known = node.support is not None and node.support.is_constant
+        if not known or dist.support.covers(node.support):  # type: ignore[arg-type]
+            return None
+        return f"others of the {node.support.describe()}"  # type: ignore[union-attr]
+    values = node.domain.low + np.arange(node.domain.size)
+    with np.errstate(all="ignore"):
+        at = values.reshape((-1,) + (1,) * len(dist.batch_shape))
+        reached = np.isfinite(dist.log_prob(at)).reshape(len(values), -1).any(axis=1)
+    missed = [node.domain.states[k] for k in np.flatnonzero(~reached)]
+    return (
+        ", ".join(map(repr, missed[:5])) + (", ..." if len(missed) > 5 else "") if missed else None
+    )
 
 
 def _check_kind(

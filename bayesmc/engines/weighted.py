@@ -41,6 +41,11 @@ class WeightedEngine(Engine):
     #: what helps where the weights are too uneven
     remedy: ClassVar[str]
 
+    @property
+    def zero_remedy(self) -> str:
+        """What to check where no draw is possible."""
+        return "check the evidence, or use Exact() where explain(net, evidence) says it can"
+
     def steps(self, problem: Problem) -> list[Step]:
         """The steps of one pass."""
         raise NotImplementedError
@@ -166,7 +171,7 @@ class WeightedEngine(Engine):
         if top == -np.inf:
             raise ZeroProbabilityError(
                 f"{type(self).__name__}: none of {draws} draws is compatible with the evidence, so its "
-                "probability is zero or far too small for this engine; check the evidence, or use Exact()"
+                f"probability is zero or far too small for this engine; {self.zero_remedy}"
             )
 
     def _set_evidence(self, posterior: Any, log_total: float, draws: int, weighted: bool) -> None:

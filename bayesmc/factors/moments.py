@@ -7,16 +7,22 @@ Gaussian for every configuration of the discrete variables that switch it or any
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ..errors import BudgetError
 from .gaussian import Conditional
 
 Scope = tuple[Any, ...]
+#: components from which on means and variances are had from the parents' where that is possible
+_MANY = 1 << 12
+#: components beyond which a mixture is refused
+_MOST = 1 << 26
 #: configurations worked on at a time
 _CHUNK = 1 << 14
 #: entries of a joint covariance held at a time
@@ -79,8 +85,11 @@ class Moments:
         """Mean ``(d,)`` and covariance ``(d, d)`` of one block; all that share its scope come along."""
         if block not in self._collapsed:
             scope = self.scopes[block]
-            group = [b for b, s in self.scopes.items() if s == scope]
-            self._collapsed.update(self._collapse(group, tuple(scope)))
+            if self._count(scope) > _MANY and not self._of[block].scope:
+                self._collapsed[block] = self._by_parents(block)
+            else:
+                group = [b for b, s in self.scopes.items() if s == scope]
+                self._collapsed.update(self._collapse(group, tuple(scope)))
         return self._collapsed[block]
 
     def components(
@@ -117,6 +126,29 @@ class Moments:
             drawn[block] = value
         return drawn
 
+    def _count(self, scope: Iterable[Any]) -> float:
+        """Number of configurations of some discrete variables."""
+        return math.prod([float(self._cards[v]) for v in scope])
+
+    def _by_parents(self, block: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Moments of a block that no discrete variable switches itself: linear in those of its parents,
+        two at a time, however many configurations they have all together."""
+        given = self._of[block]
+        mean = given.offset.copy()
+        cov = given.root @ given.root.T
+        columns = np.cumsum([0, *(self._dims[p] for p in given.parents)])
+        gains = [given.gain[:, i:j] for i, j in itertools.pairwise(columns)]
+        for k, (p, gain) in enumerate(zip(given.parents, gains, strict=True)):
+            own_mean, own_cov = self.moments(p)
+            mean = mean + gain @ own_mean
+            cov = cov + gain @ own_cov @ gain.T
+            for other, its_gain in zip(given.parents[:k], gains[:k], strict=True):
+                _, joint = self.components([p, other]).collapsed()
+                d = self._dims[p]
+                cross = gain @ joint[:d, d:] @ its_gain.T
+                cov = cov + cross + cross.T
+        return mean, cov
+
     def _collapse(
         self, group: Sequence[Any], scope: Scope
     ) -> dict[Any, tuple[np.ndarray, np.ndarray]]:
@@ -138,6 +170,13 @@ class Moments:
         """The possible configurations of a scope, and their probabilities."""
         if not scope:
             return {}, np.ones(1)
+        count = self._count(scope)
+        if count > _MOST:
+            raise BudgetError(
+                f"it is a mixture of {count:.3g} Gaussians, one for every configuration of {len(scope)} "
+                "discrete variables; ask for fewer nodes at a time, or draw with resample(draws)",
+                int(min(8 * count, 2**62)),
+            )
         table = self._joint(scope)
         at = np.nonzero(table)
         weights = table[at]

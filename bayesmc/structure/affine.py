@@ -65,9 +65,12 @@ def why_not_linear(
     """
     kept = model.cache.setdefault("why not linear", {})
     pattern = frozenset((name, seen.mask is None) for name, seen in observed.items())
-    if pattern not in kept:  # what tracing proves holds for all values
-        kept[pattern] = _find_reason(model, observed, inputs)
-    return kept[pattern]
+    if pattern in kept:  # what tracing proves holds for all values
+        return kept[pattern]
+    if len(kept) > 256:
+        kept.clear()
+    reason = kept[pattern] = _find_reason(model, observed, inputs)
+    return reason
 
 
 def affine_nodes(
@@ -99,7 +102,7 @@ def _find_reason(
         if node.kind == "deterministic":
             why = _pass_on(model, node, above, values)
         elif node.is_stochastic and (node.is_discrete or node.domain is not None):
-            why = _why_not_discrete_child(node, above, name in observed)
+            why = _why_not_discrete_child(node, above, observed.get(name))
         elif is_hidden(node, observed) or (node.is_stochastic and above):
             why = _why_not_gaussian(model, node, above, values)
         if why is not None:
@@ -146,13 +149,14 @@ def _pass_on(
 
 
 def _why_not_discrete_child(
-    node: CompiledNode, above: tuple[str, ...], is_observed: bool
+    node: CompiledNode, above: tuple[str, ...], seen: Observed | None
 ) -> str | None:
     if above:
         return f"is discrete and depends on the continuous {_nodes(above)}"
-    if node.domain is None and not is_observed:
+    if node.domain is None and (seen is None or seen.mask is not None):
         assert node.support is not None
-        return f"is discrete with too many values to enumerate ({node.support.describe()})"
+        partly = "" if seen is None else "observed only in part and "
+        return f"is {partly}discrete with too many values to enumerate ({node.support.describe()})"
     return None
 
 
@@ -163,9 +167,13 @@ def _why_not_gaussian(
         return f"is a matrix of shape {node.event_shape}"
     try:
         result, _ = _call(model, node, values)
+        if type(result).__module__.startswith("scipy.stats"):
+            return (
+                "is a distribution of scipy.stats, which cannot be traced; write Normal or MvNormal"
+            )
         dist = result if isinstance(result, TracedCall) else as_distribution(result)
     except Exception as error:
-        return f"cannot be traced through its dependence on {_nodes(above)} ({error})"
+        return f"depends on the continuous {_nodes(above)} in a way that cannot be traced ({error})"
     family: Any
     traced: dict[str, Any] = {}
     if isinstance(dist, Distribution):

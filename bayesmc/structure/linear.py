@@ -96,21 +96,21 @@ def linear_gaussian(
 
 
 class _Reader:
-    """Readings, kept with the model."""
+    """The latest reading of every node, kept with the model."""
 
     def __init__(
         self, model: Model, observed: Mapping[str, Observed], known: Mapping[str, np.ndarray]
     ) -> None:
         self.model, self.observed, self.known = model, observed, known
-        self.kept: dict[Any, Reading] = model.cache.setdefault("linear readings", {})
-        if len(self.kept) > 2 * len(model.nodes) + 64:
-            self.kept.clear()
+        self.kept: dict[str, tuple[Any, Reading]] = model.cache.setdefault("linear readings", {})
 
     def __call__(self, name: str) -> Reading:
-        key = (name, tuple(self._seen(p) for p in self._boundary(name)))
-        if key not in self.kept:
-            self.kept[key] = Reading(self.model, name, self.observed, self.known)
-        return self.kept[key]
+        key = tuple(self._seen(p) for p in self._boundary(name))
+        latest = self.kept.get(name)
+        if latest is None or latest[0] != key:
+            latest = key, Reading(self.model, name, self.observed, self.known)
+            self.kept[name] = latest
+        return latest[1]
 
     def _boundary(self, name: str) -> tuple[str, ...]:
         """The nodes that a function depends on, directly or through deterministic ones."""

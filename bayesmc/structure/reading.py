@@ -189,7 +189,9 @@ class Reading:
         self.tril = tril[first].reshape((*self.cards, self.count, self.d, self.d))
         bad = np.asarray(invalid.any(axis=axis))
         self.invalid = bad.reshape((*self.cards, self.count))
-        self.offset = loc[first]
+        self.offset = loc[first].copy()  # a view would keep all points alive
+        if self.hidden:
+            self._check_scale(tril, axis)
         loc = np.moveaxis(loc, axis, -1)  # (*cards, elements, d, points)
         steps = np.array([c.step for c in self.columns])
         n = len(steps)
@@ -230,6 +232,17 @@ class Reading:
             moved[:, k] = kept[:, at] if column.element is None else kept[:, at, None]
         shaped = {n: v.reshape((count, *self.model[n].value_shape)) for n, v in points.items()}
         return shaped, moved
+
+    def _check_scale(self, tril: np.ndarray, axis: int) -> None:
+        """The scale must be the same at all points, whatever tracing said."""
+        off = np.abs(tril - np.expand_dims(np.take(tril, 0, axis=axis), axis))
+        size = np.abs(tril).max(axis=(-2, -1), initial=0.0)
+        moves = (off.max(axis=(-2, -1), initial=0.0) > _TOLERANCE * size).any(axis=axis)
+        if (moves.reshape(self.invalid.shape) & ~self.invalid).any():
+            raise UnsupportedError(
+                f"node {self.node.name!r} has a scale that depends on "
+                f"{', '.join(repr(p.name) for p in self.hidden)}"
+            )
 
     def _check_affine(self, found: np.ndarray, moved: np.ndarray) -> None:
         """What the function gives at further points must be what its coefficients say."""

@@ -11,7 +11,6 @@ import dataclasses
 import functools
 import itertools
 import os
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +21,7 @@ import scipy.stats
 
 import bayesmc as bmc
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
+from bayesmc.network import pose
 from bayesmc.testing import (
     ConditionalGaussian,
     assert_matches,
@@ -598,11 +598,9 @@ def test_many_observations_of_one_mean() -> None:
     net.add("x", lambda mean: bmc.Normal(mean, 2.0), plates="i")
     x = np.random.default_rng(0).normal(3.0, 2.0, n)
     x[::10] = np.nan
-    start = time.perf_counter()
     posterior = bmc.infer(net, {"x": x}, engine=EXACT)
     mean, var = posterior.mean("mean"), posterior.var("mean")
     hidden = posterior.mean("x")[::10]
-    assert time.perf_counter() - start < 20.0  # about a second; not n squared
     seen = x[~np.isnan(x)]
     precision = 1 / 100 + len(seen) / 4
     assert var == pytest.approx(1 / precision, rel=1e-9)
@@ -626,9 +624,7 @@ def test_many_observations_of_three_groups() -> None:
     net.add("effect", lambda grand: bmc.Normal(grand, 1.0), plates="group")
     net.add("x", lambda effect: bmc.Normal(effect[group], 2.0), plates="i")
     x = rng.normal(np.array([-1.0, 0.5, 2.0])[group], 2.0)
-    start = time.perf_counter()
     posterior = bmc.infer(net, {"x": x}, engine=EXACT)
-    assert time.perf_counter() - start < 20.0
     counts = np.bincount(group)
     prior = np.eye(3) + 25.0
     precision = np.linalg.inv(prior) + np.diag(counts / 4)
@@ -677,10 +673,10 @@ def test_thirty_switching_steps_that_separate() -> None:
         net.add(f"x{t}", lambda s: bmc.Normal(np.where(s == 1, 2.0, -1.0), 1.0), parents=[f"s{t}"])
         net.add(f"y{t}", lambda x: bmc.Normal(0.5 * x, 0.7), parents=[f"x{t}"])
     y = np.random.default_rng(5).normal(0.0, 1.0, steps)
-    start = time.perf_counter()
-    posterior = bmc.infer(net, {f"y{t}": y[t] for t in range(steps)}, engine=EXACT)
+    evidence = {f"y{t}": y[t] for t in range(steps)}
+    assert EXACT.cost(pose(net, evidence)).bytes < 1e5
+    posterior = bmc.infer(net, evidence, engine=EXACT)
     means = np.array([posterior.mean(f"x{t}") for t in range(steps)])
-    assert time.perf_counter() - start < 20.0
     centre, spread = np.array([-1.0, 2.0]), np.sqrt(0.25 + 0.49)
     total, smoothed = forward_backward(scipy.stats.norm.logpdf(y[:, None], 0.5 * centre, spread))
     assert posterior.log_marginal_likelihood == pytest.approx(total, abs=1e-8)
@@ -708,9 +704,9 @@ def test_thirty_steps_of_a_seen_autoregression() -> None:
             parents=[f"s{t}", f"x{t - 1}"],
         )
     x = np.random.default_rng(6).normal(0.0, 1.0, steps)
-    start = time.perf_counter()
-    posterior = bmc.infer(net, {f"x{t}": x[t] for t in range(steps)}, engine=EXACT)
-    assert time.perf_counter() - start < 20.0
+    evidence = {f"x{t}": x[t] for t in range(steps)}
+    assert EXACT.cost(pose(net, evidence)).bytes < 1e5
+    posterior = bmc.infer(net, evidence, engine=EXACT)
     before = np.concatenate([[0.0], x[:-1]])
     total, smoothed = forward_backward(
         scipy.stats.norm.logpdf(x[:, None], slope * before[:, None], noise)
@@ -744,10 +740,8 @@ def test_a_hidden_switching_chain_is_refused_with_its_size() -> None:
     assert reason is not None
     assert "LikelihoodWeighting" in reason
     assert any(figure in reason for figure in ("1.07e+09", "1073741824", "2^30", "2**30", "2³⁰"))
-    start = time.perf_counter()
     with pytest.raises(BudgetError):
         bmc.infer(net, evidence, engine=EXACT)
-    assert time.perf_counter() - start < 20.0
 
 
 def test_a_short_hidden_switching_chain() -> None:
@@ -794,12 +788,10 @@ def test_a_thousand_steps_of_a_linear_chain() -> None:
         else:
             net.add(f"x{t}", lambda x: bmc.Normal(slope * x + 0.1, q), parents=[f"x{t - 1}"])
         net.add(f"y{t}", lambda x: bmc.Normal(x, r), parents=[f"x{t}"])
-    start = time.perf_counter()
     evidence = {f"y{t}": y[t] for t in range(steps) if seen[t]}
     posterior = bmc.infer(net, evidence, engine=EXACT)
     mean = np.array([posterior.mean(f"x{t}") for t in range(steps)])
     var = np.array([posterior.var(f"x{t}") for t in range(steps)])
-    assert time.perf_counter() - start < 60.0
     total, wanted_mean, wanted_var = smoother(np.where(seen, y, np.nan), slope, 0.1, q, r)
     assert posterior.log_marginal_likelihood == pytest.approx(total, rel=1e-9)
     np.testing.assert_allclose(mean, wanted_mean, atol=1e-8)
@@ -868,3 +860,78 @@ def test_events_have_no_favourite_unit(unit: float) -> None:
     posterior = bmc.infer(net, engine=EXACT)
     above = posterior.probability(lambda x: x * unit > unit)
     assert above == pytest.approx(0.15865525393145707)
+
+
+def test_unseen_switches_of_others_do_not_matter() -> None:
+    """A chain of 40 switches that nothing observed depends on is too much only for who asks for its end."""
+    net = bmc.BayesNet()
+    net.add("d", bmc.Bernoulli(0.3))
+    net.add("y", lambda d: bmc.Normal(2.0 * d, 1.0))
+    for t in range(40):
+        net.add(f"s{t}", bmc.Bernoulli(0.3))
+        above = [f"x{t - 1}"] if t else []
+        net.add(f"x{t}", lambda *v: bmc.Normal(sum(v) * 1.0, 1.0), parents=[*above, f"s{t}"])
+    posterior = bmc.infer(net, {"y": 1.0})
+    assert isinstance(posterior.engine, bmc.Exact)
+    assert posterior.mean("d") == pytest.approx(0.3)
+    assert posterior.mean("x3") == pytest.approx(1.2)
+    with pytest.raises(BudgetError, match=r"'x39'.*1.1e\+12 Gaussians.*40 discrete"):
+        posterior.mean("x39")
+    assert np.isnan(posterior.summary(["x39"]).columns["mean"]).all()
+
+
+def test_means_over_a_plate_of_switched_elements() -> None:
+    """Averages of 40 elements with a switch each: linear, so no joint configuration is needed."""
+    net = bmc.BayesNet(plates={"p": 40})
+    net.add("z", bmc.Bernoulli(0.5), plates="p")
+    net.add("x", lambda z: bmc.Normal(2.0 * z, 1.0), plates="p")
+    net.add("m", lambda x: x.mean("p"))
+    net.add("y", lambda x: bmc.Normal(x, 1.0), plates="p")
+    y = np.linspace(-1.0, 3.0, 40)
+    posterior = bmc.infer(net, {"y": y}, engine=EXACT)
+    mean, var = posterior.mean("x"), posterior.var("x")
+    assert posterior.mean("m") == pytest.approx(mean.mean())
+    assert posterior.var("m") == pytest.approx(var.sum() / 40**2)
+    assert posterior.expectation(lambda x: x.mean(axis=-1)) == pytest.approx(mean.mean())
+    odds = np.exp(-((y - 2) ** 2) / 4) / (np.exp(-((y - 2) ** 2) / 4) + np.exp(-(y**2) / 4))
+    both = posterior.expectation(lambda x, z: x * z, plates="p")
+    np.testing.assert_allclose(both, odds * (2 + y) / 2)
+    above = posterior.probability(lambda x: x > 1.0, plates="p")
+    high, low = (1 + y / 2 - 1.0) / np.sqrt(0.5), (y / 2 - 1.0) / np.sqrt(0.5)
+    np.testing.assert_allclose(
+        above, odds * scipy.special.ndtr(high) + (1 - odds) * scipy.special.ndtr(low)
+    )
+    with pytest.raises(BudgetError, match=r"'x'.*1.1e\+12 Gaussians"):
+        posterior.cov("x")
+    assert np.isfinite(posterior.summary(["m"]).columns["mean"]).all()
+
+
+def test_a_scale_that_hides_from_tracing_is_refused() -> None:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, np.exp(x) if isinstance(x, np.ndarray) else 1.0))
+    assert "scale that depends on 'x'" in EXACT.unsupported(net, {"y": 1.0})
+
+
+def test_partly_seen_counts_are_left_to_others() -> None:
+    net = bmc.BayesNet(plates={"p": 3})
+    net.add("s", bmc.Bernoulli(0.5))
+    net.add("k", lambda s: bmc.Poisson(1.0 + s), plates="p")
+    evidence = {"k": [1, np.nan, 4]}
+    assert "observed only in part" in EXACT.unsupported(net, evidence)
+    posterior = bmc.infer(net, evidence, rng=0)
+    assert isinstance(posterior.engine, bmc.LikelihoodWeighting)
+    odds = np.exp(-2) * 2**5 / (np.exp(-2) * 2**5 + 1)
+    assert posterior.mean("s") == pytest.approx(odds, abs=0.03)
+
+
+def test_readings_do_not_pile_up() -> None:
+    net = bmc.BayesNet()
+    net.add("u", bmc.Normal(0.0, 1.0))
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda u, x: bmc.Normal(np.exp(u) * x, 1.0))
+    for k in range(40):
+        posterior = bmc.infer(net, {"u": 0.1 * k, "y": 1.0}, engine=EXACT)
+        gain = np.exp(0.1 * k)
+        assert posterior.mean("x") == pytest.approx(gain / (1 + gain**2))
+    assert len(posterior.model.cache["linear readings"]) <= 3

@@ -21,6 +21,7 @@ from bayesmc.errors import (
     ModelError,
     ParameterError,
     ShapeError,
+    SupportWarning,
     UnknownNodeError,
     UnsupportedError,
     ZeroProbabilityError,
@@ -308,7 +309,10 @@ def test_a_narrow_proposal_warns_with_the_remedy() -> None:
 def test_nothing_compatible_is_an_error() -> None:
     net = bmc.BayesNet()
     net.add("x", bmc.Uniform(0.0, 1.0))
-    with pytest.raises(ZeroProbabilityError, match="Importance: none of 100 draws"):
+    with (
+        pytest.warns(SupportWarning, match=r"\[2, 3\] and never gives others"),
+        pytest.raises(ZeroProbabilityError, match="none of 100 draws.*proposals of 'x' reach"),
+    ):
         infer({"x": bmc.Uniform(2.0, 3.0)}, net, {}, draws=100)
 
 
@@ -525,3 +529,54 @@ def test_bad_parameters_matter_only_where_the_weight_is_positive() -> None:
         posterior = infer(proposal, net, {})
     assert (posterior["s"] < 0).any()
     assert posterior.mean("s") == pytest.approx(2.0, abs=5 * float(posterior.mcse("s")))
+
+
+# ---- proposals that leave gaps --------------------------------------------------------------------
+
+GAPS = {
+    "a finite node's other states": (
+        bmc.DiscreteUniform(3, 6),
+        bmc.Categorical([0.25] * 4),
+        "4, 5, 6",
+    ),
+    "a state of probability zero": (bmc.Bernoulli(0.5), bmc.Bernoulli(1.0), "never gives 0"),
+    "negative numbers": (bmc.Normal(0.0, 1.0), bmc.Gamma(2.0, 2.0), "others of the real numbers"),
+    "large counts": (bmc.Poisson(2.0), bmc.Binomial(3, 0.5), "others of the integers >= 0"),
+}
+
+
+@pytest.mark.parametrize("gap", GAPS)
+def test_a_proposal_that_cannot_reach_all_values_is_warned_of(gap: str) -> None:
+    target, proposal, words = GAPS[gap]
+    net = bmc.BayesNet()
+    net.add("x", target)
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    engine = bmc.Importance(500, proposal={"x": proposal})
+    with pytest.warns(SupportWarning, match=words) as caught:
+        bmc.infer(net, {"y": 3.0}, engine=engine, rng=0)
+    assert len(caught) == 1  # once, not for every chunk
+
+
+def test_a_proposal_that_covers_its_target_is_not_warned_of() -> None:
+    net = bmc.BayesNet()
+    net.add("n", bmc.Poisson(2.0))
+    net.add("u", bmc.Uniform(0.0, 1.0))
+    net.add("y", lambda n, u: bmc.Normal(n + u, 1.0))
+    proposal = {"n": bmc.Geometric(0.3), "u": bmc.Normal(0.5, 1.0)}
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SupportWarning)
+        bmc.infer(net, {"y": 3.0}, engine=bmc.Importance(5000, proposal=proposal), rng=0)
+
+
+def test_draws_of_probability_zero_excuse_their_children_in_any_order() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Gamma(3.0, 2.0))
+    net.add("b", lambda a: bmc.Exponential(a))
+    net.add("y", lambda b: bmc.Normal(b, 0.5))
+    proposals = {"b": lambda y: bmc.Normal(y, 1.0), "a": bmc.Normal(1.0, 1.0)}
+    backwards = dict(reversed(proposals.items()))
+    answers = [
+        bmc.infer(net, {"y": 1.5}, engine=bmc.Importance(20_000, proposal=p), rng=0).mean("a")
+        for p in (proposals, backwards)
+    ]
+    assert answers[0] == pytest.approx(answers[1], abs=0.05)

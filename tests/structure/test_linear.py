@@ -7,7 +7,6 @@ compared with numbers written down by hand. All of these are short in binary, so
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -463,10 +462,8 @@ def test_a_function_of_too_many_switches_is_refused() -> None:
     net.add("s", bmc.Bernoulli(0.5), plates="row")
     net.add("x", lambda s: bmc.Normal(s.sum("row"), 1.0))
     problem = pose(net, {})
-    begin = time.perf_counter()
     with pytest.raises(BudgetError, match="'x'"):
         linear_gaussian(problem.model, problem.observed, problem.inputs)
-    assert time.perf_counter() - begin < 2
 
 
 # ---- numbers that are hard ------------------------------------------------------------------------
@@ -597,7 +594,7 @@ REASONS: dict[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
     "a discrete child": (lambda x: bmc.Bernoulli(1 / (1 + np.exp(-x))), ("'y'", "'x'", "discrete")),
     "a look at the numbers": (
         lambda x: bmc.Normal(np.vectorize(lambda v: 2.0 * v)(x), 1.0),
-        ("'y'", "'x'", "varies with x"),
+        ("'y'", "'x'", "only NumPy operations"),
     ),
     "a function of no use": (
         lambda bent: bmc.Normal(bent, 1.0),
@@ -655,9 +652,7 @@ def test_many_observations_are_read_in_groups() -> None:
     net.add("x", bmc.Normal(0.0, 1.0))
     net.add("y", lambda m: bmc.Normal(m[group_of], 1.0), plates="point")
     problem = pose(net, {"y": rng.normal(size=count)})
-    begin = time.perf_counter()
     part = linear_gaussian(problem.model, problem.observed, problem.inputs)
-    assert time.perf_counter() - begin < 2
     assert len(part.likelihoods) == groups
     assert all(f.rows.shape == (1, 2) for f in part.likelihoods)
 
@@ -669,9 +664,7 @@ def test_many_observations_of_one_parent() -> None:
     design = np.random.default_rng(1).normal(size=(count, 3))
     net.add("y", lambda v: bmc.Normal(np.vecdot(design, v), 1.0), plates="point")
     problem = pose(net, {"y": design.sum(axis=1)})
-    begin = time.perf_counter()
     (factor,) = linear_gaussian(problem.model, problem.observed, problem.inputs).likelihoods
-    assert time.perf_counter() - begin < 2
     a, z = factor.rows[:, :-1], factor.rows[:, -1]
     np.testing.assert_allclose(a.T @ a, design.T @ design, rtol=1e-10)
     np.testing.assert_allclose(np.linalg.solve(a, z), np.ones(3), rtol=1e-10)
