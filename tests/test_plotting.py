@@ -332,3 +332,17 @@ def test_without_matplotlib_the_error_names_the_extra(tmp_path: Path) -> None:
     ran = subprocess.run([sys.executable, "-c", code, str(tmp_path)], cwd=root, text=True,
                          capture_output=True, check=True)  # fmt: skip
     assert "pip install 'bayesmc[plot]'" in ran.stdout
+
+
+def test_an_exact_marginal_is_drawn_as_the_curve_it_is() -> None:
+    net = bmc.BayesNet()
+    net.add("s", bmc.Bernoulli(0.3))
+    net.add("x", lambda s: bmc.Normal(4.0 * s, 0.5))
+    posterior = bmc.infer(net, engine=bmc.Exact())
+    ax = plot_marginal(posterior, "x")
+    (line,) = ax.get_lines()
+    points, heights = line.get_data()
+    expected = np.exp(bmc.Mixture([0.7, 0.3], bmc.Normal([0.0, 4.0], 0.5)).log_prob(points))
+    np.testing.assert_allclose(heights, expected, atol=1e-12)
+    assert points[0] < -1.2 and points[-1] > 5.2
+    pyplot.close(ax.figure)

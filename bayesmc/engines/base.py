@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.errors import BayesmcError
 from bayesmc.network import BayesNet, Problem, pose
 from bayesmc.results import Posterior
 
@@ -24,7 +25,11 @@ class Engine:
         inputs: Mapping[str, Any] | None = None,
     ) -> str | None:
         """Why this engine cannot answer (too costly included), or None."""
-        return self.refusal(pose(net, evidence, inputs))
+        problem = pose(net, evidence, inputs)
+        try:
+            return self.refusal(problem)
+        except BayesmcError as error:  # options that do not fit the net
+            return str(error)
 
     def refusal(self, problem: Problem) -> str | None:
         """Why this engine cannot answer a posed problem, or None."""

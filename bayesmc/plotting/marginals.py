@@ -21,7 +21,7 @@ PRIOR, POSTERIOR = "#9aa7b2", "#2a6f97"
 POINTS = 400  # at which a density is drawn
 PANEL = (2.6, 2.1)  # inches
 COLUMNS = 4
-CENTRAL = (0.002, 0.998)  # the part of the draws that is shown
+OUTSIDE = 0.002  # probability left out of the picture at either end
 WIDEST = 12.0  # how many posterior ranges a prior's tails may take
 
 
@@ -77,12 +77,16 @@ def plot_marginal(
         _draw_bars(ax, [bars], [color], [label])
     else:
         low, high = _range(marginal)
-        # Rice's rule, with the weights' effective number of draws
-        count = int(np.clip(2 * _effective(marginal) ** (1 / 3), 10, 60))
-        heights, edges = marginal.histogram(np.linspace(low, high, count + 1), density=False)
-        ax.stairs(heights / np.diff(edges), edges, fill=True, color=color, alpha=0.25)
         points = np.linspace(low, high, POINTS)
-        ax.plot(points, marginal.density(points), color=color, label=label)
+        density = marginal.density(points)
+        if marginal.distribution is None:
+            # Rice's rule, with the weights' effective number of draws
+            count = int(np.clip(2 * _effective(marginal) ** (1 / 3), 10, 60))
+            heights, edges = marginal.histogram(np.linspace(low, high, count + 1), density=False)
+            ax.stairs(heights / np.diff(edges), edges, fill=True, color=color, alpha=0.25)
+        else:
+            ax.fill_between(points, density, color=color, alpha=0.25, linewidth=0)
+        ax.plot(points, density, color=color, label=label)
         ax.set_ylim(bottom=0)
         ax.set_ylabel("density")
     ax.set_xlabel(_title(name, index))
@@ -221,10 +225,8 @@ def _effective(marginal: Marginal) -> float:
 
 
 def _range(marginal: Marginal) -> tuple[float, float]:
-    """The central part of the draws, with some room on both sides."""
-    order = np.argsort(marginal.values)
-    values, mass = marginal.values[order], np.cumsum(marginal.weights[order])
-    low, high = values[np.searchsorted(mass, CENTRAL).clip(max=len(values) - 1)]
+    """The central part, with some room on both sides."""
+    low, high = marginal.bounds(OUTSIDE)
     room = 0.08 * (high - low) or max(abs(low), 1.0) * 1e-2
     return float(low - room), float(high + room)
 

@@ -1,4 +1,4 @@
-"""``Marginal``: one node's distribution, from weighted draws, as histogram, kernel density or table."""
+"""``Marginal``: one node's distribution as histogram, density or table, from weighted draws or exactly."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class Marginal:
     ----------
     name : str
     values : ndarray, shape (draws, *plates, *event)
-        Draws; the node's possible values where it is answered from a table, the means of the components
-        where it is a mixture of Gaussians.
-    weights : ndarray, shape (draws,) or (*plates, states)
+        Draws; the node's possible values where it is answered from a table; where it is a mixture of
+        Gaussians the means of the components, ``(components, *plates, *event)``.
+    weights : ndarray, shape (draws,), (*plates, states) or (*plates, components)
         Weights that sum to 1.
     states : tuple or None
         For a finite discrete node.
@@ -65,6 +65,7 @@ class Marginal:
 
     def density(self, points: Any, bandwidth: str | float = "scott") -> np.ndarray:
         """Density at ``points``: exact where it is known, else a kernel estimate on weighted draws.
+
         Parameters
         ----------
         points : array_like
@@ -92,11 +93,31 @@ class Marginal:
         """Probabilities of bins, between the 0.1 % and 99.9 % quantiles where no range is given."""
         assert self.distribution is not None
         if np.ndim(bins) == 0:
-            low, high = self.distribution.ppf([0.001, 0.999]) if limits is None else limits
+            if isinstance(bins, str):
+                raise UnsupportedError(
+                    f"marginal({self.name!r}).histogram(bins={bins!r}): rules of thumb are for draws; give a "
+                    "number of bins, or edges"
+                )
+            low, high = self.bounds() if limits is None else limits
+            if low == high:  # as np.histogram does
+                low, high = low - 0.5, high + 0.5
             bins = np.linspace(low, high, int(bins) + 1)
         edges = np.asarray(bins, dtype=float)
         mass = np.diff(self.distribution.cdf(edges))
-        return (mass / np.diff(edges) / mass.sum() if density else mass), edges
+        total = mass.sum()
+        return (mass / np.diff(edges) / (total if total > 0 else 1.0) if density else mass), edges
+
+    def bounds(self, outside: float = 0.001) -> tuple[float, float]:
+        """The ends between which a scalar lies, but for a probability of ``outside`` at either end."""
+        values = self._scalar("bounds")
+        if self.distribution is not None:
+            low, high = self.distribution.ppf([outside, 1 - outside])
+            return float(low), float(high)
+        order = np.argsort(values)
+        mass = np.cumsum(self.weights[order])
+        found = np.searchsorted(mass, [outside * mass[-1], (1 - outside) * mass[-1]])
+        ends = values[order][np.minimum(found, len(order) - 1)]
+        return float(ends[0]), float(ends[1])
 
     def _scalar(self, what: str) -> np.ndarray:
         if self.states is not None:

@@ -935,3 +935,20 @@ def test_readings_do_not_pile_up() -> None:
         gain = np.exp(0.1 * k)
         assert posterior.mean("x") == pytest.approx(gain / (1 + gain**2))
     assert len(posterior.model.cache["linear readings"]) <= 3
+
+
+def test_histograms_of_exact_marginals() -> None:
+    net = bmc.BayesNet(plates={"p": 2})
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("x", lambda m: bmc.Normal(m, 1.0), plates="p")
+    posterior = bmc.infer(net, {"x": [1.0, np.nan]}, engine=EXACT)
+    heights, edges = posterior.marginal("x", 1).histogram(bins=50)
+    assert (heights * np.diff(edges)).sum() == pytest.approx(1.0)
+    middles = (edges[1:] + edges[:-1]) / 2
+    expected = scipy.stats.norm.pdf(middles, 0.5, np.sqrt(1.5))
+    np.testing.assert_allclose(heights, expected, rtol=0.02)
+    seen, ends = posterior.marginal("x", 0).histogram(bins=3)
+    assert ends.tolist() == pytest.approx([0.5, 5 / 6, 7 / 6, 1.5])
+    assert seen.tolist() == pytest.approx([0.0, 3.0, 0.0])
+    with pytest.raises(UnsupportedError, match="number of bins"):
+        posterior.marginal("x", 1).histogram(bins="auto")
