@@ -1,1 +1,1 @@
-"""Nets on real numbers, run by ``make demo`` (``python -m examples.demo``)."""
+"""Scripts of a page or two, each run by ``python -m examples.NAME``, all by ``make demo``."""

@@ -1,4 +1,6 @@
-"""Old Faithful's 272 eruptions: minutes that each lasted, and minutes until the next.
+"""A helper, not a script: Old Faithful's 272 eruptions, how long each lasted, and until the next.
+
+Both in minutes.
 
 Azzalini, A. and Bowman, A. W. (1990). A look at some data on the Old Faithful geyser. Applied
 Statistics 39(3), 357-365; in this form Haerdle, W. (1991), Smoothing Techniques with Implementation

@@ -8,9 +8,14 @@ cancer or bronchitis, or none of them, or more than one of them."
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc import plotting
+from examples import compare, picture
 
 ANSWERS = ("no", "yes")
 DISEASES = ("tuberculosis", "cancer", "bronchitis")
@@ -60,3 +65,56 @@ def chest_clinic() -> bmc.BayesNet:
         states=ANSWERS,
     )
     return net
+
+
+def questions(draws: int) -> Iterator[compare.Table]:
+    """Which disease, before the X-ray and after it."""
+    yield which_disease(draws, "a smoker back from Asia, short of breath", AT_FIRST)
+    yield which_disease(draws, "the same, and the X-ray is positive", WITH_XRAY)
+
+
+def which_disease(draws: int, when: str, evidence: Mapping[str, str]) -> compare.Table:
+    """The diseases given the findings, exactly and by two kinds of sampling."""
+    net = chest_clinic()
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [(posterior.probabilities(name)[1], posterior.mcse(name)[1]) for name in DISEASES]
+
+    counted = compare.count(
+        net,
+        draws,
+        lambda values: np.all([values[name] == evidence[name] for name in evidence], axis=0),
+        lambda kept: [kept[name] == "yes" for name in DISEASES],
+    )
+    rows = (
+        compare.infer(net, evidence, bmc.Exact(), ask),
+        compare.infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+        counted,
+    )
+    return compare.Table(f"Which disease? {when}", DISEASES, rows)
+
+
+def draw() -> dict[str, Any]:
+    """The graph, and the unobserved nodes before any finding and after all of them."""
+    picture.pyplot()
+    net = chest_clinic()
+    healthy, ill = (bmc.infer(net, e, engine=bmc.Exact()) for e in ({}, WITH_XRAY))
+    panels = plotting.plot_prior_posterior(healthy, ill)
+    panels[0].set_ylabel("probability")
+    return {
+        "chest_clinic": plotting.plot_dag(net, observed=WITH_XRAY).figure,
+        "chest_clinic_marginals": panels[0].figure,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a table for each question, and draw the net and its marginals."""
+    options = picture.options(__doc__, arguments)
+    for table in questions(20_000 if options.fast else 1_000_000):
+        compare.print_table(table)
+    for name, figure in draw().items():
+        picture.save(figure, options.out, name)
+
+
+if __name__ == "__main__":
+    main()

@@ -9,10 +9,15 @@ waiting) as the density of the duration times that of the waiting time given the
 from __future__ import annotations
 
 import math
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc import plotting
+from examples import compare, picture
 from examples.data_faithful import ERUPTIONS
 
 KINDS = ("short", "long")
@@ -95,3 +100,133 @@ def typical_given(waits: np.ndarray) -> tuple[float, float, float]:
         - 0.5 * math.log(precision)
     )
     return float(mean), float(precision**-0.5), float(log_evidence)
+
+
+def questions(draws: int) -> Iterator[compare.Table]:
+    """Every question with the answers of every engine that takes it."""
+    yield which_kind(draws)
+    yield how_long(draws)
+    yield which_kinds_all(draws // 50)
+    yield learn_typical_wait(draws)
+
+
+def which_kind(draws: int) -> compare.Table:
+    """One eruption of Old Faithful: the kind is hidden, both times are measured."""
+    net = two_kinds(1)
+    evidence = {"duration": [2.9], "waiting": [66.0]}
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [(posterior.probabilities("kind")[0, 1], posterior.mcse("kind")[0, 1])]
+
+    rows = (
+        compare.infer(net, evidence, bmc.Exact(), ask),
+        compare.infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+    )
+    return compare.Table(
+        "Old Faithful: it lasted 2.9 min, the next came 66 min later", ("long",), rows
+    )
+
+
+def how_long(draws: int) -> compare.Table:
+    """The same when nobody timed it: the duration is hidden, too, and is integrated out."""
+    net = two_kinds(1)
+    evidence = {"waiting": [66.0]}
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [
+            (posterior.probabilities("kind")[0, 1], posterior.mcse("kind")[0, 1]),
+            (posterior.mean("duration")[0], posterior.mcse("duration")[0]),
+        ]
+
+    counted = compare.count(
+        net,
+        draws,
+        # waiting times are recorded to the minute
+        lambda values: np.abs(values["waiting"][:, 0] - 66.0) < 0.5,
+        lambda kept: [kept["kind"][:, 0] == "long", kept["duration"][:, 0]],
+    )
+    rows = (
+        compare.Row("closed form", kind_and_duration_given(66.0), compare.EXACT),
+        compare.infer(net, evidence, bmc.Exact(), ask),
+        compare.infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+        counted,
+    )
+    question = "Old Faithful: nobody timed it, the next came 66 min later"
+    return compare.Table(question, ("long", "mean minutes"), rows)
+
+
+def which_kinds_all(draws: int) -> compare.Table:
+    """All 272 eruptions at once: easy for elimination, hopeless for importance weights."""
+    net = two_kinds()
+    evidence = {"duration": DURATIONS, "waiting": WAITS}
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [(posterior.log_marginal_likelihood, posterior.log_marginal_likelihood_mcse)]
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rows = (
+            compare.Row("published fit", (LOG_LIKELIHOOD,), compare.EXACT),
+            compare.infer(net, evidence, bmc.Exact(), ask),
+            compare.infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+        )
+    warned = tuple(dict.fromkeys(str(warning.message) for warning in caught))
+    return compare.Table("Old Faithful: all 272 eruptions at once", ("log P(times)",), rows, warned)
+
+
+def learn_typical_wait(draws: int) -> compare.Table:
+    """An unknown mean, learnt from the first eight waits after long eruptions."""
+    net = typical_wait()
+    evidence = {"wait": FIRST_LONG_WAITS}
+
+    def ask(posterior: Any) -> list[tuple[float, float]]:
+        return [
+            (posterior.mean("typical"), posterior.mcse("typical")),
+            (posterior.log_marginal_likelihood, posterior.log_marginal_likelihood_mcse),
+        ]
+
+    mean, _, log_p = typical_given(FIRST_LONG_WAITS)
+    rows = (
+        compare.Row("closed form", (mean, log_p), compare.EXACT),
+        compare.infer(net, evidence, bmc.Exact(), ask),
+        compare.infer(net, evidence, bmc.LikelihoodWeighting(draws), ask),
+    )
+    question = "Old Faithful: the typical wait after a long eruption, from eight of them"
+    return compare.Table(question, ("mean minutes", "log P(waits)"), rows)
+
+
+def draw() -> dict[str, Any]:
+    """The graph with its plate, and the typical wait before and after eight waits."""
+    figure, panels = picture.axes([["typical"]], (5.2, 3.4))
+    ax, minutes = panels["typical"], np.linspace(20.0, 120.0, 501)
+    for evidence, label, color in (
+        ({}, "prior", picture.FAINT),
+        ({"wait": FIRST_LONG_WAITS}, "posterior", picture.EXACT),
+    ):
+        posterior = bmc.infer(typical_wait(), evidence, engine=bmc.Exact())
+        density = posterior.marginal("typical").density(minutes)
+        ax.plot(minutes, density, color=color, label=label)
+        ax.fill_between(minutes, density, color=color, alpha=0.25, lw=0)
+    ax.plot(FIRST_LONG_WAITS, 0 * FIRST_LONG_WAITS, "|", ms=12, color=picture.OTHER, label="waits")
+    ax.set(
+        xlabel="typical wait after a long eruption, minutes", ylabel="density, per minute", ylim=0
+    )
+    ax.legend(frameon=False, loc="upper left")
+    observed = ["duration", "waiting"]
+    return {
+        "old_faithful": plotting.plot_dag(two_kinds(len(ERUPTIONS)), observed=observed).figure,
+        "old_faithful_marginals": figure,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print a table for each question, and draw a net and what it learnt."""
+    options = picture.options(__doc__, arguments)
+    for table in questions(20_000 if options.fast else 1_000_000):
+        compare.print_table(table)
+    for name, figure in draw().items():
+        picture.save(figure, options.out, name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-"""What the scripts of the figures share: their options, empty axes, and a saved file."""
+"""A helper, not a script: the examples' options, empty axes, and a saved file."""
 
 from __future__ import annotations
 
@@ -15,26 +15,29 @@ def options(doc: str | None, arguments: Sequence[str] | None) -> argparse.Namesp
     """``fast`` and ``out``, as every example takes them."""
     parser = argparse.ArgumentParser(description=doc)
     parser.add_argument("--fast", action="store_true", help="few draws, for a smoke test")
-    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for the picture")
+    parser.add_argument("--out", type=Path, default=Path("out"), help="folder for pictures")
     return parser.parse_args(arguments)
 
 
 def axes(mosaic: list[list[str]], size: tuple[float, float], **keywords: Any) -> tuple[Any, Any]:
     """A figure and its axes by name, without the frame's upper and right side."""
-    import matplotlib
-
-    matplotlib.use("agg")  # write files; open no window
-    from matplotlib import pyplot
-
-    with pyplot.rc_context({"axes.spines.top": False, "axes.spines.right": False}):
-        return pyplot.subplot_mosaic(mosaic, figsize=size, layout="constrained", **keywords)
+    with pyplot().rc_context({"axes.spines.top": False, "axes.spines.right": False}):
+        return pyplot().subplot_mosaic(mosaic, figsize=size, layout="constrained", **keywords)
 
 
 def save(figure: Any, folder: Path, name: str) -> None:
     """Write ``name``.png, and say where."""
-    from matplotlib import pyplot
-
     folder.mkdir(parents=True, exist_ok=True)
     figure.savefig(folder / f"{name}.png", dpi=150)
-    pyplot.close(figure)
+    pyplot().close(figure)
     print(f"wrote {folder / name}.png")
+
+
+def pyplot() -> Any:
+    """``matplotlib.pyplot``, set to write files and open no window."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    return pyplot

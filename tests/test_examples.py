@@ -11,6 +11,7 @@ import pytest
 import bayesmc as bmc
 from examples import (
     central_limit,
+    compare,
     data_faithful,
     demo,
     diagnosis,
@@ -23,8 +24,8 @@ from examples import (
 
 
 @pytest.fixture(scope="module")
-def tables() -> list[demo.Table]:
-    return list(demo.questions(200_000))
+def tables() -> list[compare.Table]:
+    return [table for example in demo.NETS for table in example.questions(200_000)]
 
 
 def test_demo_prints_tables_and_writes_pictures(
@@ -35,13 +36,13 @@ def test_demo_prints_tables_and_writes_pictures(
     for figure in ("Monte Carlo error", "ESS", "seconds"):
         assert printed.count(figure) >= 6
     pictures = list((tmp_path / "out").iterdir())
-    assert len(pictures) == 4 + len(demo.FIGURES)
+    assert len(pictures) == 2 * len(demo.NETS) + len(demo.FIGURES)
     for path in pictures:
         assert path.read_bytes().startswith(b"\x89PNG")
         assert str(path) in printed
 
 
-def test_demo_engines_agree(tables: list[demo.Table]) -> None:
+def test_demo_engines_agree(tables: list[compare.Table]) -> None:
     """Every sampled figure lies within 4.5 of its Monte Carlo errors of the exact one.
 
     The false-alarm rate of that is below 1e-3 for all figures together, at a fixed seed, where at
@@ -49,7 +50,7 @@ def test_demo_engines_agree(tables: list[demo.Table]) -> None:
     """
     checked = 0
     for table in tables:
-        exact = [row for row in table.rows if row.errors == demo.EXACT]
+        exact = [row for row in table.rows if row.errors == compare.EXACT]
         for row in exact[1:]:
             assert row.answers == pytest.approx(exact[0].answers)
         for row in table.rows:
@@ -61,14 +62,14 @@ def test_demo_engines_agree(tables: list[demo.Table]) -> None:
 
 
 def test_demo_says_what_does_not_work(
-    tables: list[demo.Table], capsys: pytest.CaptureFixture[str]
+    tables: list[compare.Table], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert [row.engine for table in tables for row in table.rows if row.refusal] == []
     squared = bmc.BayesNet()
     squared.add("x", bmc.Normal(0.0, 1.0))
     squared.add("y", lambda x: bmc.Normal(x**2, 1.0))
-    refused = demo.infer(squared, {"y": 1.0}, bmc.Exact(), lambda posterior: [])
-    demo.print_table(demo.Table("a square", ("x",), (refused,)))
+    refused = compare.infer(squared, {"y": 1.0}, bmc.Exact(), lambda posterior: [])
+    compare.print_table(compare.Table("a square", ("x",), (refused,)))
     assert "'x'" in refused.refusal
     assert f"refuses: {refused.refusal}" in capsys.readouterr().out
     (warned,) = (table for table in tables if table.warned)
@@ -132,6 +133,29 @@ def test_closed_forms_hold_by_quadrature() -> None:
     assert old_faithful.typical_given(waits) == pytest.approx((mean, sd, log_p))
 
 
+@pytest.mark.parametrize("example", demo.NETS, ids=lambda example: example.__name__.split(".")[1])
+def test_nets_run_by_themselves(
+    example: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Twice the same pictures; the tables hold times, which differ."""
+    for folder in ("one", "two"):
+        example.main(["--fast", "--out", str(tmp_path / folder)])
+    printed = capsys.readouterr().out
+    assert printed.count("Exact ") == 2 * len(list(example.questions(1_000)))
+    pictures = sorted((tmp_path / "one").iterdir())
+    assert len(pictures) == 2
+    for path in pictures:
+        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+        assert str(path) in printed
+
+
+def test_every_example_is_run_by_the_demonstration_or_marked_as_a_helper() -> None:
+    run = {example.__name__.split(".")[1] for example in (*demo.NETS, *demo.FIGURES)}
+    for path in Path(demo.__file__).parent.glob("[!_]*.py"):
+        marked = path.read_text("utf-8").startswith('"""A helper, not a script: ')
+        assert marked != (path.stem in run | {"demo"}), path.name
+
+
 @pytest.mark.parametrize("figure", demo.FIGURES, ids=lambda figure: figure.__name__.split(".")[1])
 def test_figures_run_by_themselves(
     figure: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -140,7 +164,7 @@ def test_figures_run_by_themselves(
     printed = []
     for folder in ("one", "two"):
         figure.main(["--fast", "--out", str(tmp_path / folder)])
-        printed.append(capsys.readouterr().out.replace(folder, ""))
+        printed.append(capsys.readouterr().out.replace(str(tmp_path / folder), ""))
     assert printed[0] == printed[1]
     first, second = (next((tmp_path / folder).iterdir()) for folder in ("one", "two"))
     assert first.name == figure.__name__.split(".")[1] + ".png"
@@ -154,6 +178,12 @@ def test_parzen_improves_with_samples_if_the_window_is_narrow() -> None:
     assert errors[20, "silverman"] > errors[200, "silverman"] > errors[2000, "silverman"] > 0.1
     assert errors[2000, 1.5] > 0.9 * errors[20, 1.5]  # more samples do not mend a wide window
     assert parzen.error(parzen.TRUTH) == 0
+    # the rule is for one Gaussian: with the spread of either peak it gives less than half the width
+    n = len(parzen.SAMPLES)
+    assert parzen.width(n, 0.15) == pytest.approx(0.15)
+    rule = (4 / (3 * n)) ** 0.2
+    assert parzen.width(n, "silverman") == pytest.approx(rule * parzen.SAMPLES.std(ddof=1))
+    assert parzen.width(n, "silverman") > 2 * rule * 1.0
     assert np.trapezoid(parzen.TRUTH, parzen.GRID) == pytest.approx(1.0, abs=1e-5)
 
 
@@ -170,6 +200,16 @@ def test_sums_of_uniforms_follow_irwin_and_hall(terms: int) -> None:
     slope = np.gradient(central_limit.exact(terms, grid, terms), grid)
     off = np.abs(slope - central_limit.exact(terms, grid, terms - 1))
     assert np.sort(off)[-5] < 1e-3  # but for the corners of the uniform and the triangle
+
+
+def test_the_gap_to_the_gaussian_shrinks_like_one_over_n() -> None:
+    assert [central_limit.gap(n) for n in central_limit.TERMS[:2]] == pytest.approx(
+        [0.199, 0.031], abs=5e-4
+    )
+    # Edgeworth's first term at z = 0, where it is largest: excess kurtosis -1.2 / n, times 3 / 24
+    for n in (8, 12):
+        expected = 1.2 / n * 3 / 24 / np.sqrt(2 * np.pi)
+        assert central_limit.gap(n) == pytest.approx(expected, rel=0.05)
 
 
 def test_bearing_has_the_density_of_the_change_of_variables() -> None:

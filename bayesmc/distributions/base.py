@@ -70,8 +70,12 @@ class Distribution:
         rng : seed, Generator or None
         sample_shape : int or tuple of int
         """
-        shape = as_shape(sample_shape) + self.batch_shape
-        return self._sample(np.random.default_rng(rng), shape)
+        try:
+            shape = as_shape(sample_shape) + self.batch_shape
+            return self._sample(np.random.default_rng(rng), shape)
+        except (TypeError, ValueError) as error:
+            self._explain_sample(sample_shape, error)
+            raise
 
     def sample_to(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         """Draws of shape ``shape + event_shape``, where the batch broadcasts to ``shape``.
@@ -88,8 +92,12 @@ class Distribution:
         ``x`` has shape ``(..., *event_shape)``; the result broadcasts ``...`` and the batch.
         """
         # Outside the support a density takes logarithms of zero and worse: that is no accident.
-        with np.errstate(all="ignore"):
-            return self._log_prob(np.asarray(x))
+        try:
+            with np.errstate(all="ignore"):
+                return self._log_prob(np.asarray(x))
+        except (TypeError, ValueError, IndexError) as error:
+            self._explain_log_prob(x, error)
+            raise
 
     @property
     def mean(self) -> np.ndarray:
@@ -150,7 +158,7 @@ class Distribution:
         >>> float((rate.log_prob(rate.constrain(0.5)) + rate.log_abs_det_jacobian(0.5)).round(4))
         -0.6487
         """
-        return self.transform.constrain(u)
+        return self._mapped("constrain", u)
 
     def unconstrain(self, x: Any) -> np.ndarray:
         """The unconstrained numbers behind ``x``: the inverse of ``constrain``.
@@ -165,7 +173,7 @@ class Distribution:
         -------
         ndarray, shape (..., *transform.unconstrained_shape)
         """
-        return self.transform.unconstrain(x)
+        return self._mapped("unconstrain", x)
 
     def log_abs_det_jacobian(self, u: Any) -> np.ndarray:
         """``log |det dx/du|`` at ``u``, summed over the event.
@@ -179,7 +187,7 @@ class Distribution:
         ndarray, shape (...)
             ``...`` broadcast with the batch of bounds that depend on parents.
         """
-        return self.transform.log_abs_det_jacobian(u)
+        return self._mapped("log_abs_det_jacobian", u)
 
     def cdf(self, x: Any) -> np.ndarray:
         """Probability of a value at most ``x``."""
@@ -218,6 +226,66 @@ class Distribution:
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         raise NotImplementedError
+
+    # ---- what went wrong, once something has ------------------------------------------------
+
+    def _explain_sample(self, sample_shape: Any, error: Exception) -> None:
+        """Raise what is wrong with ``sample_shape``, if that is what failed."""
+        sizes = np.asarray(sample_shape)
+        if isinstance(error, BayesmcError) or (
+            sizes.size == 0 or sizes.dtype.kind in "iu" and sizes.min() >= 0
+        ):
+            return
+        raise ShapeError(
+            f"{self._family}.sample: sample_shape must be a nonnegative whole number or a tuple of "
+            f"them; got {sample_shape!r}"
+        ) from error
+
+    def _explain_log_prob(self, x: Any, error: Exception) -> None:
+        """Raise what is wrong with the values ``x``, if that is what failed."""
+        if isinstance(error, BayesmcError):
+            return
+        values = self._numbers("log_prob", "values", x, error)
+        cut = max(values.ndim - len(self.event_shape), 0)
+        lead, event = values.shape[:cut], values.shape[cut:]
+        if event != self.event_shape:
+            raise ShapeError(
+                f"{self._family}.log_prob: the values have shape {values.shape}, not "
+                f"(..., *{self.event_shape})"
+            ) from error
+        try:
+            np.broadcast_shapes(lead, self.batch_shape)
+        except ValueError:
+            raise ShapeError(
+                f"{self._family}.log_prob: values of shape {values.shape} do not broadcast with "
+                f"batch shape {self.batch_shape}; add an axis, as in x[:, None]"
+            ) from error
+
+    def _mapped(self, what: str, value: Any) -> np.ndarray:
+        """A map of the ``transform``, whose faults are told as this family's."""
+        transform = self.transform
+        free = what != "unconstrain"
+        try:
+            return getattr(transform, what)(value)
+        except (TypeError, ValueError) as error:
+            noun = "free values" if free else "values"
+            shape = self._numbers(what, noun, value, error).shape
+            wanted = transform.unconstrained_shape if free else self.event_shape
+            if shape[max(len(shape) - len(wanted), 0) :] == wanted:
+                fault = f"does not broadcast with batch shape {self.batch_shape}"
+            else:
+                fault = f"is not (..., *{wanted})"
+            raise ShapeError(
+                f"{self._family}.{what}: the {noun} have shape {shape}, which {fault}"
+            ) from error
+
+    def _numbers(self, what: str, noun: str, value: Any, error: Exception) -> np.ndarray:
+        try:
+            return np.asarray(value, dtype=float)
+        except (TypeError, ValueError):
+            raise ParameterError(
+                f"{self._family}.{what}: the {noun} must be numbers; got {value!r:.80}"
+            ) from error
 
     # ---- what a family's constructor calls --------------------------------------------------
 

@@ -9,7 +9,13 @@ import numpy as np
 
 from bayesmc.distributions.base import Distribution, draw_to
 from bayesmc.distributions.support import Support, as_support
-from bayesmc.errors import ShapeError, UnsupportedError
+from bayesmc.errors import (
+    BayesmcError,
+    DensityError,
+    ParameterError,
+    ShapeError,
+    UnsupportedError,
+)
 from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to
 
 
@@ -35,6 +41,10 @@ class Density(Distribution):
 
     Raises
     ------
+    ParameterError
+        The bounds of ``support`` leave nothing between them.
+    DensityError
+        On use, when ``log_prob`` fails or does not return numbers.
     ShapeError
         On use, when ``log_prob`` or ``sample`` returns another shape than promised.
     UnsupportedError
@@ -66,10 +76,14 @@ class Density(Distribution):
             raise TypeError(
                 f"Density({log_prob!r}): the first argument is a function, the log density"
             )
+        if sample is not None and not callable(sample):
+            raise TypeError(
+                f"Density(sample={sample!r:.80}): sample is a function, sample(rng, sample_shape)"
+            )
         self._function = log_prob
         self._sampler = sample
         self.event_shape = as_shape(event_shape)
-        self._support = as_support(support)
+        self._support = _checked_support(support)
         if self._support.kind == "real" and len(self.event_shape) == 1:
             self._support = as_support("real vector")
         self._batch = None if batch_shape is None else as_shape(batch_shape)
@@ -151,8 +165,30 @@ class Density(Distribution):
         return inside
 
     def _evaluate(self, x: np.ndarray) -> np.ndarray:
-        with np.errstate(all="ignore"):
-            return np.asarray(self._function(x), dtype=float)
+        value: Any = None
+        try:
+            with np.errstate(all="ignore"):
+                value = self._function(x)
+                return np.asarray(value, dtype=float)
+        except BayesmcError:
+            raise
+        except Exception as error:
+            if value is None:
+                fault = f"fails on arrays of shape {x.shape} ({type(error).__name__}: {error})"
+            else:
+                fault = f"returned {value!r:.80} for values of shape {x.shape}, not log densities"
+            raise DensityError(
+                f"Density: log_prob {fault}; write it with NumPy, element by element (np.where for if)"
+            ) from error
+
+
+def _checked_support(spec: Any) -> Support:
+    support = as_support(spec)
+    low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
+    empty = low > high if support.is_discrete else low >= high
+    if np.any(empty | np.isnan(low) | np.isnan(high)):
+        raise ParameterError(f"Density(support={spec!r}): the support must have low < high")
+    return support
 
 
 def _points(support: Support, event_shape: Shape) -> list[np.ndarray]:

@@ -61,6 +61,8 @@ class InverseCdf(Distribution):
     ParameterError
         ``high`` is not above ``low``, or the density's integral is zero, infinite or not resolved,
         or the log density is NaN or plus infinity inside the bounds.
+    DensityError
+        A function fails on arrays, or does not return numbers.
     UnsupportedError
         ``density`` is discrete or has vectors as values.
 
@@ -256,8 +258,19 @@ class InverseCdf(Distribution):
             if bad.any():
                 shaped = bad.reshape(self.batch_shape)
                 index = first_index(shaped)
+                if name.startswith("share") and self._is_no_logarithm(shaped):
+                    requirement += (
+                        "; it is nowhere negative: the function must return the LOG density"
+                    )
                 self._reject(name, values.reshape(self.batch_shape)[index], shaped, requirement)
                 good &= ~bad
+
+    def _is_no_logarithm(self, bad: np.ndarray) -> bool:
+        """Whether the log density of the ``bad`` elements looks like a density: nowhere negative."""
+        at = np.linspace(-8.0, 8.0, 129).reshape((-1,) + (1,) * bad.ndim)
+        with np.errstate(all="ignore"):
+            values = np.broadcast_to(self.density.log_prob(self._map.out(at)), (129, *bad.shape))
+        return bool((values[:, bad] >= 0).all())
 
     @cached_property
     def _moments(self) -> tuple[np.ndarray, np.ndarray]:

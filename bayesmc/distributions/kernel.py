@@ -10,7 +10,7 @@ from scipy import special
 
 from bayesmc.distributions.base import Distribution, as_float, as_quantile
 from bayesmc.distributions.categorical import Categorical
-from bayesmc.distributions.mixture import bisect
+from bayesmc.distributions.mixture import invert
 from bayesmc.distributions.support import Support, real, real_vector
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
 from bayesmc.shapes import Shape, first_index
@@ -22,6 +22,9 @@ _RULES = ("scott", "silverman")
 
 class KernelDensity(Distribution):
     """Kernel density estimate (Parzen window) with Gaussian kernels about ``points``.
+
+    Points that are vectors, an array of shape ``(n, d)``, need ``vectors=True``: without it the array
+    is a batch of n estimates, each of d numbers.
 
     Parameters
     ----------
@@ -157,13 +160,13 @@ class KernelDensity(Distribution):
         return np.minimum(total, 1.0)
 
     def ppf(self, q: Any) -> np.ndarray:
-        """Quantile by bisection between the outermost kernels' quantiles."""
+        """Quantile, found between the outermost kernels' quantiles."""
         self._one_number("ppf")
         q = as_quantile(q)
         used = np.where(self.weights > 0, self.points, np.nan)
         z = self._factor[..., 0, 0] * special.ndtri(q)
         low, high = np.nanmin(used, axis=-1) + z, np.nanmax(used, axis=-1) + z
-        return bisect(self.cdf, q, low, high)
+        return invert(self.cdf, self.log_prob, q, low, high)
 
     # ---- kernels ----------------------------------------------------------------------------
 

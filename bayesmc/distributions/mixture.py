@@ -20,6 +20,8 @@ from bayesmc.errors import ShapeError, UnsupportedError
 from bayesmc.shapes import Shape, broadcast_shapes
 
 _AT_ONCE = 1 << 22  # component draws held at a time
+_EPS = 2.0**-52
+_NEWTON = 40  # turns, before what has not settled is bisected
 
 
 class Mixture(Distribution):
@@ -122,7 +124,7 @@ class Mixture(Distribution):
         return self._weigh(self._parts.evaluate("cdf", np.asarray(x)))
 
     def ppf(self, q: Any) -> np.ndarray:
-        """Quantile by bisection between the least and the greatest quantile of the components."""
+        """Quantile, found between the least and the greatest quantile of the components."""
         q = as_quantile(q)
         quantiles = self._parts.evaluate("ppf", q)
         used = self.weights > 0
@@ -135,7 +137,9 @@ class Mixture(Distribution):
             return np.where(
                 q == 0, low, np.where(q == 1, high, whole_ppf(self.cdf, inner, start, stop))
             )
-        return bisect(self.cdf, q, low, high)
+        if np.array_equal(low, high, equal_nan=True):  # one component, or all alike
+            return low
+        return invert(self.cdf, self.log_prob, q, low, high)
 
     def _average(self, values: np.ndarray) -> np.ndarray:
         """Weighted sum of ``(..., K, *event)`` over the components, in full batch shape."""
@@ -328,19 +332,70 @@ def _not_mixed(supports: Sequence[Support]) -> UnsupportedError:
     )
 
 
-def bisect(
-    cdf: Callable[[np.ndarray], np.ndarray], q: np.ndarray, low: np.ndarray, high: np.ndarray
+def invert(
+    cdf: Callable[[np.ndarray], np.ndarray],
+    log_prob: Callable[[np.ndarray], np.ndarray],
+    q: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
 ) -> np.ndarray:
-    """Where ``cdf`` crosses ``q`` between ``low`` and ``high``, to the last bit."""
-    answer = np.where(q == 1, high, low)
+    """Where a continuous ``cdf`` crosses ``q`` between ``low`` and ``high``, to rounding.
+
+    Newton's steps on the logarithm of the nearer tail, which is nearly straight far out, kept in a
+    bracket that is halved where they do not halve themselves. Where the density does not fix the place (a
+    gap between components), the crossing is bisected to the last bit.
+    """
+    answer = np.where(q == 1, high, low)  # at q = 0 or 1 the bounds are the answer, maybe infinite
     active = np.isfinite(low) & np.isfinite(high)
     low, high = np.where(active, low, 0.0), np.where(active, high, 0.0)
+    active, q, low, high = np.broadcast_arrays(active, q, low, high)
+    found, width = np.where(q == 0, low, high), high - low
+    at, move = low + 0.5 * width, width
+    done = ~(low < high) | (q == 0)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON):
+            if done.all():
+                break
+            value, density = cdf(at), np.exp(log_prob(at))
+            short = value < q
+            low, high = np.where(short, at, low), np.where(short, high, at)
+            step = _newton_step(value, density, q)
+            missing = np.abs(value - q)
+            sure = (missing + _EPS * q) / density <= 1e-10 * width
+            fine = np.abs(step) <= 4 * _EPS * np.abs(at)
+            settled = sure & (fine | (missing <= 4 * _EPS * q)) & ~done
+            found = np.where(settled, at, found)
+            done = done | settled
+            usable = (at + step > low) & (at + step < high) & (np.abs(step) <= 0.5 * np.abs(move))
+            halves = low + 0.5 * (high - low)
+            move = np.where(usable, step, halves - at)
+            at = np.where(usable, at + step, halves)
+        if not done.all():
+            found = np.where(done, found, _bisect(cdf, q, low, high, done))
+    return np.where(active, found, answer)
+
+
+def _newton_step(value: np.ndarray, density: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Towards ``q``, along the logarithm of the nearer tail's probability."""
+    upper = q > 0.5
+    have, wanted = np.where(upper, 1 - value, value), np.where(upper, 1 - q, q)
+    step = np.log(have / wanted) * have / density
+    return np.where(upper, step, -step)
+
+
+def _bisect(
+    cdf: Callable[[np.ndarray], np.ndarray],
+    q: np.ndarray,
+    low: np.ndarray,
+    high: np.ndarray,
+    done: np.ndarray,
+) -> np.ndarray:
+    """The least number in the bracket whose ``cdf`` reaches ``q``."""
     for _ in range(2200):  # at most: halving an interval of doubles ends well before
         middle = low + 0.5 * (high - low)
-        done = (middle <= low) | (middle >= high)
+        done = done | (middle <= low) | (middle >= high)
         if done.all():
             break
         short = cdf(middle) < q
         low, high = np.where(short & ~done, middle, low), np.where(short | done, high, middle)
-    # at q = 0 or 1 the bounds are the answer and may be infinite
-    return np.where(active, high, answer)
+    return high

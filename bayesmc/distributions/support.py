@@ -128,6 +128,34 @@ class Support:
             inside = inside & (x == np.floor(x))
         return inside
 
+    def covers(self, other: Support) -> bool:
+        """Whether draws of a distribution on this support can fall everywhere on ``other``.
+
+        False only where they surely cannot; whether a bound itself is included does not matter.
+        Between discrete and continuous supports nothing is covered. Bounds that depend on parents
+        are compared batch element by batch element.
+
+        Parameters
+        ----------
+        other : Support
+
+        Examples
+        --------
+        >>> from bayesmc.distributions.support import integers, interval, positive, real
+        >>> real.covers(positive), positive.covers(real), positive.covers(interval(0.0, 2.0))
+        (True, False, True)
+        >>> real.covers(integers(0)), integers(0).covers(integers(1, 6))
+        (False, True)
+        """
+        if self.is_discrete != other.is_discrete:
+            return False
+        mine, theirs = _components(self), _components(other)
+        if len(mine) != len(theirs) and 1 not in (len(mine), len(theirs)):
+            return True  # vectors of unlike lengths: nothing can be said
+        size = max(len(mine), len(theirs))
+        mine, theirs = (ones * (size // len(ones)) for ones in (mine, theirs))
+        return all(_covers(a, b) for a, b in zip(mine, theirs, strict=True))
+
     def describe(self) -> str:
         """The support in words, for messages."""
         if self.kind in ("interval", "integers"):
@@ -268,6 +296,35 @@ def _first(bound: Any) -> Any:
 
 def _same(a: Any, b: Any) -> bool:
     return np.shape(a) == np.shape(b) and bool(np.all(np.asarray(a) == np.asarray(b)))
+
+
+def _components(support: Support) -> list[Support]:
+    """The support of each component of a product; of anything else, the one that serves them all."""
+    if support.kind != "product":
+        return [support]
+    return [part for part, count in support.parts for _ in range(max(count, 1))]
+
+
+def _covers(mine: Support, other: Support) -> bool:
+    if mine.kind in ("simplex", "positive definite"):
+        return mine.kind == other.kind
+    (low, high), (least, most) = _range(mine), _range(other)
+    return not (_above(low, least) or _above(most, high))
+
+
+def _range(support: Support) -> tuple[Any, Any]:
+    """Between which numbers each component lies."""
+    return {"circle": (-np.pi, np.pi), "simplex": (0.0, 1.0), "counts": (0.0, np.inf)}.get(
+        support.kind, (support.low, support.high)
+    )
+
+
+def _above(a: Any, b: Any) -> bool:
+    """Whether some ``a`` exceeds its ``b``; of batches that do not fit, whether each exceeds all."""
+    try:
+        return bool(np.any(np.greater(a, b)))
+    except ValueError:
+        return bool(np.min(a) > np.max(b))
 
 
 def _part(part: Support, count: int) -> str:

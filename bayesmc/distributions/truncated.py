@@ -77,6 +77,7 @@ class Truncated(Distribution):
             low, high = np.maximum(low, self.base.low), np.minimum(high, self.base.high)
             self.base = self.base.base
         self.is_discrete = self.base.is_discrete  # type: ignore[misc]
+        self._given = (low, high)  # as messages show them
         if self.is_discrete:
             low, high = np.ceil(low), np.floor(high)
         self._set_batch(self.base.batch_shape, low.shape, high.shape)
@@ -158,8 +159,7 @@ class Truncated(Distribution):
         ok = low <= high if self.is_discrete else low < high
         if ok.all():
             return low, high
-        shape = broadcast_shapes(low.shape, high.shape)
-        pair = np.stack([np.broadcast_to(low, shape), np.broadcast_to(high, shape)], axis=-1)
+        pair = self._pair(broadcast_shapes(low.shape, high.shape))
         what = "an interval with an integer in it" if self.is_discrete else "low < high"
         self._reject("(low, high)", pair[first_index(~ok)], ~ok, what)
         return np.where(ok, low, -np.inf), np.where(ok, high, np.inf)
@@ -167,16 +167,25 @@ class Truncated(Distribution):
     def _weigh(self) -> None:
         """Find the side to work on, the log of its tail at the start, and the log mass."""
         self._measure()
-        bad = ~(self._log_mass > self._doubtful)
+        least, greatest = self._least, self._greatest
+        outside = least > greatest if self.is_discrete else ~(least < greatest)
+        bad = outside | ~(self._log_mass > self._doubtful)
         if not bad.any():
             return
-        bounds = (self.low, self.high)
-        pair = np.stack([np.broadcast_to(b, bad.shape) for b in bounds], axis=-1)
-        what = "an interval whose probability under the base can be told from rounding"
-        self._reject("(low, high)", pair[first_index(bad)], bad, what)
+        support = self.base.support.describe()
+        doubtful = "an interval whose probability under the base can be told from rounding"
+        missed = f"an interval where {type(self.base).__name__} has mass ({support})"
+        for fault, what in ((outside, missed), (bad & ~outside, doubtful)):
+            if fault.any():
+                fault = np.broadcast_to(fault, bad.shape)
+                self._reject("(low, high)", self._pair(bad.shape)[first_index(fault)], fault, what)
         self._least = np.where(bad, np.asarray(self.base.support.low, float), self._least)
         self._greatest = np.where(bad, np.asarray(self.base.support.high, float), self._greatest)
         self._measure()
+
+    def _pair(self, shape: Shape) -> np.ndarray:
+        """The bounds as they were given, side by side."""
+        return np.stack([np.broadcast_to(bound, shape) for bound in self._given], axis=-1)
 
     def _measure(self) -> None:
         tails, before = self._base_tails, self._least - self.is_discrete
@@ -282,7 +291,10 @@ class Truncated(Distribution):
         return mean, (probs * (k - mean) ** 2).sum(axis=0)
 
     def _integrals(self) -> tuple[np.ndarray, np.ndarray]:
-        """Integrals over the quantile scale, or adaptive ones where that scale is not smooth."""
+        """Over the interval where the density is smooth there, else over quantiles, else adaptive."""
+        found = self._over_interval()
+        if found is not None:
+            return found
         mean, var = self._over_quantiles(1)
         coarse_mean, coarse_var = self._over_quantiles(2)
         # the rule's digits double with the nodes: agreement to five means ten
@@ -292,6 +304,33 @@ class Truncated(Distribution):
             return mean, var
         adaptive = InverseCdf(self)  # modes apart: the quantile rises in steps
         return adaptive.mean, adaptive.var
+
+    def _over_interval(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The double exponential rule on bounded intervals, if the total mass comes out as one."""
+        if not (np.isfinite(self._least) & np.isfinite(self._greatest)).all():
+            return None
+        lead = (-1,) + (1,) * len(self.batch_shape)
+        log_u, log_rest, weights = (v.reshape(lead) for v in _DOUBLE_EXPONENTIAL)
+        width = self._greatest - self._least
+        # measured from the nearer end, where the density may have a power law
+        part = width * np.exp(np.minimum(log_u, log_rest))
+        x = np.where(log_u < log_rest, self._least + part, self._greatest - part)
+        terms = np.exp(self.log_prob(x)) * weights * width
+        terms = np.where(
+            np.isfinite(terms), terms, 0.0
+        )  # at a bound; the total tells what was lost
+        totals, means, variances = [], [], []
+        for every in (1, 2):
+            at, mass = x[::every], every * terms[::every]
+            total = mass.sum(axis=0)
+            middle = (mass * at).sum(axis=0) / total
+            totals.append(total)
+            means.append(middle)
+            variances.append((mass * (at - middle) ** 2).sum(axis=0) / total)
+        good = (np.abs(totals[0] - 1) <= 1e-9) & (np.abs(totals[1] - 1) <= 1e-5)
+        good &= np.abs(means[0] - means[1]) <= 1e-5 * np.sqrt(variances[0])
+        good &= np.abs(variances[0] - variances[1]) <= 1e-5 * variances[0]
+        return (means[0], variances[0]) if good.all() else None
 
     def _over_quantiles(self, every: int) -> tuple[np.ndarray, np.ndarray]:
         """Mean and variance by the double exponential rule, with each or with every other node."""

@@ -6,19 +6,20 @@ own that knows no nets. ``from_pgmpy``, ``from_pyagrum`` and ``to_networkx`` tra
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bayesmc.errors import FileFormatError
+from bayesmc.errors import CycleError, FileFormatError
 from bayesmc.io.adapters import from_pgmpy, from_pyagrum, to_networkx
 from bayesmc.io.bif import format_bif, parse_bif
 from bayesmc.io.content import read_bytes, read_text, write_bytes
 from bayesmc.io.record import TableNode
-from bayesmc.io.tables import records
+from bayesmc.io.tables import check_net, records
 from bayesmc.io.xmlbif import format_xmlbif, parse_xmlbif
 from bayesmc.network import BayesNet
+from bayesmc.network.ordering import topological_order
 
 __all__ = ["from_pgmpy", "from_pyagrum", "read", "to_networkx", "write"]
 
@@ -47,7 +48,8 @@ def read(path: str | PathLike[str]) -> BayesNet:
     Raises
     ------
     FileFormatError
-        With file and line, where the text is not of the format or a row is no probability vector.
+        With file and line, where the text is not of the format, a row is no probability vector, or
+        the parents form a cycle.
     OSError
         If the file cannot be opened.
 
@@ -64,7 +66,9 @@ def read(path: str | PathLike[str]) -> BayesNet:
     """
     chosen = _format_of(path)
     net = BayesNet(Path(path).name.split(".")[0])
-    for node in chosen.parse(chosen.content(path), path):
+    nodes = chosen.parse(chosen.content(path), path)
+    _check_acyclic(nodes, path)
+    for node in nodes:
         net.table(node.name, node.parents, node.probs, states=node.states)
     return net
 
@@ -72,11 +76,13 @@ def read(path: str | PathLike[str]) -> BayesNet:
 def write(net: BayesNet, path: str | PathLike[str]) -> None:
     """Write a discrete net without plates in the format of the file's name, as ``read`` knows them.
 
-    A name ending in ``.gz`` is compressed. Functions of discrete parents are written as the tables
-    they make, states that are numbers as their text.
+    A name ending in ``.gz`` is compressed. Nodes stand in the order of their declaration. Functions
+    of discrete parents are written as the tables they make, states that are numbers as their text.
 
     Raises
     ------
+    TypeError
+        ``net`` is no ``BayesNet``.
     UnsupportedError
         The net has a node that the format cannot hold: continuous, plated, an input, or with a
         potential.
@@ -99,9 +105,22 @@ def write(net: BayesNet, path: str | PathLike[str]) -> None:
     }
     <BLANKLINE>
     """
+    check_net("write", "net, path", net)
     chosen = _format_of(path)
-    text = chosen.format(records(net.model(), chosen.name), net.name or "unknown")
+    text = chosen.format(records(net, chosen.name), net.name or "unknown")
     write_bytes(path, text.encode())
+
+
+def _check_acyclic(nodes: Sequence[TableNode], path: str | PathLike[str]) -> None:
+    try:
+        topological_order({node.name: node.parents for node in nodes})
+    except CycleError as error:
+        lines = {node.name: node.line for node in nodes}
+        raise FileFormatError(
+            f"the variables' parents form a cycle: {' -> '.join(error.path)}; a Bayes net has none",
+            path,
+            lines[error.path[0]],
+        ) from None
 
 
 def _format_of(path: str | PathLike[str]) -> _Format:

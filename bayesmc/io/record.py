@@ -22,6 +22,8 @@ class TableNode:
         Read-only; every row sums to 1.
     properties : tuple of str
         The texts of the variable's ``property`` lines or elements.
+    line : int or None
+        Where the file says what its parents are (from 1).
     """
 
     name: str
@@ -29,3 +31,4 @@ class TableNode:
     parents: tuple[str, ...]
     probs: np.ndarray
     properties: tuple[str, ...] = ()
+    line: int | None = None

@@ -6,9 +6,17 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.io.record import TableNode
-from bayesmc.network import Model
+from bayesmc.network import BayesNet, Model
 from bayesmc.shapes import first_index
 from bayesmc.structure import Table, tabulate
+
+
+def check_net(call: str, arguments: str, net: object) -> None:
+    """Refuse what is no net, such as a path in its place, in the words of the call."""
+    if not isinstance(net, BayesNet):
+        raise TypeError(
+            f"{call}({arguments}): net is a {type(net).__name__}, {net!r:.60}; give a BayesNet"
+        )
 
 
 def table_of(model: Model, name: str) -> Table | None:
@@ -28,19 +36,20 @@ def table_of(model: Model, name: str) -> Table | None:
     return tabulate(model, node, {})
 
 
-def records(model: Model, format: str) -> list[TableNode]:  # noqa: A002 - said to the user
-    """A discrete net without plates as the records that ``format`` holds.
+def records(net: BayesNet, format: str) -> list[TableNode]:  # noqa: A002 - said to the user
+    """A discrete net without plates as the records that ``format`` holds, in the order of declaration.
 
     Raises
     ------
     UnsupportedError
         Names the first node that the format cannot hold, or a potential.
     """
+    model = net.model()
     if model.potentials:
         raise UnsupportedError(
             f"write: {format} has no potentials, but the net has {list(model.potentials)}"
         )
-    return [_record(model, name, format) for name in model.nodes]
+    return [_record(model, name, format) for name in net.nodes]
 
 
 def _record(model: Model, name: str, format: str) -> TableNode:  # noqa: A002

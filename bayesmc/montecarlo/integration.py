@@ -19,10 +19,13 @@ from bayesmc.errors import (
 )
 from bayesmc.montecarlo.estimate import Estimate
 from bayesmc.montecarlo.target import (
+    check_callable,
+    check_proposal,
     chunk_sizes,
     count_of,
     evaluate,
     log_density,
+    number,
     show,
     single,
     streams,
@@ -61,19 +64,24 @@ def integrate(
     -------
     Estimate
         The integral of function times p; its error is the values' standard deviation over
-        ``sqrt(draws)``, or the delta method's where ``normalised``.
+        ``sqrt(draws)``, or the delta method's where ``normalised``. Where booleans came out all
+        equal, the error is that of a rate of ``1 / (draws + 2)``, as in ``hit_or_miss``.
 
     Raises
     ------
     QueryError
-        The function returns another first axis than the points', or NaN or infinity.
+        The function fails on arrays, or returns another first axis than the points', complex
+        numbers, NaN or infinity.
     ZeroProbabilityError
         All weights are zero.
     UnsupportedError
-        What is to be drawn from cannot be sampled.
+        What is to be drawn from cannot be sampled, or one of density and proposal is discrete and
+        the other continuous.
 
     Warns
     -----
+    SupportWarning
+        The proposal's support is narrower than the declared one of the density.
     LowEssWarning
         The weighted values (with ``normalised`` the weights) amount to fewer than 100 draws.
 
@@ -91,6 +99,7 @@ def integrate(
     True
     """
     count = count_of("integrate", draws, 2)
+    check_callable("integrate", function)
     if proposal is None and normalised:
         raise ParameterError(
             "integrate: normalised=True weights draws of another density; give it with proposal="
@@ -100,21 +109,26 @@ def integrate(
         "distribution" if proposal is None else "proposal",
         distribution if proposal is None else proposal,
     )
-    values, log_weights = [], []
+    if proposal is not None:
+        check_proposal("integrate", distribution, source)
+    values, log_weights, is_event = [], [], False
     log_p = log_density("integrate", "distribution", distribution) if proposal is not None else None
     log_q = log_density("integrate", "proposal", source)
     for size, generator in zip(chunk_sizes(count, source.event_shape), streams(rng), strict=False):
         points = source.sample(generator, size)
         value = evaluate("integrate", function, points)
         weight = np.zeros(size) if log_p is None else log_p(points) - log_q(points)
+        is_event = value.dtype == bool
         values.append(_finite(value, weight, points))
         log_weights.append(weight)
     value = np.concatenate(values)
-    if log_p is None:
-        return _plain(value)
     weight = np.concatenate(log_weights)
-    _warn(value, weight, normalised)
-    return _ratio(value, weight) if normalised else _weighted(value, weight)
+    if log_p is None:
+        found = _plain(value)
+    else:
+        _warn(value, weight, normalised)
+        found = _ratio(value, weight) if normalised else _weighted(value, weight)
+    return _not_certain(found, value, weight, normalised) if is_event else found
 
 
 def hit_or_miss(
@@ -168,8 +182,9 @@ def hit_or_miss(
     True
     """
     count = count_of("hit_or_miss", draws, 1)
+    check_callable("hit_or_miss", function)
     low, high = _box(low, high)
-    if height is not None and not 0 < height < np.inf:
+    if height is not None and not 0 < number("hit_or_miss", "height", height) < np.inf:
         raise ParameterError(f"hit_or_miss: height must be positive and finite; got {height!r}")
     hits = 0
     for size, generator in zip(chunk_sizes(count, low.shape), streams(rng), strict=False):
@@ -182,8 +197,7 @@ def hit_or_miss(
             )
         hits += int(np.count_nonzero(_hit(value, points, height, generator)))
     volume = float(np.prod(high - low)) * (1.0 if height is None else float(height))
-    rate = (hits + 1) / (count + 2)
-    return Estimate(volume * hits / count, volume * np.sqrt(rate * (1 - rate) / count), count)
+    return Estimate(volume * hits / count, volume * _binomial_error(hits, count), count)
 
 
 def _hit(
@@ -209,7 +223,12 @@ def _hit(
 
 
 def _box(low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
-    low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    try:
+        low, high = np.asarray(low, dtype=float), np.asarray(high, dtype=float)
+    except (TypeError, ValueError):
+        raise ParameterError(
+            f"hit_or_miss: low and high must be numbers or vectors; got {low!r:.60} and {high!r:.60}"
+        ) from None
     if low.ndim > 1 or high.ndim > 1:
         raise ShapeError("hit_or_miss: low and high must be numbers or vectors")
     try:
@@ -260,6 +279,25 @@ def _ratio(value: np.ndarray, log_weight: np.ndarray) -> Estimate:
     mean = (weight * value).sum(axis=0)
     error = np.sqrt((weight**2 * (value - mean) ** 2).sum(axis=0))
     return Estimate(mean, error, len(value))
+
+
+def _not_certain(
+    found: Estimate, value: np.ndarray, log_weight: np.ndarray, normalised: bool
+) -> Estimate:
+    """Booleans that came out all equal (where they have weight) leave the error of a rare event."""
+    used = value[log_weight > -np.inf]
+    equal = (used == used[:1]).all(axis=0)
+    weight = np.exp(log_weight - log_weight.max())
+    size = 1.0 if normalised else float(np.exp(log_weight.max()) * weight.mean())
+    count = float(weight.sum() ** 2 / (weight**2).sum())  # effective draws
+    error = np.where(equal, size * _binomial_error(0, count), 0.0)
+    return Estimate(found.value, np.maximum(found.standard_error, error), found.draws)
+
+
+def _binomial_error(hits: float, count: float) -> float:
+    """Standard error of a share of hits, never zero (Laplace's rule of succession for the rate)."""
+    rate = (hits + 1) / (count + 2)
+    return float(np.sqrt(rate * (1 - rate) / count))
 
 
 def _warn(value: np.ndarray, log_weight: np.ndarray, normalised: bool) -> None:

@@ -8,7 +8,16 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import EnvelopeError, ParameterError, UnsupportedError
-from bayesmc.montecarlo.target import CHUNK, count_of, log_density, show, single, streams
+from bayesmc.montecarlo.target import (
+    CHUNK,
+    check_proposal,
+    count_of,
+    log_density,
+    number,
+    show,
+    single,
+    streams,
+)
 
 _CALL = "rejection_sample"
 #: by how much rounding may lift a log density above an envelope that touches it
@@ -99,7 +108,13 @@ def rejection_sample(
     DensityError
         A log density is NaN or plus infinity.
     UnsupportedError
-        ``max_proposals`` were not enough, or ``proposal`` cannot be sampled.
+        ``max_proposals`` were not enough, ``proposal`` cannot be sampled, or one of density and
+        proposal is discrete and the other continuous.
+
+    Warns
+    -----
+    SupportWarning
+        The proposal's support is narrower than the declared one of the density.
 
     References
     ----------
@@ -117,9 +132,11 @@ def rejection_sample(
     ((5000,), True)
     """
     wanted = count_of(_CALL, draws, 1)
+    max_proposals = count_of(_CALL, max_proposals, 1, "max_proposals")
     log_k = _log_envelope(envelope, log_envelope)
     log_p = log_density(_CALL, "density", density)
     proposal = single(_CALL, "proposal", proposal)
+    check_proposal(_CALL, density, proposal)
     log_q = log_density(_CALL, "proposal", proposal)
     most = max(1, CHUNK // max(1, int(np.prod(proposal.event_shape))))
     size = min(most, max(64, 2 * wanted))
@@ -160,7 +177,10 @@ def _log_envelope(envelope: float | None, log_envelope: float | None) -> float:
     if (envelope is None) == (log_envelope is None):
         raise ParameterError(f"{_CALL}: give exactly one of envelope and log_envelope")
     with np.errstate(all="ignore"):
-        value = float(np.log(float(envelope))) if envelope is not None else float(log_envelope)  # type: ignore[arg-type]
+        if envelope is not None:
+            value = float(np.log(number(_CALL, "envelope", envelope)))
+        else:
+            value = number(_CALL, "log_envelope", log_envelope)
     if not np.isfinite(value):
         shown = envelope if envelope is not None else log_envelope
         raise ParameterError(f"{_CALL}: the envelope k must be positive and finite; got {shown!r}")

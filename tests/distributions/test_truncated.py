@@ -232,7 +232,12 @@ def test_the_support_is_exact_and_maps_to_the_line() -> None:
     [
         (lambda: d.Truncated(d.Normal(), [0, 3], [2, 1]), ParameterError, "low < high.*at index 1"),
         (lambda: d.Truncated(d.Normal(), np.nan), ParameterError, "low must be a number"),
-        (lambda: d.Truncated(d.Uniform(0, 1), [0.5, 2], 3), ParameterError, "rounding.*at index 1"),
+        (lambda: d.Truncated(d.Uniform(0, 1), [0.5, 2], 3), ParameterError,
+         r"where Uniform has mass \(numbers in \[0, 1\]\); got \[2. 3.\] at index 1"),
+        (lambda: d.Truncated(d.Gamma(2.0, 1.0), -3.0, -1.0), ParameterError,
+         r"where Gamma has mass \(numbers >= 0\); got \[-3. -1.\]"),
+        (lambda: d.Truncated(d.Poisson(3.0), -5, -2), ParameterError, r"integers >= 0\); got \[-5. -2.\]"),
+        (lambda: d.Truncated(d.Poisson(3.0), 1.2, 1.8), ParameterError, r"integer in it; got \[1.2 1.8\]"),
         (lambda: d.Truncated(BASES["Mixture"], 30.0), ParameterError, "told from rounding"),
         (lambda: d.Truncated(d.Poisson(3.0), 0.2, 0.3), ParameterError, "integer in it"),
         (lambda: d.Truncated(d.Dirichlet([1, 1])), UnsupportedError, "one number"),

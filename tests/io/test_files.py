@@ -11,6 +11,9 @@ from hypothesis import strategies as st
 
 import bayesmc as bmc
 from bayesmc.errors import FileFormatError, UnsupportedError
+from bayesmc.io.bif import format_bif
+from bayesmc.io.record import TableNode
+from bayesmc.io.xmlbif import format_xmlbif
 from bayesmc.testing import random_net
 
 SUFFIXES = [".bif", ".xmlbif", ".bifxml", ".xml"]
@@ -71,10 +74,50 @@ def test_random_nets_round_trip(tmp_path_factory, seed, suffix):
     path = tmp_path_factory.mktemp("nets") / f"net{suffix}"
     bmc.io.write(net, path)
     again = bmc.io.read(path)
-    assert list(again) == list(net.model().nodes)  # parents first
+    assert again.nodes == net.nodes
     (states, probs), (states_again, probs_again) = joint(net), joint(again)
     assert states_again == states
     np.testing.assert_allclose(probs_again, probs, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_the_order_of_declaration_is_kept(tmp_path, suffix):
+    net = bmc.BayesNet("backwards")
+    net.table("wet", ["rain"], [[0.9, 0.1], [0.2, 0.8]], states=("no", "yes"))
+    net.table("rain", probs=[0.8, 0.2], states=("no", "yes"))
+    assert list(net.model().nodes) == ["rain", "wet"]
+    for path in (tmp_path / "one.bif", tmp_path / f"two{suffix}"):
+        bmc.io.write(net, path)
+        net = bmc.io.read(path)
+        assert net.nodes == ("wet", "rain")
+    np.testing.assert_allclose(bmc.infer(net, {"wet": "yes"}).probabilities("rain"), [1 / 3, 2 / 3])
+
+
+@pytest.mark.parametrize("suffix", [".bif", ".xml"])
+def test_a_cycle_is_found_with_its_line(tmp_path, suffix):
+    nodes = [
+        TableNode(name, ("no", "yes"), parents, np.full((2,) * len(parents) + (2,), 0.5))
+        for name, parents in {"a": ("c",), "b": ("a",), "c": ("b",), "d": ("a", "c")}.items()
+    ]
+    path = tmp_path / f"ring{suffix}"
+    path.write_text({".bif": format_bif, ".xml": format_xmlbif}[suffix](nodes))
+    with pytest.raises(FileFormatError, match="parents form a cycle: a -> b -> c -> a;") as caught:
+        bmc.io.read(path)
+    start = {".bif": "probability ( a ", ".xml": "<DEFINITION>"}[suffix]
+    lines = path.read_text().splitlines()
+    first = next(k for k, line in enumerate(lines, 1) if line.startswith(start))
+    assert (caught.value.path, caught.value.line) == (path, first)
+    assert "_prev" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", ["net.bif", None, {"a": 1}])
+def test_what_is_no_net_is_refused_in_words(tmp_path, wrong):
+    kind = type(wrong).__name__
+    with pytest.raises(TypeError, match=rf"write\(net, path\): net is a {kind}, .*give a BayesNet"):
+        bmc.io.write(wrong, tmp_path / "net.bif")
+    with pytest.raises(TypeError, match=rf"to_networkx\(net\): net is a {kind}, .*give a BayesNet"):
+        bmc.io.to_networkx(wrong)
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

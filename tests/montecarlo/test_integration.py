@@ -67,7 +67,12 @@ def test_vectors_of_values_and_of_points() -> None:
 
 def test_a_proposal_makes_a_rare_event_cheap() -> None:
     tail = integrate(
-        lambda x: x > 5, bmc.Normal(), 10_000, 0, proposal=bmc.Truncated(bmc.Normal(), 5.0)
+        # beyond the proposal's reach the function vanishes, so a bare function gives the density
+        lambda x: x > 5,
+        bmc.Normal().log_prob,
+        10_000,
+        0,
+        proposal=bmc.Truncated(bmc.Normal(), 5.0),
     )
     np.testing.assert_allclose(tail.value, stats.norm.sf(5), rtol=1e-9)
     shifted = integrate(lambda x: x > 5, bmc.Normal(), 10_000, 0, proposal=bmc.Normal(5.0, 1.0))
@@ -91,6 +96,41 @@ def test_poor_weights_warn() -> None:
 def test_no_hit_is_not_certainty() -> None:
     none = hit_or_miss(lambda x: x > 2, 0.0, 1.0, 1000, 0)
     assert none.value == 0 and 0 < none.interval(0.95)[1] < 0.01
+
+
+def test_all_draws_alike_are_not_certainty() -> None:
+    guard = np.sqrt(1 / 1002 * (1001 / 1002) / 1000)
+    wide = bmc.Normal(0.0, 1.5)
+    for never in (True, False):
+
+        def alike(x: np.ndarray, never: bool = never) -> np.ndarray:
+            return (x > 50) == never
+
+        plain = integrate(alike, bmc.Normal(), 1000, 0)
+        np.testing.assert_allclose(plain.standard_error, guard)
+        for normalised in (True, False):
+            weighted = integrate(alike, bmc.Normal(), 1000, 0, proposal=wide, normalised=normalised)
+            assert weighted.standard_error >= guard  # weights only lower the effective draws
+    pair = integrate(lambda x: np.stack([x > 50, x > 0], axis=-1), bmc.Normal(), 1000, 0)
+    np.testing.assert_allclose(pair.standard_error[0], guard)
+    np.testing.assert_allclose(pair.standard_error[1], 0.5 / np.sqrt(1000), rtol=0.05)
+    # numbers may be constant: their error is zero (the negative control)
+    assert integrate(lambda x: 3.0 + 0 * x, bmc.Normal(), 1000, 0).standard_error == 0
+
+
+def test_a_proposal_that_cannot_reach_warns() -> None:
+    with pytest.warns(
+        errors.SupportWarning, match=r"Uniform lies on numbers in \[-1, 1\].*support="
+    ):
+        integrate(lambda x: x, bmc.Normal(), 1000, 0, proposal=bmc.Uniform(-1.0, 1.0))
+    cut = bmc.Density(bmc.Normal().log_prob, support=(-1, 1))
+    # declared, or wider, it does not (warnings are errors here)
+    integrate(lambda x: x, cut, 1000, 0, proposal=bmc.Uniform(-1.0, 1.0))
+    integrate(lambda x: x, bmc.Gamma(2.0, 1.0), 1000, 0, proposal=bmc.Normal(2.0, 2.0))
+
+
+def _branches(x: np.ndarray) -> float:
+    return 1.0 if x > 0 else 0.0
 
 
 def test_a_lid_that_is_too_low_names_the_point() -> None:
@@ -132,8 +172,25 @@ def test_an_estimate_is_a_value() -> None:
         (lambda: integrate(np.cos, bmc.Normal(), normalised=True), errors.ParameterError, "proposal="),
         (lambda: integrate(np.cos, bmc.Density(lambda x: -(x**2))), errors.UnsupportedError,
          "InverseCdf"),
-        (lambda: integrate(np.cos, bmc.Uniform(5, 6), 9, 0, proposal=bmc.Uniform(0, 1)),
+        (lambda: integrate(np.cos, bmc.Uniform(5, 6).log_prob, 9, 0, proposal=bmc.Uniform(0, 1)),
          errors.ZeroProbabilityError, "covers the density"),
+        (lambda: integrate(np.cos, bmc.Normal(), 9, 0, proposal=bmc.Poisson(1.0)),
+         errors.UnsupportedError, "Normal is continuous and the proposal Poisson discrete"),
+        (lambda: integrate(np.cos, bmc.Poisson(1.0), 9, 0, proposal=bmc.Normal()),
+         errors.UnsupportedError, "give a proposal on integers >= 0"),
+        (lambda: integrate(lambda x: 1j * x, bmc.Normal(), 9), errors.QueryError, "complex numbers"),
+        (lambda: integrate(lambda x: x.astype(str), bmc.Normal(), 9), errors.QueryError, "must return real"),
+        (lambda: integrate(_branches, bmc.Normal(), 9), errors.QueryError,
+         r"fails on arrays of shape \(9,\) \(ValueError.*np.where for if"),
+        (lambda: integrate(np.cos, _branches, 9, proposal=bmc.Normal()), errors.QueryError,
+         "log density distribution fails on arrays"),
+        (lambda: integrate("x", bmc.Normal(), 9), errors.ParameterError, "function must be callable"),
+        (lambda: integrate(np.cos, bmc.Normal(), "9"), errors.ParameterError, "draws must be a whole.*'9'"),
+        (lambda: integrate(np.cos, bmc.Normal(), np.inf), errors.ParameterError, "draws must be a whole"),
+        (lambda: hit_or_miss(3, 0.0, 1.0), errors.ParameterError, "hit_or_miss: function must be callable"),
+        (lambda: hit_or_miss(_branches, 0.0, 1.0), errors.QueryError, "hit_or_miss: the function fails"),
+        (lambda: hit_or_miss(_quarter, "a", 1.0), errors.ParameterError, "low and high must be numbers"),
+        (lambda: hit_or_miss(np.sin, 0.0, 1.0, height="a"), errors.ParameterError, "height must be a number"),
         (lambda: hit_or_miss(_quarter, [0, 0], [1, np.inf]), errors.ParameterError, "finite low < high"),
         (lambda: hit_or_miss(_quarter, [0, 0], [1, 1, 1]), errors.ShapeError, "components"),
         (lambda: hit_or_miss(np.sin, 0.0, 1.0), errors.QueryError, "not booleans"),

@@ -93,6 +93,11 @@ def test_a_proposal_with_lighter_tails_is_found_out() -> None:
         rejection_sample(bmc.StudentT(3.0), bmc.Normal(), 2.0, draws=20_000, rng=0)
 
 
+def test_a_proposal_that_cannot_reach_warns() -> None:
+    with pytest.warns(errors.SupportWarning, match="rejection_sample: .* never reached"):
+        rejection_sample(BUMPS, bmc.Uniform(-1.0, 1.0), 11.0, draws=10, rng=0)
+
+
 def test_it_gives_up_with_the_acceptance_so_far() -> None:
     with pytest.raises(errors.UnsupportedError, match="of 1,000 draws accepted among 2,000 prop"):
         rejection_sample(BUMPS, WIDE, 1100.0, draws=1000, rng=0, max_proposals=2000)
@@ -113,6 +118,13 @@ def test_one_draw_has_no_integral() -> None:
         (lambda: rejection_sample(BUMPS, WIDE, -1.0), errors.ParameterError, "positive and finite"),
         (lambda: rejection_sample(BUMPS, WIDE, 11.0, draws=0), errors.ParameterError, "at least 1"),
         (lambda: rejection_sample(BUMPS, WIDE, 11.0, draws=2.5), errors.ParameterError, "whole"),
+        (lambda: rejection_sample(BUMPS, WIDE, "a"), errors.ParameterError, "envelope must be a number"),
+        (lambda: rejection_sample(BUMPS, WIDE, log_envelope="a"), errors.ParameterError,
+         "log_envelope must be a number"),
+        (lambda: rejection_sample(BUMPS, WIDE, 11.0, max_proposals="a"), errors.ParameterError,
+         "max_proposals must be a whole number"),
+        (lambda: rejection_sample(BUMPS, bmc.Poisson(1.0), 11.0), errors.UnsupportedError,
+         "rejection_sample: .* continuous and the proposal Poisson discrete"),
         (lambda: rejection_sample(BUMPS, BUMPS, 11.0), errors.UnsupportedError, "InverseCdf"),
         (lambda: rejection_sample(BUMPS, bmc.Normal([0, 1], 1), 11.0), errors.ShapeError, "batch"),
         (lambda: rejection_sample(3.0, WIDE, 11.0), errors.ParameterError, "density must be"),

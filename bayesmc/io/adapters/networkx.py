@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from bayesmc.io.tables import table_of
+from bayesmc.io.tables import check_net, table_of
 from bayesmc.network import BayesNet, Model
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ def to_networkx(
 
     Raises
     ------
+    TypeError
+        ``net`` is no ``BayesNet``.
     ModelError, EvidenceError
         As on the net's first use: it is compiled.
 
@@ -55,6 +57,7 @@ def to_networkx(
     >>> graph.nodes["wet"]["probs"].tolist()
     [[0.75, 0.25], [0.25, 0.75]]
     """
+    check_net("to_networkx", "net", net)
     import networkx
 
     # a size for plates that data decide; what is read off the net does not depend on it

@@ -101,7 +101,7 @@ class _Reader(Cursor):
     def __init__(self, text: str, path: Any) -> None:
         super().__init__(text, path)
         self.variables: dict[str, _Variable] = {}
-        self.tables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {}
+        self.tables: dict[str, tuple[tuple[str, ...], np.ndarray, int]] = {}
 
     def nodes(self) -> list[TableNode]:
         blocks: list[int] = []  # probability blocks wait: they may precede their variables
@@ -116,17 +116,19 @@ class _Reader(Cursor):
                 self.skip_block(at, "probability")
             else:
                 self.fail(f"expected 'network', 'variable' or 'probability', found {keyword!r}")
+        line, counted = 1, 0
         for at in blocks:
+            line, counted = line + self.text.count("\n", counted, at), at
             self.at = at
-            self.read_probability(at)
+            self.read_probability(at, line)
         return [self.node(name, variable) for name, variable in self.variables.items()]
 
     def node(self, name: str, variable: _Variable) -> TableNode:
         if name not in self.tables:
             self.fail(f"variable {name!r} has no probability block; add one", variable.at)
-        parents, probs = self.tables[name]
+        parents, probs, line = self.tables[name]
         probs.flags.writeable = False
-        return TableNode(name, variable.states, parents, probs, variable.properties)
+        return TableNode(name, variable.states, parents, probs, variable.properties, line)
 
     def skip_network(self, at: int) -> None:
         match = _NETWORK_HEAD.match(self.text, self.at)
@@ -182,7 +184,7 @@ class _Reader(Cursor):
         self.at = match.end()
         return states
 
-    def read_probability(self, at: int) -> None:
+    def read_probability(self, at: int, line: int) -> None:
         scope = _SCOPE.match(self.text, self.at)
         assert scope is not None  # the first pass matched it here
         child, *parents = self.names(scope[1], scope.start(1)) or ("",)
@@ -194,7 +196,7 @@ class _Reader(Cursor):
         if child in self.tables:
             self.fail(f"variable {child!r} has a second probability block", at)
         self.at = scope.end()
-        self.tables[child] = (tuple(parents), self.read_table(child, parents, at))
+        self.tables[child] = (tuple(parents), self.read_table(child, parents, at), line)
 
     def read_table(self, child: str, parents: list[str], at: int) -> np.ndarray:
         """The table of one block; ``self.at`` is after its opening brace."""

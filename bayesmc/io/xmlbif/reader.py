@@ -131,7 +131,8 @@ class _Reader:
         probs = self.read_table(name, parents, definition)
         probs.flags.writeable = False
         texts = (element.text for element in self.variables[name].all("PROPERTY"))
-        return TableNode(name, self.states[name], parents, probs, tuple(t for t in texts if t))
+        properties = tuple(text for text in texts if text)
+        return TableNode(name, self.states[name], parents, probs, properties, definition.line)
 
     def read_table(self, name: str, parents: Sequence[str], definition: Element) -> np.ndarray:
         shape = [len(self.states[variable]) for variable in (*parents, name)]
