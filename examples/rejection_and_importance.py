@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     area = montecarlo.integrate(np.ones_like, target, found.proposed, rng=2, proposal=PROPOSAL)
     integral = np.exp(found.log_normalizer)
     print(f"Rejection and importance: {found.proposed:,} draws of the proposal each")
-    print(f"  rejection   accepts {found.acceptance:.1%}; expected {INTEGRAL / K:.1%}")
+    print(f"  rejection   accepts {found.acceptance_rate:.1%}; expected {INTEGRAL / K:.1%}")
     print(f"  mean        exact {MEAN:.4f}   rejection {found.draws.mean():.4f} +- {error:.4f}   "
           f"importance {weighted.value:.4f} +- {weighted.standard_error:.4f}")  # fmt: skip
     print(f"  integral    exact {INTEGRAL:.4f}   rejection {integral:.4f} +- "

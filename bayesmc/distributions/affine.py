@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesmc.distributions.adapt import as_distribution
 from bayesmc.distributions.base import Distribution, as_float, as_quantile
-from bayesmc.distributions.support import Support, interval
+from bayesmc.distributions.support import Support, interval, product
 from bayesmc.distributions.tails import Tails, tails_of
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
 from bayesmc.shapes import Shape
@@ -95,9 +95,11 @@ class Affine(Distribution):
     def support(self) -> Support:
         support = self.base.support
         if support.kind == "interval":
-            if self.event_shape:  # the same bounds for every component, in the base
-                return _mapped(support, self.loc[..., 0], self.scale[..., 0])
-            return _mapped(support, self.loc, self.scale)
+            if not self.event_shape:
+                return _mapped(support, self.loc, self.scale)
+            loc, scale = np.broadcast_arrays(self.loc, self.scale, np.zeros(self.event_shape))[:2]
+            parts = [_mapped(support, loc[..., k], scale[..., k]) for k in range(loc.shape[-1])]
+            return product([(part, 0) for part in parts])
         if support.kind == "product":
             return _mapped_product(support, self.loc, self.scale, self.event_shape)
         return support

@@ -99,7 +99,8 @@ def _joint_average(
     if not events and not others:
         # an affine function alone: its mean is its value at the mean
         means = {n: gaussian.mean(n)[None] for n in continuous}
-        found, columns = None, {}
+        found: Components | None = None
+        columns: dict[str, list[int]] = {}
         weights = np.ones(1)
     else:
         only = None if where is None else {n: where[n][1] for n in continuous}

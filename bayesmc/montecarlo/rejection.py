@@ -57,14 +57,14 @@ class RejectionSample:
     standard_error: float
 
     @property
-    def acceptance(self) -> float:
+    def acceptance_rate(self) -> float:
         """Share of the proposals that was accepted."""
         return len(self.draws) / self.proposed
 
     def __repr__(self) -> str:
         return (
             f"RejectionSample({len(self.draws):,} draws from {self.proposed:,} proposals, acceptance "
-            f"{self.acceptance:.3g}, log_normalizer {self.log_normalizer:.3g} +- "
+            f"{self.acceptance_rate:.3g}, log_normalizer {self.log_normalizer:.3g} +- "
             f"{self.standard_error:.2g})"
         )
 
@@ -128,7 +128,7 @@ def rejection_sample(
     >>> from bayesmc.montecarlo import rejection_sample
     >>> two_bumps = bmc.Density(lambda x: np.logaddexp(-((x - 2) ** 2), -((x + 2) ** 2)))
     >>> found = rejection_sample(two_bumps, bmc.Normal(0.0, 3.0), envelope=11.0, draws=5000, rng=1)
-    >>> found.draws.shape, bool(abs(found.acceptance - 2 * np.sqrt(np.pi) / 11) < 0.02)
+    >>> found.draws.shape, bool(abs(found.acceptance_rate - 2 * np.sqrt(np.pi) / 11) < 0.02)
     ((5000,), True)
     """
     wanted = count_of(_CALL, draws, 1)

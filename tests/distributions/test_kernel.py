@@ -61,6 +61,7 @@ def test_draws_fit() -> None:
     draws = vectors.sample(2, 50_000)
     # 6 standard errors of 3 means
     assert (np.abs(draws.mean(0) - vectors.mean) < 6 * np.sqrt(vectors.var / 50_000)).all()
+    # nearly normal: 0.05 is 8 standard errors, sqrt(2 / 50,000) each
     np.testing.assert_allclose(draws.var(0), vectors.var, rtol=0.05)
 
 

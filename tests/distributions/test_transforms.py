@@ -42,6 +42,16 @@ INF = np.inf
 Make = Callable[[], d.Distribution]
 
 
+def _waits() -> d.Density:
+    """Two positive numbers side by side, on one support for both."""
+    return d.Density(
+        lambda v: -v.sum(axis=-1),
+        lambda rng, shape: rng.exponential(size=(*shape, 2)),
+        event_shape=(2,),
+        support="positive",
+    )
+
+
 def _normals(size: int) -> d.Distribution:
     return d.MvNormal(np.zeros(size), np.eye(size) + 0.3)
 
@@ -70,6 +80,7 @@ EXAMPLES: dict[str, tuple[Make, ...]] = {
         lambda: d.Affine(d.Gamma([2.0, 3.0], 1.0), [[1.0], [-1.0]], -2.0),
         lambda: d.Affine(d.Beta(2.0, 3.0), [-4.0, 1.0, 2.0], [0.5, -3.0, 10.0]),
         lambda: d.Affine(_normals(2), 1.0, [2.0, 3.0]),
+        lambda: d.Affine(_waits(), [[0.0, 5.0], [1.0, 1.0]], [1.0, -2.0]),
     ),
     "Bernoulli": (lambda: d.Bernoulli(0.3),),
     "Beta": (lambda: d.Beta(2.0, 3.0), lambda: d.Beta([[0.7], [4.0]], [1.0, 2.0, 3.0])),

@@ -35,9 +35,9 @@ def test_acceptance_and_integral() -> None:
     found = rejection_sample(BUMPS, WIDE, 11.0, draws=20_000, rng=1)
     rate = BUMPS_INTEGRAL / 11.0
     # false alarm 1e-6 (4.9 standard errors)
-    assert abs(found.acceptance - rate) < 4.9 * np.sqrt(rate * (1 - rate) / found.proposed)
+    assert abs(found.acceptance_rate - rate) < 4.9 * np.sqrt(rate * (1 - rate) / found.proposed)
     assert abs(found.log_normalizer - np.log(BUMPS_INTEGRAL)) < 4.9 * found.standard_error
-    assert found.acceptance == 20_000 / found.proposed
+    assert found.acceptance_rate == 20_000 / found.proposed
     logged = rejection_sample(BUMPS, WIDE, log_envelope=np.log(11.0), draws=20_000, rng=1)
     np.testing.assert_array_equal(logged.draws, found.draws)
 
@@ -49,7 +49,7 @@ def test_the_integral_is_unbiased() -> None:
     ratios = np.array([np.exp(run.log_normalizer) for run in runs]) / BUMPS_INTEGRAL
     error = ratios.std() / np.sqrt(len(ratios))
     assert abs(ratios.mean() - 1) < 4 * error
-    plain = np.array([11.0 * run.acceptance for run in runs]) / BUMPS_INTEGRAL
+    plain = np.array([11.0 * run.acceptance_rate for run in runs]) / BUMPS_INTEGRAL
     assert abs(plain.mean() - 1) > 4 * error
     # the reported error is the spread of the log, to the order of 1 / n
     np.testing.assert_allclose(
@@ -67,7 +67,7 @@ def test_a_function_vectors_and_a_tight_envelope() -> None:
     assert ((found.draws**2).sum(axis=-1) <= 1).all()
     assert abs(np.exp(found.log_normalizer) / np.pi - 1) < 4.9 * found.standard_error
     everything = rejection_sample(stats.norm(), bmc.Normal(), 1.0, draws=100, rng=0)
-    assert (everything.proposed, everything.acceptance) == (100, 1.0)
+    assert (everything.proposed, everything.acceptance_rate) == (100, 1.0)
 
 
 def test_the_same_seed_gives_the_same_draws() -> None:
