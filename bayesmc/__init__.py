@@ -5,9 +5,9 @@ distribution. See ``bayesmc.BayesNet`` and ``bayesmc.infer``.
 """
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from bayesmc import errors, io, montecarlo
+from bayesmc import errors
 from bayesmc.auto import Explanation, explain, infer
 from bayesmc.distributions import (
     Affine,
@@ -53,6 +53,9 @@ from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet
 from bayesmc.plates import PlateArray, stack
 from bayesmc.results import Marginal, Posterior, Summary
+
+if TYPE_CHECKING:
+    from bayesmc import io, montecarlo
 
 __version__ = "0.1.0"
 
@@ -112,7 +115,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    """``bayesmc.plotting`` and ``bayesmc.testing`` load when first asked for."""
-    if name in ("plotting", "testing"):
+    """What not every program needs loads when first asked for."""
+    if name in ("io", "montecarlo", "plotting", "testing"):
         return importlib.import_module(f"bayesmc.{name}")
     raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")

@@ -220,7 +220,9 @@ class Tracer(NDArrayOperatorsMixin):
 
     def _refuse(self, what: str) -> TypeError:
         names = ", ".join(sorted(self.sources))
-        return TypeError(f"it asks for {what} of {names}, where only NumPy operations can be followed")
+        return TypeError(
+            f"it asks for {what} of {names}, where only NumPy operations can be followed"
+        )
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         raise self._refuse("a plain array")
