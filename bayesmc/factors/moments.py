@@ -101,6 +101,9 @@ class Moments:
         covariances are empty.
         """
         scope = tuple(dict.fromkeys([*(v for b in blocks for v in self.scopes[b]), *extra]))
+        if not scope and len(blocks) == 1:  # one Gaussian, as worked out with all others
+            mean, cov = self.moments(blocks[0])
+            return Components({}, np.ones(1), mean[None], cov[None])
         states, weights = self._configurations(scope)
         passed = _Descent(self._of, self._dims, self._cards, self._visits(blocks), blocks, spread)
         means, covs = [], []
