@@ -167,7 +167,32 @@ class Cauchy(Distribution):
         return self.loc + self.scale * z
 
 
-class HalfNormal(Distribution):
+class _Half(Distribution):
+    """The absolute value of a distribution symmetric about zero, with its scale as the only parameter."""
+
+    parameter_ndim = {"scale": 0}
+
+    def __init__(self, scale: Any = 1.0) -> None:
+        scale = as_float(scale)
+        self._set_batch(scale.shape)
+        self.scale = self._positive("scale", scale)
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        draws = self._whole(rng, shape)
+        np.abs(draws, out=draws)
+        draws *= self.scale
+        return draws
+
+    def _whole(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        """Draws of the whole distribution at scale one."""
+        raise NotImplementedError
+
+    @property
+    def support(self) -> Support:
+        return nonnegative
+
+
+class HalfNormal(_Half):
     """Half-normal distribution: the absolute value of a normal one of mean zero.
 
     Parameters
@@ -191,18 +216,8 @@ class HalfNormal(Distribution):
     (-0.9189, 1.5958)
     """
 
-    parameter_ndim = {"scale": 0}
-
-    def __init__(self, scale: Any = 1.0) -> None:
-        scale = as_float(scale)
-        self._set_batch(scale.shape)
-        self.scale = self._positive("scale", scale)
-
-    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
-        draws = np.asarray(rng.standard_normal(shape))
-        np.abs(draws, out=draws)
-        draws *= self.scale
-        return draws
+    def _whole(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        return np.asarray(rng.standard_normal(shape))
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         z = np.asarray(x / self.scale)
@@ -219,10 +234,6 @@ class HalfNormal(Distribution):
     def var(self) -> np.ndarray:
         return self.scale**2 * (1 - 2 / np.pi)
 
-    @property
-    def support(self) -> Support:
-        return nonnegative
-
     def cdf(self, x: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
             return special.erf(np.maximum(x, 0.0) / self.scale / np.sqrt(2.0))
@@ -231,7 +242,7 @@ class HalfNormal(Distribution):
         return self.scale * (np.sqrt(2.0) * special.erfinv(as_quantile(q)))
 
 
-class HalfCauchy(Distribution):
+class HalfCauchy(_Half):
     """Half-Cauchy distribution: the absolute value of a Cauchy one centred at zero.
 
     Parameters
@@ -256,18 +267,8 @@ class HalfCauchy(Distribution):
     (-2.7542, 0.5)
     """
 
-    parameter_ndim = {"scale": 0}
-
-    def __init__(self, scale: Any = 1.0) -> None:
-        scale = as_float(scale)
-        self._set_batch(scale.shape)
-        self.scale = self._positive("scale", scale)
-
-    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
-        draws = np.asarray(rng.standard_cauchy(shape))
-        np.abs(draws, out=draws)
-        draws *= self.scale
-        return draws
+    def _whole(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        return np.asarray(rng.standard_cauchy(shape))
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         value = _minus_log1p_square(x / self.scale)
@@ -283,10 +284,6 @@ class HalfCauchy(Distribution):
     def var(self) -> np.ndarray:
         """Infinite, as in SciPy."""
         return np.full(self.batch_shape, np.inf)
-
-    @property
-    def support(self) -> Support:
-        return nonnegative
 
     def cdf(self, x: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
