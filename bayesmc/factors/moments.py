@@ -50,6 +50,8 @@ class Components:
 
     def collapsed(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean and covariance of the whole mixture."""
+        if len(self.weights) == 1:
+            return self.mean[0], self.cov[0]
         mean = self.weights @ self.mean
         spread = self.mean - mean
         within = np.tensordot(self.weights, self.cov, axes=1)

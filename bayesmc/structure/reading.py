@@ -117,6 +117,8 @@ class Reading:
 
     def invalid_rows(self) -> Iterator[InvalidRows]:
         """Elements and configurations with bad parameters."""
+        if not self.invalid.any():
+            return
         rows = self.invalid.reshape(math.prod(self.cards), self.count)
         bad = np.asarray(rows.any(axis=0))
         for e in np.flatnonzero(bad).tolist():
