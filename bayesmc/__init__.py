@@ -55,7 +55,7 @@ from bayesmc.plates import PlateArray, stack
 from bayesmc.results import Marginal, Posterior, Summary
 
 if TYPE_CHECKING:
-    from bayesmc import io, montecarlo
+    from bayesmc import io, markov, montecarlo
 
 __version__ = "0.1.0"
 
@@ -109,6 +109,7 @@ __all__ = [
     "explain",
     "infer",
     "io",
+    "markov",
     "montecarlo",
     "stack",
 ]
@@ -116,6 +117,6 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """What not every program needs loads when first asked for."""
-    if name in ("io", "montecarlo", "plotting", "testing"):
+    if name in ("io", "markov", "montecarlo", "plotting", "testing"):
         return importlib.import_module(f"bayesmc.{name}")
     raise AttributeError(f"module 'bayesmc' has no attribute {name!r}")

@@ -12,6 +12,7 @@ from examples import (
     central_limit,
     diagnosis,
     expectation_and_marginal,
+    markov_chains,
     old_faithful,
     parzen,
     picture,
@@ -21,7 +22,8 @@ from examples import (
 
 NETS = (diagnosis, old_faithful)
 FIGURES = (
-    parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal
+    parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
+    markov_chains,
 )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from examples import (
     demo,
     diagnosis,
     expectation_and_marginal,
+    markov_chains,
     old_faithful,
     parzen,
     pushforward,
@@ -250,3 +251,21 @@ def test_mean_distance_lies_in_its_band() -> None:
     assert abs(mean[-1] + 0.02 - banana.EXACT) > 4.5 * error[-1]  # such a slip would show
     assert mean[99] == pytest.approx(values[:100].mean())
     assert error[99] == pytest.approx(values[:100].std(ddof=1) / 10)
+
+
+def test_markov_chains_are_what_the_figure_says_of_them() -> None:
+    """Laws by hand; Metropolis keeps the law and is balanced; the bounds hold the mixing time."""
+    three, balanced = markov_chains.THREE, markov_chains.BALANCED
+    law = np.array([0.6, 1 / 0.9, 1.0])  # in terms of the third: 1 from 3 only, 3 from 2 only
+    np.testing.assert_allclose(three.stationary, [law / law.sum()], rtol=1e-14)
+    np.testing.assert_allclose(balanced.stationary, three.stationary, rtol=1e-13)
+    assert balanced.is_reversible() and not three.is_reversible()
+    np.testing.assert_array_equal(
+        markov_chains.REDUCIBLE.stationary, [[0.5, 0.5, 0, 0], [0, 0, 0, 1]]
+    )
+    climber, hills = markov_chains.CLIMBER, markov_chains.HILLS
+    np.testing.assert_allclose(climber.stationary, [hills / hills.sum()], rtol=1e-12)
+    distances = markov_chains.distances(climber, markov_chains.STEPS)
+    first = int(np.argmax(distances <= markov_chains.EPS))
+    lower, upper = climber.mixing_time_bounds(markov_chains.EPS)
+    assert lower <= climber.mixing_time(markov_chains.EPS) == first <= upper < markov_chains.STEPS

@@ -29,7 +29,7 @@ dbn | structure | results
 network
 factors | montecarlo
 distributions
-resampling | gaussian | diagnostics | tracing | plates | states | randomness | progress
+resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
 errors | shapes
 """
 DEPTH = {
