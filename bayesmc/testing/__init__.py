@@ -1,4 +1,5 @@
-"""Tools to test engines, and nets, against exact answers: random nets, enumeration, a statistical match.
+"""Tools to test engines, and nets, against exact answers: random nets, enumeration, a statistical match;
+and Markov kernels, ours and users', against the joint law they must keep.
 
 Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for ``bayes_nets`` and
 ``evidence_for`` only.
@@ -6,11 +7,13 @@ Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for 
 
 from bayesmc.testing.conditional_gaussian import ConditionalGaussian, GaussianAnswer
 from bayesmc.testing.gaussians import GaussianOptions, gaussian_evidence, random_gaussian_net
+from bayesmc.testing.kernels import GewekeResult, RankResult, geweke_test, rank_test
 from bayesmc.testing.matching import Comparison, Match, assert_matches, compare
 from bayesmc.testing.nets import NetOptions, random_net
 from bayesmc.testing.observing import random_evidence
 from bayesmc.testing.oracle import Enumerated, enumerate_posterior
 from bayesmc.testing.strategies import bayes_nets, evidence_for
+from bayesmc.testing.uniformity import uniformity_p_value
 
 __all__ = [
     "Comparison",
@@ -18,15 +21,20 @@ __all__ = [
     "Enumerated",
     "GaussianAnswer",
     "GaussianOptions",
+    "GewekeResult",
     "Match",
     "NetOptions",
+    "RankResult",
     "assert_matches",
     "bayes_nets",
     "compare",
     "enumerate_posterior",
     "evidence_for",
     "gaussian_evidence",
+    "geweke_test",
     "random_evidence",
     "random_gaussian_net",
     "random_net",
+    "rank_test",
+    "uniformity_p_value",
 ]
