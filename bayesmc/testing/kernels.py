@@ -19,6 +19,7 @@ import scipy.special
 
 from bayesmc.errors import DensityError, ShapeError
 from bayesmc.randomness import seed_sequence
+from bayesmc.testing.matching import holm
 from bayesmc.testing.uniformity import uniformity_p_value
 
 #: ``prior(rng, n)``: ``n`` draws of the state, in arrays (or a container of arrays) of ``n`` rows
@@ -51,7 +52,7 @@ class GewekeResult:
 
     def rejected(self, alpha: float = 1e-3) -> tuple[str, ...]:
         """Statistics whose means differ, least likely first; ``alpha`` is the chance of any false alarm."""
-        return _holm(self.p_values, alpha)
+        return _rejected(self.p_values, alpha)
 
     def __repr__(self) -> str:
         rows = [
@@ -88,7 +89,7 @@ class RankResult:
 
     def rejected(self) -> tuple[str, ...]:
         """Statistics whose ranks are not uniform, least likely first (Holm's method at ``level``)."""
-        return _holm(self.p_values, self.level)
+        return _rejected(self.p_values, self.level)
 
     def __repr__(self) -> str:
         head = f"RankResult, alpha = {self.alpha:g}, stage {self.stage} judged at {self.level:.3g}"
@@ -422,11 +423,7 @@ def _by_p_value(p_values: Mapping[str, float]) -> list[str]:
     return sorted(p_values, key=p_values.__getitem__)
 
 
-def _holm(p_values: Mapping[str, float], alpha: float) -> tuple[str, ...]:
+def _rejected(p_values: Mapping[str, float], alpha: float) -> tuple[str, ...]:
     """Step down through the p-values, smallest first, until one is not rejected."""
-    rejected: list[str] = []
-    for name in _by_p_value(p_values):
-        if not p_values[name] * (len(p_values) - len(rejected)) < alpha:
-            break
-        rejected.append(name)
-    return tuple(rejected)
+    names = _by_p_value(p_values)
+    return tuple(names[: holm([p_values[name] for name in names], alpha)])

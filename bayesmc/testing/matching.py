@@ -142,8 +142,8 @@ def compare(
         else:
             _compare_mean(table, posterior, exact, name, node)
     found = sorted(table.comparisons, key=lambda c: (c.p_value, -c.errors))
-    rejected = _holm(found, alpha)
-    return Match(len(found), table.skipped, found[0] if found else None, rejected, alpha)
+    rejected = found[: holm([comparison.p_value for comparison in found], alpha)]
+    return Match(len(found), table.skipped, found[0] if found else None, tuple(rejected), alpha)
 
 
 def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
@@ -299,14 +299,11 @@ def _effective(posterior: Any, name: str, node: Any) -> np.ndarray:
     return ess if posterior.weight_ess is None else np.fmin(ess, posterior.weight_ess)
 
 
-def _holm(ordered: Sequence[Comparison], alpha: float) -> tuple[Comparison, ...]:
-    """Step down through the p-values, smallest first, until one is not rejected."""
-    rejected = []
-    for rank, comparison in enumerate(ordered):
-        if not comparison.p_value * (len(ordered) - rank) < alpha:
-            break
-        rejected.append(comparison)
-    return tuple(rejected)
+def holm(p_values: Sequence[float], alpha: float) -> int:
+    """How many p-values, smallest first, Holm's step-down procedure rejects (Holm 1979)."""
+    count = len(p_values)
+    kept = (k for k, p in enumerate(p_values) if not p * (count - k) < alpha)
+    return next(kept, count)
 
 
 def _element(at: tuple[int, ...]) -> str:
