@@ -47,10 +47,11 @@ from bayesmc.distributions import (
     WrappedNormal,
 )
 from bayesmc.engines.exact import Exact
+from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.importance import Importance
 from bayesmc.engines.rejection import Rejection
 from bayesmc.engines.weighting import LikelihoodWeighting
-from bayesmc.network import BayesNet
+from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.results import Marginal, Posterior, Summary
 
@@ -74,8 +75,10 @@ __all__ = [
     "Exact",
     "Explanation",
     "Exponential",
+    "FactorGraph",
     "Gamma",
     "Geometric",
+    "Gibbs",
     "HalfCauchy",
     "HalfNormal",
     "Importance",

@@ -8,9 +8,10 @@ from typing import Any
 
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
+from bayesmc.engines.exact_plan import too_large_to_search
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError
-from bayesmc.network import BayesNet, Problem, pose
+from bayesmc.network import BayesNet, FactorGraph, Problem, pose
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
 
@@ -62,7 +63,7 @@ class Explanation:
 
 
 def infer(
-    net: BayesNet,
+    net: BayesNet | FactorGraph,
     evidence: Mapping[str, Any] | None = None,
     *,
     inputs: Mapping[str, Any] | None = None,
@@ -72,11 +73,11 @@ def infer(
     keep: str | Sequence[str] = "draws",
     resume: Posterior | None = None,
 ) -> Posterior:
-    """The posterior of a net given evidence.
+    """The posterior of a net, or of a factor graph, given evidence.
 
     Parameters
     ----------
-    net : BayesNet
+    net : BayesNet or FactorGraph
     evidence : dict, optional
         Node name -> value, an array over the node's plates, or a state label. A masked entry, NaN in a
         plated node, or None is unobserved.
@@ -122,7 +123,7 @@ def infer(
 
 
 def explain(
-    net: BayesNet,
+    net: BayesNet | FactorGraph,
     evidence: Mapping[str, Any] | None = None,
     engine: Any = None,
     *,
@@ -160,7 +161,8 @@ def explain(
 def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
     """Exact where cheap, otherwise likelihood weighting."""
     exact = Exact(max_bytes=_CHEAP)
-    why_not = exact.refusal(problem)
+    too_large = too_large_to_search(problem)
+    why_not = too_large if too_large is not None else exact.refusal(problem)
     if why_not is None:
         cost = exact.cost(problem)
         size = readable_bytes(cost.bytes)
@@ -169,7 +171,7 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
             (f"hidden nodes are finite or linear-Gaussian: {cost.words}, about {size}",),
             {},
         )
-    if Exact().refusal(problem) is None:
+    if too_large is None and Exact().refusal(problem) is None:
         cost = Exact().cost(problem)
         why_not = (
             f"it would take about {readable_bytes(cost.bytes)} ({cost.words}), more than counts as cheap; "

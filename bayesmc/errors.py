@@ -64,11 +64,14 @@ class ParameterError(BayesmcError, ValueError):
     ----------
     index : tuple of int
         First offending position in the parameter's batch shape.
+    value : object
+        The offending value there, where known.
     """
 
-    def __init__(self, message: str, index: tuple[int, ...] = ()) -> None:
+    def __init__(self, message: str, index: tuple[int, ...] = (), value: Any = None) -> None:
         super().__init__(message)
         self.index = index
+        self.value = value
 
 
 class DensityError(BayesmcError, ValueError):
@@ -132,6 +135,14 @@ class BayesmcWarning(UserWarning):
 
 class LowEssWarning(BayesmcWarning):
     """Importance weights rest on too few draws for the answer to be trusted."""
+
+
+class ConvergenceWarning(BayesmcWarning):
+    """Chains that have not mixed, or a block that accepts too few or too many of its proposals."""
+
+
+class InterruptWarning(BayesmcWarning):
+    """A run was interrupted; its answer rests on the draws made before."""
 
 
 class SupportWarning(BayesmcWarning):

@@ -324,6 +324,7 @@ class Distribution:
         error = ParameterError(
             f"{self._family}: {name} must be {requirement}; got {_short(value)}{_at(index)}",
             index,
+            value,
         )
         if not _mark_invalid.get():
             raise error

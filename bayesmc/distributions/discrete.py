@@ -19,6 +19,7 @@ from bayesmc.shapes import Shape
 
 _BINARY = integers(0, 1)
 _COUNTS = integers(0)
+_LARGEST = 2.0**62  # draws are int64; what lies further out stops here
 
 
 class _Odds(Distribution):
@@ -231,7 +232,7 @@ class Poisson(Distribution):
         self.rate = self._check("rate", rate, ok, 1.0, "nonnegative and finite")
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
-        return np.asarray(rng.poisson(self.rate, shape))
+        return np.asarray(rng.poisson(np.minimum(self.rate, _LARGEST), shape))
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         inside = (x >= 0) & (x == np.floor(x)) & (x < np.inf)

@@ -25,7 +25,7 @@ from bayesmc.distributions import (
 from bayesmc.errors import EnvelopeError, EvidenceError, ShapeError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.network.forward import Pass, Step
-from bayesmc.network.model import arguments_of
+from bayesmc.network.model import arguments_of, potential_shape
 from bayesmc.network.store import unknown
 from bayesmc.shapes import Shape, broadcasts_to
 from bayesmc.structure import configure, constants_of
@@ -89,7 +89,8 @@ def proved_log_bound(problem: Problem, name: str) -> np.ndarray | None:
     """
     model = problem.model
     if name in model.potentials:
-        return _largest_potential(problem, name)
+        indexed = model.potentials[name][0].index is not None
+        return None if indexed else _largest_potential(problem, name)
     node = model[name]
     bound = _largest_density(problem, node)
     if bound is not None:
@@ -156,7 +157,7 @@ def _check_name(problem: Problem, name: str) -> None:
 
 def _plate_shape(model: Model, name: str) -> Shape:
     if name in model.potentials:
-        return tuple(model.sizes[p] for p in model.potentials[name][0].plates)
+        return potential_shape(model.sizes, model.potentials[name][0])
     return model[name].plate_shape
 
 

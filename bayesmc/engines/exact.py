@@ -27,9 +27,6 @@ from bayesmc.network import Model, Problem
 from bayesmc.results import Posterior
 from bayesmc.structure import InvalidRows, Variable
 
-#: what to name where this engine refuses
-_OTHERS = "LikelihoodWeighting(draws) or Importance(draws, proposal=...)"
-
 
 @dataclass(frozen=True)
 class Exact(Engine):
@@ -107,30 +104,38 @@ class Exact(Engine):
         return ExactPosterior(problem, self, solved)
 
     def _why_not(self, problem: Problem) -> UnsupportedError | None:
+        others = _others(problem.model)
         reason = why_no_plan(problem)
         if reason is not None:
             return UnsupportedError(
                 "Exact needs every hidden node to have finitely many values or to be linear-Gaussian given "
-                f"those, but {reason}; use {_OTHERS}"
+                f"those, but {reason}; use {others}"
             )
         try:
             cost = plan_for(problem).cost
         except BudgetError as error:
-            return BudgetError(f"Exact: {error}; use {_OTHERS}", error.bytes)
+            return BudgetError(f"Exact: {error}; use {others}", error.bytes)
         except UnsupportedError as error:
-            return UnsupportedError(f"Exact: {error}; use {_OTHERS}")
+            return UnsupportedError(f"Exact: {error}; use {others}")
         except ModelError as error:
             return UnsupportedError(
                 f"Exact evaluates functions on all configurations of their parents, also impossible ones, "
-                f"and one of them fails there: {error}; use {_OTHERS}"
+                f"and one of them fails there: {error}; use {others}"
             )
         if cost.bytes > self.max_bytes:
             return BudgetError(
                 f"Exact would need about {readable_bytes(cost.bytes)} ({cost.words}), above "
-                f"max_bytes={readable_bytes(self.max_bytes)}; use {_OTHERS}, or raise Exact(max_bytes=)",
+                f"max_bytes={readable_bytes(self.max_bytes)}; use {others}, or raise Exact(max_bytes=)",
                 int(min(cost.bytes, 2**62)),
             )
         return None
+
+
+def _others(model: Model) -> str:
+    """What to name where this engine refuses."""
+    if any(node.declaration.source == "variable" for node in model.nodes.values()):
+        return "Gibbs(draws) or MetropolisHastings(draws)"
+    return "LikelihoodWeighting(draws) or Importance(draws, proposal=...)"
 
 
 def _states(problem: Problem) -> dict[Variable, int]:

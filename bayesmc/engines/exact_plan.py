@@ -24,11 +24,15 @@ from bayesmc.structure import (
     InvalidRows,
     LinearGaussian,
     Variable,
+    core_size,
     discrete_net,
     linear_gaussian,
     why_not_discrete,
     why_not_linear,
 )
+
+#: variables up to which an elimination order is looked for unasked
+_SEARCHED = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,9 +196,27 @@ Plan = DiscretePlan | HybridPlan
 def why_no_plan(problem: Problem) -> str | None:
     """Why a net is neither discrete nor conditional linear-Gaussian given the evidence, or None."""
     model, observed = problem.model, problem.observed
-    if why_not_discrete(model, observed) is None:
-        return None
+    why = why_not_discrete(model, observed)
+    if why is None or any(n.declaration.source == "variable" for n in model.nodes.values()):
+        return why
     return why_not_linear(model, observed, problem.inputs)
+
+
+def too_large_to_search(problem: Problem) -> str | None:
+    """Why looking for an elimination order would itself cost too much to call the answer cheap, or None."""
+    model = problem.model
+    finite = (math.prod(n.plate_shape) for n in model.nodes.values() if n.domain is not None)
+    if sum(finite) <= _SEARCHED or why_not_discrete(model, problem.observed) is not None:
+        return None
+    core = model.cache.get("core size")
+    if core is None:
+        core = model.cache["core size"] = core_size(model, problem.observed)
+    if core <= _SEARCHED:
+        return None
+    return (
+        f"{core} discrete variables have three neighbours or more, also once simpler ones are summed out: "
+        "too many to look for an elimination order first; engine=bmc.Exact() looks all the same"
+    )
 
 
 def plan_for(problem: Problem) -> Plan:

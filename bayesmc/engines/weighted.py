@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.base import Engine
+from bayesmc.engines.base import Engine, same_question
 from bayesmc.engines.forward import chunk_sizes
 from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
@@ -165,7 +165,7 @@ class WeightedEngine(Engine):
         if old.problem is None or set(old._stored) != names or not self.continues(old.engine):
             return False
         weighted = self.is_weighted(problem)
-        return (old.log_weights is not None) == weighted and _same_question(old.problem, problem)
+        return (old.log_weights is not None) == weighted and same_question(old.problem, problem)
 
     def _refuse_zero(self, top: float, draws: int) -> None:
         if top == -np.inf:
@@ -292,29 +292,3 @@ def _counted(chunks: Iterable[Pass], bar: Progress) -> Iterator[Pass]:
     for chunk in chunks:
         yield chunk
         bar.advance(chunk.batch[0])
-
-
-def _same_question(was: Problem, now: Problem) -> bool:
-    """Whether two problems are the same net with the same evidence and inputs."""
-    old, new = was.model, now.model
-    same_net = (
-        list(old.nodes) == list(new.nodes)
-        and all(old[n].declaration is c.declaration for n, c in new.nodes.items())
-        and list(old.potentials) == list(new.potentials)
-        and all(old.potentials[n][0] is v[0] for n, v in new.potentials.items())
-        and old.sizes == new.sizes
-    )
-    return (
-        same_net
-        and was.observed.keys() == now.observed.keys()
-        and all(
-            np.array_equal(o.value, now.observed[n].value)
-            and _same_mask(o.mask, now.observed[n].mask)
-            for n, o in was.observed.items()
-        )
-        and all(np.array_equal(v, now.inputs[n]) for n, v in was.inputs.items())
-    )
-
-
-def _same_mask(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    return a is b if a is None or b is None else np.array_equal(a, b)

@@ -80,3 +80,54 @@ class Aligner:
         if self._insert is not None:
             value = value[self._insert]
         return read_only(value)
+
+
+class RowAligner(Aligner):
+    """Turns the stored value of one variable into the argument of a potential over rows of an index.
+
+    The argument has shape ``(*batch, rows, *event)``: row r holds element ``flat[r]`` of the variable.
+
+    Parameters
+    ----------
+    plates : tuple of str
+        The variable's plates.
+    flat : ndarray of int, shape (rows,)
+        Positions among the elements of the plates, in C order.
+    count : int
+        Number of those elements.
+    """
+
+    __slots__ = ("_all", "count", "flat")
+
+    def __init__(
+        self,
+        plates: Sequence[str],
+        event_ndim: int,
+        domain: Domain | None,
+        flat: np.ndarray,
+        count: int,
+        positions: bool = False,
+    ) -> None:
+        super().__init__(plates, plates, event_ndim, domain, positions)
+        self.own = 1
+        self.flat, self.count = flat, count
+        self._all = len(flat) == count and bool((flat == np.arange(count)).all())
+
+    def __call__(self, value: np.ndarray) -> Any:
+        return self.argument(self.place(value))
+
+    def place(self, value: np.ndarray) -> np.ndarray:
+        """The stored values of every row, read-only and not decoded."""
+        lead = value.ndim - self.trailing
+        event = value.shape[value.ndim - self.event_ndim :]
+        elements = value.reshape((*value.shape[:lead], self.count, *event))
+        if self._all or self.count == 1:  # one element broadcasts over the rows
+            return elements
+        return np.take(elements, self.flat, axis=lead)
+
+    def argument(self, stored: np.ndarray) -> np.ndarray:
+        """What the function receives for stored values of the rows (of one for all: it broadcasts)."""
+        value = stored if self.domain is None else self.domain.decode(stored)
+        lead = value.ndim - 1 - self.event_ndim
+        shape = (*value.shape[:lead], len(self.flat), *value.shape[lead + 1 :])
+        return read_only(value if value.shape == shape else np.broadcast_to(value, shape))

@@ -22,7 +22,7 @@ from bayesmc.errors import (
     ShapeError,
     StateError,
 )
-from bayesmc.network.align import Aligner
+from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.domain import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
@@ -72,8 +72,7 @@ def compile_model(
             nodes[key] = node
             model.probe[key] = value
     for key, potential in potentials.items():
-        what = Declaration(key, "function", potential.parents, potential.plates)
-        model.potentials[key] = (potential, _links(potential.parents, what, nodes))
+        model.potentials[key] = (potential, _potential_links(potential, nodes))
     return model
 
 
@@ -93,6 +92,29 @@ def _links(
             ),
         )
         for p in parents
+    )
+
+
+def _potential_links(
+    potential: Potential, nodes: Mapping[str, CompiledNode]
+) -> tuple[tuple[str, Aligner], ...]:
+    if potential.index is None:
+        source = "table" if potential.is_table else "function"
+        what = Declaration(potential.name, source, potential.parents, potential.plates)
+        return _links(potential.parents, what, nodes)
+    return tuple(
+        (
+            name,
+            RowAligner(
+                nodes[name].plates,
+                len(nodes[name].event_shape),
+                nodes[name].domain,
+                flat,
+                math.prod(nodes[name].plate_shape),
+                positions=potential.is_table,
+            ),
+        )
+        for name, flat in zip(potential.parents, potential.index, strict=True)
     )
 
 

@@ -61,6 +61,16 @@ def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str,
     return observed
 
 
+def read_question(
+    net: Any, evidence: Mapping[str, Any] | None, inputs: Mapping[str, Any] | None
+) -> tuple[Any, Model, dict[str, Observed], dict[str, np.ndarray]]:
+    """A snapshot of a net, its model for the data, and evidence and inputs as stored values."""
+    model = net.model(evidence if isinstance(evidence, Mapping) else None, inputs)
+    observed = read_evidence(model, evidence)
+    given = read_inputs({n: c.declaration for n, c in model.nodes.items()}, model.sizes, inputs)
+    return net.snapshot(), model, observed, given
+
+
 def read_inputs(
     declarations: Mapping[str, Declaration],
     sizes: Mapping[str, int],

@@ -189,6 +189,12 @@ def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None
     ]
     if not from_density:
         return None
+    if model[from_density[0]].declaration.source == "variable":
+        return (
+            f"{who} samples every hidden node from its conditional density, but {from_density[0]!r} is a "
+            "variable of a factor graph, which has none; use Gibbs(draws), MetropolisHastings(draws), or "
+            "Exact() where the graph is discrete and narrow"
+        )
     return (
         f"{who} samples every hidden node from its conditional density, but {from_density[0]!r} is a "
         "Density without sample=; give one, or observe the node"

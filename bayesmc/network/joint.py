@@ -35,7 +35,7 @@ def joint_log_prob(
                 )
             stored_value = store(node, values[name])
             try:
-                total = total + _one_log_prob(model, name, stored_value, stored, total)
+                total = total + node_log_prob(model, name, stored_value, stored, total)
             except ValueError as error:
                 if isinstance(error, BayesmcError):
                     raise
@@ -71,7 +71,7 @@ def joint_sample(
     }
 
 
-def _one_log_prob(
+def node_log_prob(
     model: Model, name: str, value: np.ndarray, stored: Mapping[str, np.ndarray], total: Any
 ) -> np.ndarray:
     """Log density of one node's values given its parents', summed over its plates."""

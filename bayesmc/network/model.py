@@ -23,7 +23,7 @@ from bayesmc.errors import (
     ParameterError,
     ShapeError,
 )
-from bayesmc.network.align import Aligner
+from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.domain import Domain
 from bayesmc.network.elementwise import call_elementwise
 from bayesmc.network.node import Declaration, Node, Potential
@@ -178,10 +178,49 @@ class Model:
     def potential(
         self, name: str, values: Mapping[str, np.ndarray], total: bool = True
     ) -> np.ndarray:
-        """Log factor ``name``, shape the batch: summed over its plates, unless ``total`` is false."""
+        """Log factor ``name``, shape the batch: summed over its plates or rows, unless ``total`` is false.
+
+        Without ``total`` the shape is ``(*batch, *plates)``, or ``(*batch, rows)`` for one with an index.
+        """
         potential, links = self.potentials[name]
         arguments, batch = arguments_of(links, values)
-        plates = tuple(self.sizes[p] for p in potential.plates)
+        result = self._log_factors(potential, links, arguments, batch)
+        if not (total and result.ndim > len(batch)):
+            return result
+        return result.sum(axis=tuple(range(len(batch), result.ndim)))
+
+    def potential_at(self, name: str, rows: Sequence[np.ndarray]) -> np.ndarray:
+        """Log factors of a potential with an index, given what stands in each entry of its scope.
+
+        Parameters
+        ----------
+        rows : sequence of ndarray
+            For each entry of the scope stored values, shape ``(*batch, rows or 1, *event)``; so one entry
+            can run through candidates while another of the same variable stays.
+
+        Returns
+        -------
+        ndarray, shape ``(*batch, rows)``
+        """
+        potential, links = self.potentials[name]
+        batch: Shape = ()
+        arguments = []
+        for (_, link), stored in zip(links, rows, strict=True):
+            assert isinstance(link, RowAligner)
+            batch = broadcast_shapes(batch, stored.shape[: stored.ndim - 1 - link.event_ndim])
+            arguments.append(link.argument(stored))
+        return self._log_factors(potential, links, arguments, batch)
+
+    def _log_factors(
+        self,
+        potential: Potential,
+        links: tuple[tuple[str, Aligner], ...],
+        arguments: Sequence[Any],
+        batch: Shape,
+    ) -> np.ndarray:
+        """What a potential's function returns, checked, shape ``(*batch, *plates or rows)``."""
+        name = potential.name
+        plates = potential_shape(self.sizes, potential)
         what = Declaration(f"potential {name}", "function", function=potential.function)
         raw = np.asarray(call(what, arguments, batch + plates, links, wants_array=True))
         if raw.dtype.kind == "b":
@@ -193,16 +232,19 @@ class Model:
         if not broadcasts_to(result.shape, batch + plates):
             raise ShapeError(
                 f"potential {name!r} returns shape {result.shape}, which does not fit "
-                f"{batch + plates}; reduce foreign plates with .sum(plate) or name plates="
+                f"{batch + plates}; "
+                + (
+                    "reduce foreign plates with .sum(plate) or name plates="
+                    if potential.index is None
+                    else "it receives one array per entry of the scope, with the rows of index= on the "
+                    "last axis before the event's, and returns one log factor per row"
+                )
             )
         if not (result < np.inf).all():
             raise DensityError(
                 f"potential {name!r} is NaN or plus infinity; a log factor must be finite (or -inf)"
             )
-        full = np.broadcast_to(result, batch + plates)
-        if not (plates and total):
-            return full
-        return full.sum(axis=tuple(range(len(batch), full.ndim)))
+        return np.broadcast_to(result, batch + plates)
 
     def sample_stored(
         self, name: str, distribution: Distribution, rng: np.random.Generator, batch: Shape
@@ -217,6 +259,13 @@ class Model:
             draws = node.domain.from_support(draws)
         draws.flags.writeable = False
         return draws
+
+
+def potential_shape(sizes: Mapping[str, int], potential: Potential) -> Shape:
+    """Shape of a potential's factors: the rows of its index, or its plates."""
+    if potential.rows is not None:
+        return (potential.rows,)
+    return tuple(sizes[p] for p in potential.plates)
 
 
 def arguments_of(

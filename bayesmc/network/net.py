@@ -6,7 +6,7 @@ It wraps a networkx graph (``net.graph``) and is not one, and it knows no engine
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,11 +19,20 @@ from bayesmc.errors import (
     PlateError,
     UnknownNodeError,
 )
-from bayesmc.network.evidence import plate_sizes, read_inputs
+from bayesmc.network.evidence import plate_sizes, read_inputs, read_question
+from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.intervene import fixed
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Node, Potential, bind, checked_rows
+from bayesmc.network.node import (
+    Declaration,
+    Node,
+    Potential,
+    bind,
+    checked_rows,
+    plain_states,
+    plate_size,
+)
 from bayesmc.network.store import ModelStore, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
@@ -81,7 +90,7 @@ class BayesNet:
         self._sizes: dict[str, int | None] = {}
         self._labels: dict[str, tuple[Any, ...]] = {}
         for plate, size in (plates or {}).items():
-            self._sizes[plate] = _plate_size(plate, size)
+            self._sizes[plate] = plate_size(plate, size)
             if size is not None and not isinstance(size, (int, np.integer)):
                 self._labels[plate] = tuple(size)
         self._kept_store: ModelStore | None = None
@@ -223,7 +232,7 @@ class BayesNet:
                 f"node {name!r}: probs has {table.ndim} axes, but {len(parents)} parents and the node "
                 f"itself make {len(parents) + 1}"
             )
-        states = None if states is None else _states(states)
+        states = None if states is None else plain_states(states)
         if states is not None and len(states) != table.shape[-1]:
             raise ModelError(
                 f"node {name!r}: states= has {len(states)} entries, but the last axis of probs has "
@@ -462,6 +471,31 @@ class BayesNet:
         self._store.validate(model)
         return model
 
+    def to_factor_graph(
+        self,
+        evidence: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> FactorGraph:
+        """The net given evidence as variables and factors: one variable per hidden node.
+
+        Every conditional density that a hidden node enters is a batch of factors, and so is every
+        potential; scopes reach through deterministic nodes.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet()
+        >>> net.add("rain", bmc.Bernoulli(0.2))
+        >>> net.add("sprinkler", bmc.Bernoulli(0.4))
+        >>> net.add("wet", lambda rain, sprinkler: bmc.Bernoulli(0.1 + 0.4 * (rain + sprinkler)))
+        >>> graph = net.to_factor_graph({"wet": 1})
+        >>> sorted(graph.markov_blanket("rain"))
+        ['sprinkler']
+        >>> graph.full_conditional("rain", {"sprinkler": 1}).probs.round(4).tolist()
+        [0.6897, 0.3103]
+        """
+        return FactorGraph.of(*read_question(self, evidence, inputs))
+
     # ---- private ----------------------------------------------------------------------------
 
     def _declare_function(
@@ -480,7 +514,7 @@ class BayesNet:
                 f"node {name!r}: {function.__name__} is a class; call it, {function.__name__}(...), or "
                 "list parents= for its arguments"
             )
-        labels = None if states is None else _states(states)
+        labels = None if states is None else plain_states(states)
         own = self._node_plates(name, plates)
         self._declare(Declaration(name, "function", names, own, labels, bound, vectorize), replace_)
 
@@ -540,31 +574,3 @@ class _Constant:
 
     def __call__(self) -> Distribution:
         return self.distribution
-
-
-def _states(states: Sequence[Any]) -> tuple[Any, ...]:
-    """States as plain Python values, so that labels compare and print as they were typed."""
-    if isinstance(states, (str, Set)) or not isinstance(states, (Sequence, np.ndarray)):
-        raise ModelError(f"states={states!r}: give a list or tuple, in the order of the support")
-    return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
-
-
-def _plate_size(plate: str, size: Any) -> int | None:
-    if not isinstance(plate, str):
-        raise PlateError(f"a plate's name is a string, not {plate!r}")
-    if size is None:
-        return None
-    if isinstance(size, str):
-        raise PlateError(
-            f"plate {plate!r}: {size!r} is one string; give a size or a list of labels"
-        )
-    if not isinstance(size, (int, np.integer, Sequence, np.ndarray)) or isinstance(size, bool):
-        raise PlateError(
-            f"plate {plate!r}: {size!r} is no size; give an int, a list of labels or None"
-        )
-    count = int(size) if isinstance(size, (int, np.integer)) else len(size)
-    if not isinstance(size, (int, np.integer)) and len(set(size)) != count:
-        raise PlateError(f"plate {plate!r}: a label stands twice in {list(size)}")
-    if count < 0:
-        raise PlateError(f"plate {plate!r}: size {count} is negative")
-    return count

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, ParameterError
+from bayesmc.errors import ModelError, ParameterError, PlateError
 from bayesmc.network.domain import Domain
 from bayesmc.shapes import Shape, first_index
 
@@ -46,7 +46,8 @@ class Node:
 class Declaration:
     """What was declared under one name.
 
-    ``source`` is "function", "table", "input" or "fixed"; ``function`` takes the parents in order.
+    ``source`` is "function", "table", "input", "fixed", or "variable" (of a factor graph: its function
+    returns a flat density, log 1 on all of its support); ``function`` takes the parents in order.
     """
 
     name: str
@@ -64,12 +65,39 @@ class Declaration:
 
 @dataclass(frozen=True, eq=False)
 class Potential:
-    """An extra log factor on named nodes."""
+    """An extra log factor on named nodes, or one factor per row of an index.
+
+    Attributes
+    ----------
+    parents : tuple of str
+        The scope, in the order of the function's arguments; with an index a name may stand twice.
+    function : callable
+        Returns log factors; with a table it looks positions up.
+    plates : tuple of str
+        One factor per element of these; none with an index.
+    index : tuple of ndarray of int, optional
+        For each entry of the scope the element that each row takes, shape (rows,): a position among
+        the elements of the variable's plates in C order (all zeros for a variable without plates).
+    is_table : bool
+        The function takes positions of finite nodes instead of their values.
+    """
 
     name: str
     parents: tuple[str, ...]
     function: Callable[..., Any]
     plates: tuple[str, ...] = field(default=())
+    index: tuple[np.ndarray, ...] | None = None
+    is_table: bool = False
+
+    @property
+    def scope(self) -> tuple[str, ...]:
+        """Names of the nodes, in the order of the function's arguments."""
+        return self.parents
+
+    @property
+    def rows(self) -> int | None:
+        """Number of rows of the index; None without one."""
+        return None if self.index is None else len(self.index[0])
 
 
 def bind(
@@ -124,6 +152,35 @@ def checked_rows(name: str, table: np.ndarray) -> np.ndarray:
     table = table / table.sum(axis=-1, keepdims=True)
     table.flags.writeable = False
     return table
+
+
+def plain_states(states: Sequence[Any]) -> tuple[Any, ...]:
+    """States as plain Python values, so that labels compare and print as they were typed."""
+    if isinstance(states, (str, Set)) or not isinstance(states, (Sequence, np.ndarray)):
+        raise ModelError(f"states={states!r}: give a list or tuple, in the order of the support")
+    return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
+
+
+def plate_size(plate: str, size: Any) -> int | None:
+    """Size of a plate from an int, a list of labels or None; what is neither raises."""
+    if not isinstance(plate, str):
+        raise PlateError(f"a plate's name is a string, not {plate!r}")
+    if size is None:
+        return None
+    if isinstance(size, str):
+        raise PlateError(
+            f"plate {plate!r}: {size!r} is one string; give a size or a list of labels"
+        )
+    if not isinstance(size, (int, np.integer, Sequence, np.ndarray)) or isinstance(size, bool):
+        raise PlateError(
+            f"plate {plate!r}: {size!r} is no size; give an int, a list of labels or None"
+        )
+    count = int(size) if isinstance(size, (int, np.integer)) else len(size)
+    if not isinstance(size, (int, np.integer)) and len(set(size)) != count:
+        raise PlateError(f"plate {plate!r}: a label stands twice in {list(size)}")
+    if count < 0:
+        raise PlateError(f"plate {plate!r}: size {count} is negative")
+    return count
 
 
 def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:

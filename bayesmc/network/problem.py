@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import ModelError
-from bayesmc.network.evidence import Observed, read_evidence, read_inputs
+from bayesmc.network.evidence import Observed, read_question
+from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.model import Model
 from bayesmc.network.net import BayesNet
 
@@ -20,8 +21,8 @@ class Problem:
 
     Attributes
     ----------
-    net : BayesNet
-        A snapshot: later declarations on the user's net do not reach it.
+    net : BayesNet or FactorGraph
+        A snapshot: later declarations on the user's own do not reach it.
     model : Model
     observed : dict
         Node name -> ``Observed``.
@@ -29,20 +30,20 @@ class Problem:
         Input name -> stored value.
     """
 
-    net: BayesNet
+    net: BayesNet | FactorGraph
     model: Model
     observed: dict[str, Observed]
     inputs: dict[str, np.ndarray]
 
 
 def pose(
-    net: BayesNet, evidence: Mapping[str, Any] | None, inputs: Mapping[str, Any] | None = None
+    net: BayesNet | FactorGraph,
+    evidence: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None = None,
 ) -> Problem:
-    """Validate the net, read evidence and inputs, and take the snapshot."""
+    """Validate the net or factor graph, read evidence and inputs, and take the snapshot."""
+    if isinstance(net, FactorGraph):
+        return Problem(*net.question(evidence, inputs))
     if not isinstance(net, BayesNet):
-        raise ModelError(f"expected a BayesNet, not {type(net).__name__}")
-    known = evidence if isinstance(evidence, Mapping) else None
-    model = net.model(known, inputs)
-    observed = read_evidence(model, evidence)
-    given = read_inputs({n: c.declaration for n, c in model.nodes.items()}, model.sizes, inputs)
-    return Problem(net.snapshot(), model, observed, given)
+        raise ModelError(f"expected a BayesNet or a FactorGraph, not {type(net).__name__}")
+    return Problem(*read_question(net, evidence, inputs))

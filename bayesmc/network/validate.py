@@ -15,7 +15,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, BroadcastError, ModelError
 from bayesmc.network.compile import entry
-from bayesmc.network.model import CompiledNode, Model, arguments_of, call
+from bayesmc.network.model import CompiledNode, Model, arguments_of, call, potential_shape
 from bayesmc.network.node import Declaration
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, masks, nearly_equal
@@ -40,8 +40,11 @@ def validate_model(model: Model) -> None:
                 f"potential {name}", "function", potential.parents, potential.plates,
                 function=potential.function,
             )  # fmt: skip
-            sizes = tuple(model.sizes[p] for p in potential.plates)
-            _check_node(model, CompiledNode(what, links, sizes, is_stochastic=False))
+            shape = potential_shape(model.sizes, potential)
+            node = CompiledNode(what, links, shape, is_stochastic=False)
+            _check_node(model, node)
+            if potential.index is not None:
+                _check_rows(model, node)
 
 
 def _check_node(model: Model, node: CompiledNode) -> None:
@@ -165,6 +168,27 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
                         "plate. To mix elements (a mean, a cumulative sum), use an unplated "
                         "deterministic node that reads the whole plate"
                     )
+
+
+def _check_rows(model: Model, node: CompiledNode) -> None:
+    """What some rows of an index take must not move the log factors of other rows."""
+    shape = model.probe_shape
+    first, last = (
+        arguments_of(node.links, entry(node.links, model.probe, shape, at))[0]
+        for at in ((0,) * len(shape), tuple(n - 1 for n in shape))
+    )
+    before = _signature(node, first, node.plate_shape).arrays[0]
+    for chosen in masks(node.plate_shape[0]):
+        moved = [
+            np.where(chosen.reshape((-1,) + (1,) * link.event_ndim), b, a)
+            for a, b, (_, link) in zip(first, last, node.links, strict=True)
+        ]
+        after = _signature(node, moved, node.plate_shape).arrays[0]
+        if not nearly_equal(before[~chosen], after[~chosen]):
+            raise BroadcastError(
+                f"{_what(node)}: changing some rows of its arguments moves the log factors of others; "
+                "row r of the result may depend on row r of every argument only"
+            )
 
 
 def _perturbed(

@@ -1,5 +1,6 @@
 """Results: posteriors that answer the same queries whatever made them."""
 
+from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint, RunningChains
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
@@ -7,9 +8,13 @@ from bayesmc.results.sums import Sums, SumsPosterior
 from bayesmc.results.table import Summary
 
 __all__ = [
+    "ChainsPosterior",
+    "ChainsSums",
+    "Checkpoint",
     "DrawsPosterior",
     "Marginal",
     "Posterior",
+    "RunningChains",
     "Summary",
     "Sums",
     "SumsPosterior",

@@ -1,6 +1,7 @@
 """Structure read off a net: tables of finite nodes, discrete factors, linear-Gaussian conditionals."""
 
 from bayesmc.structure.affine import is_hidden, why_not_linear
+from bayesmc.structure.core import core_size
 from bayesmc.structure.discrete import (
     DiscreteNet,
     FactorSource,
@@ -23,6 +24,7 @@ __all__ = [
     "Variable",
     "configure",
     "constants_of",
+    "core_size",
     "discrete_net",
     "is_hidden",
     "known_values",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +13,8 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BudgetError
 from bayesmc.factors import FactorLike, LogTable
 from bayesmc.network import Model, Observed
+from bayesmc.network.model import potential_shape
+from bayesmc.network.node import Potential
 from bayesmc.shapes import Shape
 from bayesmc.structure.tables import TABLE_ENTRIES, configure, constants_of
 
@@ -34,6 +36,9 @@ class FactorSource:
         Finite nodes all of whose elements matter (foreign plates), one axis each.
     from_evidence : bool
         Its tables depend on the values of observed continuous nodes.
+    index : tuple, optional
+        Of a potential over rows of an index: for each node of ``alone``, which may stand there more than
+        once, the element that every row takes.
     """
 
     name: str
@@ -42,6 +47,7 @@ class FactorSource:
     whole: tuple[str, ...]
     from_evidence: bool
     is_potential: bool = False
+    index: tuple[list[int], ...] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,19 +146,7 @@ def discrete_net(
         for element in range(math.prod(node.plate_shape))
     }
     net = DiscreteNet(model, constants_of(model, inputs), cards)
-    continuous = {n for n, o in observed.items() if model[n].domain is None and o.mask is None}
-    sources = [
-        _source(model, name, node.parents, node.plates, continuous)
-        for name, node in model.nodes.items()
-        if node.kind not in ("input", "fixed")
-        and (node.domain is not None or node.is_stochastic)
-        and name not in without
-    ]
-    sources += [
-        _source(model, name, potential.parents, potential.plates, continuous, is_potential=True)
-        for name, (potential, _) in model.potentials.items()
-    ]
-    for source in sorted(sources, key=lambda s: s.from_evidence):
+    for source in _sources(model, observed, without):
         _check_size(net, source)
         for element in np.ndindex(_plate_shape(model, source)):
             net.scopes.append(_full_scope(model, source, element))
@@ -163,7 +157,38 @@ def discrete_net(
     return net
 
 
+def discrete_scopes(
+    model: Model, observed: Mapping[str, Observed]
+) -> Iterator[tuple[Variable, ...]]:
+    """The scope of every factor of a net whose hidden nodes are finite, without its table."""
+    for source in _sources(model, observed):
+        for element in np.ndindex(_plate_shape(model, source)):
+            yield _full_scope(model, source, element)
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _sources(
+    model: Model, observed: Mapping[str, Observed], without: Container[str] = ()
+) -> list[FactorSource]:
+    """What becomes factors: first what is static, then what depends on the evidence."""
+    continuous = {n for n, o in observed.items() if model[n].domain is None and o.mask is None}
+    sources = [
+        _source(model, name, node.parents, node.plates, continuous)
+        for name, node in model.nodes.items()
+        if node.kind not in ("input", "fixed")
+        and node.declaration.source != "variable"  # its density is flat
+        and (node.domain is not None or node.is_stochastic)
+        and name not in without
+    ]
+    sources += [
+        _source(model, name, potential.parents, potential.plates, continuous, is_potential=True)
+        if potential.index is None
+        else _indexed_source(model, potential)
+        for name, (potential, _) in model.potentials.items()
+    ]
+    return sorted(sources, key=lambda s: s.from_evidence)
 
 
 def _source(
@@ -198,11 +223,24 @@ def _source(
     return FactorSource(name, plates, alone, whole_nodes, from_evidence, is_potential)
 
 
+def _indexed_source(model: Model, potential: Potential) -> FactorSource:
+    """A potential over rows of an index, whose scope is all stochastic nodes."""
+    assert potential.index is not None
+    finite = [model[n].domain is not None for n in potential.scope]
+    alone = tuple(n for n, is_finite in zip(potential.scope, finite, strict=True) if is_finite)
+    index = tuple(at.tolist() for at, f in zip(potential.index, finite, strict=True) if f)
+    return FactorSource(potential.name, (), alone, (), not all(finite), True, index)
+
+
 def _plate_shape(model: Model, source: FactorSource) -> Shape:
+    if source.is_potential:
+        return potential_shape(model.sizes, model.potentials[source.name][0])
     return tuple(model.sizes[p] for p in source.plates)
 
 
 def _scope(model: Model, source: FactorSource, element: Shape) -> tuple[Variable, ...]:
+    if source.index is not None:
+        return tuple((n, at[element[0]]) for n, at in zip(source.alone, source.index, strict=True))
     scope: list[Variable] = []
     for name in source.alone:
         node = model[name]
@@ -224,11 +262,12 @@ def _full_scope(model: Model, source: FactorSource, element: Shape) -> tuple[Var
 
 
 def _check_size(net: DiscreteNet, source: FactorSource) -> None:
-    if 0 in _plate_shape(net.model, source):
+    shape = _plate_shape(net.model, source)
+    if 0 in shape:
         return
-    scope = _full_scope(net.model, source, (0,) * len(source.plates))
+    scope = _full_scope(net.model, source, (0,) * len(shape))
     entries = float(math.prod(net.cards[v] for v in scope))
-    entries *= math.prod(_plate_shape(net.model, source))
+    entries *= math.prod(shape)
     if entries > TABLE_ENTRIES:
         what = "potential" if source.is_potential else "node"
         raise BudgetError(
@@ -247,16 +286,40 @@ def _fill(
 ) -> None:
     """Append the factors of a source, one per plate element, and its rows with bad parameters."""
     with marking_invalid(), np.errstate(all="ignore"):
-        values, cards = configure(
-            model, known, source.alone, source.whole, _parents_of(model, source)
-        )
-        table, is_log, invalid = _table(model, source, values, cards)
+        if source.index is not None:
+            table, cards = _indexed_table(model, source, known)
+            is_log, invalid = True, None
+        else:
+            values, cards = configure(
+                model, known, source.alone, source.whole, _parents_of(model, source)
+            )
+            table, is_log, invalid = _table(model, source, values, cards)
     for flat, element in enumerate(np.ndindex(_plate_shape(model, source))):
         at = (slice(None),) * len(cards) + element
         part = np.array(table[at])
         factors.append(LogTable(part) if is_log else part)
         if invalid is not None and invalid[at].any():
             bad.append((source.name, flat, _scope(model, source, element), invalid[at]))
+
+
+def _indexed_table(
+    model: Model, source: FactorSource, known: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, Shape]:
+    """Logs of a potential over rows of an index, shape ``(*cards, rows)``, one axis per finite entry."""
+    potential, links = model.potentials[source.name]
+    cards = tuple(model[n].domain.size for n in source.alone)  # type: ignore[union-attr]
+    rows: list[np.ndarray] = []
+    axis = 0
+    for name, link in links:
+        domain = model[name].domain
+        if domain is None:
+            rows.append(link.place(known[name]))
+            continue
+        shape = (1,) * axis + (domain.size,) + (1,) * (len(cards) - axis)
+        rows.append(np.arange(domain.size).reshape(shape))
+        axis += 1
+    table = model.potential_at(source.name, rows)
+    return np.broadcast_to(table, (*cards, *potential_shape(model.sizes, potential))), cards
 
 
 def _table(

@@ -1,0 +1,260 @@
+"""What is worth a warning after a run of chains: chains that have not mixed, and bad acceptance rates.
+
+The check must stay cheap beside the run, so it looks at some scalars of every node, in very long chains at
+every k-th draw. A rough screen by batch means finds those that look worst, and only these are judged, by
+ArviZ, whose figures the warnings quote. It warns; it proves nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc import diagnostics
+from bayesmc.network import CompiledNode, Model
+from bayesmc.results import ChainsPosterior, ChainsSums
+
+#: R-hat above which chains disagree (Vehtari et al. 2021, sec. 5)
+MAX_RHAT = 1.01
+#: effective draws of a chain below which neither R-hat nor errors can be trusted
+MIN_ESS = 100
+#: scalars looked at
+_SCALARS = 200
+#: of these, scalars judged by their R-hat, and as many by their effective size
+_JUDGED = 6
+#: draws of all scalars and chains that are judged: of large scalars fewer are, though at least two
+_ELEMENTS = 250_000
+#: draws of one scalar in all chains to which more are thinned, though not below ``_DRAWS`` per chain
+_ONE = 100_000
+_DRAWS = 1000
+#: chains looked at; of more, some more or less stuck ones hardly change the figures
+_CHAINS = 64
+#: batches of a chain in the screen, and draws of a scalar from which it learns its quantiles
+_BATCHES = 20
+_SAMPLE = 1000
+
+
+def poor_mixing(posterior: ChainsPosterior | ChainsSums, forward: frozenset[str]) -> list[str]:
+    """What is wrong with the chains, in words, and the remedy; nodes of ``forward`` are not looked at."""
+    if isinstance(posterior, ChainsSums):
+        judged = _summed_figures(posterior, forward)
+    else:
+        judged = _figures(posterior, forward)
+    if not judged.looked:
+        return []
+    return [*_disagreement(judged), *_few_draws(judged, *posterior._chains_and_draws)]
+
+
+def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator[str]:
+    """Blocks whose mean acceptance rate lies outside the useful ``band`` (see ``Sampler``)."""
+    for block, rates in acceptance.items():
+        limits = band.get(block) if isinstance(band, Mapping) else band
+        rate = float(np.mean(rates))
+        if limits is None or limits[0] <= rate <= limits[1] or math.isnan(rate):
+            continue
+        low = rate < limits[0]
+        yield (
+            f"{block!r} accepts {100 * rate:.3g} % of its proposals, "
+            + (f"under {100 * limits[0]:g} %" if low else f"over {100 * limits[1]:g} %")
+            + (
+                "; use narrower proposals"
+                if low
+                else ", by steps too small to get far; use wider ones"
+            )
+            + ", or a longer warmup= where they adapt"
+        )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Judged(NamedTuple):
+    """Figures of the scalars that were judged, and how many were looked at."""
+
+    looked: int
+    #: name of a scalar -> its R-hat
+    rhat: dict[str, float]
+    #: name of a scalar -> the smaller one of its effective sizes, and which it is
+    ess: dict[str, tuple[float, str]]
+
+
+def _disagreement(judged: _Judged) -> Iterator[str]:
+    worst = max(judged.rhat, key=lambda name: np.nan_to_num(judged.rhat[name], posinf=np.inf))
+    rhat = judged.rhat[worst]
+    if not rhat > MAX_RHAT:
+        return
+    still = (
+        "every chain stands still, at different values" if np.isinf(rhat) else f"above {MAX_RHAT}"
+    )
+    others = _others([value > MAX_RHAT for value in judged.rhat.values()], judged.looked)
+    yield (
+        f"the chains have not mixed: R-hat of {worst!r} is {rhat:.3g} ({still}{others}); use more warmup= "
+        "and draws= (infer(..., resume=posterior) adds draws), or another engine"
+    )
+
+
+def _few_draws(judged: _Judged, chains: int, draws: int) -> Iterator[str]:
+    worst = min(judged.ess, key=lambda name: np.nan_to_num(judged.ess[name][0], nan=np.inf))
+    ess, kind = judged.ess[worst]
+    needed = float(MIN_ESS * chains)
+    if ess < needed:
+        others = _others([value < needed for value, _ in judged.ess.values()], judged.looked)
+        yield (
+            f"the {chains} x {draws} draws of {worst!r} are worth {ess:.0f} independent ones ({kind} ESS, "
+            f"under {MIN_ESS} per chain{others}), too few for error bars; use more draws= "
+            "(infer(..., resume=posterior) adds some) or thinning=, or another engine"
+        )
+    elif not ess >= needed:
+        yield (
+            f"{draws} draws per chain are too few to tell whether the chains have mixed; use more draws="
+        )
+
+
+def _others(bad: list[bool], looked: int) -> str:
+    count = sum(bad) - 1
+    if count <= 0:
+        return ""
+    if len(bad) == looked:
+        return f", and so are {count} more of {looked} looked at"
+    return f", and so are {count} more of the {len(bad)} that look worst of {looked}"
+
+
+def _figures(posterior: ChainsPosterior, forward: frozenset[str]) -> _Judged:
+    """What ArviZ says of those scalars that the screen finds worst; scalars that never move are left out."""
+    block, chains = posterior.ensemble_size, posterior._chains_and_draws[0]
+    names, columns = [], []
+    for name, index in _some(_moving(posterior, forward), posterior.model):
+        at: tuple[Any, ...] = (slice(None), slice(None), *index)
+        values = posterior._stored[name][at]
+        if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
+            names.append(_scalar(posterior.model, name, index))
+            columns.append(_thinned(values, block))
+    if not names:
+        return _Judged(0, {}, {})
+    share = len(columns[0]) / chains
+    many = min(_JUDGED, max(2, _ELEMENTS // max(columns[0].size, 1)))
+    disagreement, ess = np.transpose([_screen(values, block) for values in columns])
+    apart = np.argsort(-disagreement, kind="stable")[:many]  # NaN, of which nothing is known, last
+    slow = np.argsort(ess, kind="stable")[:many]
+
+    def figure(kind: str, at: int) -> float:
+        return diagnostics.chain_statistic(kind, columns[at], block).item()
+
+    sizes = {at: (figure("ess", at) / share, figure("tail_ess", at) / share) for at in slow}
+    return _Judged(
+        len(names),
+        {names[at]: figure("rhat", at) for at in apart},
+        {
+            names[at]: (bulk, "bulk") if not tail < bulk else (tail, "tail")
+            for at, (bulk, tail) in sizes.items()
+        },
+    )
+
+
+def _screen(values: np.ndarray, block: int) -> tuple[float, float]:
+    """How far halves of chains differ, and an effective size: rough, to rank scalars by and no more.
+
+    Both come from batch means (Flegal and Jones 2010), the first as the variance between halves over the
+    whole one, of the values and of their distance from the median, both squashed so that heavy tails do
+    not hide anything; the second as the smallest of the squashed values' and both tails'. No ranks are
+    taken and nothing is corrected for few batches. NaN if there are fewer than four blocks of draws.
+    """
+    chains, draws = values.shape
+    if draws < 4 * block:
+        return np.nan, np.nan
+    count = min(_BATCHES, draws // block)
+    values = values[:, : draws // block // count * block * count]
+    sample = values.ravel()[:: (values.size // _SAMPLE) | 1]
+    low, middle, high = np.quantile(sample, [0.05, 0.5, 0.95])
+    offset = (values - middle) / (high - low or values.std())
+    far = np.abs(offset)
+    far /= 1.0 + far
+    series = np.stack([np.copysign(far, offset), far, values <= low, values <= high])
+    means = series.reshape(4, chains, count, -1).mean(axis=-1)
+    variance = series.var(axis=(1, 2))
+    of_blocks = (
+        variance
+        if block == 1
+        else series.reshape(4, chains, -1, block).mean(axis=-1).var(axis=(1, 2))
+    )
+    half = count // 2
+    halves = np.stack([means[..., :half].mean(axis=-1), means[..., -half:].mean(axis=-1)])
+    with np.errstate(all="ignore"):
+        between = halves.var(axis=(0, 2)) / of_blocks
+        ess = chains * count * variance / means.var(axis=(1, 2))
+    return float(np.fmax(*between[:2])), float(np.fmin.reduce(ess[[0, 2, 3]]))
+
+
+def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
+    """The same from sums, whose own figures are cheap and know no tails: of all scalars looked at."""
+    ratios: dict[str, float] = {}
+    sizes: dict[str, tuple[float, str]] = {}
+    for name, node in posterior.model.nodes.items():
+        if name in forward or not posterior._running.is_batched(name):
+            continue
+        moves, rhat, ess = posterior.mcse(name) != 0, posterior.rhat(name), posterior.ess(name)
+        for index in _spread(moves.shape, _SCALARS):
+            if moves[index]:
+                scalar = _scalar(posterior.model, name, index[: len(node.value_shape)])
+                if len(index) > len(node.value_shape) and node.domain is not None:
+                    scalar += f" == {node.domain.states[index[-1]]!r}"
+                ratios[scalar] = float(rhat[index])
+                sizes[scalar] = float(ess[index]), "bulk"
+    return _Judged(len(ratios), ratios, sizes)
+
+
+def _moving(posterior: ChainsPosterior, forward: frozenset[str]) -> list[CompiledNode]:
+    """Nodes whose draws vary, as far as their shapes tell."""
+    return [
+        posterior.model[name]
+        for name, values in posterior._stored.items()
+        if name not in forward and name not in posterior._observed and values.size
+        and posterior.model[name].kind not in ("input", "fixed")
+    ]  # fmt: skip
+
+
+def _some(nodes: list[CompiledNode], model: Model) -> Iterator[tuple[str, tuple[int, ...]]]:
+    """Node and index of up to ``_SCALARS`` scalars, spread evenly over nodes and within them."""
+    if len(nodes) > _SCALARS:
+        picked = np.linspace(0, len(nodes) - 1, _SCALARS).round().astype(int)
+        nodes = [nodes[i] for i in picked]
+    left = _SCALARS
+    small_first = sorted(nodes, key=lambda node: math.prod(node.value_shape))
+    for position, node in enumerate(small_first):
+        share = left // (len(small_first) - position)
+        chosen = list(_spread(node.value_shape, share))
+        left -= len(chosen)
+        for index in chosen:
+            yield node.name, index
+
+
+def _spread(shape: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:
+    total = math.prod(shape)
+    flat = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
+    for at in zip(*np.unravel_index(flat, shape), strict=True) if shape else [()]:
+        yield tuple(int(i) for i in at)
+
+
+def _thinned(values: np.ndarray, block: int) -> np.ndarray:
+    """Every k-th block of draws of long chains, of some chains if there are many; shape (chain, draw)."""
+    if len(values) > _CHAINS:
+        values = values[np.linspace(0, len(values) - 1, _CHAINS).round().astype(int)]
+    chains, draws = values.shape
+    step = max(1, min(draws // _DRAWS, -(-chains * draws // _ONE)))
+    whole = draws // block * block
+    return values[:, :whole].reshape(chains, -1, block)[:, ::step].reshape(chains, -1)
+
+
+def _scalar(model: Model, name: str, index: tuple[int, ...]) -> str:
+    """A scalar's name with its plate labels, as in a summary."""
+    if not index:
+        return name
+    node = model[name]
+    labels: list[Any] = [
+        model.labels.get(plate, range(size))[i]
+        for plate, size, i in zip(node.plates, node.plate_shape, index, strict=False)
+    ]
+    return f"{name}[{', '.join(map(str, [*labels, *index[len(labels) :]]))}]"

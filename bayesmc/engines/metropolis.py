@@ -1,0 +1,272 @@
+"""Metropolis-Hastings on any net: the user's proposals, and adaptive moves for all other nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.metropolis_plan import Plan, plan_of
+from bayesmc.engines.metropolis_proposals import RandomWalk, check_specification
+from bayesmc.engines.starting import start_states
+from bayesmc.errors import UnsupportedError
+from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.ensemble import BlockWalk, stragglers
+from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.proposed import Proposed, ProposedBlock
+from bayesmc.network import Problem
+from bayesmc.network.forward import Pass, run, step_for
+from bayesmc.structure.target import Values
+
+#: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
+_FIRST_RESCUE = 16
+
+
+@dataclass(frozen=True, repr=False)
+class MetropolisHastings(ChainEngine):
+    """Markov chains that propose a move and accept it by the ratio of densities.
+
+    Nodes with a proposal move by it. All other continuous nodes of the chain move as one block on the
+    unconstrained scale: by a random walk whose covariance and scale adapt in the warmup and are then
+    frozen, mixed with differential evolution. For the latter every chain is an ensemble of some ten to
+    64 members, half of which move given the other half; ensembles are independent, draw t of a chain is
+    member t mod their number, and ``ess``, ``mcse`` and ``rhat`` take that into account. Beyond 200
+    numbers each node walks by itself. Other discrete nodes propose symmetric jumps and draws from their
+    own density. Nodes on which nothing observed depends are drawn forward.
+
+    Parameters
+    ----------
+    draws : int
+        Draws kept of every chain.
+    warmup : int
+        Sweeps before that, in which scales and covariances adapt.
+    chains : int
+        Chains, all in one array.
+    proposal : dict, optional
+        Node name, or a tuple of names that move as one -> one of
+
+        * a function whose argument names are nodes and which returns the distribution to propose from. It
+          receives current values, that of the node itself among them if it names it, aligned as at the
+          target. A tuple's function, which sees plated nodes as foreign, returns a dict from name to
+          distribution, or one vector distribution whose components go to the names in order;
+        * ``RandomWalk(scale)``, ``Independence(distribution)``;
+        * ``"prior"``: the node's own density given its parents.
+
+        Elements of a plate are accepted one by one where they are independent given the rest, a tuple as a
+        whole.
+    thinning : int
+        Sweeps per kept draw.
+
+    Raises
+    ------
+    TypeError, ModelError
+        Proposals that cannot be any, whatever the net. What does not fit the net or the evidence raises
+        when asked, with the proposal's name.
+
+    Notes
+    -----
+    A finite node's proposal speaks the values of its support (0, 1, ... for a Categorical), as its
+    conditional density does. A proposal that does not look at the current value must be able to reach
+    whatever the posterior allows; where supports tell that it does not, there is a ``SupportWarning``.
+
+    References
+    ----------
+    Metropolis et al. (1953), Journal of Chemical Physics 21; Hastings (1970), Biometrika 57; Haario,
+    Saksman and Tamminen (2001), Bernoulli 7; ter Braak (2006), Statistics and Computing 16.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.metropolis import MetropolisHastings
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Gamma(2.0, 1.0))
+    >>> net.add("y", lambda x: bmc.Poisson(x))
+    >>> exact = (2.0 + 3) / (1.0 + 1)
+    >>> default = bmc.infer(net, {"y": 3}, engine=MetropolisHastings(), rng=0)
+    >>> bool(abs(default.mean("x") - exact) < 0.2)
+    True
+    >>> proposal = {"x": lambda x: bmc.LogNormal(np.log(x), 0.8)}  # not symmetric: corrected
+    >>> own = bmc.infer(net, {"y": 3}, engine=MetropolisHastings(proposal=proposal), rng=0)
+    >>> bool(abs(own.mean("x") - exact) < 0.2)
+    True
+    """
+
+    draws: int = 1000
+    warmup: int = 1000
+    chains: int = 4
+    proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
+    thinning: int = 1
+
+    label: ClassVar[str] = "Metropolis-Hastings"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checked = MappingProxyType(check_specification(self.proposal))
+        object.__setattr__(self, "proposal", checked)
+
+    def refusal(self, problem: Problem) -> str | None:
+        return self._plan(problem).refusal
+
+    def describe(self, problem: Problem) -> dict[str, str]:
+        return self._plan(problem).describe()
+
+    def sampler(self, problem: Problem) -> MetropolisSampler:
+        return MetropolisSampler(self._plan(problem), self.warmup, self.thinning)
+
+    def continues(self, other: Any) -> bool:
+        if type(other) is not type(self) or list(other._given) != list(self._given):
+            return False
+        options = ("warmup", "chains", "thinning")
+        if any(getattr(self, o) != getattr(other, o) for o in options):
+            return False
+        # a pickle has lost its functions
+        return all(old is None or old == self._given[k] for k, old in other._given.items())
+
+    def _plan(self, problem: Problem) -> Plan:
+        if any(spec is None for spec in self._given.values()):
+            raise UnsupportedError(
+                "MetropolisHastings: this engine was unpickled, and pickles carry no functions; make it anew"
+            )
+        return plan_of(problem, self._given, self.chains)
+
+    @property
+    def _given(self) -> Mapping[Any, Any]:
+        assert self.proposal is not None
+        return self.proposal
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without the proposals' functions."""
+        kept = {
+            k: v if isinstance(v, (str, RandomWalk)) else None for k, v in self._given.items()
+        }
+        return {**self.__dict__, "proposal": kept}
+
+    def __copy__(self) -> MetropolisHastings:
+        return self
+
+    def __deepcopy__(self, memo: Any) -> MetropolisHastings:
+        return self
+
+    def __repr__(self) -> str:
+        options = f"draws={self.draws}, warmup={self.warmup}, chains={self.chains}"
+        if self._given:
+            shown = (
+                f"{k!r}: {v!r}" if isinstance(v, (str, RandomWalk)) else f"{k!r}: ..."
+                for k, v in self._given.items()
+            )
+            options += f", proposal={{{', '.join(shown)}}}"
+        if self.thinning != 1:
+            options += f", thinning={self.thinning}"
+        return f"MetropolisHastings({options})"
+
+
+class MetropolisSampler:
+    """One sweep: every kernel in turn, deterministic nodes recomputed after each.
+
+    Rows of the state are members of ensembles, those of a chain one after the other.
+
+    Parameters
+    ----------
+    plan : Plan
+    warmup, thinning : int
+        Sweeps of the warmup, and per draw.
+    """
+
+    def __init__(self, plan: Plan, warmup: int = 0, thinning: int = 1) -> None:
+        self.target = plan.target
+        self.kernels = plan.kernels
+        self.ensemble = plan.ensemble
+        self.warmup, self.thinning = warmup, thinning
+        model, observed = self.target.model, self.target.observed
+        self.forward = [step_for(model, model[n], observed) for n in self.target.forward]
+        self.forward_nodes = self.target.forward
+        bands = {_block(k): _band(k) for k in self.kernels}
+        self.acceptance_band: dict[str, tuple[float, float] | None] = bands
+
+    def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
+        rows = chains * self.ensemble
+        values = start_states(self.target, rows, rng)
+        inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
+        memory = [kernel.start(values, rows) for kernel in self.kernels]
+        return {"values": inside, "memory": memory, "sweep": 0, "chains": chains}
+
+    def step(self, state: Mapping[str, Any], rng: np.random.Generator, warmup: bool) -> Any:
+        values: Values = {**self.target.known, **state["values"]}
+        memory = list(state["memory"])
+        for i, kernel in enumerate(self.kernels):
+            new, memory[i] = kernel.step(values, memory[i], rng, warmup)
+            values.update(new)
+            self.target.refresh(values, kernel.names)
+        sweep = state["sweep"] + 1
+        now = {n: values[n] for n in state["values"]}
+        found = {**state, "values": now, "memory": memory, "sweep": sweep}
+        if warmup and self.ensemble > 1 and self._is_rescue(sweep):
+            return self._rescued(found, rng)
+        return found
+
+    def end_warmup(self, state: Mapping[str, Any]) -> Any:
+        memory = [k.end_warmup(m) for k, m in zip(self.kernels, state["memory"], strict=True)]
+        return {**state, "memory": memory, "sweep": 0}
+
+    def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
+        member = (state["sweep"] // self.thinning - 1) % self.ensemble
+        now = {n: v[member :: self.ensemble] for n, v in state["values"].items()}
+        values: Values = {**self.target.known, **now}
+        if self.forward:
+            values = run(self.forward, Pass(rng, (state["chains"],), values)).values
+        return values
+
+    def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        found = {}
+        for kernel, memory in zip(self.kernels, state["memory"], strict=True):
+            rate = kernel.acceptance(memory)
+            if rate is not None:
+                found[_block(kernel)] = rate.reshape(-1, self.ensemble).mean(axis=1)
+        return found
+
+    def _is_rescue(self, sweep: int) -> bool:
+        """Whether stragglers are brought back: at some sweeps in the first half of the warmup."""
+        times, rest = divmod(sweep, _FIRST_RESCUE)
+        return rest == 0 and times & (times - 1) == 0 and 2 * sweep <= self.warmup
+
+    def _rescued(self, state: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+        """The state with members that never found the mass replaced by copies of others of their ensemble.
+
+        Vague priors start some members so far out that they would walk all warmup long.
+        """
+        log = self.target.log_density({**self.target.known, **state["values"]})
+        log = np.asarray(log).reshape(-1, self.ensemble)
+        lost = stragglers(log)
+        if not lost.any():
+            return state
+        members = np.arange(log.size).reshape(log.shape)
+        rows = members.copy()
+        for chain in np.flatnonzero(lost.any(axis=1)):
+            others = members[chain][~lost[chain]]
+            rows[chain][lost[chain]] = rng.choice(others, size=int(lost[chain].sum()))
+        flat = rows.ravel()
+        memory = [
+            k.replaced(m, flat) if isinstance(k, BlockWalk) else m
+            for k, m in zip(self.kernels, state["memory"], strict=True)
+        ]
+        values = {n: v[flat] for n, v in state["values"].items()}
+        return {**state, "values": values, "memory": memory}
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _block(kernel: Kernel) -> str:
+    return ", ".join(kernel.names)
+
+
+def _band(kernel: Kernel) -> tuple[float, float] | None:
+    """Acceptance rates that tell of a useful move; None where any is."""
+    if isinstance(kernel, (Jump, Proposed, ProposedBlock)):
+        return (0.01, 1.0)
+    return (0.1, 0.9)

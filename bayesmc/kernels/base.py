@@ -1,0 +1,60 @@
+"""What a kernel is: ``start`` makes its memory, ``step`` moves its nodes; the sweep lives elsewhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesmc.structure.target import Values
+
+#: what a kernel keeps from step to step: arrays and numbers by name
+Memory = dict[str, Any]
+
+
+class Kernel:
+    """A move of some nodes that leaves their full conditional invariant.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The nodes it moves.
+    label : str
+        The kind of move, in a word or two.
+    match : str
+        What it rests on: the conjugate pair, the number of states, ...
+    """
+
+    names: tuple[str, ...] = ()
+    label: str = ""
+    match: str = ""
+
+    def words(self, name: str) -> str:
+        """What it does to one of its nodes."""
+        return f"{self.label}: {self.match}" if self.match else self.label
+
+    def start(self, values: Values, chains: int) -> Memory:
+        """Its memory before the first step."""
+        return {}
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        """New values of its nodes, and its memory; neither argument is changed.
+
+        Parameters
+        ----------
+        values : dict
+            Stored values of all nodes, hidden ones ``(chains, *plates, *event)``.
+        warmup : bool
+            Whether it may adapt.
+        """
+        raise NotImplementedError
+
+    def end_warmup(self, memory: Memory) -> Memory:
+        """Adaptation ends: what was learnt is frozen."""
+        return memory
+
+    def acceptance(self, memory: Memory) -> np.ndarray | None:
+        """Rate of accepted proposals per chain since the warmup; None where nothing is rejected."""
+        return None

@@ -1,0 +1,237 @@
+"""Scales drawn together with the Normal block they govern: each by a slice with the block integrated out.
+
+A variance component and the effects it governs hold each other fast where the data say little about either;
+drawn as one they do not. It costs several times as much as one after the other, so a scale is treated so only
+if the warmup shows that it moves slowly.
+
+References
+----------
+Liu, Wong and Kong (1994), Biometrika 81, on collapsing; van Dyk and Park (2008), JASA 103, on the order.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.transforms import Transform, transform_of
+from bayesmc.errors import DensityError
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.gaussian_block import GaussianBlock
+from bayesmc.kernels.slice import slice_move
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target, Values
+
+#: sweeps of the warmup that are watched
+_WATCH_FROM, _WATCH_TO = 40, 240
+#: lags, and the autocorrelations there that count as slow
+_SLOW = ((1, 0.6), (10, 0.1))
+#: components of a block that is worth it
+_MAX_DENSE, _MAX_LOCAL = 64, 2000
+_KINDS = ("real", "interval")
+
+
+class CollapsedBlock(Kernel):
+    """A Gaussian block, after slices of the scales that move slowly with the block integrated out.
+
+    Parameters
+    ----------
+    blankets : dict
+        Of the scales.
+    alone : dict
+        Scale -> the kernel that moves it given the block, where it is not slow.
+    """
+
+    label = "conjugate block"
+
+    def __init__(
+        self,
+        target: Target,
+        block: GaussianBlock,
+        blankets: Mapping[str, Blanket],
+        alone: Mapping[str, Kernel],
+    ) -> None:
+        self.target, self.block = target, block
+        self.alone = dict(alone)
+        self.names = (*block.names, *blankets)
+        self.blankets = dict(blankets)
+        self.transforms: dict[str, Transform] = {}
+        for name in blankets:
+            support = target.model[name].support
+            assert support is not None
+            self.transforms[name] = transform_of(support)
+        inside = {id(t) for t in block.terms}
+        self.others = {
+            name: [c for c in blanket.children if id(c.term) not in inside]
+            for name, blanket in blankets.items()
+        }
+        self.needed = _scope(target, block, blankets)
+        self.match = block.match
+
+    def words(self, name: str) -> str:
+        if name not in self.blankets:
+            return self.block.words(name)
+        block = ", ".join(self.block.names)
+        if name not in self.alone:
+            return f"collapsed slice: {block} integrated out, where it is slow without"
+        return f"{self.alone[name].words(name)}; if slow, collapsed slice with {block} integrated out"
+
+    def start(self, values: Values, chains: int) -> Memory:
+        return {
+            "sweep": 0,
+            "slow": dict.fromkeys(self.blankets, True),
+            "width": dict.fromkeys(self.blankets, 1.0),
+            "step": dict.fromkeys(self.blankets, 0.0),
+            "series": {n: np.zeros((0, chains)) for n in self.blankets},
+            "alone": {n: k.start(values, chains) for n, k in self.alone.items()},
+        }
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        state = values
+        watching = warmup and memory["sweep"] < _WATCH_TO
+        for name in self.blankets:
+            if not memory["slow"][name] or watching:
+                if name in self.alone:
+                    new, own = self.alone[name].step(state, memory["alone"][name], rng, warmup)
+                    state = {**state, **new}
+                    self.target.refresh(state, (name,))
+                    memory = {**memory, "alone": {**memory["alone"], name: own}}
+                continue
+            new, step = self._moved(state, name, memory["width"][name], rng)
+            state = {**state, name: new}
+            self.target.refresh(state, (name,))
+            if warmup:
+                memory = _widened(memory, name, step)
+        drawn, _ = self.block.step(state, {}, rng, warmup)
+        if warmup:
+            memory = self._watched(state, memory)
+        return {**{n: state[n] for n in self.blankets}, **drawn}, memory
+
+    def end_warmup(self, memory: Memory) -> Memory:
+        alone = {n: k.end_warmup(memory["alone"][n]) for n, k in self.alone.items()}
+        return {**memory, "alone": alone}
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _moved(
+        self, values: Values, name: str, width: float, rng: np.random.Generator
+    ) -> tuple[np.ndarray, float]:
+        """A slice of one node on its free scale, the block integrated out; and how far it went."""
+        transform = self.transforms[name]
+        u = transform.unconstrain(values[name])
+
+        def log_density(tried: np.ndarray) -> np.ndarray:
+            x = transform.constrain(tried)
+            inside = np.isfinite(x) & np.isfinite(transform.unconstrain(x))
+            x = np.where(inside, x, values[name])
+            log = self._log(values, name, x) + transform.log_abs_det_jacobian(tried)
+            return np.where(inside, log, -np.inf)
+
+        try:
+            moved = slice_move(log_density, u, np.full(u.shape, width), rng)
+        except DensityError as error:
+            raise DensityError(f"node {name!r}: {error}") from error
+        return transform.constrain(moved), float(np.abs(moved - u).mean())
+
+    def _log(self, values: Values, name: str, x: np.ndarray) -> np.ndarray:
+        """Log density of a node with the block integrated out, at candidates ``(..., chains)``."""
+        lead = x.shape
+        count = math.prod(lead)
+        state = dict(values)
+        for other in self.needed:
+            value = values[other]
+            wide = np.broadcast_to(value, (*lead[:-1], *value.shape))
+            state[other] = wide.reshape(count, *value.shape[1:])
+        state[name] = x.reshape(count)
+        self.target.refresh(state, (name,))
+        log = self.block.log_integral(state, count) + self.blankets[name].own_log(state)
+        for child in self.others[name]:
+            log = log + self.blankets[name].child_log(child, state)
+        return np.broadcast_to(log, (count,)).reshape(lead)
+
+    def _watched(self, state: Values, memory: Memory) -> Memory:
+        """Notes where the nodes are; at the end of the watch, which of them are slow."""
+        sweep = memory["sweep"] + 1
+        memory = {**memory, "sweep": sweep}
+        if not _WATCH_FROM <= sweep <= _WATCH_TO:
+            return memory
+        series = {}
+        for name, seen in memory["series"].items():
+            series[name] = np.vstack([seen, self.transforms[name].unconstrain(state[name])])
+        if sweep < _WATCH_TO:
+            return {**memory, "series": series}
+        slow = {
+            name: any(_autocorrelation(seen, lag) > limit for lag, limit in _SLOW)
+            for name, seen in series.items()
+        }
+        return {**memory, "slow": slow, "series": {n: s[:0] for n, s in series.items()}}
+
+
+def governing(
+    target: Target, block: GaussianBlock, blankets: Mapping[str, Blanket]
+) -> dict[str, Blanket]:
+    """The scales, and other numbers, that can be drawn with a block integrated out."""
+    layout = block.layout
+    found: dict[str, Blanket] = {}
+    if layout.dg > _MAX_DENSE or layout.n * layout.dl > _MAX_LOCAL:
+        return found
+    inside = {id(t) for t in block.terms}
+    for name, blanket in blankets.items():
+        node = target.model[name]
+        if name in block.names or node.plates or node.event_shape or node.is_discrete:
+            continue
+        if node.support is None or node.support.kind not in _KINDS or not node.support.is_single:
+            continue
+        if blanket.own is None or id(blanket.own) in inside:
+            continue
+        if inside & {id(c.term) for c in blanket.children}:
+            found[name] = blanket
+    return found
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _scope(
+    target: Target, block: GaussianBlock, blankets: Mapping[str, Blanket]
+) -> tuple[str, ...]:
+    """Hidden nodes whose values the block's terms and the nodes' own read."""
+    terms = {t.name: t for t in block.terms}
+    for blanket in blankets.values():
+        terms.update({c.term.name: c.term for c in blanket.children})
+        if blanket.own is not None:
+            terms[blanket.own.name] = blanket.own
+    found: set[str] = set()
+    todo = [n for t in terms.values() for n in t.scope]
+    while todo:
+        name = todo.pop()
+        if name in found or name in target.known:
+            continue
+        found.add(name)
+        if name in target.links:
+            todo += target.model[name].parents
+    hidden = (*target.chain, *target.links)
+    return tuple(n for n in hidden if n in found)
+
+
+def _widened(memory: Memory, name: str, step: float) -> Memory:
+    before = memory["step"][name]
+    mean = step if before == 0 else 0.9 * before + 0.1 * step
+    width = 3.0 * mean if mean > 0 else memory["width"][name]
+    return {
+        **memory,
+        "step": {**memory["step"], name: mean},
+        "width": {**memory["width"], name: width},
+    }
+
+
+def _autocorrelation(series: np.ndarray, lag: int) -> float:
+    """Autocorrelation of chains ``(sweeps, chains)``, about the mean of all."""
+    centred = series - series.mean()
+    power = float((centred**2).mean())
+    return float((centred[lag:] * centred[:-lag]).mean()) / power if power > 0 else 1.0

@@ -1,0 +1,64 @@
+"""Finite nodes: the full conditional of every state, then a draw from it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from bayesmc.errors import ZeroProbabilityError
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Values
+
+
+class Enumerate(Kernel):
+    """Draws a finite node from its full conditional, all states tried."""
+
+    label = "enumerate"
+
+    def __init__(self, blanket: Blanket) -> None:
+        self.blanket = blanket
+        self.names = (blanket.name,)
+        domain = blanket.node.domain
+        assert domain is not None
+        self.states = np.arange(domain.size, dtype=domain.dtype)
+        self.match = f"{domain.size} states"
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        blanket = self.blanket
+        state = values
+        for members in blanket.classes:
+            axes = len(blanket.node.plates) if members is None else 1
+            candidate = self.states.reshape((-1, 1) + (1,) * axes)
+            if members is not None:
+                candidate = np.broadcast_to(candidate, (len(self.states), 1, len(members)))
+            log = blanket.log_density(state, candidate, members)
+            now = blanket.current(state, members)
+            log = np.broadcast_to(log, (len(self.states), *now.shape))
+            new = draw_states(log, rng, blanket.name).astype(self.states.dtype)
+            state = {**state, blanket.name: blanket.moved(state, new, members)}
+        return {blanket.name: state[blanket.name]}, memory
+
+
+def draw_states(log: np.ndarray, rng: np.random.Generator, name: str) -> np.ndarray:
+    """Positions drawn from unnormalised log probabilities, states first: shape ``log.shape[1:]``."""
+    count = len(log)
+    top = log[0]
+    for k in range(1, count):
+        top = np.maximum(top, log[k])
+    if not np.isfinite(top).all():
+        raise ZeroProbabilityError(
+            f"node {name!r}: no state has positive probability given the others; the chain is at an "
+            "impossible configuration"
+        )
+    edges = np.exp(log[0] - top)
+    cumulative = [edges]
+    for k in range(1, count):
+        edges = edges + np.exp(log[k] - top)
+        cumulative.append(edges)
+    level = rng.random(top.shape) * edges
+    found = (level >= cumulative[0]).view(np.uint8)
+    for k in range(1, count - 1):
+        found = found + (level >= cumulative[k])
+    return found if count > 1 else np.zeros(top.shape, dtype=np.uint8)

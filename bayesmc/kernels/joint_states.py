@@ -1,0 +1,150 @@
+"""Small blocks of finite nodes, drawn jointly: all joint states given the rest.
+
+One at a time, nodes tied by (nearly) deterministic tables hardly move, or not at all. Which nodes those are
+is found in ``coupling``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.conditionals import FiniteTerms, conditional_of
+from bayesmc.kernels.tables import TableSweep
+from bayesmc.structure.relation import Relation, relation_of
+from bayesmc.structure.target import Target, Term, Values
+
+#: joint states of a block
+_STATES = 1024
+
+
+def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None = None) -> Kernel:
+    """The kernel that draws some finite nodes jointly.
+
+    Parameters
+    ----------
+    target : Target
+    names : sequence of str
+        Chain nodes with few joint states. If they live in plates, in the same ones, and nothing they enter
+        reads them across elements; the blocks of all elements are then drawn at once.
+    terms : FiniteTerms, optional
+        Tables made before.
+
+    Raises
+    ------
+    UnsupportedError
+        The nodes make no such block.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.joint_states import joint_states
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Bernoulli(0.5))
+    >>> net.add("y", bmc.Bernoulli(0.5))
+    >>> net.add("parity", lambda x, y: bmc.Bernoulli((x + y) % 2 * 1.0))
+    >>> target = target_of(pose(net, {"parity": 1}))
+    >>> kernel = joint_states(target, ("x", "y"))
+    >>> start = {"x": np.ones(4, dtype=np.uint8), "y": np.zeros(4, dtype=np.uint8)}
+    >>> new, _ = kernel.step({**target.known, **start}, {}, np.random.default_rng(0), False)
+    >>> (new["x"] + new["y"]).tolist()
+    [1, 1, 1, 1]
+    """
+    conditional = conditional_of(FiniteTerms(target) if terms is None else terms, names)
+    if conditional is not None and conditional.states <= _STATES:
+        return TableSweep(target, (conditional,))
+    return JointStates(target, names)
+
+
+class JointStates(Kernel):
+    """Draws a block from all its joint states, whatever the terms around it are.
+
+    Parameters
+    ----------
+    target : Target
+    names : sequence of str
+        As for `joint_states`.
+    """
+
+    label = "enumerate jointly"
+
+    def __init__(self, target: Target, names: Sequence[str]) -> None:
+        self.target = target
+        self.names = tuple(names)
+        nodes = [target.model[n] for n in names]
+        domains = [n.domain for n in nodes]
+        self.plates = nodes[0].plates
+        cards = [d.size for d in domains if d is not None]
+        if len(cards) < len(nodes) or math.prod(cards) > _STATES:
+            raise UnsupportedError(
+                f"nodes {list(names)} have no joint states to try, or more than {_STATES}; leave some out"
+            )
+        if any(n.plates != self.plates for n in nodes):
+            raise UnsupportedError(
+                f"nodes {list(names)} live in different plates; join nodes of the same plates"
+            )
+        self.states = np.indices(cards).reshape(len(cards), -1)
+        self.dtypes = [d.dtype for d in domains if d is not None]
+        self.match = f"{self.states.shape[1]} joint states of {', '.join(names)}"
+        self.terms: list[tuple[Term, Relation | None]] = []
+        for term in target.terms_of(self.names):
+            relations = [
+                relation_of(target, n, term)
+                for n in names
+                if n != term.name and _enters(target, n, term)
+            ]
+            if self.plates and any(r.kind != "aligned" for r in relations):
+                raise UnsupportedError(
+                    f"{term.name!r} reads {list(names)} across elements of {self.plates}; their blocks "
+                    "cannot be drawn one by one"
+                )
+            self.terms.append((term, None if term.name in names else relations[0]))
+
+    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Log full conditional of the joint states up to a constant, shape ``(states, chains, *plates)``."""
+        now = values[self.names[0]]
+        state = dict(values)
+        axes = (1,) * now.ndim
+        for name, codes, dtype in zip(self.names, self.states, self.dtypes, strict=True):
+            state[name] = codes.astype(dtype).reshape(-1, *axes)
+        self.target.refresh(state, self.names)
+        total = np.zeros((self.states.shape[1], *now.shape))
+        for term, relation in self.terms:
+            log = term.log(state)
+            total = total + (log if relation is None else relation.collect(log, term.shape))
+        for name, codes in zip(self.names, self.states, strict=True):
+            seen = self.target.seen(name)
+            if seen is not None and seen.mask is not None:
+                other = codes.reshape(-1, *axes) != seen.value
+                total = np.where(other & seen.mask, -np.inf, total)
+        return total
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        log = self.log_density(values)
+        top = log.max(axis=0)
+        if not np.isfinite(top).all():
+            raise ZeroProbabilityError(
+                f"nodes {list(self.names)}: no joint state has positive probability given the others; the "
+                "chain is at an impossible configuration"
+            )
+        cumulative = np.cumsum(np.exp(log - top), axis=0)
+        level = rng.random(top.shape) * cumulative[-1]
+        drawn = np.minimum((level >= cumulative).sum(axis=0), len(log) - 1)
+        moved = zip(self.names, self.states, self.dtypes, strict=True)
+        return {n: codes[drawn].astype(dtype) for n, codes, dtype in moved}, memory
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _enters(target: Target, name: str, term: Term) -> bool:
+    return bool({name, *target.below((name,))} & set(term.scope))

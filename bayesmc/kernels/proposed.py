@@ -1,0 +1,471 @@
+"""Metropolis-Hastings with proposals that are conditional densities: a user's, or the node's own.
+
+The Hastings correction is computed from the proposal itself: its density at the proposed value, and at
+the old value with the proposed one in place. Reading a user's function is the engine's affair.
+
+References
+----------
+Hastings (1970), Biometrika 57; Koller and Friedman (2009), sec. 12.3.4.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.errors import (
+    BayesmcError,
+    BroadcastError,
+    DensityError,
+    ModelError,
+    ShapeError,
+    SupportWarning,
+    UnsupportedError,
+)
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.densities import Block, accepted, compare, instead
+from bayesmc.kernels.random_walk import counted, picked
+from bayesmc.network import CompiledNode, Model
+from bayesmc.network.align import Aligner
+from bayesmc.network.model import arguments_of, call, fit
+from bayesmc.network.node import Declaration
+from bayesmc.shapes import masks, nearly_equal
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target, Values
+
+
+@dataclass(frozen=True, eq=False)
+class Conditional:
+    """A user's function, read as the density of a proposal.
+
+    Attributes
+    ----------
+    key : str or tuple of str
+        What it was given for; a tuple is a block that moves as one.
+    names : tuple of str
+    declaration : Declaration
+        The function, what it takes, and the plates it is aligned for.
+    links : tuple of (str, Aligner)
+    """
+
+    key: Any
+    names: tuple[str, ...]
+    declaration: Declaration
+    links: tuple[tuple[str, Aligner], ...]
+
+    @property
+    def is_independent(self) -> bool:
+        """Whether it proposes the same wherever its targets are."""
+        return not set(self.names) & set(self.declaration.parents)
+
+    def result(self, model: Model, values: Values) -> Any:
+        """What the function returns at the current values: a distribution, or ``Parts``."""
+        arguments, batch = arguments_of(self.links, values)
+        plates = tuple(model.sizes[p] for p in self.declaration.plates)
+        found = call(self.declaration, arguments, batch + plates, self.links)
+        if not isinstance(found, Distribution):
+            raise ModelError(
+                f"the function returns an array of shape {np.shape(found)}; return the distribution to "
+                "propose from"
+            )
+        if not isinstance(found, Parts):
+            fit(self.declaration, found, batch, plates)
+            _refuse_invalid(found)
+            return found
+        for name, part in found.parts.items():
+            fit(model[name].declaration, part, batch, model[name].plate_shape)
+            _refuse_invalid(part)
+        return found
+
+
+class Parts(Distribution):
+    """Independent distributions of several nodes, as a block's function may return them."""
+
+    def __init__(self, parts: Mapping[str, Distribution]) -> None:
+        self.parts = dict(parts)
+
+
+class Proposed(Kernel):
+    """One node, every element proposed and accepted by itself.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    conditional : Conditional or None
+        None: from the node's own density given its parents.
+    """
+
+    def __init__(self, blanket: Blanket, conditional: Conditional | None = None) -> None:
+        self.blanket = blanket
+        self.names = (blanket.name,)
+        self.conditional = conditional
+        self.label = "proposed by a function" if conditional else "proposed from its own density"
+        if conditional is not None and not conditional.declaration.parents:
+            self.label = "proposed from one distribution"
+
+    def start(self, values: Values, chains: int) -> Memory:
+        if self.conditional is not None:
+            with blaming(self.conditional):
+                dist = self._distribution(values)
+                check_kind(self.blanket.node, dist)
+                self._check_elements(values, dist)
+            if self.conditional.is_independent:
+                warn_of_gaps(self.conditional, self.blanket.node, dist)
+        return {"accepted": np.zeros(chains), "moves": 0}
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        blanket, name = self.blanket, self.blanket.name
+        state, share, count = values, 0.0, 0
+        for members in blanket.classes:
+            with blaming(self.conditional):
+                proposal, dead, forward = self._drawn(state, rng)
+            new, forward = picked(proposal, forward, members, blanket)
+            _, dead = picked(proposal, dead, members, blanket)
+            found = compare(blanket, state, new, members, dead)
+            log_ratio = found.own + found.rest - forward
+            log_ratio = log_ratio + self._backward(state, found.new, members)
+            accept = accepted(log_ratio, rng)
+            new = instead(~accept, found.new, blanket.current(state, members))
+            state = {**state, name: blanket.moved(state, new, members)}
+            taken = accept.reshape(len(accept), -1)
+            share, count = share + taken.sum(axis=1), count + taken.shape[1]
+        if warmup:
+            return {name: state[name]}, memory
+        return {name: state[name]}, counted(memory, share / max(count, 1))
+
+    def acceptance(self, memory: Memory) -> np.ndarray | None:
+        return memory["accepted"] / max(memory["moves"], 1)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _distribution(self, values: Values) -> Distribution:
+        if self.conditional is not None:
+            return self.conditional.result(self.blanket.target.model, values)
+        assert self.blanket.own is not None
+        return self.blanket.own.distribution(values)[0]
+
+    def _drawn(
+        self, values: Values, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Stored proposals of all elements, which are none of the node's values, and their densities."""
+        node = self.blanket.node
+        dist = self._distribution(values)
+        shape = (len(values[node.name]), *node.plate_shape)
+        draws = dist.sample_to(rng, shape)
+        log = np.broadcast_to(dist.log_prob(draws), shape)
+        _refuse_infinite(log)
+        stored, outside = to_stored(node, draws)
+        return stored, np.broadcast_to(outside, shape), log
+
+    def _backward(
+        self, values: Values, new: np.ndarray, members: np.ndarray | None
+    ) -> np.ndarray:
+        """Log density of proposing the old values from the new ones."""
+        blanket = self.blanket
+        conditional, name = self.conditional, blanket.name
+        state = values
+        if conditional is not None and {name, *blanket.path} & set(conditional.declaration.parents):
+            state = blanket.placed(values, new, members)
+        with blaming(conditional):
+            dist = self._distribution(state)
+            now = values[name]
+            log = dist.log_prob(to_support(blanket.node, now))
+        shape = (len(now), *blanket.node.plate_shape)
+        return picked(now, np.broadcast_to(log, shape), members, blanket)[1]
+
+    def _check_elements(self, values: Values, dist: Distribution) -> None:
+        """Refuse a function that mixes elements: they are accepted one by one."""
+        blanket, node = self.blanket, self.blanket.node
+        if blanket.size < 2:
+            return
+        now = values[node.name]
+        shape = (len(now), *node.plate_shape)
+        draws = dist.sample_to(np.random.default_rng(0), shape)
+        stored, outside = to_stored(node, draws)
+        support = node.support if blanket.own is None else blanket.own.distribution(values)[0].support
+        assert support is not None
+        outside = outside | ~support.contains(draws)
+        stored = instead(np.broadcast_to(outside, shape), stored, now)
+        before = np.broadcast_to(dist.log_prob(to_support(node, now)), shape)
+        for moved in masks(blanket.size):
+            mask = np.broadcast_to(moved.reshape(node.plate_shape), shape)
+            state = blanket.placed(values, instead(~mask, stored, now))
+            after = self._distribution(state).log_prob(to_support(node, now))
+            after = np.broadcast_to(after, shape)
+            if not nearly_equal(after[~mask], before[~mask]):
+                raise BroadcastError(
+                    "it proposes an element of the plate by looking at others of the same node, but "
+                    f"elements are accepted one by one; give it for the tuple ({node.name!r},), which moves "
+                    "as one"
+                )
+
+
+class ProposedBlock(Kernel):
+    """Several nodes proposed jointly, accepted or not as one.
+
+    Parameters
+    ----------
+    target : Target
+    names : sequence of str
+    conditional : Conditional or None
+        None: from the nodes' own densities, parents first.
+    """
+
+    def __init__(
+        self, target: Target, names: Sequence[str], conditional: Conditional | None = None
+    ) -> None:
+        self.block = Block(target, names)
+        self.names = tuple(names)
+        self.target = target
+        self.nodes = [target.model[name] for name in names]
+        self.conditional = conditional
+        self.label = (
+            "proposed jointly by a function" if conditional else "proposed from their own densities"
+        )
+
+    def start(self, values: Values, chains: int) -> Memory:
+        if self.conditional is not None:
+            with blaming(self.conditional):
+                dist = self.conditional.result(self.target.model, values)
+                parts = dist.parts if isinstance(dist, Parts) else {}
+                for node in self.nodes:
+                    if node.name in parts:
+                        check_kind(node, parts[node.name])
+                if not parts:
+                    self._check_vector(dist)
+            for node in self.nodes:
+                if node.name in parts and self.conditional.is_independent:
+                    warn_of_gaps(self.conditional, node, parts[node.name])
+        return {"accepted": np.zeros(chains), "moves": 0}
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        with blaming(self.conditional):
+            new, dead, forward = self._drawn(values, rng)
+        new = {n: instead(dead, v, values[n]) for n, v in new.items()}
+        _, log = self.block.log(values)
+        state, grown = self.block.log(values, lambda name, _: (new[name], 0.0))
+        with blaming(self.conditional):
+            backward = self._log_density(state, values)
+        log_ratio = np.where(dead, -np.inf, grown - log + backward - forward)
+        accept = accepted(log_ratio, rng)
+        moved = {n: instead(~accept, state[n], values[n]) for n in self.names}
+        if warmup:
+            return moved, memory
+        return moved, counted(memory, accept.astype(float))
+
+    def acceptance(self, memory: Memory) -> np.ndarray | None:
+        return memory["accepted"] / max(memory["moves"], 1)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _drawn(
+        self, values: Values, rng: np.random.Generator
+    ) -> tuple[Values, np.ndarray, np.ndarray]:
+        """Stored proposals, which chains have one that is no value of a node, and log densities."""
+        if self.conditional is None:
+            return self._from_own(values, rng)
+        dist = self.conditional.result(self.target.model, values)
+        chains = len(values[self.names[0]])
+        if not isinstance(dist, Parts):
+            draws = dist.sample_to(rng, (chains,))
+            log = np.broadcast_to(dist.log_prob(draws), (chains,))
+            _refuse_infinite(log)
+            new, dead = {}, np.zeros(chains, dtype=bool)
+            for node, part in zip(self.nodes, self._cut(draws), strict=True):
+                new[node.name], outside = to_stored(node, part)
+                dead |= outside.reshape(chains, -1).any(axis=1)
+            return new, dead, log
+        new, dead, log = {}, np.zeros(chains, dtype=bool), np.zeros(chains)
+        for node in self.nodes:
+            draws = dist.parts[node.name].sample_to(rng, (chains, *node.plate_shape))
+            one = np.broadcast_to(dist.parts[node.name].log_prob(draws), draws.shape[: 1 + len(node.plates)])
+            _refuse_infinite(one)
+            stored, outside = to_stored(node, draws)
+            new[node.name] = self._with_seen(node, stored, values)
+            log = log + self._summed(node, one)
+            dead |= self._summed(node, outside.astype(float)) > 0
+        return new, dead, log
+
+    def _log_density(self, given: Values, values: Values) -> np.ndarray:
+        """Log density of proposing ``values`` from the state ``given``."""
+        if self.conditional is None:
+            return self._own_log(values)
+        dist = self.conditional.result(self.target.model, given)
+        if not isinstance(dist, Parts):
+            flat = [
+                to_support(n, values[n.name]).reshape(len(values[n.name]), -1) for n in self.nodes
+            ]
+            return dist.log_prob(np.concatenate(flat, axis=1))
+        total = np.zeros(len(values[self.names[0]]))
+        for node in self.nodes:
+            log = dist.parts[node.name].log_prob(to_support(node, values[node.name]))
+            log = np.broadcast_to(log, (len(total), *node.plate_shape))
+            total = total + self._summed(node, log)
+        return total
+
+    def _from_own(
+        self, values: Values, rng: np.random.Generator
+    ) -> tuple[Values, np.ndarray, np.ndarray]:
+        """Draws from the nodes' own densities, parents first."""
+        model, state = self.target.model, dict(values)
+        chains = len(values[self.names[0]])
+        for name in self.block.order:
+            if name not in self.block.names:
+                state[name], _ = model.evaluate(name, state)
+                continue
+            dist, _ = self.block.own[name].distribution(state)
+            stored = model.sample_stored(name, dist, rng, (chains,))
+            state[name] = self._with_seen(model[name], stored, values)
+        log = self._own_log(state)
+        return {n: state[n] for n in self.names}, np.zeros(chains, dtype=bool), log
+
+    def _own_log(self, values: Values) -> np.ndarray:
+        """Log density of drawing the values of all nodes from their own densities."""
+        total = np.zeros(len(values[self.names[0]]))
+        for node in self.nodes:
+            log = self.block.own[node.name].log(values)
+            total = total + self._summed(
+                node, np.broadcast_to(log, (len(total), *node.plate_shape))
+            )
+        return total
+
+    def _with_seen(self, node: CompiledNode, new: np.ndarray, values: Values) -> np.ndarray:
+        """A proposal with the observed elements of a partly observed node in place."""
+        seen = self.target.seen(node.name)
+        if seen is None:
+            return new
+        assert seen.mask is not None
+        return instead(np.broadcast_to(seen.mask, new.shape[: 1 + len(node.plates)]), new, values[node.name])
+
+    def _summed(self, node: CompiledNode, log: np.ndarray) -> np.ndarray:
+        """Sum over the elements that move, shape (chains,)."""
+        flat = log.reshape(len(log), -1)
+        free = self.target.free_elements(node.name)
+        return (flat if free is None else flat[:, free]).sum(axis=1)
+
+    def _cut(self, draws: np.ndarray) -> list[np.ndarray]:
+        """A vector's components as values of the nodes, in order."""
+        sizes = [math.prod(node.value_shape) for node in self.nodes]
+        pieces = np.split(draws, np.cumsum(sizes)[:-1], axis=-1)
+        return [
+            piece.reshape(len(draws), *node.value_shape)
+            for node, piece in zip(self.nodes, pieces, strict=True)
+        ]
+
+    def _check_vector(self, dist: Distribution) -> None:
+        size = sum(math.prod(node.value_shape) for node in self.nodes)
+        parts = ", ".join(f"{node.name} {math.prod(node.value_shape)}" for node in self.nodes)
+        if dist.event_shape != (size,):
+            raise ShapeError(
+                f"the distribution draws values of shape {dist.event_shape}, but the block has {size} "
+                f"components ({parts}); return one vector of them, or a dict from name to distribution"
+            )
+        for node in self.nodes:
+            check_kind(node, dist, shaped=False)
+            if self.target.seen(node.name) is not None:
+                raise UnsupportedError(
+                    f"{node.name!r} is partly observed, and a vector cannot be drawn in part; propose "
+                    "its missing elements by a dict from name to distribution"
+                )
+
+
+@contextmanager
+def blaming(conditional: Conditional | None) -> Iterator[None]:
+    """What goes wrong inside is the proposal's fault, not the node's."""
+    try:
+        yield
+    except BayesmcError as error:
+        if conditional is not None:
+            node = f"node {conditional.declaration.name!r}"
+            text = str(error)
+            rest = text.removeprefix(node) if text.startswith(node) else f": {text}"
+            what = f"MetropolisHastings: proposal for {conditional.key!r}"
+            error.args = (f"{what}{rest}", *error.args[1:])
+        raise
+
+
+def to_stored(node: CompiledNode, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Draws as stored values, and which are no value of a finite node, shape (chains, *plates)."""
+    if node.domain is None:
+        return draws, np.zeros(draws.shape[: draws.ndim - len(node.event_shape)], dtype=bool)
+    positions = draws - node.domain.low
+    outside = ~((positions >= 0) & (positions < node.domain.size))
+    if outside.any():
+        positions = np.where(outside, 0, positions)
+    return positions.astype(node.domain.dtype), outside
+
+
+def to_support(node: CompiledNode, stored: np.ndarray) -> np.ndarray:
+    """Stored values as the values that distributions speak."""
+    return stored if node.domain is None else node.domain.to_support(stored)
+
+
+def check_kind(node: CompiledNode, dist: Distribution, shaped: bool = True) -> None:
+    """Refuse a proposal whose draws are no values of the node."""
+    if bool(dist.is_discrete) != node.is_discrete:
+        kinds = {True: "discrete", False: "continuous"}
+        raise ModelError(
+            f"{node.name!r} is {kinds[node.is_discrete]}, but {type(dist).__name__} is "
+            f"{kinds[not node.is_discrete]}; propose a {kinds[node.is_discrete]} distribution"
+        )
+    if shaped and dist.event_shape != node.event_shape:
+        raise ShapeError(
+            f"{type(dist).__name__} draws values of shape {dist.event_shape}, but one value of "
+            f"{node.name!r} has shape {node.event_shape}"
+        )
+
+
+def warn_of_gaps(conditional: Conditional, node: CompiledNode, dist: Distribution) -> None:
+    """Warn where a proposal never reaches what its target may be, as far as supports tell."""
+    never = _never_proposed(node, dist)
+    if never is not None:
+        warnings.warn(
+            f"MetropolisHastings: the proposal for {conditional.key!r} is on {dist.support.describe()} and "
+            f"never gives {never}, which {node.name!r} may take; what is never proposed is missing from all "
+            "answers: propose from a distribution that covers the node's support",
+            SupportWarning,
+            stacklevel=2,
+        )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _never_proposed(node: CompiledNode, dist: Distribution) -> str | None:
+    """Values of a node, in words, that no draw of its proposal can have; None if none is known."""
+    if node.domain is None:
+        known = node.support is not None and node.support.is_constant
+        if not known or dist.support.covers(node.support):  # type: ignore[arg-type]
+            return None
+        return f"others of the {node.support.describe()}"  # type: ignore[union-attr]
+    values = node.domain.low + np.arange(node.domain.size)
+    at = values.reshape((-1,) + (1,) * len(dist.batch_shape))
+    reached = np.isfinite(dist.log_prob(at)).reshape(len(values), -1).any(axis=1)
+    missed = [repr(node.domain.states[k]) for k in np.flatnonzero(~reached)]
+    return ", ".join(missed[:5]) + (", ..." if len(missed) > 5 else "") if missed else None
+
+
+def _refuse_invalid(dist: Distribution) -> None:
+    """Raise for bad parameters: a proposal is asked only where the chains are, or may go."""
+    if dist.invalid is not None and dist.invalid.any() and dist.problem is not None:
+        raise dist.problem
+
+
+def _refuse_infinite(log: np.ndarray) -> None:
+    if not np.isfinite(log).all():
+        found = log[~np.isfinite(log)].flat[0]
+        raise DensityError(
+            f"the log density at one of its own draws is {found}; sample= and log_prob of a proposal must "
+            "describe the same, finite density"
+        )

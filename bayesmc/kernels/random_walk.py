@@ -1,0 +1,199 @@
+"""Random walks of one node: every element takes a Gaussian step and is accepted by itself.
+
+On the unconstrained scale of its support a node of any kind can walk, a simplex and a matrix, too; the
+acceptance ratio then has the change of volume. Walks of several nodes at once are in ``ensemble``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.support import Support
+from bayesmc.distributions.transforms import Identity, Transform, Wrapped, transform_of
+from bayesmc.kernels.adaptation import Steps, chance
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.densities import accepted, compare, instead
+from bayesmc.network import Model
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Values
+
+#: free numbers beyond these are at a bound as far as floating point can tell
+_FAR = 700.0
+
+
+class AdaptiveWalk(Kernel):
+    """Metropolis-Hastings with Gaussian steps, whose size and shape adapt until the warmup ends.
+
+    All chains and all elements of a plate that are independent given the rest step together, each accepted
+    by itself; the components of a vector, a simplex or a matrix step jointly.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    reason : str
+        Why the node walks, for the table of kernels.
+    scale : array_like, optional
+        Standard deviations of the steps, broadcasting to ``(*plates, *event)`` (of the unconstrained
+        numbers, if it walks there); by default they are learnt.
+    unconstrained : bool
+        Walk on the unconstrained scale; otherwise on the node's own, where steps out of the support are
+        rejected.
+    adaptive : bool
+        Learn in the warmup, from ``scale`` on if it is given.
+
+    References
+    ----------
+    Haario, Saksman and Tamminen (2001), Bernoulli 7; Roberts and Rosenthal (2001), Statistical Science 16.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.random_walk import AdaptiveWalk
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.blanket import Blanket
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("w", bmc.Dirichlet([1.0, 1.0, 1.0]))
+    >>> net.add("n", lambda w: bmc.Multinomial(10, w))
+    >>> target = target_of(pose(net, {"n": [5, 3, 2]}))
+    >>> kernel = AdaptiveWalk(Blanket(target, "w"))
+    >>> values = {**target.known, "w": np.full((4, 3), 1 / 3)}
+    >>> new, memory = kernel.step(values, kernel.start(values, 4), np.random.default_rng(0), True)
+    >>> new["w"].shape, bool(np.allclose(new["w"].sum(axis=-1), 1.0))
+    ((4, 3), True)
+    """
+
+    label = "adaptive random walk"
+
+    def __init__(
+        self,
+        blanket: Blanket,
+        reason: str = "",
+        *,
+        scale: Any = None,
+        unconstrained: bool = True,
+        adaptive: bool = True,
+    ) -> None:
+        self.blanket = blanket
+        self.names = (blanket.name,)
+        self.match = reason
+        self.unconstrained = unconstrained
+        node = blanket.node
+        support = some_support(blanket.target.model, node.name)
+        self.free_shape = walked(support, node.event_shape, unconstrained).unconstrained_shape
+        size = math.prod(self.free_shape)
+        if scale is not None:
+            full = np.broadcast_to(scale, node.plate_shape + self.free_shape)
+            scale = full.reshape(blanket.size, size)
+        self.steps = Steps(size, scale, adaptive)
+        if not adaptive:
+            self.label = "random walk"
+
+    def start(self, values: Values, chains: int) -> Memory:
+        free = self._free(self._transform(values), values[self.blanket.name])
+        return {"steps": self.steps.start(free), "accepted": np.zeros(chains), "moves": 0}
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        blanket, name = self.blanket, self.blanket.name
+        now = values[name]
+        transform = self._transform(values)
+        free = self._free(transform, now)
+        tried = free + self.steps.draw(memory["steps"], rng)
+        shape = (len(now), *blanket.node.plate_shape)
+        proposal = transform.constrain(tried.reshape(shape + self.free_shape))
+        volume = self._volume(transform, tried, shape) - self._volume(transform, free, shape)
+        rates = np.full(tried.shape[:2], np.nan)
+        state, taken = values, []
+        for members in blanket.classes:
+            new, grown = picked(proposal, volume, members, blanket)
+            dead = self._outside(new)
+            found = compare(blanket, state, new, members, dead)
+            log_ratio = found.own + found.rest + grown
+            accept = accepted(log_ratio, rng)
+            new = instead(~accept, found.new, blanket.current(state, members))
+            state = {**state, name: blanket.moved(state, new, members)}
+            at = slice(None) if members is None else members
+            rates[:, at] = chance(log_ratio).reshape(len(now), -1)
+            free[:, at] = instead(~accept.reshape(len(now), -1), tried[:, at], free[:, at])
+            taken.append(accept.reshape(len(now), -1))
+        if warmup:
+            steps = self.steps.learnt(memory["steps"], free, rates)
+            return {name: state[name]}, {**memory, "steps": steps}
+        share = np.concatenate(taken, axis=1).mean(axis=1)
+        return {name: state[name]}, counted(memory, share)
+
+    def end_warmup(self, memory: Memory) -> Memory:
+        return {**memory, "steps": self.steps.frozen(memory["steps"])}
+
+    def acceptance(self, memory: Memory) -> np.ndarray | None:
+        return memory["accepted"] / max(memory["moves"], 1)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _transform(self, values: Values) -> Transform:
+        """The map to the numbers that walk, given the parents."""
+        blanket = self.blanket
+        support = blanket.node.support  # None where its bounds depend on parents
+        if support is None and blanket.own is not None:
+            support = blanket.own.distribution(values)[0].support
+        assert support is not None
+        return walked(support, blanket.event_shape, self.unconstrained)
+
+    def _free(self, transform: Transform, value: np.ndarray) -> np.ndarray:
+        """The numbers that walk, shape (chains, elements, size)."""
+        return finite(transform.unconstrain(value)).reshape(
+            len(value), self.blanket.size, self.steps.size
+        )
+
+    def _volume(self, transform: Transform, free: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        log = transform.log_abs_det_jacobian(free.reshape(shape + self.free_shape))
+        return np.broadcast_to(log, shape)
+
+    def _outside(self, new: np.ndarray) -> np.ndarray | None:
+        """Proposals outside the support of a variable that has no density of its own."""
+        if self.blanket.own is not None or self.unconstrained:
+            return None
+        assert self.blanket.node.support is not None
+        return ~self.blanket.node.support.contains(new)
+
+
+def some_support(model: Model, name: str) -> Support:
+    """The support of a node; if its bounds depend on parents, that for some values of these."""
+    support = model[name].support
+    return model.evaluate(name, model.probe)[0].support if support is None else support
+
+
+def walked(support: Support, event_shape: tuple[int, ...], unconstrained: bool) -> Transform:
+    """The map from the numbers that walk to values: on a node's own scale, they are the values."""
+    if unconstrained:
+        return transform_of(support, event_shape)
+    return (Wrapped if support.kind == "circle" else Identity)(event_shape)
+
+
+def finite(free: np.ndarray) -> np.ndarray:
+    """Free numbers with those at a bound moved next to it."""
+    if np.isfinite(free).all():
+        return free
+    return np.clip(np.nan_to_num(free, nan=0.0), -_FAR, _FAR)
+
+
+def picked(
+    value: np.ndarray, log: np.ndarray, members: np.ndarray | None, blanket: Blanket
+) -> tuple[np.ndarray, np.ndarray]:
+    """A class of elements of a value ``(chains, *plates, *event)`` and of numbers ``(chains, *plates)``."""
+    if members is None:
+        return value, log
+    chains = len(value)
+    flat = value.reshape(chains, blanket.size, *blanket.event_shape)
+    return flat[:, members], log.reshape(chains, -1)[:, members]
+
+
+def counted(memory: Memory, share: np.ndarray) -> Memory:
+    """The memory with one more step, of which each chain accepted a share."""
+    return {**memory, "accepted": memory["accepted"] + share, "moves": memory["moves"] + 1}

@@ -1,0 +1,262 @@
+"""Slice sampling of numbers, all chains and all elements at once.
+
+References
+----------
+Neal (2003), Slice sampling, Annals of Statistics 31, sections 4.1 (stepping out, shrinkage) and 3 (integers).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.support import Support
+from bayesmc.errors import DensityError
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Values
+
+#: widths by which an interval may grow
+_GROWTH = 64
+#: shrinkages after which the density cannot be what it was
+_SHRINKAGES = 400
+#: shrunk intervals tried in one call, for arrays up to a size where calls cost more than numbers
+_AHEAD = 4
+_SMALL = 4096
+
+
+def slice_move(
+    log_density: Callable[[np.ndarray], np.ndarray],
+    x: np.ndarray,
+    width: np.ndarray,
+    rng: np.random.Generator,
+    low: Any = -np.inf,
+    high: Any = np.inf,
+) -> np.ndarray:
+    """One step from every element of ``x``, each on its own slice.
+
+    Parameters
+    ----------
+    log_density : callable
+        Log densities, up to a constant, at an array of the shape of ``x``, or with an axis in front.
+    width : ndarray
+        Size of the first interval, broadcasts to ``x``.
+    low, high : float or ndarray
+        Bounds of the support.
+
+    Raises
+    ------
+    DensityError
+        The density at ``x`` itself is zero, or no point was found.
+    """
+    left = x - width * rng.random(x.shape)
+    ends = np.stack([x, left, left + width])
+    bounds = np.stack([np.broadcast_to(low, x.shape), np.broadcast_to(high, x.shape)])
+    inside = (ends > bounds[0]) & (ends < bounds[1])
+    inside[0] = True
+    found = log_density(np.where(inside, ends, x))
+    if not (found[0] > -np.inf).all():
+        raise DensityError("the density is zero at the chain's own value")
+    level = found[0] - rng.standard_exponential(x.shape)
+    ends, going = ends[1:], (found[1:] > level) & inside[1:]
+    step = np.stack([np.broadcast_to(-width, x.shape), np.broadcast_to(width, x.shape)])
+    # the growth that is allowed is split at random, so that the way back is as likely
+    first = np.floor(_GROWTH * rng.random(x.shape))
+    left_over = np.stack([first, _GROWTH - 1 - first])
+    while True:
+        going &= left_over > 0
+        if not going.any():
+            break
+        ends = np.where(going, ends + step, ends)
+        left_over = left_over - going
+        going &= (ends > bounds[0]) & (ends < bounds[1])
+        if not going.any():
+            break
+        going &= log_density(np.where(going, ends, x)) > level
+    left, right = np.clip(ends, bounds[0], bounds[1])
+    return _shrink(log_density, x, level, left, right, rng)
+
+
+def _shrink(
+    log_density: Callable[[np.ndarray], np.ndarray],
+    x: np.ndarray,
+    level: np.ndarray,
+    left: np.ndarray,
+    right: np.ndarray,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Draws from the intervals, shrunk towards ``x`` at every miss, until all have hit.
+
+    Where the next interval lies does not depend on the density, so small arrays try several in one call.
+    """
+    ahead = _AHEAD if x.size <= _SMALL else 1
+    result = x
+    open_ = np.ones(x.shape, dtype=bool)
+    for _ in range(_SHRINKAGES // ahead):
+        tried = np.empty((ahead, *x.shape))
+        for k in range(ahead):
+            tried[k] = left + rng.random(x.shape) * (right - left)
+            below = tried[k] < x
+            left = np.where(below, tried[k], left)
+            right = np.where(below, right, tried[k])
+        good = log_density(np.where(open_, tried, x)) > level
+        for k in range(ahead):
+            hit = open_ & good[k]
+            result = np.where(hit, tried[k], result)
+            open_ = open_ & ~hit
+        if not open_.any():
+            return result
+    raise DensityError(
+        "slice sampling found no point at least as likely as the chain's own; the log density changes "
+        "from call to call, or is NaN nearby"
+    )
+
+
+def is_half_line(support: Support) -> bool:
+    """Whether a support is everything above one constant."""
+    if support.kind != "interval" or not support.is_single:
+        return False
+    return bool(np.isfinite(support.low).all() and np.all(support.high == np.inf))
+
+
+class Slice(Kernel):
+    """Slice sampling of a node of numbers; components of a vector one after the other."""
+
+    label = "slice"
+
+    def __init__(self, blanket: Blanket, reason: str = "") -> None:
+        self.blanket = blanket
+        self.names = (blanket.name,)
+        self.match = reason
+        self.is_integer = blanket.node.is_discrete
+        support = blanket.node.support
+        self.on_logs = support is not None and is_half_line(support)
+
+    def start(self, values: Values, chains: int) -> Memory:
+        spread = np.ones(self.blanket.node.value_shape)
+        return {"width": spread, "moved": np.zeros_like(spread), "count": 0}
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        blanket = self.blanket
+        name = blanket.name
+        state = values
+        for members in blanket.classes:
+            for component in np.ndindex(blanket.event_shape):
+                new = self._move(state, members, component, memory, rng)
+                state = {**state, name: blanket.moved(state, new, members)}
+        if warmup:
+            low = blanket.node.support.low if self.on_logs else None  # type: ignore[union-attr]
+            ends = (values[name], state[name])
+            before, after = ends if low is None else (np.log(end - low) for end in ends)
+            memory = self._adapted(memory, before, after)
+        return {name: state[name]}, memory
+
+    def _move(
+        self,
+        values: Values,
+        members: np.ndarray | None,
+        component: tuple[int, ...],
+        memory: Memory,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        """The node's value (of a class) with one component moved."""
+        blanket = self.blanket
+        now = blanket.current(values, members)
+        at = (Ellipsis, *component)
+        x = now[at].astype(float)
+        width = memory["width"][at]
+        if members is not None:
+            width = width.ravel()[members]
+        low, high = self._bounds(values, members, component)
+        if self.is_integer:  # a number uniform in the cell of each integer
+            x = x + rng.random(x.shape)
+            high = high + 1.0
+        start, here = low, x
+        if self.on_logs:  # scales differ by factors: near zero an additive step would take forever
+            x = np.log(x - start)
+            low = high = np.inf
+            low = -low
+
+        def log_density(tried: np.ndarray) -> np.ndarray:
+            if self.is_integer:
+                tried = np.floor(tried)
+            logs = tried
+            inside: Any = True
+            if self.on_logs:
+                tried = start + np.exp(tried)
+                inside = (tried > start) & (tried < np.inf)
+                tried = np.where(inside, tried, here)
+            if not component:
+                candidate = tried
+            else:
+                candidate = np.array(np.broadcast_to(now, tried.shape + blanket.event_shape))
+                candidate[at] = tried
+            log = blanket.log_density(values, candidate, members)
+            if self.on_logs:
+                log = np.where(inside, log + logs, -np.inf)
+            return np.broadcast_to(log, tried.shape)
+
+        try:
+            moved = slice_move(log_density, x, width, rng, low, high)
+        except DensityError as error:
+            raise DensityError(f"node {blanket.name!r}: {error}") from error
+        if self.is_integer:
+            moved = np.floor(moved)
+        if self.on_logs:
+            moved = start + np.exp(moved)
+        if not component:
+            return moved.astype(now.dtype, copy=False)
+        new = now.copy()
+        new[at] = moved
+        return new
+
+    def _bounds(
+        self, values: Values, members: np.ndarray | None, component: tuple[int, ...]
+    ) -> tuple[Any, Any]:
+        """Bounds of the support given the parents, broadcasting to ``(chains, *plates)`` or the class."""
+        blanket = self.blanket
+        if blanket.own is None:
+            support = blanket.node.support
+        else:
+            support = blanket.own.distribution(values)[0].support
+        assert support is not None
+        if support.kind == "product":
+            support = _part(support, component[0])
+        if support.kind not in ("interval", "integers"):
+            return -np.inf, np.inf
+        ends = []
+        for end in (support.low, support.high):
+            end = np.asarray(end, dtype=float)
+            if members is not None and end.ndim:
+                lead = end.shape[: max(end.ndim - len(blanket.node.plates), 0)]
+                end = np.broadcast_to(end, lead + blanket.node.plate_shape)
+                end = end.reshape(*lead, -1)[..., members]
+            ends.append(end)
+        return ends[0], ends[1]
+
+    def _adapted(self, memory: Memory, before: np.ndarray, after: np.ndarray) -> Memory:
+        """Widths follow how far steps go: about three times the mean, which is near the slice's size."""
+        count = memory["count"] + 1
+        step = np.abs(after.astype(float) - before).mean(axis=0)
+        rate = max(1.0 / count, 0.02)
+        moved = (1 - rate) * memory["moved"] + rate * step
+        width = np.where(moved > 0, 3.0 * moved, memory["width"])
+        if self.is_integer:
+            width = np.maximum(np.ceil(width), 1.0)
+        return {"width": width, "moved": moved, "count": count}
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _part(support: Support, component: int) -> Support:
+    """The support of one component of a product."""
+    for part, size in support.parts:
+        component -= max(size, 1)
+        if component < 0:
+            return part
+    raise AssertionError("a product has a part for every component")

@@ -1,0 +1,364 @@
+"""Finite nodes whose whole Markov blanket is finite tables: draws by lookup.
+
+Where the blanket has few configurations the full conditional stands in a table, and a draw is a gather and
+some comparisons; nodes, and small blocks of nodes, that do not meet are drawn together. Where it has many,
+or where nodes live in plates, the log rows of the terms are gathered and summed. Anything else is left to
+the general kernels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from bayesmc.errors import ZeroProbabilityError
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.conditionals import Conditional, FiniteTerm, FiniteTerms, conditional_of
+from bayesmc.kernels.enumerate import draw_states
+from bayesmc.network import Model
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target, Values
+
+#: conditionals of more states are drawn by binary search
+_COMPARED = 6
+_BITS = 31
+#: table entries of a group: positions are computed in float32, which holds whole numbers up to 2**24
+_GROUP_ENTRIES = 1 << 22
+#: conditionals of a group: its matrix of strides stays small beside the states that it multiplies
+_GROUP_SIZE = 48
+
+
+def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
+    """The kernel of one finite node whose own density and children are tables; None where they are not.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    terms : FiniteTerms, optional
+        Tables made before, to be shared between nodes.
+    """
+    if blanket.node.domain is None:
+        return None
+    terms = FiniteTerms(blanket.target) if terms is None else terms
+    conditional = conditional_of(terms, (blanket.name,))
+    if conditional is not None:
+        return TableSweep(blanket.target, (conditional,))
+    around = terms.around((blanket.name,))
+    if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
+        return None
+    return RowSums(blanket, around)
+
+
+def table_kernels(
+    target: Target, blocks: Sequence[Sequence[str]], terms: FiniteTerms | None = None
+) -> tuple[list[Kernel], list[tuple[str, ...]]]:
+    """One kernel for all nodes and blocks whose full conditionals are tables, and those that are left.
+
+    Parameters
+    ----------
+    blocks : sequence of sequence of str
+        Single nodes as blocks of one; a node may stand in several.
+    """
+    terms = FiniteTerms(target) if terms is None else terms
+    found = [conditional_of(terms, block) for block in blocks]
+    ready = [c for c in found if c is not None]
+    left = [tuple(b) for b, c in zip(blocks, found, strict=True) if c is None]
+    return ([TableSweep(target, ready)] if ready else []), left
+
+
+class TableSweep(Kernel):
+    """Draws nodes and blocks from tabulated full conditionals, those that do not meet at once.
+
+    Parameters
+    ----------
+    conditionals : sequence of Conditional
+        Each is drawn once per step.
+    """
+
+    label = "enumerate"
+    match = "full conditional tabulated over the Markov blanket"
+
+    def __init__(self, target: Target, conditionals: Sequence[Conditional]) -> None:
+        self.conditionals = tuple(conditionals)
+        parts = [p for colour in _colours(self.conditionals) for p in _parts(colour)]
+        self.names = tuple(dict.fromkeys(n for part in parts for c in part for n in c.names))
+        outside = dict.fromkeys(n for c in self.conditionals for n in c.blanket)
+        self.rows = (*self.names, *(n for n in outside if n not in self.names))
+        place = {n: i for i, n in enumerate(self.rows)}
+        self.groups = [_Group(part, place) for part in parts]
+        domains = [target.model[n].domain for n in self.names]
+        self.dtypes = [d.dtype for d in domains if d is not None]
+        self.dtype = max(self.dtypes, key=lambda d: d.itemsize)
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        chains = len(values[self.names[0]])
+        # one more row of ones carries where the tables of a group begin
+        codes = np.ones((len(self.rows) + 1, chains), dtype=np.float32)
+        for row, name in enumerate(self.rows):
+            codes[row] = values[name]
+        draws = sum(group.count for group in self.groups)
+        bits = _random_bits(rng, (draws, chains))
+        begin = 0
+        for group in self.groups:
+            group.draw(codes, bits[begin : begin + group.count])
+            begin += group.count
+        new = codes[: len(self.names)].astype(self.dtype)
+        new.flags.writeable = False
+        if self.dtype.itemsize == 1:
+            return dict(zip(self.names, new, strict=True)), memory
+        moved = zip(self.names, new, self.dtypes, strict=True)
+        return {n: row.astype(dtype, copy=False) for n, row, dtype in moved}, memory
+
+
+class RowSums(Kernel):
+    """Draws a finite node from the sum of the log rows that the rest selects, state by state.
+
+    Parameters
+    ----------
+    blanket : Blanket
+        All its relations are aligned.
+    around : sequence of FiniteTerm
+        All terms that the node enters.
+    """
+
+    label = "enumerate"
+    match = "sum of tabulated log rows"
+
+    def __init__(self, blanket: Blanket, around: Sequence[FiniteTerm]) -> None:
+        self.blanket = blanket
+        self.names = (blanket.name,)
+        domain = blanket.node.domain
+        assert domain is not None
+        self.domain = domain
+        relations = {c.term.name: c.relation for c in blanket.children}
+        self.parts = [
+            (_Rows(blanket.target.model, table, blanket.name), relations.get(table.term.name))
+            for table in around
+        ]
+
+    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Log full conditional of every state up to a constant, shape ``(states, chains, *plates)``."""
+        now = values[self.blanket.name]
+        total = np.zeros((self.domain.size, *now.shape))
+        for rows, relation in self.parts:
+            log = rows(values)
+            if relation is not None and rows.shape:
+                log = relation.collect(log, rows.shape)
+            elif not rows.shape:  # the node has no plates, else some node of the scope would have
+                log = log.reshape(log.shape[:2])
+            total += log
+        return total
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        name = self.blanket.name
+        new = draw_states(self.log_density(values), rng, name).astype(self.domain.dtype)
+        free = self.blanket.target.free_elements(name)
+        if free is not None:
+            new = self.blanket.moved(values, new.reshape(len(new), -1)[:, free], free)
+        return {name: new}, memory
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Group:
+    """Conditionals that are drawn together: no two meet, and all are compared or all searched.
+
+    Positions in their tables are one product of a matrix of strides with the states of all nodes.
+    """
+
+    def __init__(self, part: Sequence[Conditional], place: Mapping[str, int]) -> None:
+        self.part = tuple(part)
+        self.count = len(part)
+        self.width = _width(part[0])
+        self.columns, self.strides = _strides(part, place, self.width)
+        self.edges = _searched(part, self.width) if self.width > 1 else _compared(part)
+        dead = np.concatenate([c.probs.sum(axis=1) == 0 for c in part])
+        self.impossible = dead if dead.any() else None
+        self.written = [np.array([place[n] for n in c.names]) for c in part]
+        self.states = [np.indices(c.cards).reshape(len(c.cards), -1) for c in part]
+        # single nodes are stored as they are drawn, neighbouring rows as one slice
+        self.rows: slice | np.ndarray | None = None
+        if all(len(c.names) == 1 for c in part):
+            self.rows = np.concatenate(self.written)
+            first = int(self.rows[0])
+            if (self.rows == np.arange(first, first + self.count)).all():
+                self.rows = slice(first, first + self.count)
+
+    def draw(self, codes: np.ndarray, bits: np.ndarray) -> None:
+        """Replace the states of its nodes in ``codes`` (nodes and a row of ones, chains)."""
+        read = codes if self.columns is None else codes[self.columns]
+        index = (self.strides @ read).astype(np.intp)
+        if self.impossible is not None:
+            self._check(index)
+        new = self._search(index, bits) if self.width > 1 else self._compare(index, bits)
+        if self.rows is not None:
+            codes[self.rows] = new
+            return
+        for rows, states, drawn in zip(self.written, self.states, new, strict=True):
+            codes[rows] = states[:, drawn]
+
+    def _compare(self, index: np.ndarray, bits: np.ndarray) -> np.ndarray:
+        new = np.zeros(bits.shape, dtype=np.uint8)
+        for count, edges in self.edges:
+            passed = bits[:count] >= edges.take(index[:count])
+            new[:count] += passed.view(np.uint8)
+        return new
+
+    def _search(self, index: np.ndarray, bits: np.ndarray) -> np.ndarray:
+        """Binary search in the row of each draw; the row's last edge is never exceeded."""
+        _, edges = self.edges[0]
+        at = index.copy()
+        step = self.width // 2
+        while step:
+            at += step * (bits >= edges.take(at + (step - 1)))
+            step //= 2
+        return at - index
+
+    def _check(self, index: np.ndarray) -> None:
+        assert self.impossible is not None
+        bad = self.impossible.take(index // self.width)
+        if bad.any():
+            names = self.part[int(np.argwhere(bad)[0, 0])].names
+            what = f"node {names[0]!r}" if len(names) == 1 else f"nodes {list(names)}"
+            raise ZeroProbabilityError(
+                f"{what}: no state has positive probability given the others; the chain is at an "
+                "impossible configuration"
+            )
+
+
+class _Rows:
+    """Log factors of one term for all states of a node, gathered by the states of the others."""
+
+    def __init__(self, model: Model, table: FiniteTerm, name: str) -> None:
+        self.shape = table.log.shape[len(table.scope) :]
+        self.plates = table.plates
+        axis = table.scope.index(name)
+        self.others = [(n, model[n].plates) for n in table.scope if n != name]
+        log = np.moveaxis(table.log, axis, 0)
+        self.log = np.ascontiguousarray(log.reshape(len(log), -1))
+        cards = log.shape[1 : len(table.scope)]
+        elements = math.prod(self.shape)
+        self.strides = [math.prod(cards[i + 1 :]) * elements for i in range(len(cards))]
+        self.offset = np.arange(elements).reshape(self.shape)
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Shape ``(states, chains or 1, *shape)``."""
+        index = self.offset[None]
+        for (name, plates), stride in zip(self.others, self.strides, strict=True):
+            at = _placed(values[name], plates, self.plates) if self.shape else values[name]
+            index = index + at.astype(np.intp) * stride
+        return self.log.take(index, axis=1)
+
+
+def _placed(value: np.ndarray, own: Sequence[str], plates: Sequence[str]) -> np.ndarray:
+    """``(chains, *own)`` with its axes where ``plates`` has them, size one elsewhere."""
+    order = sorted(range(len(own)), key=lambda i: plates.index(own[i]))
+    moved = value.transpose(0, *(1 + i for i in order))
+    sizes = dict(zip((own[i] for i in order), moved.shape[1:], strict=True))
+    return moved.reshape(len(value), *(sizes.get(p, 1) for p in plates))
+
+
+def _colours(conditionals: Sequence[Conditional]) -> list[list[Conditional]]:
+    """Sets in which nobody moves what another reads or moves, greedily in the given order."""
+    sets: list[tuple[list[Conditional], set[str], set[str]]] = []
+    for c in conditionals:
+        near = {*c.names, *c.blanket}
+        at = (s for s in sets if not s[1] & near and not s[2] & set(c.names))
+        chosen = next(at, None)
+        if chosen is None:
+            chosen = ([], set(), set())
+            sets.append(chosen)
+        chosen[0].append(c)
+        chosen[1].update(c.names)
+        chosen[2].update(c.blanket)
+    return [members for members, _, _ in sets]
+
+
+def _parts(colour: Sequence[Conditional]) -> Iterator[list[Conditional]]:
+    """A colour cut into groups: alike in how they are drawn, of moderate size, many states first."""
+    by_width: dict[int, list[Conditional]] = {}
+    for c in colour:
+        by_width.setdefault(_width(c), []).append(c)
+    for width, members in by_width.items():
+        part: list[Conditional] = []
+        entries = 0
+        for c in sorted(members, key=lambda c: -c.states):
+            size = len(c.probs) * width
+            if part and (entries + size > _GROUP_ENTRIES or len(part) == _GROUP_SIZE):
+                yield part
+                part, entries = [], 0
+            part.append(c)
+            entries += size
+        yield part
+
+
+def _width(c: Conditional) -> int:
+    """Entries of a row to be searched; 1 where states are compared one by one."""
+    return 1 if c.states <= _COMPARED else 1 << (c.states - 1).bit_length()
+
+
+def _strides(
+    part: Sequence[Conditional], place: Mapping[str, int], width: int
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """Rows of the states that are read (None for all), and their weights, shape (part, rows)."""
+    ones = len(place)
+    used = sorted({place[n] for c in part for n in c.blanket} | {ones})
+    columns = np.array(used) if 2 * len(used) < ones else None
+    at = {row: i for i, row in enumerate(used)} if columns is not None else range(ones + 1)
+    strides = np.zeros((len(part), len(at)), dtype=np.float32)
+    begin = 0
+    for row, c in enumerate(part):
+        for name, stride in zip(c.blanket, c.strides, strict=True):
+            strides[row, at[place[name]]] = stride * width
+        strides[row, at[ones]] = begin
+        begin += len(c.probs) * width
+    return columns, strides
+
+
+def _compared(part: Sequence[Conditional]) -> list[tuple[int, np.ndarray]]:
+    """For each k the number of conditionals that have a k-th edge, and those edges over all rows."""
+    edges = [_thresholds(c.probs) for c in part]
+    found = []
+    for k in range(max(e.shape[1] for e in edges)):
+        having = [e[:, k] for e in edges if e.shape[1] > k]
+        found.append((len(having), np.concatenate(having)))
+    return found
+
+
+def _searched(part: Sequence[Conditional], width: int) -> list[tuple[int, np.ndarray]]:
+    """All edges, each row padded to ``width`` with what no draw exceeds."""
+    padded = []
+    for c in part:
+        rows = np.full((len(c.probs), width), 1 << _BITS, dtype=np.uint32)
+        rows[:, : c.states - 1] = _thresholds(c.probs)
+        padded.append(rows.ravel())
+    return [(len(part), np.concatenate(padded))]
+
+
+def _thresholds(probs: np.ndarray) -> np.ndarray:
+    """Cumulative rows as integers of ``_BITS`` bits, shape (rows, states - 1).
+
+    States of probability zero have no width at all.
+    """
+    cumulative = np.cumsum(probs, axis=1)
+    last = cumulative[:, -1:]
+    edges = np.rint(cumulative / np.where(last > 0, last, 1.0) * float(1 << _BITS))
+    edges = edges.astype(np.uint32)
+    top = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
+    edges[np.arange(probs.shape[1]) >= top[:, None]] = 1 << _BITS
+    return edges[:, :-1]
+
+
+def _random_bits(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """Independent uniform integers below ``2**_BITS``: cheaper than floats, and as fine as needed."""
+    count = math.prod(shape)
+    words = rng.bit_generator.random_raw((count + 1) // 2).view(np.uint32)[:count]
+    words >>= np.uint32(32 - _BITS)
+    return words.reshape(shape)

@@ -1,0 +1,411 @@
+"""Posteriors from Markov chains: draws or sums that know their chains, and where to go on from.
+
+How a chain moves is the engines' affair; here stands what is asked of its draws. Figures for chains whose
+every draw comes from the next member of an ensemble are taken over blocks of one draw per member.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from bayesmc import diagnostics
+from bayesmc.distributions import marking_invalid
+from bayesmc.network import CompiledNode, Model, Observed, Problem
+from bayesmc.results.draws import DrawsPosterior
+from bayesmc.results.posterior import Posterior
+from bayesmc.results.sums import Sums, SumsPosterior
+
+#: batch means kept per chain, once there are as many; twice as many are merged in pairs
+_BATCHES = 16
+#: draws that summaries take in at once
+_BUFFER = 32
+#: numbers that the buffers of all nodes may hold together
+_BUFFER_ELEMENTS = 1 << 21
+#: numbers that the batch means of one node may take; a larger node has no errors in summaries
+_BATCH_ELEMENTS = 1 << 22
+
+
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Where chains stand after their last kept draw, to go on from.
+
+    Attributes
+    ----------
+    state : dict
+        The sampler's state.
+    generator : dict
+        State of the bit generator.
+    values : dict
+        Stored values of the last draw.
+    observed : dict
+        The evidence, as stored.
+    densities : dict or None
+        Node or potential -> its log density at ``values`` (a deterministic node's sum); filled in by
+        pickling, which loses the functions, so that another function is noticed.
+    """
+
+    state: Mapping[str, Any]
+    generator: Mapping[str, Any]
+    values: Mapping[str, np.ndarray]
+    observed: Mapping[str, Observed]
+    densities: Mapping[str, float] | None = None
+
+    def fits(self, model: Model, problem: Problem) -> bool:
+        """Whether it belongs to this question, though the functions of its ``model`` are lost."""
+        if list(model.nodes) != list(problem.model.nodes) or model.sizes != problem.model.sizes:
+            return False
+        if any(_outline(node) != _outline(problem.model[n]) for n, node in model.nodes.items()):
+            return False
+        seen = problem.observed
+        if self.observed.keys() != seen.keys() or not all(
+            np.array_equal(o.value, seen[n].value) and np.array_equal(o.mask, seen[n].mask)  # type: ignore[arg-type]
+            for n, o in self.observed.items()
+        ):
+            return False
+        before, now = self.densities or {}, _densities(problem, self.values)
+        return before.keys() == now.keys() and all(
+            math.isclose(now[n], value, rel_tol=1e-9, abs_tol=1e-9) or now[n] == value
+            for n, value in before.items()
+        )
+
+
+class _Chains(Posterior):
+    """What a posterior from Markov chains tells besides."""
+
+    #: block of nodes -> share of accepted proposals since the warmup, shape (chain,)
+    acceptance: dict[str, np.ndarray]
+    #: members that a chain's draws come from in turn; 1 for an ordinary chain
+    ensemble_size: int
+    #: sweeps before the first draw, during which the engine adapted
+    warmup: int
+    checkpoint: Checkpoint | None
+
+    def _describe(
+        self,
+        shape: tuple[int, int],
+        acceptance: Mapping[str, np.ndarray],
+        ensemble_size: int,
+        warmup: int,
+        checkpoint: Checkpoint | None,
+    ) -> None:
+        self._chains_and_draws = shape
+        self.acceptance = dict(acceptance)
+        self.ensemble_size = ensemble_size
+        self.warmup = warmup
+        self.checkpoint = checkpoint
+
+    def _title(self) -> str:
+        chains, draws = self._chains_and_draws
+        many = f"{chains} chain{'s' if chains > 1 else ''} of {draws} draws"
+        return f"{super()._title()}: {many} after {self.warmup} of warmup"
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        point = self.checkpoint
+        if point is not None and point.densities is None and self.problem is not None:
+            densities = _densities(self.problem, point.values)
+            state["checkpoint"] = replace(point, densities=densities)
+        return state
+
+
+class ChainsPosterior(_Chains, DrawsPosterior):
+    """Draws of Markov chains, shape ``(chain, draw, *plates, *event)``.
+
+    Parameters
+    ----------
+    acceptance : dict
+        Block of nodes -> acceptance rate since the warmup, shape (chain,); none where all is exact.
+    ensemble_size : int
+        Members that a chain's draws come from in turn.
+    warmup : int
+    checkpoint : Checkpoint, optional
+        What ``resume`` needs.
+
+    Notes
+    -----
+    With an ensemble, neighbouring draws are nearly independent while those ``ensemble_size`` apart are
+    not, so errors, effective sizes and R-hat are those of block means (``diagnostics.chain_statistic``).
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        engine: Any,
+        stored: Mapping[str, np.ndarray],
+        shape: tuple[int, int],
+        acceptance: Mapping[str, np.ndarray] | None = None,
+        ensemble_size: int = 1,
+        warmup: int = 0,
+        checkpoint: Checkpoint | None = None,
+    ) -> None:
+        super().__init__(problem, engine, stored, shape)
+        self._describe(shape, acceptance or {}, ensemble_size, warmup, checkpoint)
+
+    def mcse(self, what: Any) -> np.ndarray:
+        return diagnostics.chain_statistic("mcse", self._scalars(what), self.ensemble_size)
+
+    def ess(self, what: Any) -> np.ndarray:
+        return diagnostics.chain_statistic("ess", self._scalars(what), self.ensemble_size)
+
+    def rhat(self, what: Any) -> np.ndarray:
+        return diagnostics.chain_statistic("rhat", self._scalars(what), self.ensemble_size)
+
+    def _predict(self, *arguments: Any) -> DrawsPosterior:
+        drawn = super()._predict(*arguments)
+        assert drawn.problem is not None
+        return ChainsPosterior(
+            drawn.problem,
+            self.engine,
+            drawn._stored,
+            self._shape,
+            self.acceptance,
+            self.ensemble_size,
+            self.warmup,
+        )
+
+
+class ChainsSums(_Chains, SumsPosterior):
+    """Means, variances and probabilities of Markov chains, summed as they went.
+
+    Monte Carlo errors come from batch means, never below those of independent draws, and effective sizes
+    from the errors; R-hat compares halves of the chains by their batch means, without ranks. They are NaN
+    with fewer than four batches, and for nodes of very many numbers.
+
+    References
+    ----------
+    Flegal and Jones (2010), Annals of Statistics 38(2).
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        engine: Any,
+        running: RunningChains,
+        acceptance: Mapping[str, np.ndarray],
+        warmup: int,
+        checkpoint: Checkpoint,
+    ) -> None:
+        super().__init__(problem, engine, running.total(), False)
+        self._running = running
+        shape = (running.chains, running.draws)
+        self._describe(shape, acceptance, running.ensemble, warmup, checkpoint)
+
+    def mcse(self, what: Any) -> np.ndarray:
+        independent = super().mcse(what)
+        series = self._batch_means(what)
+        if series is None:
+            return np.where(independent == 0, 0.0, np.nan)
+        batches, chains = series.shape[:2]
+        error = np.sqrt(series.var(axis=(0, 1), ddof=1) / (batches * chains))
+        return np.maximum(error, independent)
+
+    def ess(self, what: Any) -> np.ndarray:
+        error, independent = self.mcse(what), super().mcse(what)
+        with np.errstate(invalid="ignore"):
+            share = np.where(independent == 0, 1.0, independent / error)
+        return self._sums.draws * share**2
+
+    def rhat(self, what: Any) -> np.ndarray:
+        variance = self._sums.draws * super().mcse(what) ** 2
+        series = self._batch_means(what)
+        if series is None:
+            return np.full(variance.shape, np.nan)
+        half = len(series) // 2
+        means = np.concatenate([series[:half].mean(axis=0), series[-half:].mean(axis=0)])
+        within = variance - means.var(axis=0)
+        draws = self._running.draws / 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = means.var(axis=0, ddof=1) / np.where(within > 1e-12 * variance, within, 0.0)
+            rhat = np.sqrt((draws - 1) / draws + ratio)
+        return np.where(variance > 0, rhat, np.nan)
+
+    def _batch_means(self, name: str) -> np.ndarray | None:
+        """Means of batches, shape ``(batch, chain, *figure)``, of what the node's mean errs like."""
+        series = self._running.batch_means(name)
+        if series is None or len(series) < 4:
+            return None
+        node = self._node(name)
+        shape = series.shape[:2] + node.value_shape
+        if self._is_circular(name):
+            cosine, sine = np.moveaxis(series, 2, 0)
+            mean, turns = self.mean(name), self._sums.turns(name)[0, :2] / self._sums.weight[0]
+            cosine, sine = cosine.reshape(shape), sine.reshape(shape)
+            return (sine * np.cos(mean) - cosine * np.sin(mean)) / np.hypot(*turns)
+        labelled = node.domain is not None and node.domain.labels is not None
+        return series.reshape((*shape, -1) if labelled else shape)
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        return {**state, "_running": self._running.with_model(state["model"])}
+
+
+class RunningChains:
+    """Sums and batch means of chains, of constant size.
+
+    Draws are taken in by the buffer, and a buffer always holds the same number of them, so that what is
+    summed does not depend on where a run was cut.
+
+    Parameters
+    ----------
+    model : Model
+    names : tuple of str
+    chains, ensemble : int
+    """
+
+    def __init__(self, model: Model, names: tuple[str, ...], chains: int, ensemble: int) -> None:
+        self.chains = chains
+        self.ensemble = ensemble
+        self.draws = 0
+        self._sums = Sums(model, names)
+        self._pending = 0
+        self._buffers: dict[str, np.ndarray] = {}
+        self._constant: dict[str, np.ndarray] = {}
+        self._means: dict[str, _BatchMeans] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self._sums.names
+
+    def add(self, values: Mapping[str, np.ndarray]) -> None:
+        """Take in one draw of every chain, ``(chain, *plates, *event)``, or without chains if constant."""
+        if not self.draws:
+            self._prepare(values)
+        at = self._pending
+        for name, buffer in self._buffers.items():
+            buffer[at] = values[name]
+        self.draws += 1
+        self._pending += 1
+        if self._pending == self._size:
+            self._empty()
+
+    def total(self) -> Sums:
+        """The sums over all draws so far, for reading only."""
+        if not self._pending:
+            return self._sums
+        model = self._sums.model
+        sums = copy.deepcopy(self._sums, {id(model): model})
+        self._add_to(sums)
+        return sums
+
+    def is_batched(self, name: str) -> bool:
+        """Whether batch means are kept: not of constants, nor of nodes of very many numbers."""
+        return name in self._means
+
+    def batch_means(self, name: str) -> np.ndarray | None:
+        """Means of equal batches, shape ``(batch, chain, figures...)``; None where there are none."""
+        means = self._means.get(name)
+        return None if means is None else means.values
+
+    def with_model(self, model: Model) -> RunningChains:
+        """The same for another compilation of the same net, independent of this one."""
+        return copy.deepcopy(self, {id(self._sums.model): model})
+
+    def _prepare(self, values: Mapping[str, np.ndarray]) -> None:
+        """Decide from the first draw what is constant, and how many draws make a buffer."""
+        moving = {}
+        for name in self.names:
+            node = self._sums.model[name]
+            if values[name].ndim == len(node.value_shape):
+                self._constant[name] = np.array(values[name])
+            else:
+                moving[name] = node
+        numbers = self.chains * sum(math.prod(node.value_shape) for node in moving.values())
+        draws = min(_BUFFER, max(1, _BUFFER_ELEMENTS // max(numbers, 1)))
+        self._size = self.ensemble * max(1, draws // self.ensemble)
+        for name, node in moving.items():
+            dtype = stored_dtype(node, values[name])
+            shape = (self._size, self.chains, *node.value_shape)
+            self._buffers[name] = np.empty(shape, dtype=dtype)
+            width = math.prod(_figures(node, values[name][None]).shape[2:])
+            if 2 * _BATCHES * self.chains * width <= _BATCH_ELEMENTS:
+                self._means[name] = _BatchMeans()
+
+    def _empty(self) -> None:
+        self._add_to(self._sums)
+        for name, means in self._means.items():
+            means.add(_figures(self._sums.model[name], self._buffers[name]).mean(axis=0))
+        self._pending = 0
+
+    def _add_to(self, sums: Sums) -> None:
+        count = self._pending * self.chains
+        values = {
+            n: b[: self._pending].reshape(count, *b.shape[2:]) for n, b in self._buffers.items()
+        }
+        sums.add({**self._constant, **values}, 0.0, count)
+
+
+def stored_dtype(node: CompiledNode, values: np.ndarray) -> np.dtype:
+    """The type that draws of a node are kept in: the smallest for positions of a finite one."""
+    return values.dtype if node.domain is None else node.domain.dtype
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _BatchMeans:
+    """Means of equally long batches; when there are too many, neighbours are merged."""
+
+    def __init__(self) -> None:
+        self._kept: list[np.ndarray] = []
+        self._length = 1
+        self._sum: Any = 0.0
+        self._count = 0
+
+    def add(self, mean: np.ndarray) -> None:
+        """Take in the mean of one more buffer, shape ``(chain, ...)``."""
+        self._sum = self._sum + mean
+        self._count += 1
+        if self._count < self._length:
+            return
+        self._kept.append(self._sum / self._length)
+        self._sum, self._count = 0.0, 0
+        if len(self._kept) == 2 * _BATCHES:
+            pairs = zip(self._kept[::2], self._kept[1::2], strict=True)
+            self._kept = [(a + b) / 2 for a, b in pairs]
+            self._length *= 2
+
+    @property
+    def values(self) -> np.ndarray | None:
+        return np.stack(self._kept) if self._kept else None
+
+
+def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
+    """What the answers about a node are means of, shape ``(draw, chain, ...)``."""
+    if node.domain is None:
+        if node.support is not None and node.support.kind == "circle":
+            return np.stack([np.cos(draws), np.sin(draws)], axis=2)
+        return draws
+    if node.domain.labels is None:
+        return np.take(np.asarray(node.domain.numbers, dtype=float), draws)
+    return (draws[..., None] == np.arange(node.domain.size)).astype(float)
+
+
+def _outline(node: CompiledNode) -> tuple[Any, ...]:
+    """What can be compared of a node whose function is lost."""
+    arrays = (node.declaration.probs, node.declaration.value)
+    tables = tuple(None if a is None else (a.shape, a.tobytes()) for a in arrays)
+    states = None if node.domain is None else node.domain.states
+    return (node.kind, node.parents, node.plates, node.value_shape, states, *tables)
+
+
+def _densities(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Log density of every node and potential at some draws, summed; a deterministic node's values."""
+    model = problem.model
+    at = {**problem.inputs, **values}
+    found = {name: float(np.sum(value)) for name, value in problem.inputs.items()}
+    with marking_invalid(), np.errstate(all="ignore"):
+        for name, node in model.nodes.items():
+            if node.is_stochastic and node.declaration.source in ("function", "table"):
+                given, _ = model.evaluate(name, at)
+                found[name] = float(np.sum(model.log_density(name, given, at[name])))
+            elif node.kind == "deterministic":
+                found[name] = float(np.sum(model.evaluate(name, at)[0], dtype=float))
+        for name in model.potentials:
+            found[f"potential {name}"] = float(np.sum(model.potential(name, at)))
+    return found

@@ -1,0 +1,235 @@
+"""The full conditional of one node: its own density and the terms it enters, element by element."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.network.model import arguments_of, call, fit
+from bayesmc.plates import Lookups, PlateArray
+from bayesmc.shapes import Shape
+from bayesmc.structure.colouring import colours
+from bayesmc.structure.relation import Relation, relation_of
+from bayesmc.structure.target import Target, Term, Values
+
+
+@dataclass(frozen=True, eq=False)
+class Child:
+    """A term that a node enters other than as its own density, and how their elements relate."""
+
+    term: Term
+    relation: Relation
+
+
+class Blanket:
+    """The full conditional of a chain node up to a constant.
+
+    Attributes
+    ----------
+    own : Term or None
+        The node's own density (a variable of a factor graph has none).
+    children : tuple of Child
+    classes : tuple
+        Sets of flat elements to be updated in turn, each of elements that are independent given all
+        others; ``(None,)`` where all can move at once.
+    path : tuple of str
+        Deterministic nodes to recompute when the node moves.
+    """
+
+    def __init__(self, target: Target, name: str) -> None:
+        self.target = target
+        self.name = name
+        self.node = target.model[name]
+        self.own = target.terms.get(name)
+        self.path = target.below((name,))
+        self.children = tuple(
+            Child(term, relation_of(target, name, term))
+            for term in target.terms_of((name,))
+            if term is not self.own
+        )
+        self.size = math.prod(self.node.plate_shape)
+        self.classes = _classes(self)
+        #: whether candidates may have size 1 along plates: every term broadcasts them
+        self.broadcasts = all(c.relation.kind == "aligned" for c in self.children)
+
+    @property
+    def event_shape(self) -> Shape:
+        return self.node.event_shape
+
+    def current(self, values: Mapping[str, np.ndarray], members: np.ndarray | None) -> np.ndarray:
+        """The node's value ``(chains, *plates, *event)``; of a class ``(chains, members, *event)``."""
+        value = values[self.name]
+        if members is None:
+            return value
+        return self._flat(value)[(slice(None), members)]
+
+    def moved(
+        self, values: Mapping[str, np.ndarray], new: np.ndarray, members: np.ndarray | None
+    ) -> np.ndarray:
+        """The node's whole value with a class replaced."""
+        if members is None:
+            return new
+        flat = self._flat(values[self.name]).copy()
+        flat[:, members] = new
+        return flat.reshape(values[self.name].shape)
+
+    def log_density(
+        self,
+        values: Mapping[str, np.ndarray],
+        candidate: np.ndarray,
+        members: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Log full conditional of every element at candidate values, up to a constant.
+
+        Parameters
+        ----------
+        candidate : ndarray, shape (*lead, *plates, *event); of a class (*lead, members, *event)
+            ``lead`` broadcasts with the chains.
+
+        Returns
+        -------
+        ndarray, shape (*lead, *plates); of a class (*lead, members)
+        """
+        state = self.placed(values, candidate, members)
+        total = self.own_log(state, members)
+        # a child may have no parameters where the candidate is impossible
+        for child in self.children:
+            total = total + self.child_log(child, state, members)
+        return total
+
+    def placed(
+        self,
+        values: Mapping[str, np.ndarray],
+        candidate: np.ndarray,
+        members: np.ndarray | None = None,
+    ) -> Values:
+        """The state with a candidate in place, deterministic nodes recomputed."""
+        state = dict(values)
+        if members is not None:
+            candidate = self._filled(values[self.name], candidate, members)
+        elif not self.broadcasts:
+            lead = candidate.shape[: candidate.ndim - len(self.node.value_shape)]
+            candidate = np.broadcast_to(candidate, lead + self.node.value_shape)
+        state[self.name] = candidate
+        for link in self.path:
+            state[link], _ = self.target.model.evaluate(link, state)
+        return state
+
+    def own_log(
+        self, state: Mapping[str, np.ndarray], members: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Log density of the node itself in a state, shape ``(*lead, *plates)`` or what broadcasts to it."""
+        value = state[self.name]
+        if self.own is None:
+            lead = value.shape[: value.ndim - len(self.node.value_shape)]
+            log = np.zeros(lead + (1,) * len(self.node.plates))
+        else:
+            log = self.own.log(state)
+        if members is None:
+            return log
+        lead = log.shape[: log.ndim - len(self.node.plates)]
+        full = np.broadcast_to(log, lead + self.node.plate_shape)
+        return full.reshape(*lead, -1)[..., members]
+
+    def child_log(
+        self, child: Child, state: Mapping[str, np.ndarray], members: np.ndarray | None = None
+    ) -> np.ndarray:
+        """One term's log factors in a state, summed for every element of the node."""
+        term = child.term
+        keys: tuple[Any, ...] = ()
+        if child.relation.kind != "lookup":
+            log = term.log(state)
+        elif term.is_potential:
+            log, keys = self.potential_looked_up(child, state)
+        else:
+            dist, batch, keys = self.distribution_looked_up(child, state)
+            log = term.log_of(dist, batch, state[term.name])
+        return child.relation.collect(log, term.shape, keys, members)
+
+    def distribution(
+        self, child: Child, state: Mapping[str, np.ndarray]
+    ) -> tuple[Distribution, Shape, tuple[Any, ...]]:
+        """A child's distribution, the batch of its parents, and the index by which it read the node."""
+        if child.relation.kind != "lookup":
+            return (*child.term.distribution(state), ())
+        return self.distribution_looked_up(child, state)
+
+    def distribution_looked_up(
+        self, child: Child, state: Mapping[str, np.ndarray]
+    ) -> tuple[Distribution, Shape, tuple[Any, ...]]:
+        node = self.target.model[child.term.name]
+        arguments, batch, watched = self._watched(child, node.links, state)
+        dist = call(node.declaration, arguments, batch + node.plate_shape, node.links)
+        fit(node.declaration, dist, batch, node.plate_shape)
+        return dist, batch, watched.keys[0]
+
+    def potential_looked_up(
+        self, child: Child, state: Mapping[str, np.ndarray]
+    ) -> tuple[np.ndarray, tuple[Any, ...]]:
+        potential, links = self.target.model.potentials[child.term.name]
+        arguments, batch, watched = self._watched(child, links, state)
+        log = np.asarray(potential.function(*arguments), dtype=float)
+        return np.broadcast_to(log, batch + child.term.shape), watched.keys[0]
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _watched(
+        self, child: Child, links: Any, state: Mapping[str, np.ndarray]
+    ) -> tuple[list[Any], Shape, Lookups]:
+        """Arguments, with the one through which the node arrives noting how it is looked up."""
+        arguments, batch = arguments_of(links, state)
+        watched: Any = None
+        for i, (parent, _) in enumerate(links):
+            if parent == child.relation.source:
+                a = arguments[i]
+                assert isinstance(a, PlateArray)
+                watched = Lookups(a.array, a.plates, a.own, a.event_ndim, parent)
+                arguments[i] = watched
+        return arguments, batch, watched
+
+    def _flat(self, value: np.ndarray) -> np.ndarray:
+        """Value with its plates in one axis."""
+        lead = value.shape[: value.ndim - len(self.node.value_shape)]
+        return value.reshape(*lead, self.size, *self.event_shape)
+
+    def _filled(
+        self, value: np.ndarray, candidate: np.ndarray, members: np.ndarray
+    ) -> np.ndarray:
+        lead = candidate.shape[: candidate.ndim - 1 - len(self.event_shape)]
+        flat = self._flat(value)
+        lead = np.broadcast_shapes(lead, flat.shape[:1])
+        full = np.array(np.broadcast_to(flat, lead + flat.shape[1:]))
+        full[(Ellipsis, members, *(slice(None),) * len(self.event_shape))] = candidate
+        return full.reshape(lead + self.node.value_shape)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _classes(blanket: Blanket) -> tuple[np.ndarray | None, ...]:
+    """Elements that may move together, by colour; hidden ones only."""
+    free = blanket.target.free_elements(blanket.name)
+    relations = [c.relation for c in blanket.children]
+    coupled = {p for r in relations for p in r.coupled}
+    edges = [e for r in relations if r.kind == "rows" and len(e := r.edges)]
+    if not coupled and not edges:
+        return (free,)
+    if coupled:
+        shape, plates = blanket.node.plate_shape, blanket.node.plates
+        at = np.unravel_index(np.arange(blanket.size), shape)
+        inner = [plates.index(p) for p in plates if p in coupled]
+        sizes = tuple(shape[i] for i in inner)
+        number = np.ravel_multi_index([at[i] for i in inner], sizes)
+        sets = [np.flatnonzero(number == k) for k in range(math.prod(sizes))]
+        if edges:  # members of a set may still meet in rows
+            sets = [np.array([e]) for e in range(blanket.size)]
+    else:
+        sets = colours(blanket.size, np.concatenate(edges))
+    if free is not None:
+        sets = [np.intersect1d(s, free) for s in sets]
+    return tuple(s for s in sets if len(s))

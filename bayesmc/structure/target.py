@@ -1,0 +1,259 @@
+"""The posterior up to a constant, as terms over a state: what every kernel of a Markov chain moves on.
+
+A *term* is one log factor of the joint density: a node's conditional density, or a potential. The state
+holds stored values of all nodes, hidden ones with a leading axis of chains. What is not part of the chain
+is found here, too: nodes on which nothing observed depends are drawn forward afterwards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.errors import ParameterError
+from bayesmc.network import Model, Observed, Problem
+from bayesmc.network.model import invalid_error
+from bayesmc.shapes import Shape, broadcast_shapes
+
+Values = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Term:
+    """One log factor: of a node (its conditional density) or of a potential.
+
+    Attributes
+    ----------
+    plates : tuple of str
+        Its elements; a potential over rows of an index has one nameless plate.
+    parents : tuple of str
+        What its function reads.
+    mask : ndarray of bool or None
+        Elements that count: those seen of a partly observed node whose missing ones are drawn forward.
+    """
+
+    model: Model = field(repr=False)
+    name: str
+    plates: tuple[str, ...]
+    shape: Shape
+    parents: tuple[str, ...]
+    is_potential: bool = False
+    mask: np.ndarray | None = None
+
+    @property
+    def scope(self) -> tuple[str, ...]:
+        """The nodes it reads directly, its own among them."""
+        return self.parents if self.is_potential else (*self.parents, self.name)
+
+    @property
+    def has_density(self) -> bool:
+        return not self.is_potential
+
+    def distribution(self, values: Mapping[str, np.ndarray]) -> tuple[Distribution, Shape]:
+        """A node's distribution given its parents, and the batch shape of those."""
+        return self.model.evaluate(self.name, values)
+
+    def log(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Log factor of every element, shape ``(*lead, *plates)`` (or what broadcasts to it)."""
+        if self.is_potential:
+            return self.model.potential(self.name, values, total=False)
+        dist, batch = self.distribution(values)
+        return self.log_of(dist, batch, values[self.name])
+
+    def log_of(self, dist: Distribution, batch: Shape, value: np.ndarray) -> np.ndarray:
+        """Log density of stored values under a distribution that was evaluated before.
+
+        Parameters that overflowed have density zero; those out of their range are the model's fault and
+        raise.
+        """
+        node = self.model[self.name]
+        result = self.model.log_density(self.name, dist, value)
+        if dist.invalid is not None:
+            lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
+            if _is_finite(dist.problem):
+                error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
+                if error is not None:
+                    raise error
+            result = np.where(dist.invalid, -np.inf, result)
+        return result if self.mask is None else np.where(self.mask, result, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A posed problem as terms.
+
+    Attributes
+    ----------
+    chain : tuple of str
+        Hidden nodes that something observed depends on, parents first.
+    forward : tuple of str
+        All other nodes that are not known, parents first: they are computed or drawn from the rest.
+    known : dict
+        Stored values that never change: inputs, fixed nodes, what was observed, and what follows from it.
+    terms : dict
+        Name -> ``Term``; those that do not depend on the chain are left out.
+    """
+
+    problem: Problem
+    chain: tuple[str, ...]
+    forward: tuple[str, ...]
+    known: Values
+    terms: dict[str, Term]
+    #: deterministic nodes between the chain and the terms, parents first
+    links: tuple[str, ...]
+    _below: dict[str, tuple[str, ...]] = field(default_factory=dict, repr=False)
+
+    @property
+    def model(self) -> Model:
+        return self.problem.model
+
+    @property
+    def observed(self) -> Mapping[str, Observed]:
+        return self.problem.observed
+
+    def seen(self, name: str) -> Observed | None:
+        return self.problem.observed.get(name)
+
+    def free_elements(self, name: str) -> np.ndarray | None:
+        """Flat plate elements of a chain node that are hidden; None where all are."""
+        seen = self.seen(name)
+        return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
+
+    def below(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Deterministic nodes that follow from some nodes on the way to terms, parents first."""
+        key = "\0".join(names)
+        found = self._below.get(key)
+        if found is None:
+            reached = set(key.split("\0"))
+            order = []
+            for link in self.links:
+                if reached & set(self.model[link].parents):
+                    reached.add(link)
+                    order.append(link)
+            found = self._below[key] = tuple(order)
+        return found
+
+    def refresh(self, values: Values, moved: Iterable[str]) -> None:
+        """Recompute the deterministic nodes that depend on nodes that moved."""
+        for link in self.below(moved):
+            values[link], _ = self.model.evaluate(link, values)
+
+    def terms_of(self, names: Iterable[str]) -> tuple[Term, ...]:
+        """The terms that some chain nodes enter, directly or through deterministic nodes."""
+        reached = {*names, *self.below(names)}
+        return tuple(t for t in self.terms.values() if reached & set(t.scope))
+
+    def log_density(
+        self, values: Mapping[str, np.ndarray], terms: Iterable[Term] | None = None
+    ) -> Any:
+        """Sum of terms (all of them by default), shape the batch."""
+        total: Any = 0.0
+        for term in self.terms.values() if terms is None else terms:
+            log = term.log(values)
+            if term.shape:
+                lead = log.shape[: log.ndim - len(term.shape)]
+                log = np.broadcast_to(log, lead + term.shape)
+                log = log.sum(axis=tuple(range(-len(term.shape), 0)))
+            total = total + log
+        return total
+
+
+def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
+    """Chain, forward nodes, terms and constants of a posed problem.
+
+    Parameters
+    ----------
+    also : iterable of str
+        Nodes that belong to the chain even where nothing observed depends on them; so do those whose
+        density has no sampler.
+    """
+    model, observed = problem.model, problem.observed
+    known: Values = dict(problem.inputs)
+    varying: set[str] = set()
+    for name, node in model.nodes.items():
+        seen = observed.get(name)
+        if node.kind == "input":
+            continue
+        if node.kind == "deterministic":
+            if varying & set(node.parents):
+                varying.add(name)
+            else:
+                known[name], _ = model.evaluate(name, known)
+        elif node.kind == "fixed":
+            known[name], _ = model.evaluate(name, known)
+        elif seen is not None and seen.mask is None:
+            known[name] = seen.value
+        else:
+            varying.add(name)
+    unsampled = {n for n in varying if model[n].is_stochastic and model[n].unsampled}
+    wanted = _ancestors(model, observed, varying, unsampled | set(also))
+    chain = tuple(
+        n for n, node in model.nodes.items() if n in wanted and n in varying and node.is_stochastic
+    )
+    inside = set(chain)
+    links = tuple(
+        n
+        for n, node in model.nodes.items()
+        if n in varying and n in wanted and not node.is_stochastic
+    )
+    forward = tuple(n for n in model.nodes if n in varying and n not in inside and n not in links)
+    terms = _terms(model, observed, inside, varying)
+    for name in forward:
+        if name in observed:  # its term reads what was seen; what is missing is masked
+            known[name] = observed[name].value
+    return Target(problem, chain, forward, known, terms, links)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _is_finite(problem: ParameterError | None) -> bool:
+    """Whether a parameter was refused for what it is, not because it overflowed on the way."""
+    value = None if problem is None else problem.value
+    return value is None or bool(np.isfinite(np.asarray(value, dtype=float)).all())
+
+
+def _ancestors(
+    model: Model, observed: Mapping[str, Observed], varying: set[str], also: set[str]
+) -> set[str]:
+    """Varying nodes above something observed or a potential, and some besides."""
+    wanted = set(also)
+    for potential, _ in model.potentials.values():
+        wanted |= {p for p in potential.parents if p in varying}
+    for name in reversed(list(model.nodes)):
+        if name in wanted or name in observed:
+            wanted |= {p for p in model[name].parents if p in varying}
+    return wanted
+
+
+def _terms(
+    model: Model, observed: Mapping[str, Observed], inside: set[str], varying: set[str]
+) -> dict[str, Term]:
+    terms: dict[str, Term] = {}
+    for name, node in model.nodes.items():
+        if not node.is_stochastic or node.declaration.source == "variable":
+            continue
+        seen = observed.get(name)
+        if name not in inside and (seen is None or not varying & set(node.parents)):
+            continue
+        mask = None if name in inside or seen is None else seen.mask
+        terms[name] = Term(model, name, node.plates, node.plate_shape, node.parents, mask=mask)
+    for name, (potential, _) in model.potentials.items():
+        if not varying & set(potential.parents):
+            continue
+        shape = potential_shape(model, name)
+        terms[name] = Term(model, name, potential.plates, shape, potential.parents, True)
+    return terms
+
+
+def potential_shape(model: Model, name: str) -> Shape:
+    """Shape of a potential's elements: its plates, or the rows of its index."""
+    potential, _ = model.potentials[name]
+    index = getattr(potential, "index", None)
+    if index is not None:
+        return (len(index[0]),)
+    return tuple(model.sizes[p] for p in potential.plates)

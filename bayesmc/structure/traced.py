@@ -1,0 +1,177 @@
+"""What a term's function does to some nodes, found by calling it once with stand-ins for their values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.network.model import arguments_of
+from bayesmc.plates import Lookups, PlateArray
+from bayesmc.structure.target import Target, Term
+from bayesmc.tracing import TracedCall, Tracer, is_traced
+
+
+@dataclass(frozen=True, eq=False)
+class Traced:
+    """A call with stand-ins.
+
+    Attributes
+    ----------
+    result : object
+        What the function returned: a ``TracedCall``, a distribution or an array that do not depend on the
+        traced nodes, or a ``Tracer``.
+    keys : list of tuple
+        Indices by which a traced node in foreign plates was looked up.
+    keys_are_constant : bool
+        They are the same in every call.
+    """
+
+    result: Any
+    keys: list[tuple[Any, ...]]
+    keys_are_constant: bool = False
+
+    @property
+    def sources(self) -> frozenset[str]:
+        """Names that the result varies with; ``x[0]`` through the first lookup, ``x[*]`` through all of x."""
+        if isinstance(self.result, TracedCall):
+            return frozenset().union(*map(_sources, self.result.traced.values()))
+        return _sources(self.result)
+
+
+class Untraceable(Exception):
+    """A function that cannot be followed; the message says why."""
+
+
+def trace_term(target: Target, names: tuple[str, ...], term: Term) -> Traced | None:
+    """A term's function with stand-ins for chain nodes; None where it cannot be followed."""
+    try:
+        return traced_term(target, names, term)
+    except Untraceable:
+        return None
+
+
+def traced_term(target: Target, names: tuple[str, ...], term: Term) -> Traced:
+    """As ``trace_term``; raises ``Untraceable`` with the reason."""
+    result, keys = _call(target, names, term)
+    constant = False
+    if keys and not _has_discrete_ancestor(target, term, names):
+        constant = _same_keys(target, names, term, keys)
+    return Traced(result, keys, constant)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _call(
+    target: Target, names: tuple[str, ...], term: Term
+) -> tuple[Any, list[tuple[Any, ...]]]:
+    model = target.model
+    values: dict[str, Any] = {**model.probe, **target.known}
+    for name in names:
+        node = model[name]
+        if node.domain is not None:
+            raise Untraceable(f"{name!r} is discrete")
+        values[name] = Tracer(
+            np.asarray(values[name], dtype=float), [name], event_ndim=len(node.event_shape)
+        )
+    keys: list[tuple[Any, ...]] = []
+    with marking_invalid(), np.errstate(all="ignore"):
+        for link in target.below(names):
+            node = model[link]
+            if node.declaration.vectorize or node.declaration.function is None or node.domain:
+                raise Untraceable(f"node {link!r} cannot be followed")
+            value, batch = _made(node.links, values, node.declaration.function, [])
+            if not is_traced(value):
+                value = np.asarray(value)
+            values[link] = np.broadcast_to(value, batch + node.value_shape)
+        if term.is_potential:
+            potential, links = model.potentials[term.name]
+            function, vectorize = potential.function, False
+        else:
+            declaration = model[term.name].declaration
+            links = model[term.name].links
+            function, vectorize = declaration.function, declaration.vectorize
+        if vectorize or function is None:
+            raise Untraceable(f"{term.name!r} is called element by element")
+        result, _ = _made(links, values, function, keys)
+    return result, keys
+
+
+def _made(links: Any, values: Mapping[str, Any], function: Any, keys: list[Any]) -> tuple[Any, Any]:
+    arguments, batch = arguments_of(links, values)
+    made = []
+    for i, (parent, _) in enumerate(links):
+        argument = arguments[i]
+        if isinstance(argument, PlateArray) and is_traced(argument.array):
+            argument = Lookups(
+                argument.array, argument.plates, argument.own, argument.event_ndim, parent
+            )
+            made.append(argument)
+            arguments[i] = argument
+    try:
+        result = function(*arguments)
+    except Exception as error:
+        raise Untraceable(str(error)) from error
+    for argument in made:
+        keys.extend(argument.keys)
+    if len([a for a in made if a.keys]) > 1:
+        raise Untraceable("several parents in foreign plates are looked up")
+    return result, batch
+
+
+def _has_discrete_ancestor(target: Target, term: Term, names: tuple[str, ...]) -> bool:
+    """Whether a hidden discrete node reaches the term's function."""
+    todo, seen = list(term.parents), set()
+    while todo:
+        name = todo.pop()
+        if name in seen or name in target.known:
+            continue
+        seen.add(name)
+        node = target.model[name]
+        if node.is_stochastic:
+            if node.is_discrete:
+                return True
+        else:
+            todo += node.parents
+    return False
+
+
+def _same_keys(
+    target: Target, names: tuple[str, ...], term: Term, keys: list[tuple[Any, ...]]
+) -> bool:
+    """Whether the indices stay the same, with all hidden continuous nodes traced."""
+    todo, above = list(term.parents), set()
+    while todo:
+        name = todo.pop()
+        if name in above or name in target.known:
+            continue
+        above.add(name)
+        if not target.model[name].is_stochastic:
+            todo += target.model[name].parents
+    everyone = tuple(
+        n for n in target.chain if n in above and target.model[n].domain is None
+    )
+    try:
+        _, again = _call(target, everyone, term)
+    except Untraceable:
+        return False
+    flat = [k for pair in again for k in pair]
+    if any(is_traced(k) for k in flat):
+        return False
+    wanted = [tuple(np.asarray(k).tobytes() for k in pair) for pair in keys]
+    found = [tuple(np.asarray(k).tobytes() for k in pair) for pair in again]
+    return all(k in found for k in wanted)
+
+
+def _sources(value: Any) -> frozenset[str]:
+    if isinstance(value, Tracer):
+        return value.sources
+    if isinstance(value, (list, tuple)):
+        return frozenset().union(*map(_sources, value))
+    if isinstance(value, TracedCall):
+        return frozenset().union(*map(_sources, value.arguments.values()))
+    return frozenset()

@@ -1,0 +1,473 @@
+"""The loop of chains: what is kept, going on bit for bit, interruption, errors and warnings.
+
+A small sampler of autoregressive chains stands in for the engines, so that every number is known.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc import diagnostics
+from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.convergence import poor_acceptance, poor_mixing
+from bayesmc.errors import ConvergenceWarning, DensityError, InterruptWarning, UnsupportedError
+from bayesmc.network import Problem, pose
+from bayesmc.randomness import Purpose, seed_sequence, stream
+from bayesmc.results import ChainsPosterior
+
+KEEPS = ["draws", ["x", "s"], "summaries"]
+
+
+def net_of(shift: float = 0.0) -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"p": 3})
+    net.add("x", bmc.Normal(shift, 1.0), plates="p")
+    net.add("s", bmc.Bernoulli(0.3), states=("no", "yes"))
+    net.add("n", bmc.DiscreteUniform(1, 3))
+    net.add("angle", bmc.VonMises(0.5, 4.0))
+    net.add("double", lambda x: 2.0 * x, plates="p")
+    net.add("nine", lambda n: 9.0)
+    net.add("y", lambda x: bmc.Normal(x, 1.0), plates="p")
+    return net
+
+
+DATA = {"y": [0.5, -0.5, 1.5]}
+
+
+class Walker:
+    """x is AR(1) with coefficient ``phi``, s and n are drawn afresh, angle too, outside the chain."""
+
+    forward_nodes = frozenset({"angle"})
+
+    def __init__(self, engine: Autoregression) -> None:
+        self.engine = engine
+        if engine.ensemble > 1:
+            self.ensemble = engine.ensemble
+
+    def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
+        shape = (chains, self.engine.ensemble, 3)
+        x = rng.normal(size=shape) + self.engine.apart * np.arange(chains)[:, None, None]
+        return {"x": x, "n": np.zeros(chains, int), "sweeps": 0, "turn": 0, "s": np.zeros(chains)}
+
+    def step(self, state: Mapping[str, Any], rng: np.random.Generator, warmup: bool) -> Any:
+        engine, sweeps = self.engine, state["sweeps"] + 1
+        if engine.at_sweep is not None:
+            engine.at_sweep(sweeps, warmup)
+        centre = engine.apart * np.arange(len(state["x"]))[:, None, None]
+        noise = rng.normal(size=state["x"].shape) * np.sqrt(1 - engine.phi**2)
+        x = centre + engine.phi * (state["x"] - centre) + noise
+        if engine.in_place:
+            state["x"][...] = x
+            x = state["x"]
+        chains = len(x)
+        n = rng.integers(3, size=chains) if not engine.stuck else np.arange(chains) % 3
+        s = rng.random(chains) < (0.3 if engine.stuck is None else 0.0)
+        return {"x": x, "n": n, "s": s, "sweeps": sweeps, "turn": state["turn"]}
+
+    def end_warmup(self, state: Mapping[str, Any]) -> dict[str, Any]:
+        return {**state, "sweeps": 0}
+
+    def values(self, state: Any, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        chosen = state["x"][:, state["sweeps"] % self.engine.ensemble].copy()
+        angle = rng.vonmises(0.5, 4.0, size=len(chosen))
+        found = {"x": chosen, "s": state["s"], "n": state["n"], "angle": angle}
+        return {**found, "double": 2 * chosen, "nine": np.array(0)}  # a position
+
+    def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        return {"x": np.full(len(state["x"]), self.engine.rate) + state["sweeps"] * 1e-9}
+
+
+@dataclass(frozen=True)
+class Autoregression(ChainEngine):
+    draws: int = 1000
+    warmup: int = 10
+    chains: int = 4
+    thinning: int = 1
+    phi: float = 0.5
+    apart: float = 0.0
+    stuck: bool | None = None
+    ensemble: int = 1
+    rate: float = 0.4
+    in_place: bool = False
+    at_sweep: Callable[[int, bool], None] | None = field(default=None, compare=False)
+
+    label = "autoregression"
+
+    def refusal(self, problem: Problem) -> None:
+        return None
+
+    def describe(self, problem: Problem) -> dict[str, str]:
+        return {}
+
+    def sampler(self, problem: Problem) -> Walker:
+        return Walker(self)
+
+
+def quiet(**options: Any) -> bmc.Posterior:
+    """An answer whose warnings are not of interest."""
+    rest: dict[str, Any] = {k: options.pop(k) for k in ("keep", "resume") if k in options}
+    net = options.pop("net", NET)
+    evidence = options.pop("evidence", DATA)
+    seed = options.pop("rng", 7)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return bmc.infer(net, evidence, engine=Autoregression(**options), rng=seed, **rest)
+
+
+NET = net_of()
+
+
+# ---- what is kept --------------------------------------------------------------------------------
+
+
+def test_draws_are_the_samplers_own() -> None:
+    engine = Autoregression(draws=20, warmup=5, chains=2, thinning=3)
+    posterior = quiet(draws=20, warmup=5, chains=2, thinning=3)
+    walker, rng = Walker(engine), stream(seed_sequence(7), Purpose.INFER)
+    state = walker.start(rng, 2)
+    for _ in range(5):
+        state = walker.step(state, rng, True)
+    state = walker.end_warmup(state)
+    for draw in range(20):
+        for _ in range(3):
+            state = walker.step(state, rng, False)
+        values = walker.values(state, rng)
+        for name in ("x", "angle", "double"):
+            np.testing.assert_array_equal(posterior[name][:, draw], values[name])
+        np.testing.assert_array_equal(posterior["n"][:, draw], values["n"] + 1)
+    assert posterior.warmup == 5 and posterior.ensemble_size == 1
+    np.testing.assert_allclose(posterior.acceptance["x"], [0.4, 0.4], atol=1e-6)
+    assert str(posterior.summary(["x"])).startswith(
+        "Autoregression: 2 chains of 20 draws after 5 of warmup\n"
+    )
+
+
+def test_kept_in_the_stored_types() -> None:
+    posterior = quiet(draws=20)
+    assert posterior._stored["s"].dtype == np.uint8 and posterior._stored["n"].dtype == np.uint8
+    assert posterior._stored["x"].shape == (4, 20, 3)
+    assert posterior._stored["nine"].shape == (1, 1)
+    assert posterior._stored["y"].shape == (1, 1, 3)  # observed, and not among the sampler's values
+    assert posterior["nine"].tolist() == [[9.0] * 20] * 4
+    assert all(not a.flags.writeable for a in posterior._stored.values())
+
+
+def test_only_what_is_asked_for_is_kept() -> None:
+    posterior = quiet(draws=20, keep=["s", "x"])
+    assert posterior.names == ("x", "s")
+    np.testing.assert_array_equal(posterior["x"], quiet(draws=20)["x"])
+
+
+def test_sums_of_the_same_draws() -> None:
+    draws, sums = quiet(draws=777, phi=0.9), quiet(draws=777, phi=0.9, keep="summaries")
+    for name in ("x", "double", "n", "angle", "nine"):
+        np.testing.assert_allclose(sums.mean(name), draws.mean(name), rtol=1e-9)
+        np.testing.assert_allclose(sums.var(name), draws.var(name), rtol=1e-9)
+    np.testing.assert_allclose(sums.probabilities("s"), draws.probabilities("s"), rtol=1e-9)
+    for name in ("x", "s", "n", "angle"):  # 24 batches of 32: a fifth either way would be rare
+        np.testing.assert_allclose(sums.mcse(name), draws.mcse(name), rtol=0.35)
+    assert (sums.rhat("x") < 1.1).all() and (sums.rhat("x") > 0.99).all()
+    assert sums.mcse("nine") == 0.0 and np.isnan(sums.rhat("nine"))
+    assert str(sums.summary()).startswith("Autoregression: 4 chains of 777 draws")
+
+
+def test_same_seed_same_draws() -> None:
+    np.testing.assert_array_equal(quiet(draws=9)["x"], quiet(draws=9)["x"])
+    assert (quiet(draws=9)["x"] != quiet(draws=9, rng=8)["x"]).any()
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"draws": 0}, {"warmup": -1}, {"warmup": 2.0}, {"warmup": True}, {"chains": 0}, {"thinning": 0}],
+)  # fmt: skip
+def test_options_are_checked(options: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=rf"Autoregression\({next(iter(options))}="):
+        Autoregression(**options)
+    assert Autoregression(warmup=0).warmup == 0
+
+
+def test_what_does_not_fit_in_memory_is_said() -> None:
+    with pytest.raises(bmc.errors.BudgetError, match='keep="summaries"'):
+        quiet(draws=10**15, warmup=0)
+
+
+# ---- going on ------------------------------------------------------------------------------------
+
+
+def same(a: bmc.Posterior, b: bmc.Posterior) -> None:
+    assert type(a) is type(b) and a.names == b.names and a._title() == b._title()
+    assert a.acceptance.keys() == b.acceptance.keys()
+    for key, rates in a.acceptance.items():
+        np.testing.assert_array_equal(rates, b.acceptance[key])
+    if isinstance(a, ChainsPosterior):
+        for name in a.names:
+            assert a._stored[name].dtype == b._stored[name].dtype
+            np.testing.assert_array_equal(a._stored[name], b._stored[name])
+        return
+    for name in a.names:
+        for figure in ("mcse", "ess", "rhat"):
+            np.testing.assert_array_equal(getattr(a, figure)(name), getattr(b, figure)(name))
+    np.testing.assert_array_equal(a.probabilities("s"), b.probabilities("s"))
+    for name in ("x", "n", "angle", "double", "nine", "y"):
+        np.testing.assert_array_equal(a.mean(name), b.mean(name))
+        np.testing.assert_array_equal(a.var(name), b.var(name))
+
+
+@pytest.mark.parametrize("keep", KEEPS, ids=["draws", "list", "summaries"])
+@pytest.mark.parametrize("cut", [300, 64])
+@pytest.mark.parametrize("pickled", [False, True], ids=["live", "pickled"])
+@pytest.mark.parametrize("options", [{}, {"in_place": True, "thinning": 2}, {"ensemble": 5}])
+def test_going_on_is_as_if_never_stopped(
+    keep: Any, cut: int, pickled: bool, options: dict[str, Any]
+) -> None:
+    whole = quiet(draws=500, keep=keep, **options)
+    first = quiet(draws=cut, keep=keep, **options)
+    if pickled:
+        first = pickle.loads(pickle.dumps(first))
+    for _ in range(2):  # the first part is not used up
+        both = quiet(draws=500 - cut, keep=keep, resume=first, rng=99, **options)
+        same(whole, both)
+    third = quiet(draws=100, keep=keep, resume=both, **options)
+    same(third, quiet(draws=600, keep=keep, **options))
+
+
+def test_one_draw_of_one_chain_goes_on() -> None:
+    first = quiet(draws=1, chains=1)
+    same(quiet(draws=4, chains=1), quiet(draws=3, chains=1, resume=first))
+
+
+@pytest.mark.parametrize("pickled", [False, True], ids=["live", "pickled"])
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"evidence": {"y": [0.5, -0.5, 1.0]}},
+        {"evidence": {"y": np.ma.array([0.5, -0.5, 1.5], mask=[0, 0, 1])}},
+        {"evidence": {}},
+        {"net": net_of(0.1)},
+        {"phi": 0.6},
+        {"chains": 3},
+        {"thinning": 2},
+        {"keep": ["x"]},
+        {"keep": "summaries"},
+    ],
+    ids=["value", "mask", "nothing", "net", "option", "chains", "thinning", "nodes", "summaries"],
+)
+def test_another_question_does_not_go_on(pickled: bool, other: dict[str, Any]) -> None:
+    first = quiet(draws=20)
+    if pickled:
+        first = pickle.loads(pickle.dumps(first))
+    with pytest.raises(UnsupportedError, match="resume= takes an earlier Autoregression"):
+        quiet(draws=20, resume=first, **other)
+
+
+def test_other_posteriors_do_not_go_on() -> None:
+    weighted = bmc.infer(NET, DATA, engine=bmc.LikelihoodWeighting(2000), rng=0)
+    predicted = quiet(draws=20).predict("y", rng=0)
+    for old in (weighted, predicted):
+        with pytest.raises(UnsupportedError, match="resume="):
+            quiet(draws=20, resume=old)
+
+
+def test_a_pickle_needs_the_same_functions() -> None:
+    """Functions are lost in pickles; a net declared anew is recognised by its densities."""
+    loaded = pickle.loads(pickle.dumps(quiet(draws=20)))
+    same(quiet(draws=30), quiet(draws=10, resume=loaded, net=net_of()))
+    with pytest.raises(UnsupportedError, match="resume="):
+        quiet(draws=10, resume=loaded, net=net_of(0.1))
+    live = quiet(draws=20)
+    with pytest.raises(
+        UnsupportedError, match="resume="
+    ):  # declared anew: not known to be the same
+        quiet(draws=10, resume=live, net=net_of())
+
+
+# ---- interruption --------------------------------------------------------------------------------
+
+
+def raising(at: int, error: Callable[[], BaseException]) -> Callable[[int, bool], None]:
+    def hook(sweep: int, warmup: bool) -> None:
+        if sweep == at and not warmup:
+            raise error()
+
+    return hook
+
+
+@pytest.mark.parametrize("keep", KEEPS, ids=["draws", "list", "summaries"])
+@pytest.mark.parametrize("sweep", [61, 62])
+def test_an_interrupt_in_a_sweep_returns_whole_draws(keep: Any, sweep: int) -> None:
+    options: dict[str, Any] = {"keep": keep, "thinning": 2}
+    with pytest.warns(
+        InterruptWarning, match="has the 30 draws of each of 4 chains .* resume=post"
+    ):
+        cut = quiet(draws=100, at_sweep=raising(sweep, KeyboardInterrupt), **options)
+    same(cut, quiet(draws=30, **options))
+    same(quiet(draws=100, **options), quiet(draws=70, resume=cut, **options))
+
+
+def test_ctrl_c_waits_for_the_end_of_a_draw() -> None:
+    """A sampler that writes into its own state is interrupted between sweeps, and goes on bit for bit."""
+
+    def press(sweep: int, warmup: bool) -> None:
+        if sweep == 41 and not warmup:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)  # were it not put off, it would be raised here
+
+    handler = signal.getsignal(signal.SIGINT)
+    options: dict[str, Any] = {"in_place": True, "thinning": 2}
+    with pytest.warns(InterruptWarning, match="has the 21 draws"):
+        cut = quiet(draws=100, at_sweep=press, **options)
+    assert signal.getsignal(signal.SIGINT) is handler
+    same(quiet(draws=100, **options), quiet(draws=79, resume=cut, **options))
+
+
+def test_a_second_ctrl_c_does_not_wait() -> None:
+    passed = []
+
+    def press_twice(sweep: int, warmup: bool) -> None:
+        if sweep == 41 and not warmup:
+            os.kill(os.getpid(), signal.SIGINT)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.01)
+            passed.append(sweep)
+
+    with pytest.warns(InterruptWarning, match="has the 40 draws"):
+        quiet(draws=100, at_sweep=press_twice)
+    assert not passed
+
+
+def test_interrupted_before_any_draw_there_is_nothing() -> None:
+    def in_warmup(sweep: int, warmup: bool) -> None:
+        if sweep == 4 and warmup:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        quiet(at_sweep=in_warmup)
+    with pytest.raises(KeyboardInterrupt):
+        quiet(at_sweep=raising(1, KeyboardInterrupt))
+
+
+@pytest.mark.parametrize("keep", KEEPS, ids=["draws", "list", "summaries"])
+def test_interrupted_at_once_while_going_on_the_earlier_draws_return(keep: Any) -> None:
+    first = quiet(draws=30, keep=keep)
+    with pytest.warns(InterruptWarning, match="has the 30 draws"):
+        again = quiet(draws=9, keep=keep, resume=first, at_sweep=raising(31, KeyboardInterrupt))
+    same(first, again)
+    same(quiet(draws=39, keep=keep), quiet(draws=9, keep=keep, resume=again))
+
+
+# ---- errors --------------------------------------------------------------------------------------
+
+
+def test_an_error_says_when() -> None:
+    def fails(sweep: int, warmup: bool) -> None:
+        if sweep == (4 if during else 17) and warmup == during:
+            raise DensityError("node 'x': the log density is nan at x = 3")
+
+    during = True
+    with pytest.raises(DensityError, match=r"nan at x = 3, at iteration 4 \(warmup\)$"):
+        quiet(at_sweep=fails)
+    during = False
+    with pytest.raises(DensityError, match=r"nan at x = 3, at iteration 17$"):
+        quiet(at_sweep=fails)
+    first = quiet(draws=10)
+    with pytest.raises(DensityError, match="at iteration 17$"):
+        quiet(at_sweep=fails, resume=first)
+
+
+# ---- warnings ------------------------------------------------------------------------------------
+
+
+def warned(keep: str = "draws", **options: Any) -> list[str]:
+    engine = Autoregression(**options)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        bmc.infer(NET, DATA, engine=engine, rng=3, keep=keep)
+    assert all(w.category is ConvergenceWarning and w.filename == __file__ for w in caught)
+    return [str(w.message) for w in caught]
+
+
+def test_good_chains_are_not_warned_of() -> None:
+    assert warned() == []
+    assert warned(chains=1, draws=2000) == []
+    assert warned(ensemble=5, draws=2000) == []
+
+
+def test_chains_apart_are() -> None:
+    mixed, *rest = warned(apart=1.0)
+    assert "have not mixed: R-hat of 'x[" in mixed and "resume=" in mixed and "warmup=" in mixed
+    assert "and so are 5 more of 8 looked at" in mixed  # x and double, in three elements each; n, s
+    assert all("R-hat" not in message for message in rest)
+
+
+def test_slow_chains_are() -> None:
+    messages = warned(phi=0.99)
+    assert any("independent ones (bulk ESS, under 100 per chain" in m for m in messages)
+    assert warned(phi=0.9, draws=4000) == []
+
+
+def test_too_few_draws_to_tell() -> None:
+    (message,) = warned(draws=3)
+    assert "3 draws per chain are too few to tell" in message
+
+
+def test_summaries_are_judged_too() -> None:
+    assert warned("summaries", draws=4000) == []
+    assert "have not mixed: R-hat of 'x[" in warned("summaries", draws=4000, apart=1.0)[0]
+    assert any("bulk ESS" in m for m in warned("summaries", phi=0.99))
+    assert "20 draws per chain are too few to tell" in warned("summaries", draws=20)[0]
+
+
+def test_states_never_left_are_no_fault_unless_they_differ() -> None:
+    assert warned(stuck=False) == []  # s is "no" in all chains, always
+    first, *_ = warned(stuck=True)  # n stands at 1, 2, 3, 1
+    assert "R-hat of 'n' is inf (every chain stands still, at different values)" in first
+
+
+def test_an_ensembles_members_do_not_pass_for_independent_draws() -> None:
+    """Members that hardly move look independent draw by draw; blocks of them tell."""
+    assert any("ESS, under 100 per chain" in m for m in warned(ensemble=10, phi=0.999, draws=2000))
+    slow = quiet(ensemble=10, phi=0.999, draws=2000)
+    naive = diagnostics.chain_statistic("ess", slow["x"])
+    assert (slow.ess("x") < 0.2 * naive).all()
+
+
+def test_nodes_outside_the_chain_are_not_looked_at() -> None:
+    assert all("angle" not in m for m in warned(apart=2.0, phi=0.99))
+
+
+def test_acceptance_outside_the_band() -> None:
+    (low,) = warned(rate=0.04)
+    assert low.startswith(
+        "Autoregression: 'x' accepts 4 % of its proposals, under 10 %; use narrower"
+    )
+    (high,) = warned(rate=0.97)
+    assert "'x' accepts 97 % of its proposals, over 90 %" in high and "use wider" in high
+    rates = {"a": np.array([0.95, 1.0]), "b": np.array([0.95, 1.0])}
+    assert len(list(poor_acceptance(rates, (0.1, 0.9)))) == 2
+    (only,) = poor_acceptance(rates, {"a": None, "b": (0.2, 0.6)})
+    assert "'b'" in only
+
+
+@pytest.mark.parametrize(
+    ("chains", "draws", "size"), [(4, 1000, 1000), (256, 1000, 30), (2, 200_000, 8)]
+)
+def test_the_check_is_cheap(chains: int, draws: int, size: int) -> None:
+    """Many scalars, many chains, long ones: 0.1 to 0.3 s; the bound is for a machine with other work."""
+    net = bmc.BayesNet(plates={"p": size})
+    net.add("x", bmc.Normal(0.0, 1.0), plates="p")
+    x = np.random.default_rng(0).normal(size=(chains, draws, 1))
+    stored = {"x": np.broadcast_to(x, (chains, draws, size))}
+    posterior = ChainsPosterior(pose(net, {}), Autoregression(), stored, (chains, draws))
+    start = time.perf_counter()
+    assert poor_mixing(posterior, frozenset()) == []
+    assert time.perf_counter() - start < 1.5
