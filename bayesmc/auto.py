@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
-from bayesmc.engines.base import Engine
+from bayesmc.engines.base import Engine, Treatment
 from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.exact_plan import too_large_to_search
+from bayesmc.engines.gibbs import Gibbs
+from bayesmc.engines.gibbs_plan import plan_of
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
@@ -32,6 +34,8 @@ class Explanation:
         Engine name -> why it was not taken.
     nodes : dict
         Node -> what the engine does to it.
+    table : tuple of Treatment
+        The same in columns (node, kernel, why, plates, colour), for engines that move nodes one by one.
 
     Examples
     --------
@@ -50,10 +54,13 @@ class Explanation:
     reasons: tuple[str, ...]
     refused: dict[str, str] = field(default_factory=dict)
     nodes: dict[str, str] = field(default_factory=dict)
+    table: tuple[Treatment, ...] = ()
 
     def __str__(self) -> str:
         lines = [f"engine: {self.engine!r}", *(f"  because {r}" for r in self.reasons)]
         lines += [f"not {name}: {why}" for name, why in self.refused.items()]
+        if self.table:
+            return "\n".join([*lines, *_columns(self.table)])
         shown = list(self.nodes.items())
         width = max((len(n) for n, _ in shown), default=0)
         lines += [f"  {name.ljust(width)}  {what}" for name, what in shown[:40]]
@@ -153,13 +160,29 @@ def explain(
             refused = {type(chosen).__name__: why}
             reasons = ("it was asked for, but it cannot answer",)
     nodes = {} if type(chosen).__name__ in refused else chosen.describe(problem)
-    explanation = Explanation(chosen, tuple(reasons), refused, nodes)
+    table = () if type(chosen).__name__ in refused else tuple(chosen.table(problem))
+    explanation = Explanation(chosen, tuple(reasons), refused, nodes, table)
     print(explanation)
     return explanation
 
 
+def _columns(table: Sequence[Treatment]) -> list[str]:
+    """A table of nodes in aligned columns; columns that are empty throughout are left out."""
+    names = [f.name for f in fields(Treatment) if f.name != "why"] + ["why"]
+    shown = [n for n in names if any(getattr(row, n) for row in table)]
+    cells = [shown, *([getattr(row, n) for n in shown] for row in table[:60])]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(shown))]
+    lines = [
+        "  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
+        for row in cells
+    ]
+    if len(table) > 60:
+        lines.append(f"  ... and {len(table) - 60} more nodes")
+    return lines
+
+
 def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
-    """Exact where cheap, otherwise likelihood weighting."""
+    """Exact where cheap; Gibbs where something was observed and its chains can move; else weighting."""
     exact = Exact(max_bytes=_CHEAP)
     too_large = too_large_to_search(problem)
     why_not = too_large if too_large is not None else exact.refusal(problem)
@@ -177,11 +200,23 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
             f"it would take about {readable_bytes(cost.bytes)} ({cost.words}), more than counts as cheap; "
             "engine=bmc.Exact() answers all the same"
         )
+    refused = {"Exact": why_not}
+    plan = plan_of(problem)
     weighting = LikelihoodWeighting()
-    why = weighting.refusal(problem)
-    if why is not None:
-        raise UnsupportedError(f"infer: no engine can answer. {why_not}. {why}")
-    return weighting, ("every hidden node can be sampled given its parents",), {"Exact": why_not}
+    forward = weighting.refusal(problem)
+    if plan.kernels and (forward is not None or not plan.constraints):
+        if forward is not None:
+            refused["LikelihoodWeighting"] = forward
+        return Gibbs(), (f"the full conditionals can be drawn from: {plan.in_short()}",), refused
+    if forward is not None:
+        raise UnsupportedError(f"infer: no engine can answer. {why_not}. {forward}")
+    if not plan.kernels:
+        return weighting, ("nothing observed depends on a hidden node",), refused
+    refused["Gibbs"] = (
+        f"zero probabilities tie {', '.join(map(repr, plan.constraints[:4]))} together, so that its chains "
+        "may be stuck"
+    )
+    return weighting, ("every hidden node can be sampled given its parents",), refused
 
 
 def _checked(engine: Any) -> Any:

@@ -158,6 +158,12 @@ def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray
 #: R-hat above which the variance within chains is but a rounding error: rank-normalised values of chains
 #: that move at all stay far below
 _STILL = 1e6
+#: what ArviZ calls the effective sizes
+_METHODS: dict[str, dict[str, Any]] = {
+    "ess": {"method": "bulk"},
+    "tail_ess": {"method": "tail", "prob": 0.05},
+    "mean_ess": {"method": "mean"},
+}
 
 
 def _figure(kind: str, values: np.ndarray, block: int) -> float:
@@ -189,12 +195,7 @@ def _ess(kind: str, values: np.ndarray, block: int) -> float:
     values = np.ldexp(values, -np.frexp(np.ptp(values))[1])
     if block > 1:
         return min(_ensemble_ess(series, block) for series in _series(kind, values))
-    method: dict[str, Any] = {
-        "ess": {"method": "bulk"},
-        "tail_ess": {"method": "tail", "prob": 0.05},
-        "mean_ess": {"method": "mean"},
-    }[kind]
-    return float(array_stats.ess(values, chain_axis=0, draw_axis=1, **method))
+    return float(array_stats.ess(values, chain_axis=0, draw_axis=1, **_METHODS[kind]))
 
 
 def _ensemble_ess(values: np.ndarray, block: int) -> float:

@@ -145,6 +145,10 @@ class InterruptWarning(BayesmcWarning):
     """A run was interrupted; its answer rests on the draws made before."""
 
 
+class ReducibleWarning(BayesmcWarning):
+    """Zero probabilities may keep a Markov chain from configurations that are possible."""
+
+
 class SupportWarning(BayesmcWarning):
     """A proposal that cannot reach values that have mass."""
 

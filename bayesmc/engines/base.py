@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,33 @@ import numpy as np
 from bayesmc.errors import BayesmcError
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
 from bayesmc.results import Posterior
+
+
+@dataclass(frozen=True)
+class Treatment:
+    """A row of the table of ``explain``: what an engine does to a node.
+
+    Attributes
+    ----------
+    node : str
+    kernel : str
+        The kind of move; empty where there is none.
+    why : str
+        The matched pair, the number of states, or why nothing better was taken.
+    plates : str
+        Plates with their sizes.
+    colour : str
+        Nodes of one colour share no factor.
+    """
+
+    node: str
+    kernel: str
+    why: str = ""
+    plates: str = ""
+    colour: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.kernel}: {self.why}" if self.kernel and self.why else self.kernel or self.why
 
 
 class Engine:
@@ -38,6 +66,10 @@ class Engine:
     def describe(self, problem: Problem) -> dict[str, str]:
         """What the engine does to each node."""
         raise NotImplementedError
+
+    def table(self, problem: Problem) -> list[Treatment]:
+        """What the engine does to each node, in columns; empty where ``describe`` says all."""
+        return []
 
     def run(
         self,

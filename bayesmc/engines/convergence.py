@@ -28,7 +28,7 @@ _JUDGED = 6
 #: draws of all scalars and chains that are judged: of large scalars fewer are, though at least two
 _ELEMENTS = 250_000
 #: draws of one scalar in all chains to which more are thinned, though not below ``_DRAWS`` per chain
-_ONE = 100_000
+_ONE = 50_000
 _DRAWS = 1000
 #: chains looked at; of more, some more or less stuck ones hardly change the figures
 _CHAINS = 64

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
+from bayesmc.engines.base import Treatment
 from bayesmc.engines.chains import ChainEngine
 from bayesmc.engines.gibbs_plan import Plan, plan_of
 from bayesmc.engines.starting import start_states
+from bayesmc.errors import ReducibleWarning
 from bayesmc.network import Problem
 from bayesmc.network.forward import Pass, run, step_for
 from bayesmc.structure.target import Values
@@ -64,13 +67,25 @@ class Gibbs(ChainEngine):
     label: ClassVar[str] = "Gibbs sampling"
 
     def refusal(self, problem: Problem) -> str | None:
-        return plan_of(problem, self.debug).refusal
+        return None
 
     def describe(self, problem: Problem) -> dict[str, str]:
-        return plan_of(problem, self.debug).describe()
+        return {row.node: str(row) for row in self.table(problem)}
+
+    def table(self, problem: Problem) -> list[Treatment]:
+        return plan_of(problem, self.debug).table()
 
     def sampler(self, problem: Problem) -> GibbsSampler:
-        return GibbsSampler(plan_of(problem, self.debug))
+        plan = plan_of(problem, self.debug)
+        if plan.constraints:
+            warnings.warn(
+                f"Gibbs: zero probabilities tie {_listed(plan.constraints)} together, so a chain may not "
+                "reach every configuration that is possible; compare with Exact() or "
+                "LikelihoodWeighting(draws)",
+                ReducibleWarning,
+                stacklevel=5,
+            )
+        return GibbsSampler(plan)
 
 
 class GibbsSampler:
@@ -119,3 +134,11 @@ class GibbsSampler:
             if rate is not None:
                 found[", ".join(kernel.names)] = rate
         return found
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _listed(names: Sequence[str]) -> str:
+    shown = ", ".join(map(repr, names[:6]))
+    return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more"

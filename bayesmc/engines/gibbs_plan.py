@@ -6,21 +6,32 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from bayesmc.engines.base import Treatment
 from bayesmc.engines.weighted import treatment
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
+from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.conjugate import conjugate_kernel
+from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.gaussian_block import gaussian_blocks
+from bayesmc.kernels.joint_states import joint_states
+from bayesmc.kernels.lattice import lattice_kernel
+from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
+from bayesmc.kernels.tables import table_kernel, table_kernels
 from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.colouring import colours
 from bayesmc.structure.target import Target, target_of
 
 #: components that move together along learnt directions, at most
 _FACTOR_SIZE = 24
-_BOXES = ("real", "interval", "circle", "real vector", "product")
+#: supports that are boxes: every number on its own
+_BOXES = ("real", "interval", "circle", "real vector", "product", "integers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,59 +41,108 @@ class Plan:
     Attributes
     ----------
     kernels : list of Kernel
-        In the order of a sweep.
+        In the order of a sweep: children before parents.
     refusals : dict
         Node -> why it has no closed form.
-    refusal : str or None
-        Why there is no plan.
+    constraints : tuple of str
+        Nodes among which zeros in tables may keep a chain from reaching every configuration.
     """
 
     problem: Problem
     target: Target
+    blankets: Mapping[str, Blanket] = field(default_factory=dict)
     kernels: list[Kernel] = field(default_factory=list)
     refusals: dict[str, str] = field(default_factory=dict)
-    refusal: str | None = None
+    constraints: tuple[str, ...] = ()
 
-    def describe(self) -> dict[str, str]:
+    def table(self) -> list[Treatment]:
         """What happens to each node."""
-        found = {n: treatment(self.problem, n) for n in self.problem.model.nodes}
-        for name in self.target.forward:
-            if self.problem.model[name].is_stochastic and self.target.seen(name) is None:
-                found[name] = "drawn forward: nothing observed depends on it"
+        model = self.problem.model
+        by_name: dict[str, list[Kernel]] = {}
         for kernel in self.kernels:
             for name in kernel.names:
-                found[name] = kernel.words(name)
-                if name in self.refusals:
-                    found[name] += f" (no closed form: {self.refusals[name]})"
+                by_name.setdefault(name, []).append(kernel)
+        number = self._colours()
+        rows = []
+        for name, node in model.nodes.items():
+            plates = ", ".join(f"{p}={model.sizes[p]}" for p in node.plates)
+            if name not in by_name:
+                forward = name in self.target.forward and node.is_stochastic
+                barren = forward and self.target.seen(name) is None
+                kernel = "forward" if barren else ""
+                why = "nothing observed depends on it" if barren else treatment(self.problem, name)
+                rows.append(Treatment(name, kernel, why, plates))
+                continue
+            kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
+            why = "; then ".join(dict.fromkeys(w for w in words if w))
+            if name in self.refusals:
+                why += f"{', ' if why else ''}since {self.refusals[name]}"
+            classes = len(self.blankets[name].classes)
+            colour = f"{number[name]}" + (f" (elements: {classes})" if classes > 1 else "")
+            rows.append(Treatment(name, " + ".join(dict.fromkeys(kinds)), why, plates, colour))
+        return rows
+
+    def in_short(self) -> str:
+        """How many nodes each kind of kernel moves."""
+        kinds: dict[str, set[str]] = {}
+        for kernel in self.kernels:
+            for name in kernel.names:
+                kinds.setdefault(kernel.words(name)[0], set()).add(name)
+        return ", ".join(f"{kind} ({len(names)})" for kind, names in kinds.items())
+
+    def _colours(self) -> dict[str, int]:
+        """Colour of every chain node: those of one colour share no factor."""
+        chain = self.target.chain
+        place = {n: i for i, n in enumerate(chain)}
+        edges = set()
+        for term in self.target.terms.values():
+            inside = self._entering(term.scope)
+            edges |= {(place[a], place[b]) for a in inside for b in inside if place[a] < place[b]}
+        found = colours(len(chain), np.array(sorted(edges), dtype=np.intp).reshape(-1, 2))
+        return {chain[i]: c for c, members in enumerate(found, 1) for i in members}
+
+    def _entering(self, scope: Sequence[str]) -> set[str]:
+        """Chain nodes that reach a scope, through deterministic nodes as well."""
+        found: set[str] = set()
+        todo = list(scope)
+        while todo:
+            name = todo.pop()
+            if name in self.blankets:
+                found.add(name)
+            elif name in self.target.links:
+                todo += self.problem.model[name].parents
         return found
 
 
 def plan_of(problem: Problem, debug: bool = False) -> Plan:
-    """The plan for a posed problem."""
+    """The plan for a posed problem, made once."""
+    key = f"gibbs plan, debug={debug}"
+    if key not in problem.cache:
+        problem.cache[key] = _planned(problem, debug)
+    return problem.cache[key]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _planned(problem: Problem, debug: bool) -> Plan:
     target = target_of(problem)
     blankets = {name: Blanket(target, name) for name in target.chain}
     blocks = gaussian_blocks(target, blankets, debug)
     joined = {n for b in blocks for n in b.names}
-    kernels: list[Kernel] = []
+    kernels, constraints = _finite(target, blankets)
     refusals: dict[str, str] = {}
-    left = [n for n in target.chain if n not in joined]
     numbers = []
-    for name in left:
-        blanket = blankets[name]
-        if blanket.node.domain is not None:
-            kernels.append(Enumerate(blanket))
+    for name in target.chain:
+        if name in joined or target.model[name].domain is not None:
             continue
-        kernel = conjugate_kernel(blanket, debug)
+        kernel = conjugate_kernel(blankets[name], debug)
         if isinstance(kernel, Kernel):
             kernels.append(kernel)
-            continue
-        refusals[name] = kernel
-        numbers.append(name)
-    for group in _together(target, blankets, numbers):
-        if len(group) > 1 or target.model[group[0]].event_shape:
-            kernels.append(FactorSlice(target, group))
-            numbers = [n for n in numbers if n not in group]
-    kernels += [Slice(blankets[n]) for n in numbers]
+        else:
+            refusals[name] = kernel
+            numbers.append(name)
+    kernels += _numbers(target, blankets, numbers)
     for block in blocks:
         scales = governing(target, block, blankets)
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
@@ -90,10 +150,52 @@ def plan_of(problem: Problem, debug: bool = False) -> Plan:
         kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
     order = {n: i for i, n in enumerate(target.chain)}
     kernels.sort(key=lambda k: -max(order[n] for n in k.names))
-    return Plan(problem, target, kernels, refusals)
+    return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 
-# ---- private ------------------------------------------------------------------------------------
+def _finite(
+    target: Target, blankets: Mapping[str, Blanket]
+) -> tuple[list[Kernel], tuple[str, ...]]:
+    """Kernels of finite nodes, and those that these may leave stuck."""
+    names = [n for n in target.chain if target.model[n].domain is not None]
+    if not names:
+        return [], ()
+    kernels: list[Kernel] = []
+    lattices = {n: k for n in names if (k := lattice_kernel(blankets[n])) is not None}
+    kernels += lattices.values()
+    if len(lattices) == len(names):
+        return kernels, ()
+    terms = FiniteTerms(target)
+    blocks = coupled_blocks(target, terms)
+    wanted = [(n,) for n in names if n not in lattices] + blocks
+    tabulated, left = table_kernels(target, wanted, terms)
+    kernels += tabulated
+    for block in left:
+        if len(block) > 1:
+            kernels.append(joint_states(target, block, terms))
+        else:
+            blanket = blankets[block[0]]
+            kernels.append(table_kernel(blanket, terms) or Enumerate(blanket))
+    return kernels, deterministic_constraints(target, blocks, terms)
+
+
+def _numbers(
+    target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]
+) -> list[Kernel]:
+    """Kernels of nodes without a closed form that have too many values to try."""
+    kernels: list[Kernel] = []
+    left = []
+    for name in names:
+        support = target.model[name].support
+        if support is None or support.kind not in _BOXES:
+            kernels.append(AdaptiveWalk(blankets[name]))
+        else:
+            left.append(name)
+    for group in _together(target, blankets, left):
+        if len(group) > 1 or target.model[group[0]].event_shape:
+            kernels.append(FactorSlice(target, group))
+            left = [n for n in left if n not in group]
+    return kernels + [Slice(blankets[n]) for n in left]
 
 
 def _together(
@@ -103,11 +205,8 @@ def _together(
     groups: list[list[str]] = []
     for name in names:
         node = target.model[name]
-        support = node.support
         size = math.prod(node.event_shape)
-        if node.plates or node.is_discrete or blankets[name].own is None:
-            continue
-        if support is None or support.kind not in _BOXES or size > _FACTOR_SIZE:
+        if node.plates or node.is_discrete or blankets[name].own is None or size > _FACTOR_SIZE:
             continue
         mine = {id(t) for t in target.terms_of((name,))}
         merged = [name]

@@ -66,10 +66,10 @@ class Steps:
         if self.scale is None:
             var = u.var(axis=0)
             var = np.where((var > 0) & np.isfinite(var), var, 1.0)
-            log_scale = math.log(self.base) + 0.5 * np.log(var).mean(axis=1)
+            log_scale = math.log(self.base) + 0.5 * np.log(var).sum(axis=1) / max(size, 1)
         else:
             var = np.broadcast_to(np.square(self.scale), (elements, size))
-            log_scale = 0.5 * np.log(var).mean(axis=1)
+            log_scale = 0.5 * np.log(var).sum(axis=1) / max(size, 1)
         cov = np.zeros((elements, size, size))
         cov[:, np.arange(size), np.arange(size)] = var
         return {
@@ -171,7 +171,7 @@ class Steps:
 def _unit(factor: np.ndarray) -> np.ndarray:
     """Triangular factors scaled to determinant one."""
     diagonal = np.diagonal(factor, axis1=-2, axis2=-1)
-    return factor / np.exp(np.log(diagonal).mean(axis=-1))[:, None, None]
+    return factor / np.exp(np.log(diagonal).sum(axis=-1) / max(diagonal.shape[-1], 1))[:, None, None]
 
 
 def chance(log_ratio: np.ndarray) -> np.ndarray:

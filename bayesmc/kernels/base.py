@@ -29,9 +29,9 @@ class Kernel:
     label: str = ""
     match: str = ""
 
-    def words(self, name: str) -> str:
-        """What it does to one of its nodes."""
-        return f"{self.label}: {self.match}" if self.match else self.label
+    def words(self, name: str) -> tuple[str, str]:
+        """What it does to one of its nodes: the kind of move, and what that rests on."""
+        return self.label, self.match
 
     def start(self, values: Values, chains: int) -> Memory:
         """Its memory before the first step."""

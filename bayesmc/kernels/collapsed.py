@@ -71,13 +71,17 @@ class CollapsedBlock(Kernel):
         self.needed = _scope(target, block, blankets)
         self.match = block.match
 
-    def words(self, name: str) -> str:
+    def words(self, name: str) -> tuple[str, str]:
         if name not in self.blankets:
             return self.block.words(name)
         block = ", ".join(self.block.names)
         if name not in self.alone:
-            return f"collapsed slice: {block} integrated out, where it is slow without"
-        return f"{self.alone[name].words(name)}; if slow, collapsed slice with {block} integrated out"
+            return "collapsed slice", f"{block} integrated out, if slow otherwise"
+        label, match = self.alone[name].words(name)
+        return (
+            f"{label} or collapsed slice",
+            f"{match}{'; ' if match else ''}if slow, {block} integrated out",
+        )
 
     def start(self, values: Values, chains: int) -> Memory:
         return {

@@ -21,8 +21,9 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conjugate_children import Partner, hidden_above, partner_of
+from bayesmc.kernels.conjugate_children import Partner, partner_of
 from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Kind, Naturals, split_prior
+from bayesmc.kernels.conjugate_labels import hidden_above
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
@@ -69,21 +70,15 @@ class Conjugate(Kernel):
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
         state = values
-        for k, members in enumerate(blanket.classes):
-            if k:  # what follows from the classes before
+        for part, members in enumerate(blanket.classes):
+            if part:  # what follows from the classes before
                 state = dict(state)
                 blanket.target.refresh(state, self.names)
-            now = blanket.current(state, members)
-            naturals, bounds = self._naturals(state, k)
-            shape = now.shape[: now.ndim - len(blanket.event_shape)]
-            drawn = self.kind.draw(naturals, bounds, rng, shape)
-            if drawn is None or self.debug:
-                posterior = self.kind.posterior(naturals, bounds, self.power)
-            if drawn is None:
-                drawn = self._drawn(state, members, posterior, bounds, now, rng)
-            if self.debug:
-                self._check(state, members, posterior, now, drawn)
-            state = {**state, blanket.name: blanket.moved(state, drawn, members)}
+            try:
+                new = self._moved(state, part, members, rng)
+            except np.linalg.LinAlgError as error:
+                raise self._degenerate(error) from error
+            state = {**state, blanket.name: blanket.moved(state, new, members)}
         return {blanket.name: state[blanket.name]}, memory
 
     def full_conditional(self, values: Values, part: int = 0) -> Distribution:
@@ -98,6 +93,23 @@ class Conjugate(Kernel):
         return self.kind.posterior(naturals, bounds, self.power)
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _moved(
+        self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
+    ) -> np.ndarray:
+        """New values of one class of elements."""
+        now = self.blanket.current(values, members)
+        shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
+        naturals, bounds = self._naturals(values, part)
+        drawn = self.kind.draw(naturals, bounds, rng, shape)
+        if drawn is not None and not self.debug:
+            return drawn
+        posterior = self.kind.posterior(naturals, bounds, self.power)
+        if drawn is None:
+            drawn = self._drawn(values, members, posterior, bounds, now, rng)
+        if self.debug:
+            self._check(values, members, posterior, now, drawn)
+        return drawn
 
     def _naturals(self, values: Values, part: int) -> tuple[Naturals, Bounds | None]:
         """Natural parameters of the full conditional: the prior's and what children add."""
@@ -157,12 +169,15 @@ class Conjugate(Kernel):
         if posterior.invalid is None:
             return new
         if self.blanket.event_shape:
-            raise DensityError(
-                f"node {self.blanket.name!r}: its full conditional ({self.match}) has no closed form left: "
-                f"{posterior.problem}"
-            )
+            raise self._degenerate(posterior.problem)
         lost = np.broadcast_to(posterior.invalid, shape)
         return np.where(lost, self._sliced(values, members, bounds, now, rng), new)
+
+    def _degenerate(self, problem: Exception | None) -> DensityError:
+        return DensityError(
+            f"node {self.blanket.name!r}: its full conditional ({self.match}) is degenerate to rounding: "
+            f"{problem}; rescale its children's coefficients, or give it a tighter prior"
+        )
 
     def _sliced(
         self,
@@ -300,6 +315,22 @@ def full_conditional(blanket: Blanket, values: Values, part: int = 0) -> Distrib
     ------
     UnsupportedError
         The node is not conjugate; the message says why.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.conjugate import full_conditional
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.blanket import Blanket
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet(plates={"toss": 4})
+    >>> net.add("p", bmc.Beta(1.0, 1.0))
+    >>> net.add("heads", lambda p: bmc.Bernoulli(p), plates="toss")
+    >>> target = target_of(pose(net, {"heads": [1, 0, 1, 1]}))
+    >>> found = full_conditional(Blanket(target, "p"), {**target.known, "p": np.array([0.5])})
+    >>> found.concentration1.tolist(), found.concentration0.tolist()
+    ([4.0], [2.0])
     """
     kernel = conjugate_kernel(blanket)
     if isinstance(kernel, str):

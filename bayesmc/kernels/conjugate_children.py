@@ -19,12 +19,18 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements, Groups, counted
 from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, slope_of
 from bayesmc.kernels.conjugate_kinds import Kind, Naturals
-from bayesmc.kernels.conjugate_labels import ByLabel, by_label, is_known, read_directly
+from bayesmc.kernels.conjugate_labels import (
+    ByLabel,
+    by_label,
+    hidden_above,
+    is_known,
+    read_directly,
+)
 from bayesmc.kernels.conjugate_pairs import Pair
 from bayesmc.kernels.conjugate_sums import Collector
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.target import Target, Term, Values
+from bayesmc.structure.target import Values
 from bayesmc.structure.traced import Untraceable, traced_term
 from bayesmc.tracing import TracedCall, Tracer
 
@@ -243,22 +249,6 @@ def partner_of(
     power = 1.0 if pair.form != "power" else value.power
     assert power is not None
     return Partner(blanket, child, kind, pair, power)
-
-
-def hidden_above(target: Target, term: Term) -> set[str]:
-    """Hidden stochastic nodes that a term's function varies with, through deterministic ones, too."""
-    todo, found, seen = list(term.parents), set(), set()
-    while todo:
-        name = todo.pop()
-        if name in seen or name in target.known and name not in target.chain:
-            continue
-        seen.add(name)
-        node = target.model[name]
-        if node.is_stochastic:
-            found.add(name)
-        else:
-            todo += node.parents
-    return found
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -140,8 +140,9 @@ class MeanVector(Kind):
     ) -> np.ndarray | None:
         precision, linear = naturals
         factor = _root_of_inverse(precision)
-        whitened = np.vecmat(linear, factor)
-        return np.matvec(factor, whitened + rng.standard_normal(shape + linear.shape[-1:]))
+        noise = rng.standard_normal(shape + linear.shape[-1:])
+        draw = np.matvec(factor, np.vecmat(linear, factor) + noise)
+        return draw if math.isfinite(draw.sum()) else None
 
 
 class Scale(Kind):

@@ -21,7 +21,7 @@ from bayesmc.kernels.conjugate_sums import ByElement, Collector
 from bayesmc.network.model import arguments_of, call
 from bayesmc.plates import Lookups, PlateArray
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.target import Target, Values
+from bayesmc.structure.target import Target, Term, Values
 from bayesmc.structure.traced import Untraceable, traced_term
 from bayesmc.tracing import TracedCall, Tracer
 
@@ -161,7 +161,7 @@ def read_directly(way: ByLabel, neutral: np.ndarray, above: set[str]) -> Values 
     hidden = [n for n in target.chain if n in above and n != way.groups.label]
     if any(target.model[n].is_discrete for n in hidden):
         return None
-    state = _example(way, hidden)
+    state = _example(way, above)
     dist, keys = way.at_labels(state, state[name])
     wanted = _FAMILIES.get(type(dist))
     if wanted is None or dist.invalid is not None or not _is_in_order(way, keys):
@@ -195,13 +195,29 @@ def is_known(target: Target, name: str) -> bool:
     return name in target.known and name not in target.chain
 
 
+def hidden_above(target: Target, term: Term) -> set[str]:
+    """Hidden stochastic nodes that a term's function varies with, through deterministic ones, too."""
+    todo, found, seen = list(term.parents), set(), set()
+    while todo:
+        name = todo.pop()
+        if name in seen or name in target.known and name not in target.chain:
+            continue
+        seen.add(name)
+        node = target.model[name]
+        if node.is_stochastic:
+            found.add(name)
+        else:
+            todo += node.parents
+    return found
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
 def _suffices(way: ByLabel) -> bool:
     """Whether parameters at every label are those of the elements with that label."""
     target, term = way.blanket.target, way.child.term
-    state = {**target.model.probe, **target.known}
+    state = _example(way, hidden_above(target, term))
     states = way.groups.states
     label = np.random.default_rng(0).permutation(np.arange(math.prod(term.shape)) % states)
     label = label.reshape(term.shape)
@@ -234,15 +250,14 @@ def _agrees(full: np.ndarray, short: np.ndarray, label: np.ndarray, event_ndim: 
     return bool(((full == short) | (np.isnan(full) & np.isnan(short))).all())
 
 
-def _example(way: ByLabel, hidden: list[str]) -> Values:
-    """One reachable value of every hidden continuous node, and what follows from them."""
+def _example(way: ByLabel, above: set[str]) -> Values:
+    """One reachable value of every hidden node, and what follows from them."""
     target = way.blanket.target
     state: Values = dict(target.known)
-    for name in hidden:
-        shape = target.model[name].value_shape
-        rows = np.broadcast_to(target.model.probe[name], target.model.probe[name].shape)
-        state[name] = rows.reshape((-1, *shape))[:1]
-    target.refresh(state, hidden)
+    for name in above:
+        rows = np.asarray(target.model.probe[name])
+        state[name] = rows.reshape((-1, *target.model[name].value_shape))[:1]
+    target.refresh(state, above)
     return state
 
 

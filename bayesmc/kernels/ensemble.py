@@ -29,7 +29,7 @@ from bayesmc.shapes import Shape
 from bayesmc.structure.target import Target, Values
 
 #: share of steps that follow a difference of two members, and of these with factor one
-_DIFFERENCES, _JUMPS = 0.5, 0.1
+_DIFFERENCES, _JUMPS = 0.5, 0.2
 #: noise of those steps, in standard deviations
 _NOISE = 1e-3
 #: kinds of moves: a Gaussian step, a difference of adapted length, a difference as it is
@@ -205,7 +205,7 @@ class BlockWalk(Kernel):
         count, at = others.shape[1], np.arange(len(rows))
         first = rng.integers(count, size=len(rows))
         second = (first + 1 + rng.integers(count - 1, size=len(rows))) % count
-        factor = 2.38 / math.sqrt(2 * self.size) * math.exp(memory["log_factor"])
+        factor = 2.38 / math.sqrt(2 * max(self.size, 1)) * math.exp(memory["log_factor"])
         difference = u[others[at, first]] - u[others[at, second]]
         noise = _NOISE * np.sqrt(memory["steps"]["cov"][0].diagonal())
         difference = np.where(jump, 1.0, factor)[:, None] * difference

@@ -13,7 +13,7 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError, ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import FiniteTerms, conditional_of
+from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms, conditional_of
 from bayesmc.kernels.tables import TableSweep
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
@@ -57,10 +57,14 @@ def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None
     >>> (new["x"] + new["y"]).tolist()
     [1, 1, 1, 1]
     """
-    conditional = conditional_of(FiniteTerms(target) if terms is None else terms, names)
+    terms = FiniteTerms(target) if terms is None else terms
+    conditional = conditional_of(terms, names)
     if conditional is not None and conditional.states <= _STATES:
         return TableSweep(target, (conditional,))
-    return JointStates(target, names)
+    around = terms.around(names)
+    if around is None or any(table.plates for table in around):
+        return JointStates(target, names)
+    return TabulatedStates(target, names, around)
 
 
 class JointStates(Kernel):
@@ -143,7 +147,50 @@ class JointStates(Kernel):
         return {n: codes[drawn].astype(dtype) for n, codes, dtype in moved}, memory
 
 
+class TabulatedStates(JointStates):
+    """As `JointStates`, where all terms are tables without plates: their log rows are gathered and summed.
+
+    Parameters
+    ----------
+    around : sequence of FiniteTerm
+        All terms that the block enters.
+    """
+
+    def __init__(self, target: Target, names: Sequence[str], around: Sequence[FiniteTerm]) -> None:
+        super().__init__(target, names)
+        self.rows = [_Rows(table, self.names, self.states) for table in around]
+
+    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        total = np.zeros((self.states.shape[1], len(values[self.names[0]])))
+        for rows in self.rows:
+            total += rows(values)
+        return total
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+class _Rows:
+    """Log factors of one table for all joint states of a block, gathered by the states of the others."""
+
+    def __init__(self, table: FiniteTerm, names: Sequence[str], states: np.ndarray) -> None:
+        inside = [i for i, n in enumerate(table.scope) if n in names]
+        outside = [i for i, n in enumerate(table.scope) if n not in names]
+        log = table.log.transpose(*inside, *outside)
+        cards = log.shape[: len(inside)]
+        self.others = [table.scope[i] for i in outside]
+        sizes = log.shape[len(inside) :]
+        self.strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
+        self.log = np.ascontiguousarray(log.reshape(math.prod(cards), -1))
+        own = [states[names.index(table.scope[i])] for i in inside]
+        self.local = np.ravel_multi_index(own, cards)
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Shape ``(joint states, chains or 1)``."""
+        at = np.zeros(1, dtype=np.intp)
+        for name, stride in zip(self.others, self.strides, strict=True):
+            at = at + values[name].astype(np.intp) * stride
+        return self.log.take(at, axis=1).take(self.local, axis=0)
 
 
 def _enters(target: Target, name: str, term: Term) -> bool:

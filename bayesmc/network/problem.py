@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -28,12 +28,15 @@ class Problem:
         Node name -> ``Observed``.
     inputs : dict
         Input name -> stored value.
+    cache : dict
+        What engines derived from the question and may use again; it lives as long as the problem.
     """
 
     net: BayesNet | FactorGraph
     model: Model
     observed: dict[str, Observed]
     inputs: dict[str, np.ndarray]
+    cache: dict[str, Any] = field(default_factory=dict, repr=False)
 
 
 def pose(

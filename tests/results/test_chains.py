@@ -87,48 +87,68 @@ def test_figures_are_arvizs() -> None:
     np.testing.assert_allclose(tail[1], reference, rtol=1e-9)
 
 
-@pytest.mark.parametrize("draws", [4, 5, 6, 7, 8, 9, 40, 57])
-@pytest.mark.parametrize("phi", [0.95, 0.0, -0.6])
-def test_short_chains_and_ties_too(draws: int, phi: float) -> None:
-    """Where Geyer's sequence ends at its first pair, at its last, or in between."""
-    rng = np.random.default_rng(draws)
-    smooth = autoregressive(rng, phi, (3, draws, 20))
-    methods: dict[str, tuple[str, dict[str, Any]]] = {
-        "ess": ("ess", {}),
-        "tail_ess": ("ess", {"method": "tail", "prob": 0.05}),
-        "mean_ess": ("ess", {"method": "mean"}),
-        "rhat": ("rhat", {}),
-        "mcse": ("mcse", {}),
-    }
-    for values in (smooth, np.floor(smooth), np.exp(9 * smooth)):
-        for kind, (method, options) in methods.items():
-            with np.errstate(all="ignore"):
-                statistic = getattr(array_stats, method)
-                reference = statistic(values, chain_axis=0, draw_axis=1, **options)
-            got = diagnostics.chain_statistic(kind, values)
-            if (
-                kind == "rhat"
-            ):  # of chains that stand still: infinite, where ArviZ divides by a rounding
-                got, reference = np.minimum(got, 1e8), np.minimum(reference, 1e8)
-            np.testing.assert_allclose(got, reference, rtol=1e-9, err_msg=kind)
+ARVIZ: dict[str, tuple[str, dict[str, Any]]] = {
+    "ess": ("ess", {}),
+    "tail_ess": ("ess", {"method": "tail", "prob": 0.05}),
+    "mean_ess": ("ess", {"method": "mean"}),
+    "rhat": ("rhat", {}),
+    "mcse": ("mcse", {}),
+}
+
+
+@pytest.mark.parametrize("kind", ARVIZ)
+@pytest.mark.parametrize("draws", [4, 7, 60])
+def test_short_chains_and_ties_too(draws: int, kind: str) -> None:
+    smooth = autoregressive(np.random.default_rng(draws), 0.8, (3, draws, 4))
+    method, options = ARVIZ[kind]
+    for values in (smooth, np.floor(smooth)):
+        with np.errstate(all="ignore"):
+            statistic = getattr(array_stats, method)
+            reference = statistic(values, chain_axis=0, draw_axis=1, **options)
+        if kind == "rhat":  # of chains that stand still: ArviZ divides by a rounding error
+            reference[reference > 1e8] = np.inf
+        got = diagnostics.chain_statistic(kind, values)
+        np.testing.assert_allclose(got, reference, rtol=1e-9)
 
 
 def test_one_chain_is_compared_with_itself() -> None:
     rng = np.random.default_rng(0)
-    steady = rng.normal(size=(1, 2000))
-    drifting = steady + np.linspace(0, 3, 2000)
+    steady = rng.normal(size=(1, 2001))
+    drifting = steady + np.linspace(0, 3, 2001)
     assert diagnostics.chain_statistic("rhat", steady) < 1.01
     assert diagnostics.chain_statistic("rhat", drifting) > 1.3
+    halves = np.concatenate([drifting[:, :1000], drifting[:, -1000:]])
+    expected = array_stats.rhat(halves, chain_axis=0, draw_axis=1)
+    assert diagnostics.chain_statistic("rhat", drifting) == pytest.approx(float(expected))
+    assert np.isnan(diagnostics.chain_statistic("rhat", steady[:, :7]))  # halves of three draws
 
 
 def test_chains_that_stand_still() -> None:
     apart = np.repeat(np.array([[1.0], [2.0], [2.0], [0.1]]), 100, axis=1)
     assert diagnostics.chain_statistic("rhat", apart) == np.inf
-    assert np.isnan(diagnostics.chain_statistic("rhat", np.full((4, 100), 0.1)))
-    assert diagnostics.chain_statistic("mcse", np.full((4, 100), 0.1)) == 0.0
-    nan = np.full((4, 100), 0.1)
-    nan[2, 3] = np.nan
-    assert np.isnan(diagnostics.chain_statistic("ess", nan))
+    assert diagnostics.chain_statistic("rhat", apart[[0, 3]], 5) == np.inf
+    long = np.repeat(apart, 1000, axis=1)
+    long[0, 7] = 1.1  # one move of one chain: large, and a number
+    assert 10 < diagnostics.chain_statistic("rhat", long) < np.inf
+    still = np.full((4, 100), 0.1)
+    for block in (1, 5):
+        assert np.isnan(diagnostics.chain_statistic("rhat", still, block))
+        assert diagnostics.chain_statistic("mcse", still, block) == 0.0
+        for kind in ("ess", "mean_ess", "tail_ess"):
+            assert diagnostics.chain_statistic(kind, still, block) == 400.0
+    still[2, 3] = np.nan
+    for kind in ARVIZ:
+        assert np.isnan(diagnostics.chain_statistic(kind, still))
+
+
+@pytest.mark.parametrize("block", [1, 5])
+def test_the_unit_does_not_matter(block: int) -> None:
+    """Values as close as 1e-15 are no constants; by a power of 2 the figures are the same to the bit."""
+    x, unit = draws_of(4, 500)["z"], 2.0**-70
+    for kind in ARVIZ:
+        got = diagnostics.chain_statistic(kind, unit * x, block)
+        expected = diagnostics.chain_statistic(kind, x, block) * (unit if kind == "mcse" else 1.0)
+        np.testing.assert_array_equal(got, expected)
 
 
 # ---- ensembles -----------------------------------------------------------------------------------
