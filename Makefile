@@ -7,7 +7,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 PY = .venv/bin/python
 PIP_FLAGS = --disable-pip-version-check -q
 
-.PHONY: help demo test lint format docs bench peers clean
+.PHONY: help demo test lint format docs bench peers references clean
 .NOTPARALLEL:
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make docs    run every snippet of README, docs and docstrings"
 	@echo "make bench   time bayesmc beside hand-written code (and peers, after 'make peers')"
 	@echo "make peers   install the packages that the benchmarks compare with, in .venv-peers"
+	@echo "make references  hold Gibbs against BUGS and posteriordb, and write docs/accuracy.md (long)"
 	@echo "make clean   remove what the other targets made"
 
 demo: .venv/.extras-plot
@@ -42,6 +43,10 @@ bench: .venv/.extras-plot,arviz,test
 	$(PY) -m benchmarks
 
 peers: .venv-peers/.installed
+
+# BAYESMC_DATA says where the published posteriors are
+references: .venv/.extras-plot,arviz,test
+	$(PY) -m references
 
 clean:
 	rm -rf .venv .venv-peers out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

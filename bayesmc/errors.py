@@ -75,7 +75,17 @@ class ParameterError(BayesmcError, ValueError):
 
 
 class DensityError(BayesmcError, ValueError):
-    """A log density came out NaN or plus infinity."""
+    """A log density came out NaN or plus infinity.
+
+    Attributes
+    ----------
+    index : tuple of int
+        First such place among batch and plates, where known.
+    """
+
+    def __init__(self, message: str, index: tuple[int, ...] = ()) -> None:
+        super().__init__(message)
+        self.index = index
 
 
 class EnvelopeError(BayesmcError, ValueError):

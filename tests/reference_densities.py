@@ -376,7 +376,7 @@ def gaussian_mixture(d: Any, rng: np.random.Generator) -> Point:
         logp += (second == s).sum() * math.log(weight)
         logp += normal(y[second == s], mu[int(s)], sigma[int(s)] ** -2)
     values = {"unordered": rng.permutation(mu), "sigma": sigma, "theta": theta}
-    return {**values, "second": second.astype(int), "response": y}, logp
+    return {**values, "first": 1 - second, "response": y}, logp
 
 
 def one_rate(d: Any, rng: np.random.Generator) -> Point:

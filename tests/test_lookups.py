@@ -469,15 +469,14 @@ def allowed(
 ) -> np.ndarray:
     """Where in the plates an element of a parent may be read, by the keys that are claimed."""
     found = np.zeros(lead, dtype=bool)
-    for place in places:
+    for place in places if element else ():
         here: Any = np.ones((), dtype=bool)
         for at, wanted in zip(keys[name][place], element[: len(PLATES[name])], strict=True):
             here = here & (np.asarray(at) == wanted)
-        shape = np.broadcast_shapes(np.shape(here), (1,))
-        fitting = all(a in (b, 1) for a, b in zip(shape[::-1], lead[::-1], strict=False)) and len(
-            shape
-        ) <= len(lead)
-        found |= np.broadcast_to(here, lead) if fitting else np.any(here)
+        if bmc.shapes.broadcasts_to(np.shape(np.atleast_1d(here)), lead):
+            found |= here
+        elif np.size(here) == 1:  # one place for all
+            found |= bool(np.any(here))
     return found
 
 
@@ -498,7 +497,8 @@ def lie(program: Program) -> str | None:
             places = [
                 int(s[len(name) + 1 : -1]) for s in result.sources if s.startswith(f"{name}[")
             ]
-            for element in np.ndindex(SHAPES[name]):
+            elements: list[Any] = list(np.ndindex(SHAPES[name])) if places else [()]
+            for element in elements:  # all at once where it is said not to matter at all
                 may = allowed(base.shape[:lead], name, places, keys, element)
                 if may.all():
                     continue
@@ -514,7 +514,7 @@ def lie(program: Program) -> str | None:
 
 @functools.cache
 def programs() -> list[list[Step]]:
-    return [p for p in map(random_program, range(1200)) if p]
+    return [p for p in map(random_program, range(900)) if p]
 
 
 def test_what_is_said_to_be_looked_up_is_read_there_alone() -> None:
@@ -540,37 +540,52 @@ def test_much_is_said_to_be_looked_up() -> None:
     """Were all read all over, the test of soundness would say nothing."""
     results = [r for r in map(traced, programs()) if r is not None]
     placed = [r for r in results if not any(s.endswith("[*]") for s in r.sources)]
-    assert len(results) > 800
-    assert len(placed) > 300
-    assert sum(len(r.sources) > 1 for r in placed) > 60
-    assert sum(r.ndim > 1 for r in placed) > 100
+    assert len(results) > 700
+    assert len(placed) > 200
+    assert sum(len(r.sources) > 1 for r in placed) > 40
+    assert sum(r.ndim > 1 for r in placed) > 40
 
 
-WRONG: dict[str, tuple[Any, str, Any]] = {
-    "sums are element by element": (axes, "_ELEMENTWISE", {np.cumsum, np.sort}),
-    "transposes are shapes": (axes, "_RESHAPING", {np.transpose}),
-    "axes of sums are behind": (axes, "covering", lambda axis, ndim: (ndim - 1, ndim)),
-    "keys touch nothing": (axes, "index_span", lambda key, ndim: axes.KEPT),
-    "keys touch the last axis": (claims, "index_span", lambda key, ndim: (ndim - 1, ndim)),
-    "matrices have no core": (axes, "_cores", lambda ufunc, inputs: ([0] * len(inputs), 0)),
-    "nothing mixes": (
-        claims, "ufunc_behind", lambda ufunc, method, inputs, kwargs, found, result: np.ndim(result),
+#: a rule, where it stands, what is wrong with it now, and steps that should bring it out
+WRONG: dict[str, tuple[Any, str, Any, tuple[str, ...]]] = {
+    "sums are element by element": (
+        axes, "_ELEMENTWISE", {np.cumsum, np.sort}, ("cumsum", "sort"),
     ),
-    "einsum keeps places": (axes, "_after_einsum", lambda args, x: iter([x.claims.behind])),
-    "the order is kept": (axes, "_reshaped", lambda before, after: axes.KEPT),
+    "transposes are element by element": (axes, "_ELEMENTWISE", {np.swapaxes}, ("swapaxes",)),
+    "axes of sums are behind": (
+        axes, "covering", lambda axis, ndim: (ndim - 1, ndim), ("cumsum", "flip", "roll"),
+    ),
+    "keys touch nothing": (
+        claims, "index_span", lambda key, ndim: axes.KEPT, ("reversed", "fancy"),
+    ),
+    "keys touch the last axis": (
+        claims, "index_span", lambda key, ndim: (ndim - 1, ndim), ("two runs of fancy", "fancy"),
+    ),
+    "matrices have no core": (
+        axes, "_cores", lambda ufunc, inputs: ([0] * len(inputs), 0), ("vecdot", "matmul"),
+    ),
+    "nothing mixes": (
+        claims, "ufunc_behind",
+        lambda ufunc, method, inputs, kwargs, found, result: np.ndim(result), ("multiply", "add"),
+    ),
+    "einsum keeps places": (
+        axes, "_after_einsum", lambda args, x: iter([x.claims.behind]), ("einsum, mixing",),
+    ),
+    "the order is kept": (
+        axes, "_reshaped", lambda before, after: axes.KEPT, ("flat", "first axes joined"),
+    ),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("rule", WRONG)
 def test_a_wrong_rule_is_caught(rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control: one wrong rule, and random programs find a lie."""
-    module, table, wrong = WRONG[rule]
+    module, table, wrong, steps = WRONG[rule]
     right = getattr(module, table)
     monkeypatch.setattr(module, table, wrong if callable(wrong) else right | wrong)
-    if table == "index_span":
-        monkeypatch.setattr(claims, table, wrong)
-    more = (random_program(seed) for seed in range(2000))
-    found = next((program for program in more if lie(program)), None)
+    more = (program for program in map(random_program, range(8000)) if program)
+    apt = (program for program in more if any(word in steps for word, _ in program))
+    found = next((program for program in apt if lie(program)), None)
     assert found is not None
     monkeypatch.undo()
     assert lie(found) is None  # it is the rule that lied

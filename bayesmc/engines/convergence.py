@@ -168,21 +168,18 @@ def _screen(values: np.ndarray, block: int) -> tuple[float, float]:
     count = min(_BATCHES, draws // block)
     values = values[:, : draws // block // count * block * count]
     sample = values.ravel()[:: (values.size // _SAMPLE) | 1]
-    low, middle, high = np.quantile(sample, [0.05, 0.5, 0.95])
-    offset = (values - middle) / (high - low or values.std())
-    far = np.abs(offset)
-    far /= 1.0 + far
-    series = np.stack([np.copysign(far, offset), far, values <= low, values <= high])
-    means = series.reshape(4, chains, count, -1).mean(axis=-1)
-    variance = series.var(axis=(1, 2))
-    of_blocks = (
-        variance
-        if block == 1
-        else series.reshape(4, chains, -1, block).mean(axis=-1).var(axis=(1, 2))
-    )
-    half = count // 2
-    halves = np.stack([means[..., :half].mean(axis=-1), means[..., -half:].mean(axis=-1)])
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):  # infinite draws, and scalars that hardly ever move
+        low, middle, high = np.quantile(sample, [0.05, 0.5, 0.95])
+        offset = (values - middle) / (high - low or values.std())
+        far = np.abs(offset)
+        far /= 1.0 + far
+        series = np.stack([np.copysign(far, offset), far, values <= low, values <= high])
+        means = series.reshape(4, chains, count, -1).mean(axis=-1)
+        variance = of_blocks = series.var(axis=(1, 2))
+        if block > 1:
+            of_blocks = series.reshape(4, chains, -1, block).mean(axis=-1).var(axis=(1, 2))
+        half = count // 2
+        halves = np.stack([means[..., :half].mean(axis=-1), means[..., -half:].mean(axis=-1)])
         between = halves.var(axis=(0, 2)) / of_blocks
         ess = chains * count * variance / means.var(axis=(1, 2))
     return float(np.fmax(*between[:2])), float(np.fmin.reduce(ess[[0, 2, 3]]))

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.gibbs_plan import Plan, plan_of
 from bayesmc.engines.starting import start_states
 from bayesmc.errors import ReducibleWarning
 from bayesmc.network import Problem
-from bayesmc.network.forward import Pass, run, step_for
+from bayesmc.network.forward import Pass, run
 from bayesmc.structure.target import Values
 
 
@@ -95,8 +96,12 @@ class GibbsSampler:
         self.plan = plan
         self.target = plan.target
         self.kernels = plan.kernels
-        model, observed = self.target.model, self.target.observed
-        self.forward = [step_for(model, model[n], observed) for n in self.target.forward]
+        problem = plan.problem
+        bare = replace(problem.model, potentials={})  # none reads what is drawn forward
+        steps = dict(
+            zip(bare.nodes, fast_steps(bare, problem.observed, problem.inputs), strict=True)
+        )
+        self.forward = [steps[n] for n in self.target.forward]
         self.forward_nodes = self.target.forward
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:

@@ -163,8 +163,9 @@ def _finite(
     kernels: list[Kernel] = []
     lattices = {n: k for n in names if (k := lattice_kernel(blankets[n])) is not None}
     kernels += lattices.values()
+    tight = tuple(n for n, k in lattices.items() if getattr(k, "constrained", False))
     if len(lattices) == len(names):
-        return kernels, ()
+        return kernels, tight
     terms = FiniteTerms(target)
     blocks = coupled_blocks(target, terms)
     wanted = [(n,) for n in names if n not in lattices] + blocks
@@ -176,7 +177,7 @@ def _finite(
         else:
             blanket = blankets[block[0]]
             kernels.append(table_kernel(blanket, terms) or Enumerate(blanket))
-    return kernels, deterministic_constraints(target, blocks, terms)
+    return kernels, (*tight, *deterministic_constraints(target, blocks, terms))
 
 
 def _numbers(

@@ -141,9 +141,7 @@ class MetropolisHastings(ChainEngine):
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the proposals' functions."""
-        kept = {
-            k: v if isinstance(v, (str, RandomWalk)) else None for k, v in self._given.items()
-        }
+        kept = {k: v if isinstance(v, (str, RandomWalk)) else None for k, v in self._given.items()}
         return {**self.__dict__, "proposal": kept}
 
     def __copy__(self) -> MetropolisHastings:

@@ -6,6 +6,7 @@ to the prior mean.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -21,6 +22,8 @@ from bayesmc.structure.target import Target, Values
 #: how far draws go from the prior mean, for successive attempts
 _SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 0.0)
 _ATTEMPTS = 8
+#: numbers of one node drawn at once, at most, where possible states are rare
+_MOST = 1 << 21
 #: the most that draws of a half line go from the middle
 _FROM_ZERO = 0.9
 #: supports that hold every point between two of theirs
@@ -35,33 +38,70 @@ def start_states(target: Target, chains: int, rng: np.random.Generator) -> Value
     ZeroProbabilityError
         None was found; the message names the term that no attempt could satisfy.
     """
-    best: Values = {}
-    best_log = np.full(chains, -np.inf)
-    culprits: dict[str, int] = {}
-    failure: BayesmcError | None = None
+    search = _Search(target, chains, rng)
+    continuous = any(not target.model[n].is_discrete for n in target.chain)
     for spread in _SPREADS:
+        search.attempt(spread, _ATTEMPTS)
+        if search.complete and not continuous:
+            break
+    largest = max((math.prod(target.model[n].value_shape) for n in target.chain), default=1)
+    attempts = _ATTEMPTS
+    while not search.complete and attempts * chains * largest <= _MOST:
+        attempts *= 8
+        search.attempt(1.0, attempts)
+    return {**target.known, **search.found()}
+
+
+class _Search:
+    """The best start state of every chain so far."""
+
+    def __init__(self, target: Target, chains: int, rng: np.random.Generator) -> None:
+        self.target, self.chains, self.rng = target, chains, rng
+        self.best: Values = {}
+        self.log = np.full(chains, -np.inf)
+        self.attempts = 0
+        self.culprits: dict[str, int] = {}
+        self.failure: BayesmcError | None = None
+
+    @property
+    def complete(self) -> bool:
+        return bool((self.log > -np.inf).all())
+
+    def attempt(self, spread: float, attempts: int) -> None:
+        """Some more draws, which replace what is much less likely."""
+        self.attempts += attempts
         try:
-            values, log = _attempt(target, chains * _ATTEMPTS, spread, rng, culprits)
-        except (ParameterError, FloatingPointError) as error:
-            failure = error  # type: ignore[assignment]
-            continue
-        log = np.where(np.isnan(log), -np.inf, log).reshape(_ATTEMPTS, chains)
-        pick = log.argmax(axis=0)
-        top = log[pick, np.arange(chains)]
+            values, log = _attempt(
+                self.target, self.chains * attempts, spread, self.rng, self.culprits
+            )
+        except ParameterError as error:
+            self.failure = error
+            return
+        log = np.where(np.isnan(log), -np.inf, log).reshape(attempts, self.chains)
+        pick = log.argmax(axis=0), np.arange(self.chains)
         # closer to the prior mean only where that helps a lot: starts ought to differ
-        better = top > best_log + (0.0 if not best else 10.0)
+        better = log[pick] > self.log + (10.0 if self.best else 0.0)
         for name, value in values.items():
-            rows = value.reshape(_ATTEMPTS, chains, *value.shape[1:])[pick, np.arange(chains)]
-            if name in best:
+            rows = value.reshape(attempts, self.chains, *value.shape[1:])[pick]
+            if name in self.best:
                 at = better.reshape((-1,) + (1,) * (rows.ndim - 1))
-                rows = np.where(at, rows, best[name])
-            best[name] = rows
-        best_log = np.where(better, top, best_log)
-    if not (best_log > -np.inf).all():
-        if failure is not None and not culprits:
-            raise failure
-        raise _impossible(target, culprits)
-    return {**target.known, **best}
+                rows = np.where(at, rows, self.best[name])
+            self.best[name] = rows
+        self.log = np.where(better, log[pick], self.log)
+
+    def found(self) -> Values:
+        """The states; a chain that found none starts where another does."""
+        alive = np.flatnonzero(self.log > -np.inf)
+        if not len(alive):
+            if self.failure is not None and not self.culprits:
+                raise self.failure
+            raise _impossible(self.culprits, self.attempts)
+        rows = np.arange(self.chains)
+        rows[self.log == -np.inf] = self.rng.choice(alive, int((self.log == -np.inf).sum()))
+        return {n: v[rows] for n, v in self.best.items()}
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _attempt(
@@ -170,9 +210,8 @@ def _of_support(node: CompiledNode, count: int, rng: np.random.Generator) -> np.
     return transform.constrain(free)
 
 
-def _impossible(target: Target, culprits: dict[str, int]) -> ZeroProbabilityError:
+def _impossible(culprits: dict[str, int], attempts: int) -> ZeroProbabilityError:
     names: Sequence[str] = sorted(culprits, key=lambda n: -culprits[n])
-    attempts = len(_SPREADS) * _ATTEMPTS
     what = f"the term of {names[0]!r} has probability zero" if names else "some term is impossible"
     return ZeroProbabilityError(
         f"no start state of positive density in {attempts} attempts per chain: {what} in all of them; "

@@ -171,7 +171,9 @@ class Steps:
 def _unit(factor: np.ndarray) -> np.ndarray:
     """Triangular factors scaled to determinant one."""
     diagonal = np.diagonal(factor, axis1=-2, axis2=-1)
-    return factor / np.exp(np.log(diagonal).sum(axis=-1) / max(diagonal.shape[-1], 1))[:, None, None]
+    return (
+        factor / np.exp(np.log(diagonal).sum(axis=-1) / max(diagonal.shape[-1], 1))[:, None, None]
+    )
 
 
 def chance(log_ratio: np.ndarray) -> np.ndarray:

@@ -30,8 +30,8 @@ from bayesmc.structure.target import Target, Values
 
 #: share of steps that follow a difference of two members, and of these with factor one
 _DIFFERENCES, _JUMPS = 0.5, 0.2
-#: noise of those steps, in standard deviations
-_NOISE = 1e-3
+#: noise of those steps, in Gaussian steps
+_NOISE = 1e-2
 #: kinds of moves: a Gaussian step, a difference of adapted length, a difference as it is
 _GAUSSIAN, _DIFFERENCE, _JUMP = 0, 1, 2
 
@@ -200,16 +200,15 @@ class BlockWalk(Kernel):
         steps = self.steps.draw(memory["steps"], rng, rows)[:, 0]
         if others is None:
             return u[rows] + steps, np.full(len(rows), _GAUSSIAN)
-        along = rng.random(len(rows)) < _DIFFERENCES
-        jump = rng.random(len(rows)) < _JUMPS
+        kind, jumps, one, other = rng.random((4, len(rows)))
+        along, jump = kind < _DIFFERENCES, jumps < _JUMPS
         count, at = others.shape[1], np.arange(len(rows))
-        first = rng.integers(count, size=len(rows))
-        second = (first + 1 + rng.integers(count - 1, size=len(rows))) % count
+        first = (one * count).astype(np.intp)
+        second = (first + 1 + (other * (count - 1)).astype(np.intp)) % count
         factor = 2.38 / math.sqrt(2 * max(self.size, 1)) * math.exp(memory["log_factor"])
         difference = u[others[at, first]] - u[others[at, second]]
-        noise = _NOISE * np.sqrt(memory["steps"]["cov"][0].diagonal())
-        difference = np.where(jump, 1.0, factor)[:, None] * difference
-        difference = difference + noise * rng.standard_normal(steps.shape)
+        # a little noise: differences of few members span less than the space
+        difference = np.where(jump, 1.0, factor)[:, None] * difference + _NOISE * steps
         moves = np.where(along, np.where(jump, _JUMP, _DIFFERENCE), _GAUSSIAN)
         return u[rows] + np.where(along[:, None], difference, steps), moves
 

@@ -58,7 +58,15 @@ def lattice_kernel(blanket: Blanket) -> Kernel | None:
 
 
 class _Lattice(Kernel):
-    """What both kernels share."""
+    """What both kernels share.
+
+    Attributes
+    ----------
+    constrained : bool
+        Some factor forbids joint states, so that moves of one site at a time may not reach all others.
+    """
+
+    constrained = False
 
     def __init__(self, blanket: Blanket) -> None:
         self.blanket = blanket
@@ -94,7 +102,7 @@ class SiteSums(_Lattice):
 
     def __init__(self, blanket: Blanket, sites: Sites) -> None:
         super().__init__(blanket)
-        self.sites = sites
+        self.constrained = any(bool(np.isneginf(b.log).any()) for b in sites.batches)
         others = (n for batch in sites.batches for n in batch.names)
         self.read = tuple(dict.fromkeys([blanket.name, *others]))
         model = blanket.target.model

@@ -166,9 +166,7 @@ class Proposed(Kernel):
         stored, outside = to_stored(node, draws)
         return stored, np.broadcast_to(outside, shape), log
 
-    def _backward(
-        self, values: Values, new: np.ndarray, members: np.ndarray | None
-    ) -> np.ndarray:
+    def _backward(self, values: Values, new: np.ndarray, members: np.ndarray | None) -> np.ndarray:
         """Log density of proposing the old values from the new ones."""
         blanket = self.blanket
         conditional, name = self.conditional, blanket.name
@@ -191,7 +189,9 @@ class Proposed(Kernel):
         shape = (len(now), *node.plate_shape)
         draws = dist.sample_to(np.random.default_rng(0), shape)
         stored, outside = to_stored(node, draws)
-        support = node.support if blanket.own is None else blanket.own.distribution(values)[0].support
+        support = (
+            node.support if blanket.own is None else blanket.own.distribution(values)[0].support
+        )
         assert support is not None
         outside = outside | ~support.contains(draws)
         stored = instead(np.broadcast_to(outside, shape), stored, now)
@@ -289,7 +289,9 @@ class ProposedBlock(Kernel):
         new, dead, log = {}, np.zeros(chains, dtype=bool), np.zeros(chains)
         for node in self.nodes:
             draws = dist.parts[node.name].sample_to(rng, (chains, *node.plate_shape))
-            one = np.broadcast_to(dist.parts[node.name].log_prob(draws), draws.shape[: 1 + len(node.plates)])
+            one = np.broadcast_to(
+                dist.parts[node.name].log_prob(draws), draws.shape[: 1 + len(node.plates)]
+            )
             _refuse_infinite(one)
             stored, outside = to_stored(node, draws)
             new[node.name] = self._with_seen(node, stored, values)
@@ -346,7 +348,9 @@ class ProposedBlock(Kernel):
         if seen is None:
             return new
         assert seen.mask is not None
-        return instead(np.broadcast_to(seen.mask, new.shape[: 1 + len(node.plates)]), new, values[node.name])
+        return instead(
+            np.broadcast_to(seen.mask, new.shape[: 1 + len(node.plates)]), new, values[node.name]
+        )
 
     def _summed(self, node: CompiledNode, log: np.ndarray) -> np.ndarray:
         """Sum over the elements that move, shape (chains,)."""

@@ -28,7 +28,7 @@ from bayesmc.network.domain import Domain
 from bayesmc.network.elementwise import call_elementwise
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.plates import Gathered, PlateArray
-from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, read_only
+from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
 from bayesmc.states import StateArray
 
 #: configurations of finite parents up to which a deterministic node is tabulated
@@ -168,10 +168,12 @@ class Model:
             bad = bad & ~distribution.invalid
             result = np.where(distribution.invalid, -np.inf, result)
         if bad.any():
-            found = np.broadcast_to(result, bad.shape)[bad].flat[0]
+            index = first_index(bad)
+            found = np.broadcast_to(result, bad.shape)[index]
             raise DensityError(
                 f"node {name!r}: the log density of {distribution!r} is {found}; a log density must "
-                "be below infinity and not NaN (check the function at the edges of its support)"
+                "be below infinity and not NaN (check the function at the edges of its support)",
+                index,
             )
         return result
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+#: components up to which two colours are tried first
+_COMPONENTS = 1000
+
 
 def colours(count: int, edges: np.ndarray) -> list[np.ndarray]:
-    """Greedy colouring of ``count`` elements, in their order.
+    """Colours of ``count`` elements, in their order.
 
     Parameters
     ----------
@@ -16,8 +19,8 @@ def colours(count: int, edges: np.ndarray) -> list[np.ndarray]:
     Returns
     -------
     list of ndarray of int
-        Elements of each colour, ascending. A grid in raster order takes two, a graph of largest degree d
-        at most d + 1.
+        Elements of each colour, ascending: two where two will do (a grid), else greedily at most one more
+        than the largest degree.
 
     References
     ----------
@@ -30,10 +33,35 @@ def colours(count: int, edges: np.ndarray) -> list[np.ndarray]:
     >>> [c.tolist() for c in colours(4, np.array([[0, 1], [1, 2], [2, 3]]))]
     [[0, 2], [1, 3]]
     """
-    if not len(edges):
-        return [np.arange(count)]
-    both = np.concatenate([edges, edges[:, ::-1]])
+    both = np.concatenate([edges, edges[:, ::-1]]).astype(np.intp)
     both = both[both[:, 0] != both[:, 1]]
+    if not len(both):
+        return [np.arange(count)] if count else []
+    found = _two(count, both)
+    if found is None:
+        found = _greedy(count, both)
+    return [np.flatnonzero(found == c) for c in range(found.max() + 1)]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _two(count: int, both: np.ndarray) -> np.ndarray | None:
+    """Colours 0 and 1 where two will do: the parity of the distance from one element of each component."""
+    from scipy.sparse import csgraph, csr_array
+
+    graph = csr_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
+    number, component = csgraph.connected_components(graph, directed=False)
+    if number > _COMPONENTS:
+        return None
+    roots = np.unique(component, return_index=True)[1]
+    distance = csgraph.dijkstra(graph, indices=roots, unweighted=True, min_only=True)
+    parity = distance.astype(np.intp) % 2
+    return None if (parity[both[:, 0]] == parity[both[:, 1]]).any() else parity
+
+
+def _greedy(count: int, both: np.ndarray) -> np.ndarray:
+    """The smallest colour that no neighbour before has, in the order of the elements."""
     order = np.argsort(both[:, 0], kind="stable")
     neighbours = both[order, 1].tolist()
     starts = np.searchsorted(both[order, 0], np.arange(count + 1)).tolist()
@@ -44,5 +72,4 @@ def colours(count: int, edges: np.ndarray) -> list[np.ndarray]:
         while c in taken:
             c += 1
         colour[e] = c
-    found = np.asarray(colour)
-    return [np.flatnonzero(found == c) for c in range(max(colour) + 1)]
+    return np.asarray(colour)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import ParameterError
+from bayesmc.errors import DensityError, ParameterError
 from bayesmc.network import Model, Observed, Problem
 from bayesmc.network.model import invalid_error
 from bayesmc.shapes import Shape, broadcast_shapes
@@ -62,19 +62,37 @@ class Term:
         if self.is_potential:
             return self.model.potential(self.name, values, total=False)
         dist, batch = self.distribution(values)
-        return self.log_of(dist, batch, values[self.name])
+        try:
+            return self.log_of(dist, batch, values[self.name])
+        except DensityError as error:
+            raise DensityError(f"{error}{self._at(values, error.index)}", error.index) from error
+
+    def _at(self, values: Mapping[str, np.ndarray], index: Shape) -> str:
+        """The values of the node and its parents at a place of its batch and plates, in words."""
+        shown = []
+        for name in self.scope[:8]:
+            node = self.model[name]
+            value = np.asarray(node.decode(values[name]))
+            lead = value.ndim - len(node.value_shape)
+            batch = index[: len(index) - len(self.plates)][-lead:] if lead else ()
+            at = tuple(min(i, n - 1) for i, n in zip(batch, value.shape, strict=False))
+            place = dict(zip(self.plates, index[len(index) - len(self.plates) :], strict=False))
+            if all(p in place for p in node.plates):
+                at += tuple(place[p] for p in node.plates)
+            shown.append(_shown(name, value[at]))
+        return f"; there {', '.join(shown)}"
 
     def log_of(self, dist: Distribution, batch: Shape, value: np.ndarray) -> np.ndarray:
         """Log density of stored values under a distribution that was evaluated before.
 
-        Parameters that overflowed have density zero; those out of their range are the model's fault and
+        Parameters that over- or underflowed have density zero; those out of their range are the model's fault and
         raise.
         """
         node = self.model[self.name]
         result = self.model.log_density(self.name, dist, value)
         if dist.invalid is not None:
             lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
-            if _is_finite(dist.problem):
+            if _is_fault(dist.problem):
                 error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
                 if error is not None:
                     raise error
@@ -211,10 +229,17 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _is_finite(problem: ParameterError | None) -> bool:
-    """Whether a parameter was refused for what it is, not because it overflowed on the way."""
+def _shown(name: str, value: np.ndarray) -> str:
+    return f"{name} = {np.array2string(value, precision=6, threshold=6)}"
+
+
+def _is_fault(problem: ParameterError | None) -> bool:
+    """Whether a parameter was refused for what it is, not because it over- or underflowed on the way."""
     value = None if problem is None else problem.value
-    return value is None or bool(np.isfinite(np.asarray(value, dtype=float)).all())
+    if value is None:
+        return True
+    array = np.asarray(value, dtype=float)
+    return bool((np.isfinite(array) & (array != 0)).all())
 
 
 def _ancestors(

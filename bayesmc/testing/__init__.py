@@ -13,6 +13,13 @@ from bayesmc.testing.nets import NetOptions, random_net
 from bayesmc.testing.observing import random_evidence
 from bayesmc.testing.oracle import Enumerated, enumerate_posterior
 from bayesmc.testing.strategies import bayes_nets, evidence_for
+from bayesmc.testing.transition import (
+    KernelMatrix,
+    Sweep,
+    exact_sweep,
+    transition_matrix,
+    transition_p_value,
+)
 from bayesmc.testing.uniformity import uniformity_p_value
 
 __all__ = [
@@ -22,19 +29,24 @@ __all__ = [
     "GaussianAnswer",
     "GaussianOptions",
     "GewekeResult",
+    "KernelMatrix",
     "Match",
     "NetOptions",
     "RankResult",
+    "Sweep",
     "assert_matches",
     "bayes_nets",
     "compare",
     "enumerate_posterior",
     "evidence_for",
+    "exact_sweep",
     "gaussian_evidence",
     "geweke_test",
     "random_evidence",
     "random_gaussian_net",
     "random_net",
     "rank_test",
+    "transition_matrix",
+    "transition_p_value",
     "uniformity_p_value",
 ]

@@ -7,6 +7,7 @@ finds the branches of that tree; what they add up to stands in ``transition``.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any
@@ -28,7 +29,9 @@ _ROWS = 4096
 #: parts into which a draw's values are cut before bisection
 _PROBES = 12
 #: settings of later draws under which two values of a draw are told apart
-_CORNERS, _INNER = 7, 4
+_CORNERS, _INNER, _SETTINGS = 7, 4, 512
+#: times that the tree is grown anew from what was found, at most
+_ROUNDS = 8
 #: cells whose predicted outcome is checked at random places
 _CHECKED = 8192
 
@@ -170,9 +173,10 @@ class Stepper:
         lost = np.flatnonzero(after[:count] < 0)
         if len(lost):
             labels = self.space.labels()[states[lost[0]]]
+            state = dict(zip(self.space.elements, labels, strict=True))
             raise ZeroProbabilityError(
-                f"exact_sweep: from {dict(zip(self.space.elements, labels, strict=True))} {self.what} goes to "
-                "a state of probability zero; it does not keep the posterior"
+                f"exact_sweep: from {state} {self.what} goes to a state of probability zero; it does not "
+                "keep the posterior"
             )
         return after[:count]
 
@@ -206,11 +210,12 @@ class Branches:
         # Two values of a draw may differ only in where later draws are cut (as two proposals of the same
         # state do), so that those cuts are where to look; hence again, until nothing is found any more.
         self._grow()
-        while True:
+        for _ in range(_ROUNDS):
             before = self.low
             self._grow()
-            if self.low.shape == before.shape and (self.low == before).all():
-                break
+            if np.array_equal(self.low, before):
+                return
+        raise UnsupportedError(self._unread())
 
     def check(self) -> None:
         """Random places of random cells must lead where the cell does."""
@@ -222,10 +227,7 @@ class Branches:
         draws = rng.integers(self.low[branch], self.high[branch])
         found = self.stepper(self.start[branch], draws)
         if (found != self.outcome[branch]).any():
-            raise UnsupportedError(
-                f"exact_sweep: {self.stepper.what} cannot be read: what a chain does is no step function of "
-                "its own draws, one after the other; choose another kernel"
-            )
+            raise UnsupportedError(self._unread())
 
     def _grow(self) -> None:
         """Cut one draw after the other."""
@@ -256,6 +258,12 @@ class Branches:
             self.weight = self.weight[branch] * ((end - begin) / count)
         self.outcome = self.stepper(self.start, self._middle())
 
+    def _unread(self) -> str:
+        return (
+            f"exact_sweep: {self.stepper.what} cannot be read: what a chain does is no step function of its "
+            "own draws, one after the other; choose another kernel"
+        )
+
     def _middle(self) -> np.ndarray:
         """A value of each cell; all act alike."""
         return self.low + (self.high - self.low) // 2
@@ -281,12 +289,9 @@ class Branches:
         ranges = self.stepper.ranges[depth + 1 :]
         rng = np.random.default_rng(depth)
         top = np.array(ranges, dtype=np.int64) - 1
-        corners = (
-            np.indices((2,) * min(len(ranges), _CORNERS))
-            .reshape(-1, 1 << min(len(ranges), _CORNERS))
-            .T
-        )
-        if len(ranges) > _CORNERS:
+        if len(ranges) <= _CORNERS:
+            corners = np.array(list(itertools.product((0, 1), repeat=len(ranges))))
+        else:
             corners = rng.integers(2, size=(1 << _CORNERS, len(ranges)))
         inside = (rng.random((_INNER, len(ranges))) * top).astype(np.int64)
         common = np.concatenate([corners * top, inside])
@@ -296,7 +301,8 @@ class Branches:
             if known:
                 mine = self.start == state
                 rows += [self.low[mine, depth + 1 :], self.high[mine, depth + 1 :] - 1]
-            found.append(np.unique(np.concatenate(rows), axis=0))
+            distinct = np.unique(np.concatenate(rows), axis=0)
+            found.append(rng.permutation(distinct)[:_SETTINGS])
         most = max(map(len, found))
         return np.stack([rows[np.arange(most) % len(rows)] for rows in found])
 

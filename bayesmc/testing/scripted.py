@@ -12,6 +12,7 @@ import math
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from bayesmc.errors import UnsupportedError
 
@@ -73,6 +74,14 @@ class ScriptedGenerator:
         (begin,), (end,) = bounds
         return (begin + self._taken(size, end + bool(endpoint) - begin)).astype(dtype)
 
+    def binomial(self, n: Any, p: Any, size: Any = None) -> np.ndarray:
+        """By inversion of the distribution function."""
+        u = self.random(size)
+        below = np.arange(int(np.max(n))).reshape((-1,) + (1,) * u.ndim)
+        # beyond n the function is 1, which u never reaches
+        cdf = np.where(below < n, scipy.special.bdtr(np.minimum(below, n), n, p), 1.0)
+        return (u >= cdf).sum(axis=0)
+
     @property
     def bit_generator(self) -> ScriptedGenerator:
         """Itself: raw words come from the same script."""
@@ -95,7 +104,7 @@ class ScriptedGenerator:
             raise AttributeError(name)
         raise UnsupportedError(
             f"exact_sweep: {self.what} draws by rng.{name}, which is not read; only random, integers, "
-            "standard_exponential and raw words are"
+            "standard_exponential, binomial and raw words are"
         )
 
     def _taken(self, size: Any, count: int) -> np.ndarray:

@@ -142,8 +142,8 @@ def exact_sweep(
     ------
     UnsupportedError
         A hidden node is not finite, or a kernel draws in a way that cannot be read: by a method other than
-        ``random``, ``integers``, ``standard_exponential`` or raw words as table look-ups take them, or
-        so that what happens to one chain depends on the draws of another.
+        ``random``, ``integers``, ``standard_exponential``, ``binomial`` or raw words as table look-ups
+        take them, or so that what happens to one chain depends on the draws of another.
     BudgetError
         Too many states, or draws in a step.
     ZeroProbabilityError

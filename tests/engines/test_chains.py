@@ -487,7 +487,7 @@ FAULTS: dict[str, tuple[Callable[[np.random.Generator, np.ndarray], np.ndarray],
     "a drift": (lambda rng, x: x + np.linspace(0, 1, 1000), "R-hat"),
     "stuck chains": (lambda rng, x: np.arange(4.0)[:, None] + 0 * x, "R-hat"),
     "a slow one": (lambda rng, x: slow(rng, 0.98), "bulk ESS"),
-    "slow tails": (lambda rng, x: x * np.exp(slow(rng, 0.99)), "tail ESS"),
+    "slow tails": (lambda rng, x: x * np.exp(1.5 * slow(rng, 0.99)), "tail ESS"),
 }
 
 
@@ -521,6 +521,18 @@ def test_members_apart_do_not_hide_an_ensemble_apart() -> None:
     x[3, :, 17] += 0.5
     (message,) = poor_mixing(posterior_of(x, 5), frozenset())
     assert "R-hat of 'x[17]'" in message
+
+
+def test_odd_scalars_are_screened_without_ado() -> None:
+    """Infinite draws, a scalar that moves in the last partial batch only, one of tiny values."""
+    x = np.random.default_rng(0).normal(size=(4, 1007, 4))
+    x[2, 5, 0] = np.inf
+    x[..., 1] = 0.0
+    x[0, -1, 1] = 1.0
+    x[..., 2] *= 1e-200
+    assert poor_mixing(posterior_of(x), frozenset()) == []
+    message, *_ = poor_mixing(posterior_of(x + 0.6 * LAST[..., None]), frozenset())
+    assert "R-hat of 'x[" in message
 
 
 @pytest.mark.parametrize(("draws", "ensemble"), [(1, 1), (3, 1), (19, 5), (3, 5)])

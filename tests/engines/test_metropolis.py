@@ -41,7 +41,7 @@ def ask(
     net: bmc.BayesNet, evidence: Any = None, proposal: Any = None, rng: int = 0, **options: Any
 ) -> Any:
     """A posterior; that chains as short as these may not have mixed is no news here."""
-    options = {"draws": 1500, "warmup": 400, "chains": 8, **options}
+    options = {"draws": 1000, "warmup": 300, "chains": 8, **options}
     keep = options.pop("keep", "draws")
     engine = MetropolisHastings(proposal=proposal, **options)
     with warnings.catch_warnings():
@@ -70,7 +70,9 @@ PROPOSALS: dict[str, Any] = {
     "outside the support": {"rate": lambda rate: bmc.Normal(rate, 1.5)},
     "whole plate": {("rate",): lambda rate: {"rate": bmc.LogNormal(np.log(rate.array), 0.4)}},
     "one vector": {
-        ("rate",): lambda rate: bmc.MvNormal(rate.array + 0.05, scale_diag=np.array([0.4, 0.7, 1.0]))
+        ("rate",): lambda rate: bmc.MvNormal(
+            rate.array + 0.05, scale_diag=np.array([0.4, 0.7, 1.0])
+        )
     },
     "walk": {"rate": RandomWalk([1.0, 1.5, 2.5])},
     "walk of logs": {"rate": RandomWalk(0.7, unconstrained=True)},
@@ -86,7 +88,7 @@ PROPOSALS: dict[str, Any] = {
 
 @pytest.mark.parametrize("kind", PROPOSALS)
 def test_proposals_are_corrected(kind: str) -> None:
-    posterior = ask(gamma_net(), SEEN, PROPOSALS[kind], draws=6000 if "own" in kind else 3000)
+    posterior = ask(gamma_net(), SEEN, PROPOSALS[kind], draws=4000 if "own" in kind else 1500)
     assert_mean(posterior, "rate", EXACT)
     (rate,) = posterior.acceptance.values()
     assert rate.shape == (8,) and ((rate > 0.005) & (rate < 1)).all()
@@ -113,7 +115,7 @@ def test_a_missing_correction_is_caught(
     drawn = kernel._drawn  # type: ignore[attr-defined]
     monkeypatch.setattr(kernel, "_drawn", symmetric)
     monkeypatch.setattr(kernel, method, lambda self, *_: 0.0)
-    posterior = ask(gamma_net(), SEEN, PROPOSALS[kind], draws=3000)
+    posterior = ask(gamma_net(), SEEN, PROPOSALS[kind], draws=2000)
     z = (posterior.mean("rate") - EXACT) / posterior.mcse("rate")
     assert np.abs(z).max() > 6
 
@@ -155,11 +157,12 @@ def test_a_joint_block_of_a_dict() -> None:
         }
 
     exact = bmc.infer(net, evidence, engine=bmc.Exact())
-    posterior = ask(net, evidence, {("k", "x"): block}, draws=6000)
+    posterior = ask(net, evidence, {("k", "x"): block}, draws=3000)
     assert_mean(posterior, "k", exact.mean("k"))
-    assert_mean(posterior, "x", exact.mean("x"))
+    z = (posterior.mean("x") - exact.mean("x"))[0] / posterior.mcse("x")[0]
+    assert abs(z) < LIMIT
     assert (posterior["x"][..., 1] == 2.5).all()
-    prior = ask(net, evidence, {("k", "x"): "prior"}, draws=6000)
+    prior = ask(net, evidence, {("k", "x"): "prior"}, draws=3000)
     assert_mean(prior, "k", exact.mean("k"))
 
 
@@ -230,12 +233,12 @@ def hybrid() -> tuple[bmc.BayesNet, dict[str, Any]]:
 def test_discrete_and_continuous_nodes_together() -> None:
     net, evidence = hybrid()
     exact = bmc.infer(net, evidence, engine=bmc.Exact())
-    posterior = ask(net, evidence, draws=3000)
+    posterior = ask(net, evidence, draws=1500)
     assert posterior.ensemble_size == 12
     for name in ("m", "x", "y", "later"):
-        free = 2 if name == "y" else slice(None)
-        z = (posterior.mean(name) - exact.mean(name)) / posterior.mcse(name)
-        assert np.abs(np.atleast_1d(z)[free]).max() < LIMIT, (name, z)
+        free = 2 if name == "y" else ...
+        z = (posterior.mean(name) - exact.mean(name))[free] / posterior.mcse(name)[free]
+        assert np.abs(z).max() < LIMIT, (name, z)
     z = (posterior.mean("z") - exact.probabilities("z")[:, 1]) / posterior.mcse("z")
     assert np.abs(z).max() < LIMIT
 
@@ -262,7 +265,7 @@ def test_members_that_start_far_out_are_brought_back() -> None:
     net.add("x", bmc.Cauchy(0.0, 1e5))
     net.add("s", bmc.HalfCauchy(10.0))
     net.add("y", lambda x, s: bmc.Normal(x, 1.0 + 0.0 * s))
-    posterior = ask(net, {"y": 1.0}, draws=2000, warmup=500)
+    posterior = ask(net, {"y": 1.0}, warmup=500)
     assert_mean(posterior, "x", 1.0)
     assert abs(posterior.std("x") - 1.0) < 0.1
 
@@ -297,7 +300,7 @@ def test_a_proposal_puts_a_node_into_the_chain() -> None:
     net.add("x", bmc.Mixture([0.3, 0.7], bmc.Normal([0.0, 10.0], [1.0, 1.0])))
     rates = []
     for width in (1.0, 8.0, 500.0):
-        posterior = ask(net, proposal={"x": RandomWalk(width)}, draws=4000)
+        posterior = ask(net, proposal={"x": RandomWalk(width)}, draws=2000)
         rates.append(posterior.acceptance["x"].mean())
         if width == 8.0:
             assert_mean(posterior, "x", 7.0)
@@ -306,11 +309,11 @@ def test_a_proposal_puts_a_node_into_the_chain() -> None:
 
 def test_a_density_without_a_sampler_needs_no_evidence() -> None:
     net = bmc.BayesNet()
-    net.add("x", bmc.Density(lambda x: -np.abs(x) ** 3))
+    net.add("x", bmc.Density(lambda x: -(np.abs(x) ** 3)))
     net.add("y", lambda x: bmc.Normal(x, 1.0))
     posterior = ask(net, draws=4000)
     grid = np.linspace(-5, 5, 4001)
-    weight = np.exp(-np.abs(grid) ** 3)
+    weight = np.exp(-(np.abs(grid) ** 3))
     assert_mean(posterior, "x", 0.0)
     exact = (weight @ grid**2) / weight.sum()
     assert abs(posterior.var("x") - exact) < 0.02
@@ -341,11 +344,15 @@ def test_options() -> None:
     assert engine.continues(MetropolisHastings(99, 5, 2, proposal=dict(walk)))
     assert not engine.continues(MetropolisHastings(10, 5, 2))
     assert not engine.continues(MetropolisHastings(10, 6, 2, proposal=walk))
-    assert not engine.continues(MetropolisHastings(10, 5, 2, proposal={**walk, "x": RandomWalk(1.0)}))
+    assert not engine.continues(
+        MetropolisHastings(10, 5, 2, proposal={**walk, "x": RandomWalk(1.0)})
+    )
     assert "RandomWalk([1.0, 2.0])" in repr(engine) and "'prior'" in repr(engine)
     walk["x"] = "prior"  # the engine has its own copy
     assert isinstance(engine.proposal["x"], RandomWalk)  # type: ignore[index]
-    lost = pickle.loads(pickle.dumps(MetropolisHastings(proposal={"x": lambda x: bmc.Normal(x, 1.0)})))
+    lost = pickle.loads(
+        pickle.dumps(MetropolisHastings(proposal={"x": lambda x: bmc.Normal(x, 1.0)}))
+    )
     net = bmc.BayesNet()
     net.add("x", bmc.Normal(0.0, 1.0))
     with pytest.raises(UnsupportedError, match="make it anew"):

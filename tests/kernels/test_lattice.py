@@ -183,6 +183,7 @@ def test_full_conditionals_equal_the_models_own(case: str) -> None:
     blanket = Blanket(target, "s")
     kernel = lattice_kernel(blanket)
     assert type(kernel) is kind
+    assert kernel.constrained == (case == "hard constraints")
     values = random_state(target, 5, 1)
     if case == "hard constraints":  # a checkerboard of two colours is proper
         values["s"] = np.tile(np.indices((3, 4)).sum(axis=0).ravel() % 2, (5, 1)).astype(np.uint8)

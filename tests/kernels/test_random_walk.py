@@ -208,7 +208,9 @@ def test_unbounded_integers_learn_how_far_to_jump() -> None:
     weights = np.exp(log - log.max())
     weights /= weights.sum()
     assert abs(z_scores(draws, weights @ grid)) < LIMIT
-    assert abs(z_scores((draws - weights @ grid) ** 2, weights @ (grid - weights @ grid) ** 2)) < LIMIT
+    assert (
+        abs(z_scores((draws - weights @ grid) ** 2, weights @ (grid - weights @ grid) ** 2)) < LIMIT
+    )
     kernel = Jump(Blanket(target, "n"))
     values = {**target.known, "n": np.full(64, 800)}
     memory, rng = kernel.start(values, 64), np.random.default_rng(1)
@@ -270,7 +272,9 @@ def ranks(make: Callable[[Blanket], Kernel], name: str, statistic: Any, seed: in
         return {k: drawn[k].astype(np.uint8 if k == "label" else float) for k in hidden}
 
     def simulate(state: Any, rng: np.random.Generator) -> np.ndarray:
-        return rng.normal(np.take_along_axis(state["mean"], state["label"].astype(int), axis=1), 1.0)
+        return rng.normal(
+            np.take_along_axis(state["mean"], state["label"].astype(int), axis=1), 1.0
+        )
 
     def move(state: Any, data: np.ndarray, rng: np.random.Generator) -> Any:
         values = {**target.known, **state, "x": data}
@@ -353,7 +357,9 @@ def test_covariances_are_learnt() -> None:
     assert np.allclose(np.exp(memory["log_scale"]), length, rtol=0.3)
     moves = np.concatenate([steps.draw(steps.frozen(memory), rng) for _ in range(200)])
     found = np.cov(moves[:, 0].T)
-    assert np.allclose(found / np.sqrt(np.linalg.det(found)), cov / np.sqrt(np.linalg.det(cov)), rtol=0.1)
+    assert np.allclose(
+        found / np.sqrt(np.linalg.det(found)), cov / np.sqrt(np.linalg.det(cov)), rtol=0.1
+    )
 
 
 def test_arguments_are_left_alone() -> None:

@@ -1,0 +1,50 @@
+"""``python -m references``: hold bayesmc against published posteriors.
+
+``--only rats pump`` runs the cases whose names hold one of the words; a run of all writes
+``docs/accuracy.md``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from references import CASES, data_folder
+from references.run import report, run_all
+
+_PAGE = Path(__file__).resolve().parents[1] / "docs" / "accuracy.md"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run what is asked for; 1 where a case is not as published."""
+    parser = argparse.ArgumentParser(prog="python -m references", description=__doc__)
+    parser.add_argument("--only", nargs="+", metavar="WORD", help="cases whose names hold a word")
+    parser.add_argument("--list", action="store_true", help="print the names of the cases")
+    parser.add_argument("--rng", type=int, default=1, help="seed of every run (default 1)")
+    parser.add_argument(
+        "--out", type=Path, help="write the page there, also for a part of the cases"
+    )
+    options = parser.parse_args(arguments)
+    cases = [c for c in CASES if not options.only or any(w in c.name for w in options.only)]
+    if options.list:
+        print(*(case.name for case in cases), sep="\n")
+        return 0
+    root = data_folder()
+    if not root.is_dir():
+        print(f"no reference data at {root}: set BAYESMC_DATA", file=sys.stderr)
+        return 2
+    if not cases:
+        print(f"no case is called like {' or '.join(options.only)}; see --list", file=sys.stderr)
+        return 2
+    outcomes = run_all(cases, root, options.rng)
+    page = options.out or (None if options.only else _PAGE)
+    if page is not None:
+        page.write_text(report(outcomes, options.rng), encoding="utf-8")
+        print(f"written: {page}")
+    return 0 if all(outcome.passed for outcome in outcomes) else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

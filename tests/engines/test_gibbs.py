@@ -1,0 +1,277 @@
+"""Gibbs as an engine: which kernels, where chains start, going on, and what goes wrong."""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.errors import (
+    ConvergenceWarning,
+    DensityError,
+    ParameterError,
+    ReducibleWarning,
+    ZeroProbabilityError,
+)
+
+pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+
+
+def mixture() -> tuple[bmc.BayesNet, dict]:
+    rng = np.random.default_rng(3)
+    net = bmc.BayesNet("mixture", plates={"cluster": 3, "point": 40})
+    net.add("weights", bmc.Dirichlet(np.ones(3)))
+    net.add("mean", bmc.Normal(0.0, 10.0), plates="cluster")
+    net.add("precision", bmc.Gamma(2.0, 1.0))
+    net.add("label", lambda weights: bmc.Categorical(weights), plates="point")
+    net.add(
+        "x",
+        lambda label, mean, precision: bmc.Normal(mean[label], precision**-0.5),
+        plates="point",
+    )
+    net.add("unseen", lambda mean: bmc.Normal(mean, 1.0), plates="cluster")
+    return net, {"x": rng.normal(size=40)}
+
+
+def hierarchical() -> tuple[bmc.BayesNet, dict]:
+    net = bmc.BayesNet("schools", plates={"school": 8})
+    se = np.array([15.0, 10, 16, 11, 9, 11, 10, 18])
+    net.add("mu", bmc.Normal(0.0, 5.0))
+    net.add("tau", bmc.HalfCauchy(5.0))
+    net.add("theta", lambda mu, tau: bmc.Normal(mu, tau), plates="school")
+    net.add("y", lambda theta: bmc.Normal(theta, se), plates="school")
+    net.add("best", lambda theta: theta.array.max(axis=-1))
+    return net, {"y": [28.0, 8, -3, 7, -1, 1, 18, 12]}
+
+
+def everything() -> tuple[bmc.BayesNet, dict]:
+    """A node for every kind of kernel."""
+    net = bmc.BayesNet("everything", plates={"i": 6})
+    net.add("p", bmc.Beta(1.0, 2.0))
+    net.add("coin", lambda p: bmc.Bernoulli(p), plates="i")
+    net.add("rate", lambda coin: bmc.Gamma(1.0 + coin, 1.0), plates="i")
+    net.add("count", lambda rate: bmc.Poisson(rate), plates="i")
+    net.add("shape", bmc.Exponential(1.0))
+    net.add("slope", bmc.Laplace(0.0, 1.0))
+    net.add("hidden", bmc.Poisson(3.0))
+    net.add("simplex", bmc.Dirichlet([1.0, 2.0, 3.0]))
+    net.add(
+        "y",
+        lambda rate, shape, slope, hidden: bmc.Weibull(
+            0.5 + shape, np.exp(0.1 * slope * rate) + 0.2 * hidden
+        ),
+        plates="i",
+    )
+    net.add("z", lambda simplex: bmc.Normal(simplex[..., 0] ** 2, 0.2))
+    return net, {"count": [0, 1, 2, 3, 1, 0], "y": np.linspace(0.5, 2.0, 6), "z": 0.3}
+
+
+# ---- which kernels ------------------------------------------------------------------------------
+
+
+def kernels(net: bmc.BayesNet, evidence: dict) -> dict[str, str]:
+    explanation = bmc.explain(net, evidence, engine=bmc.Gibbs())
+    return {row.node: row.kernel for row in explanation.table}
+
+
+def test_the_table_of_a_mixture(capsys: pytest.CaptureFixture) -> None:
+    found = kernels(*mixture())
+    assert found == {
+        "weights": "conjugate",
+        "mean": "conjugate",
+        "precision": "conjugate",
+        "label": "enumerate",
+        "x": "",
+        "unseen": "forward",
+    }
+    shown = capsys.readouterr().out
+    assert "point=40" in shown and "Gamma with Normal scale" in shown and "colour" in shown
+
+
+def test_every_kind_of_kernel_is_found() -> None:
+    found = kernels(*everything())
+    assert found["p"] == "conjugate" and found["coin"] == "enumerate"
+    assert found["shape"] == found["slope"] == "factor slice"
+    assert found["hidden"] == "slice" and "walk" in found["simplex"]
+
+
+def test_the_reason_of_a_refusal_is_told(capsys: pytest.CaptureFixture) -> None:
+    bmc.explain(*everything(), engine=bmc.Gibbs())
+    assert "Weibull" in capsys.readouterr().out
+
+
+def test_nodes_of_one_colour_share_no_term() -> None:
+    net, evidence = mixture()
+    rows = {r.node: r for r in bmc.explain(net, evidence, engine=bmc.Gibbs()).table}
+    assert rows["mean"].colour != rows["label"].colour != rows["weights"].colour
+    assert rows["weights"].colour == rows["mean"].colour  # they meet in nothing
+
+
+def test_gibbs_is_chosen_where_exact_cannot() -> None:
+    net, evidence = mixture()
+    chosen = bmc.explain(net, evidence)
+    assert chosen.engine == bmc.Gibbs() and "conjugate" in chosen.reasons[0]
+    assert isinstance(bmc.explain(net).engine, bmc.LikelihoodWeighting)  # nothing was observed
+
+
+def test_debug_runs_on_every_closed_form() -> None:
+    for build in (mixture, hierarchical, everything):
+        net, evidence = build()
+        engine = bmc.Gibbs(draws=20, warmup=20, chains=3, debug=True)
+        bmc.infer(net, evidence, engine=engine, rng=0)
+
+
+# ---- going on -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("build", [mixture, hierarchical, everything])
+@pytest.mark.parametrize("keep", ["draws", "summaries"])
+def test_resume_is_bit_for_bit(build, keep) -> None:
+    net, evidence = build()
+    options = {"warmup": 30, "chains": 3, "thinning": 2}
+    whole = bmc.infer(net, evidence, engine=bmc.Gibbs(50, **options), rng=5, keep=keep)
+    part = bmc.infer(net, evidence, engine=bmc.Gibbs(20, **options), rng=5, keep=keep)
+    part = pickle.loads(pickle.dumps(part))
+    both = bmc.infer(net, evidence, engine=bmc.Gibbs(30, **options), resume=part, keep=keep)
+    for name in net.graph.nodes:
+        if keep == "draws":
+            np.testing.assert_array_equal(whole[name], both[name])
+        np.testing.assert_array_equal(whole.mean(name), both.mean(name))
+
+
+def test_the_same_seed_gives_the_same_draws() -> None:
+    net, evidence = everything()
+    engine = bmc.Gibbs(draws=15, warmup=15, chains=2)
+    one, two = (bmc.infer(net, evidence, engine=engine, rng=8) for _ in range(2))
+    other = bmc.infer(net, evidence, engine=engine, rng=9)
+    np.testing.assert_array_equal(one["slope"], two["slope"])
+    assert (one["slope"] != other["slope"]).any()
+
+
+def test_interrupted_chains_keep_what_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    from bayesmc.engines.gibbs import GibbsSampler
+
+    net, evidence = mixture()
+    step, calls = GibbsSampler.step, []
+
+    def interrupted(self, state, rng, warmup):
+        calls.append(1)
+        if len(calls) == 36:
+            raise KeyboardInterrupt
+        return step(self, state, rng, warmup)
+
+    monkeypatch.setattr(GibbsSampler, "step", interrupted)
+    with pytest.warns(bmc.errors.InterruptWarning, match="25 draws"):
+        part = bmc.infer(net, evidence, engine=bmc.Gibbs(50, warmup=10), rng=1)
+    assert part["mean"].shape == (4, 25, 3)
+
+
+# ---- where chains start -------------------------------------------------------------------------
+
+
+def test_vague_priors_do_not_keep_chains_from_starting() -> None:
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("a", bmc.Normal(0.0, 1e3))
+    net.add("b", bmc.Normal(0.0, 1e3))
+    net.add("tau", bmc.Gamma(0.001, 0.001))
+    net.add("effect", lambda tau: bmc.Normal(0.0, tau**-0.5), plates="i")
+    x = np.array([-1.5, -0.5, 0.5, 1.5])
+    net.add("r", lambda a, b, effect: bmc.Binomial(20, logits=a + b * x + effect), plates="i")
+    posterior = bmc.infer(net, {"r": [3, 8, 11, 17]}, engine=bmc.Gibbs(200, 200), rng=0)
+    assert abs(posterior.mean("a")) < 2 and 0 < posterior.mean("b") < 4
+
+
+def test_impossible_evidence_names_the_culprit() -> None:
+    net = bmc.BayesNet()
+    net.add("scale", bmc.Gamma(2.0, 1.0))
+    net.add("y", lambda scale: bmc.Uniform(0.0, scale))
+    net.add("z", lambda scale: bmc.Normal(scale, 1.0))
+    with pytest.raises(ZeroProbabilityError, match="'y'"):
+        bmc.infer(net, {"y": -1.0, "z": 0.0}, engine=bmc.Gibbs(), rng=0)
+
+
+def test_hard_evidence_is_found_by_many_attempts() -> None:
+    """One start in some hundred is possible."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("k", bmc.Categorical(np.ones(4) / 4), plates="i")
+    net.add("low", bmc.Gamma(2.0, 1.0))
+    net.add("sum", lambda k, low: bmc.Bernoulli(np.where(k.sum("i") >= 10, 1.0, 0.0)))
+    net.add("y", lambda low: bmc.Exponential(low))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        posterior = bmc.infer(net, {"sum": 1, "y": 0.4}, engine=bmc.Gibbs(300, 50), rng=0)
+    assert (posterior["k"].sum(axis=-1) >= 10).all()
+
+
+# ---- what goes wrong ----------------------------------------------------------------------------
+
+
+def test_a_nan_density_names_node_values_and_iteration() -> None:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Gamma(20.0, 20.0))
+    net.add(
+        "y",
+        lambda x: bmc.Density(lambda v: np.where(x > 3.0, np.nan, -((v - x) ** 2)), lambda *_: 0),
+    )
+    with pytest.raises(DensityError, match=r"'y'.*nan.*x = [3-9].*y = 40.*iteration"):
+        bmc.infer(net, {"y": 40.0}, engine=bmc.Gibbs(), rng=0)
+
+
+def test_a_scale_that_turns_negative_is_the_models_fault() -> None:
+    net = bmc.BayesNet()
+    net.add("scale", bmc.Normal(1.0, 1.0))
+    net.add("y", lambda scale: bmc.Laplace(0.0, scale))
+    with pytest.raises(ParameterError, match=r"'y'.*scale must be positive"):
+        bmc.infer(net, {"y": 0.01}, engine=bmc.Gibbs(), rng=0)
+
+
+def test_chains_that_zeros_may_hold_are_told_of() -> None:
+    """Twelve coins that must all agree are too many for one block."""
+    net = bmc.BayesNet()
+    for k in range(12):
+        net.add(f"x{k}", bmc.Bernoulli(0.5))
+    names = [f"x{k}" for k in range(12)]
+    net.add(
+        "agree",
+        lambda *x: bmc.Bernoulli((sum(x) % 12 == 0) * 1.0),
+        parents=names,
+    )
+    with pytest.warns(ReducibleWarning, match="'x0'"):
+        bmc.infer(net, {"agree": 1}, engine=bmc.Gibbs(20, 5), rng=0)
+
+
+def test_tied_nodes_move_together() -> None:
+    """One at a time an exclusive or could never change; as a block it does."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Bernoulli(0.3))
+    net.add("y", bmc.Bernoulli(0.3))
+    net.add("parity", lambda x, y: bmc.Bernoulli((x + y) % 2 * 1.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", ReducibleWarning)
+        posterior = bmc.infer(net, {"parity": 0}, engine=bmc.Gibbs(2000, 10), rng=0)
+    exact = bmc.infer(net, {"parity": 0}, engine=bmc.Exact()).mean("x")
+    # 8,000 independent draws: five standard errors, a false alarm in two million
+    assert abs(posterior.mean("x") - exact) < 5 * np.sqrt(exact * (1 - exact) / 8000)
+
+
+def test_a_run_that_has_not_mixed_says_so() -> None:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 10.0))
+    net.add("y", lambda x: bmc.Normal(np.abs(x), 0.3))
+    with pytest.warns(ConvergenceWarning, match="'x'"):
+        bmc.infer(net, {"y": 8.0}, engine=bmc.Gibbs(200, 100), rng=0)
+
+
+def test_nodes_that_nothing_observed_depends_on_are_drawn_afresh() -> None:
+    """Near-deterministic tables below the evidence would trap a chain that moved through them."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.5))
+    net.table("b", ["a"], [[0.999, 0.001], [0.001, 0.999]])
+    net.table("c", ["b"], [[0.9999, 0.0001], [0.0001, 0.9999]])
+    net.add("y", lambda a: bmc.Normal(a, 2.0))
+    posterior = bmc.infer(net, {"y": 0.5}, engine=bmc.Gibbs(2000, 10), rng=0)
+    assert posterior.ess("c") > 4000
+    assert abs(posterior.mean("c") - 0.5) < 5 * 0.5 / np.sqrt(8000)

@@ -1,0 +1,300 @@
+"""Geweke's test and the rank test put to the kernels of real models, each with deliberate errors.
+
+A `Model` is a net whose hidden nodes are the state of the tests and whose observed nodes are the data; both
+are drawn from the net itself, forwards. A `Case` is a kernel on a model and faults that both tests must find.
+Every row of a test has its own data. Kernels get them in one of three ways:
+
+* ``given``: the evidence is a placeholder, and rows of data stand in the state in its place; for kernels that
+  read what is observed when they step.
+* ``moving``: the data's nodes are hidden and belong to the chain, but nothing moves them; for any kernel.
+* ``posed``: every row's data are evidence of their own; for what kernels work out of the evidence beforehand.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+import bayesmc as bmc
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.network import pose
+from bayesmc.structure.target import Target, Values, target_of
+from bayesmc.testing import geweke_test, rank_test
+
+#: shifts all seeds; where it is set, tests are longer, too
+SEED = os.environ.get("BAYESMC_SEED")
+SHIFT, LONGER = int(SEED or "0"), 8 if SEED else 1
+#: chance that a right kernel fails one test at a fresh seed
+ALPHA = 1e-4
+
+Rows = dict[str, np.ndarray]
+Statistic = Callable[[Rows, Rows], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """A net, what of it is data, and how to draw both.
+
+    Attributes
+    ----------
+    seen : tuple of str
+        The data; no hidden node depends on them.
+    moved : tuple of str
+        Nodes that statistics look at; all hidden ones by default.
+    draw : callable, optional
+        ``draw(rng, n)``: hidden nodes from their prior, where the net cannot be drawn forwards.
+    """
+
+    net: Any
+    seen: tuple[str, ...]
+    moved: tuple[str, ...] = ()
+    draw: Callable[[np.random.Generator, int], Rows] | None = None
+
+    @property
+    def compiled(self) -> Any:
+        return self.target("moving").model
+
+    @lru_cache  # noqa: B019: models live as long as the tests do
+    def target(self, how: str) -> Target:
+        """The posed model with placeholders for data, or with data that are hidden."""
+        if how == "moving":
+            return target_of(pose(self.net, {}), also=self._stochastic())
+        return target_of(pose(self.net, self.user(self.data(self.prior(np.random.default_rng(0), 1)))))
+
+    def _stochastic(self) -> list[str]:
+        model = pose(self.net, {}).model
+        return [n for n, node in model.nodes.items() if node.is_stochastic]
+
+    @property
+    def hidden(self) -> tuple[str, ...]:
+        return tuple(n for n in self.target("moving").chain if n not in self.seen)
+
+    def user(self, data: Rows, row: int = 0) -> dict[str, Any]:
+        """One row of stored data as evidence."""
+        return {n: self.compiled[n].decode(v[row]) for n, v in data.items()}
+
+    def prior(self, rng: np.random.Generator, rows: int) -> Rows:
+        if self.draw is not None:
+            with running():
+                return self.draw(rng, rows)
+        return self._forward({}, self.hidden, rng, rows)
+
+    def data(self, state: Rows, rng: np.random.Generator | int = 0) -> Rows:
+        rng = np.random.default_rng(rng) if isinstance(rng, int) else rng
+        rows = len(next(iter(state.values())))
+        return self._forward(state, self.seen, rng, rows)
+
+    def _forward(
+        self, given: Rows, names: Sequence[str], rng: np.random.Generator, rows: int
+    ) -> Rows:
+        target = self.target("moving")
+        values: Values = {**target.known, **given}
+        with running():
+            for name, node in target.model.nodes.items():
+                if name in names:
+                    dist, _ = target.model.evaluate(name, values)
+                    values[name] = target.model.sample_stored(name, dist, rng, (rows,))
+                elif name in target.links and all(p in values for p in node.parents):
+                    values[name], _ = target.model.evaluate(name, values)
+        return {n: values[n] for n in names}
+
+    def statistics(self) -> dict[str, Statistic]:
+        """Numbers that show wrong places, spreads and dependences of what moves."""
+        target = self.target("moving")
+        first = self.seen[0]
+
+        def log_density(state: Rows, data: Rows) -> np.ndarray:
+            values = {**target.known, **state, **data}
+            with running():
+                target.refresh(values, target.chain)
+                return np.asarray(target.log_density(values))
+
+        def fit(name: str) -> Statistic:
+            return lambda s, y: self._free(name, s)[:, 0] * np.arctan(_flat(y[first]).mean(axis=1))
+
+        found: dict[str, Statistic] = {"log density": log_density}
+        for name in self.moved or self.hidden:
+            found |= {
+                f"first of {name}": lambda s, y, n=name: self._free(n, s)[:, 0],
+                f"last of {name}": lambda s, y, n=name: self._free(n, s)[:, -1],
+                f"square of {name}": lambda s, y, n=name: (self._free(n, s) ** 2).mean(axis=1),
+                f"product of {name}": lambda s, y, n=name: self._free(n, s)[:, 0] * self._free(n, s)[:, -1],
+                f"{name} and {first}": fit(name),
+            }
+        return found
+
+    def _free(self, name: str, state: Rows) -> np.ndarray:
+        """A node's numbers, those above zero as logarithms: heavy tails make means uncertain."""
+        node = self.compiled[name]
+        value = _flat(state[name])
+        support = node.support
+        if node.domain is None and support is not None and support.kind == "interval":
+            if np.all(support.low == 0) and np.all(support.high == np.inf):
+                return np.log(value)
+        if support is not None and support.kind == "positive definite":
+            diagonal = np.diagonal(state[name], axis1=-2, axis2=-1)
+            ratio = state[name][..., 0, 1] / np.sqrt(diagonal.prod(axis=-1))
+            return np.concatenate([_flat(np.log(diagonal)), _flat(ratio)], axis=1)
+        return value
+
+
+Make = Callable[[Target], Kernel]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """A kernel on a model.
+
+    Attributes
+    ----------
+    make : callable
+        The kernel of a target.
+    faults : dict
+        Name -> a wrong kernel.
+    reverse : callable, optional
+        The reverse of a kernel, and its memory: ``reverse(make, target, memory)``; by default the kernel itself.
+    how : str
+        How it gets data: ``given``, ``moving`` or ``posed``.
+    warmup : int
+        Steps in which it adapts before it is tested.
+    """
+
+    model: Model
+    make: Make
+    faults: Mapping[str, Make] = field(default_factory=dict)
+    reverse: Callable[[Make, Target, Memory], tuple[Kernel, Memory]] | None = None
+    how: str = "given"
+    warmup: int = 0
+    statistics: Mapping[str, Statistic] = field(default_factory=dict)
+
+    def geweke(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
+        sizes = {"draws": 60 * LONGER, "chains": 80, **sizes}
+        kernel, _ = self._kernels(fault, sizes["chains"])
+        statistics = {**self.model.statistics(), **self.statistics}
+        return geweke_test(
+            self.model.prior, self.model.data, kernel, statistics, rng=seed + SHIFT, **sizes
+        )
+
+    def ranks(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
+        sizes = {"steps": 4, "replications": 1000 * LONGER, **sizes}
+        kernel, reverse = self._kernels(fault, sizes["replications"])
+        statistics = {**self.model.statistics(), **self.statistics}
+        return rank_test(
+            self.model.prior, self.model.data, kernel, statistics, reverse_kernel=reverse,
+            alpha=ALPHA, rng=seed + SHIFT, **sizes,
+        )  # fmt: skip
+
+    def check(self, test: str, fault: str = "", **sizes: Any) -> None:
+        """A right kernel passes, a wrong one fails."""
+        if test == "geweke":
+            result = self.geweke(fault, **sizes)
+            rejected = result.rejected(ALPHA)
+        else:
+            result = self.ranks(fault, **sizes)
+            rejected = result.rejected()
+        assert bool(rejected) == bool(fault), result
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _kernels(self, fault: str, rows: int) -> tuple[Callable, Callable]:
+        make = self.faults[fault] if fault else self.make
+        if self.how == "posed":
+            return self._posed(make, False), self._posed(make, True)
+        target = self.model.target(self.how)
+        with running():
+            kernel = make(target)
+            memory = self._adapted(kernel, target, rows)
+            other, theirs = kernel, memory
+            if self.reverse is not None:
+                other, theirs = self.reverse(make, target, memory)
+        return _stepping(target, kernel, memory), _stepping(target, other, theirs)
+
+    def _adapted(self, kernel: Kernel, target: Target, rows: int) -> Memory:
+        """The memory after the warmup, which has draws of its own."""
+        rng = np.random.default_rng(12345 + SHIFT)
+        state = self.model.prior(rng, rows)
+        data = self.model.data(state, rng)
+        values = _placed(target, state, data)
+        memory = kernel.start(values, rows)
+        for _ in range(self.warmup):
+            new, memory = kernel.step(values, memory, rng, True)
+            values = _placed(target, {**state, **new}, data)
+            state = {n: values[n] for n in state}
+        return kernel.end_warmup(memory)
+
+    def _posed(self, make: Make, backwards: bool) -> Callable:
+        made: dict[Any, tuple[Target, Kernel, Memory]] = {}
+
+        def one(data: Rows, row: int) -> tuple[Target, Kernel, Memory]:
+            key = tuple(v[row].tobytes() for v in data.values())
+            if key not in made:
+                target = target_of(pose(self.model.net, self.model.user(data, row)))
+                state = self.model.prior(np.random.default_rng(1), 1)
+                kernel = make(target)
+                memory = kernel.start({**target.known, **state}, 1)
+                if backwards and self.reverse is not None:
+                    kernel, memory = self.reverse(make, target, memory)
+                made[key] = target, kernel, kernel.end_warmup(memory)
+            return made[key]
+
+        def step(state: Rows, data: Rows, rng: np.random.Generator) -> Rows:
+            parts = []
+            with running():
+                for row in range(len(next(iter(state.values())))):
+                    target, kernel, memory = one(data, row)
+                    values = _placed(target, {n: v[row : row + 1] for n, v in state.items()}, {})
+                    new, _ = kernel.step(values, memory, rng, False)
+                    parts.append({n: new.get(n, values[n]) for n in state})
+            return {n: np.concatenate([p[n] for p in parts]) for n in state}
+
+        return step
+
+
+@contextmanager
+def running() -> Iterator[None]:
+    """What engines set while chains run."""
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield
+
+
+def each_fault(cases: Mapping[str, Case]) -> list[tuple[str, str]]:
+    """All kernels with each of their faults, and each without."""
+    return [(name, fault) for name, case in cases.items() for fault in ("", *case.faults)]
+
+
+def mixture(prior: Any, child: Callable[..., Any], points: int = 12) -> bmc.BayesNet:
+    """A node ``x`` in three overlapping categories, and children ``y`` that look it up by ``label``."""
+    net = bmc.BayesNet(plates={"k": 3, "i": points})
+    net.add("x", prior, plates="k")
+    net.add("label", bmc.Categorical([0.2, 0.3, 0.5]), plates="i")
+    net.add("y", lambda x, label: child(x[label]), plates="i")
+    return net
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _flat(value: np.ndarray) -> np.ndarray:
+    return value.reshape(len(value), -1).astype(float)
+
+
+def _placed(target: Target, state: Rows, data: Rows) -> Values:
+    values = {**target.known, **data, **state}
+    target.refresh(values, target.chain)
+    return values
+
+
+def _stepping(target: Target, kernel: Kernel, memory: Memory) -> Callable:
+    def step(state: Rows, data: Rows, rng: np.random.Generator) -> Rows:
+        with running():
+            new, _ = kernel.step(_placed(target, state, data), memory, rng, False)
+        return {**state, **{n: new[n] for n in state if n in new}}
+
+    return step
