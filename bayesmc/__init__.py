@@ -49,6 +49,8 @@ from bayesmc.distributions import (
 from bayesmc.engines.exact import Exact
 from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.importance import Importance
+from bayesmc.engines.metropolis import MetropolisHastings
+from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
 from bayesmc.engines.rejection import Rejection
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet, FactorGraph
@@ -82,6 +84,7 @@ __all__ = [
     "HalfCauchy",
     "HalfNormal",
     "Importance",
+    "Independence",
     "InverseCdf",
     "InverseGamma",
     "InverseWishart",
@@ -91,6 +94,7 @@ __all__ = [
     "LikelihoodWeighting",
     "LogNormal",
     "Marginal",
+    "MetropolisHastings",
     "Mixture",
     "Multinomial",
     "MvNormal",
@@ -99,6 +103,7 @@ __all__ = [
     "PlateArray",
     "Poisson",
     "Posterior",
+    "RandomWalk",
     "Rejection",
     "StudentT",
     "Summary",

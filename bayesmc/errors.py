@@ -6,6 +6,7 @@ models or engines: it only names what can go wrong.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -72,6 +73,20 @@ class ParameterError(BayesmcError, ValueError):
         super().__init__(message)
         self.index = index
         self.value = value
+
+    @property
+    def is_overflow(self) -> bool:
+        """Whether the value is infinite, NaN or zero: it over- or underflowed on the way, as vague priors
+        make it, rather than being wrong for what it is.
+        """
+        if not isinstance(self.value, (int, float)) and not hasattr(self.value, "dtype"):
+            return False
+        return all(v != v or v in (math.inf, -math.inf, 0) for v in _numbers(self.value))
+
+
+def _numbers(value: Any) -> list[Any]:
+    flat = value.ravel().tolist() if hasattr(value, "ravel") else [value]
+    return flat if isinstance(flat, list) else [flat]
 
 
 class DensityError(BayesmcError, ValueError):

@@ -71,12 +71,17 @@ class Outcome:
         return self.worst is not None and not self.failures
 
 
-def run_case(case: Case, root: Path, rng: int = 1) -> Outcome:
-    """Run one case; an error of the library becomes part of the outcome, so that a long run goes on."""
+def run_case(case: Case, root: Path, rng: int = 1, *, defaults: bool = True) -> Outcome:
+    """Run one case; an error of the library becomes part of the outcome, so that a long run goes on.
+
+    ``defaults=False`` leaves out the run at default settings where the case has its own.
+    """
     try:
         judged, posterior = _sample(case, case.engine(), root, rng)
         found = deviations(case, posterior, root)
-        default = _sample(case, case.factory(), root, rng)[0] if case.settings else judged
+        default: Sampled | None = judged
+        if case.settings:
+            default = _sample(case, case.factory(), root, rng)[0] if defaults else None
     except Exception as error:  # whatever it is, it belongs in the table
         return Outcome(case, error=f"{type(error).__name__}: {error}")
     worst = max(found, key=lambda deviation: deviation.units)

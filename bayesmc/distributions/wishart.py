@@ -6,6 +6,7 @@ from triangular solves. Nothing is inverted explicitly.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -112,8 +113,8 @@ class Wishart(_MatrixFamily):
     """
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
-        lower = _bartlett(rng, self.df[..., None] - np.arange(self._size), shape)
-        return _gram(self._root @ lower)
+        lower = bartlett(rng, self.df[..., None] - np.arange(self._size), shape)
+        return gram(self._root @ lower)
 
     def _log_density(self, root: np.ndarray) -> np.ndarray:
         trace = _squares(self._root, root)
@@ -178,8 +179,8 @@ class InverseWishart(_MatrixFamily):
         # If a standard Wishart matrix is U U' with U upper triangular (Bartlett's factor, its order
         # reversed), its inverse is M M' with M = U'^-1, which again is lower triangular.
         d = self._size
-        lower = _bartlett(rng, self.df[..., None] - np.arange(d - 1, -1, -1.0), shape)
-        return _gram(_divide(self._root, lower))
+        lower = bartlett(rng, self.df[..., None] - np.arange(d - 1, -1, -1.0), shape)
+        return gram(_divide(self._root, lower))
 
     def _log_density(self, root: np.ndarray) -> np.ndarray:
         trace = _squares(root, self._root)
@@ -210,25 +211,34 @@ class InverseWishart(_MatrixFamily):
         return np.broadcast_to(var, self.batch_shape + self.event_shape)
 
 
-def _bartlett(rng: np.random.Generator, df: np.ndarray, shape: Shape) -> np.ndarray:
+def bartlett(rng: np.random.Generator, df: np.ndarray, shape: Shape) -> np.ndarray:
     """Lower triangles of standard normals, with chi variates of ``df[..., i]`` on the diagonal."""
     d = df.shape[-1]
     lower = np.zeros((*shape, d, d))
-    row, column = np.tril_indices(d, -1)
-    lower[..., row, column] = rng.standard_normal((*shape, row.size))
-    i = np.arange(d)
-    lower[..., i, i] = np.sqrt(np.maximum(rng.chisquare(df, (*shape, d)), _LEAST))
+    if d > 1:
+        row, column = _below_diagonal(d)
+        lower[..., row, column] = rng.standard_normal((*shape, row.size))
+    squares = rng.chisquare(df, (*shape, d))
+    np.maximum(squares, _LEAST, out=squares)
+    np.sqrt(squares, out=lower.reshape((*shape, d * d))[..., :: d + 1])
     return lower
 
 
-def _gram(lower: np.ndarray) -> np.ndarray:
+def gram(lower: np.ndarray) -> np.ndarray:
     """``lower @ lower.T``, symmetric to the last bit and positive definite after rounding, too."""
-    shape, d = lower.shape, lower.shape[-1]
-    lower = lower.reshape((-1, d, d))
     product = _symmetric_product(lower)
-    lengths = np.sqrt(np.vecdot(lower, lower))
     # rounding can lose a pivot only where some row lies close to the span of those above it
-    suspect = np.flatnonzero((np.linalg.diagonal(lower) < _CLOSE * lengths).any(axis=-1))
+    pivots = lower.diagonal(0, -2, -1)
+    close = pivots * pivots < _CLOSE**2 * product.diagonal(0, -2, -1)
+    return _raised(lower, product, close) if close.any() else product
+
+
+def _raised(lower: np.ndarray, product: np.ndarray, close: np.ndarray) -> np.ndarray:
+    """The products with pivots that rounding lost raised to the least that can be resolved."""
+    shape, d = lower.shape, lower.shape[-1]
+    lower, product = lower.reshape((-1, d, d)), product.reshape((-1, d, d)).copy()
+    lengths = np.sqrt(np.vecdot(lower, lower))
+    suspect = np.flatnonzero(close.reshape((-1, d)).any(axis=-1))
     for floor in _FLOORS:
         suspect = suspect[~positive_definite.contains(product[suspect])]
         if not suspect.size:
@@ -240,9 +250,14 @@ def _gram(lower: np.ndarray) -> np.ndarray:
     return product.reshape(shape)
 
 
+@cache
+def _below_diagonal(d: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.tril_indices(d, -1)
+
+
 def _symmetric_product(lower: np.ndarray) -> np.ndarray:
-    product = np.tril(lower @ np.matrix_transpose(lower))
-    return product + np.matrix_transpose(np.tril(product, -1))
+    product = lower @ lower.swapaxes(-1, -2)
+    return 0.5 * (product + product.swapaxes(-1, -2))
 
 
 def _squares(root: np.ndarray, other: np.ndarray) -> np.ndarray:

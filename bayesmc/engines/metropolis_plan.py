@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +12,8 @@ from bayesmc.engines.weighted import treatment
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk, parts_of
 from bayesmc.kernels.jump import Jump
-from bayesmc.kernels.proposed import Conditional, Proposed, ProposedBlock
+from bayesmc.kernels.proposal import Conditional
+from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_unsampled
@@ -69,10 +71,7 @@ def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
         A proposal that does not fit the net or the evidence.
     """
     read = read_proposals(problem, proposal)
-    target = target_of(problem)
-    inside = [n for n in _inside(problem, read) if n in target.forward]
-    if inside:
-        target = target_of(problem, inside)
+    target = target_of(problem, _inside(problem, read))
     refusal = refuse_unsampled(
         problem.model,
         {*problem.observed, *target.chain},
@@ -108,7 +107,7 @@ def _inside(problem: Problem, read: Mapping[Key, Read]) -> list[str]:
 
     These are nodes with proposals, those that proposals look at, and those that cannot be drawn forward.
     """
-    found = []
+    found: list[str] = []
     for key, what in read.items():
         found += _names(key)
         if isinstance(what, Conditional):
@@ -146,13 +145,6 @@ def _asked_for(target: Target, key: Key, what: Read) -> Kernel:
 def _members(target: Target, size: int, chains: int) -> int:
     """Members of an ensemble for a block of so many numbers; 1 where they would take too much memory."""
     wanted = min(max(2 * (size + 1), _LEAST), _MOST)
-    elements = sum(max(_count(term.shape), 1) for term in target.terms.values())
+    elements = sum(max(math.prod(term.shape), 1) for term in target.terms.values())
     affordable = int(_ELEMENTS / (elements * chains)) // 2 * 2
     return min(wanted, affordable) if affordable >= 4 else 1
-
-
-def _count(shape: tuple[int, ...]) -> int:
-    count = 1
-    for n in shape:
-        count *= n
-    return count

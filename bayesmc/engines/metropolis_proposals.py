@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.distributions import as_distribution
 from bayesmc.errors import EvidenceError, ModelError, UnknownNodeError
-from bayesmc.kernels.proposed import Conditional, Parts
+from bayesmc.kernels.proposal import Conditional, Parts
 from bayesmc.kernels.random_walk import some_support
 from bayesmc.network import Model, Problem
 from bayesmc.network.align import Aligner

@@ -38,10 +38,10 @@ def best_rate(size: int) -> float:
 class Steps:
     """Gaussian steps of elements that each have ``size`` numbers.
 
-    A memory is a dict of arrays: ``mean`` (elements, size), ``cov`` and the shape of its ``factor`` (elements,
-    size, size), which has determinant one; ``log_scale`` (chains, elements), the mean logarithm of the
-    standard deviations, so that the length of steps does not follow a covariance that is still far off;
-    ``average`` (elements,) of these; ``count``.
+    A memory is a dict of arrays: ``mean`` (elements, size), ``cov`` and its Cholesky ``factor`` (elements,
+    size, size), the latter scaled to determinant one; ``log_scale`` (chains, elements), the mean
+    logarithm of the standard deviations, so that the length of steps does not follow a covariance that is
+    still far off; ``average`` (elements,) of these; ``count``.
 
     Parameters
     ----------

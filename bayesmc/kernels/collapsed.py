@@ -98,14 +98,16 @@ class CollapsedBlock(Kernel):
     ) -> tuple[Values, Memory]:
         state = values
         watching = warmup and memory["sweep"] < _WATCH_TO
-        for name in self.blankets:
-            if not memory["slow"][name] or watching:
-                if name in self.alone:
-                    new, own = self.alone[name].step(state, memory["alone"][name], rng, warmup)
-                    state = {**state, **new}
-                    self.target.refresh(state, (name,))
-                    memory = {**memory, "alone": {**memory["alone"], name: own}}
+        slow = [n for n in self.blankets if memory["slow"][n] and not watching]
+        # those that are drawn given the block come first: after a collapsed move it must be drawn anew
+        for name in self.alone:
+            if name in slow:
                 continue
+            new, own = self.alone[name].step(state, memory["alone"][name], rng, warmup)
+            state = {**state, **new}
+            self.target.refresh(state, (name,))
+            memory = {**memory, "alone": {**memory["alone"], name: own}}
+        for name in slow:
             new, step = self._moved(state, name, memory["width"][name], rng)
             state = {**state, name: new}
             self.target.refresh(state, (name,))

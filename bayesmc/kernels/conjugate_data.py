@@ -169,14 +169,40 @@ class Groups:
         self._kept = (label, self.second, grouped)
         return grouped
 
+    def feed(self, label: np.ndarray, sums: np.ndarray) -> None:
+        """Take in the sums for a state's labels from whoever drew them, ``(chains, states, rows)``."""
+        self._kept = (label, self.second, self._grouped(sums))
+
+    @property
+    def rows(self) -> int:
+        """Number of features: 1, the values, and their products where somebody needs squares."""
+        wanted = 1 if not self.event_ndim else self.values.shape[-1]
+        return 1 + wanted + (wanted * (wanted + 1) // 2 if self.second else 0)
+
+    def made(self) -> np.ndarray:
+        """1, the values, and their products where needed: shape (rows, elements)."""
+        if self._features is None or len(self._features) != self.rows:
+            wanted = 1 if not self.event_ndim else self.values.shape[-1]
+            v = self.values.reshape(len(self.values), wanted).T
+            rows = [np.ones((1, v.shape[1])), v]
+            if self.second:
+                i, j = np.tril_indices(wanted)
+                rows.append(v[i] * v[j])
+            self._features = np.concatenate(rows)
+        return self._features
+
+    # ---- private -------------------------------------------------------------------------------
+
     def _summed(self, label: np.ndarray) -> Grouped:
         flat = label.reshape((*label.shape[: label.ndim - self.plates], -1))
         flat = flat.reshape(-1, flat.shape[-1])
         if self.seen is not None:
             flat = flat[:, self.seen]
-        sums = sums_by_label(flat, self._made(), self.states)
-        # one axis for every plate, the labels on the last
-        sums = sums.reshape((len(flat), *(1,) * (self.plates - 1), *sums.shape[1:]))
+        return self._grouped(sums_by_label(flat, self.made(), self.states))
+
+    def _grouped(self, sums: np.ndarray) -> Grouped:
+        """Sums ``(chains, states, rows)`` with one axis for every plate, the labels on the last."""
+        sums = sums.reshape((len(sums), *(1,) * (self.plates - 1), *sums.shape[1:]))
         if not self.event_ndim:
             second = sums[..., 2] if self.second else None
             return Grouped(sums[..., 0], sums[..., 1], second, self.centre, 0)
@@ -187,19 +213,6 @@ class Groups:
             full = np.empty((*sums.shape[:-1], d, d))
             full[..., i, j] = full[..., j, i] = sums[..., d + 1 :]
         return Grouped(sums[..., 0], sums[..., 1 : d + 1], full, self.centre, 1)
-
-    def _made(self) -> np.ndarray:
-        """1, the values, and their products where needed: shape (features, elements)."""
-        wanted = 1 if not self.event_ndim else self.values.shape[-1]
-        count = 1 + wanted + (wanted * (wanted + 1) // 2 if self.second else 0)
-        if self._features is None or len(self._features) != count:
-            v = self.values.reshape(len(self.values), wanted).T
-            rows = [np.ones((1, v.shape[1])), v]
-            if self.second:
-                i, j = np.tril_indices(wanted)
-                rows.append(v[i] * v[j])
-            self._features = np.concatenate(rows)
-        return self._features
 
 
 def sums_by_label(label: np.ndarray, features: np.ndarray, states: int) -> np.ndarray:

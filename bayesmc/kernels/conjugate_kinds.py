@@ -8,6 +8,7 @@ bounds of both come back in the posterior. Which children fit which kind stands 
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from bayesmc.distributions import (
     Uniform,
 )
 from bayesmc.distributions.support import Support, interval
+from bayesmc.distributions.wishart import bartlett, gram
+from bayesmc.kernels.precisions import Precision, from_root
 from bayesmc.shapes import Shape
 
 Naturals = tuple[np.ndarray, ...]
@@ -139,9 +142,10 @@ class MeanVector(Kind):
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
         precision, linear = naturals
-        factor = _root_of_inverse(precision)
+        # inverting an upper triangle is back substitution: nothing is pivoted
+        root = np.linalg.inv(np.linalg.cholesky(precision).swapaxes(-1, -2))
         noise = rng.standard_normal(shape + linear.shape[-1:])
-        draw = np.matvec(factor, np.vecmat(linear, factor) + noise)
+        draw = np.matvec(root, np.vecmat(linear, root) + noise)
         return draw if math.isfinite(draw.sum()) else None
 
 
@@ -230,6 +234,16 @@ class Shares(Kind):
     def posterior(self, naturals: Naturals, bounds: Bounds | None, power: float) -> Distribution:
         return Dirichlet(naturals[0])
 
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        counts = naturals[0]
+        if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
+            return None
+        draw = rng.standard_gamma(counts, shape + counts.shape[-1:])
+        draw /= draw.sum(axis=-1, keepdims=True)
+        return draw
+
 
 class Covariance(Kind):
     """``|x|^-(df + d + 1)/2 exp(-tr(S x^-1) / 2)``: inverse Wishart."""
@@ -246,6 +260,28 @@ class Covariance(Kind):
 
     def posterior(self, naturals: Naturals, bounds: Bounds | None, power: float) -> Distribution:
         return InverseWishart(*naturals)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        return self.with_precision(naturals, rng, shape)[0]
+
+    def with_precision(
+        self, naturals: Naturals, rng: np.random.Generator, shape: Shape
+    ) -> tuple[np.ndarray, Precision]:
+        """A draw, and its precision from the same factors.
+
+        If the scale is ``R R'`` and B is Bartlett's triangle, the draw is ``M M'`` with ``M = R B^-1``,
+        and its precision ``N N'`` with ``N = R'^-1 B'``.
+        """
+        df, scale = naturals
+        d = scale.shape[-1]
+        uppers = np.empty((2, *np.broadcast_shapes(shape, scale.shape[:-2]), d, d))
+        uppers[0] = np.linalg.cholesky(scale).swapaxes(-1, -2)
+        uppers[1] = bartlett(rng, df[..., None] - _falling(d), shape).swapaxes(-1, -2)
+        over_root, over_noise = np.linalg.inv(uppers)
+        factor = (over_noise @ uppers[0]).swapaxes(-1, -2)
+        return gram(factor), from_root(over_root @ uppers[1])
 
 
 #: all kinds, in the order in which they are tried for a flat prior
@@ -310,6 +346,12 @@ class RootOf(Distribution):
 
 def _covers(bounds: Bounds, low: float, high: float) -> bool:
     return bool(np.all(bounds[0] <= low) and np.all(bounds[1] >= high))
+
+
+@cache
+def _falling(d: int) -> np.ndarray:
+    """``d - 1, ..., 0``."""
+    return np.arange(d - 1, -1, -1.0)
 
 
 def _root_of_inverse(precision: np.ndarray) -> np.ndarray:

@@ -80,16 +80,17 @@ class ByLabel:
     def parameters(self, values: Values) -> dict[str, np.ndarray]:
         """Parameters by label read off the nodes, shape ``(lead, *ones, labels or 1, *event)``."""
         assert self.direct is not None
-        found = {}
-        for parameter, source in self.direct.items():
-            if source.node is None:
-                found[parameter] = source.factor
-                continue
-            value = values[source.node]
-            lead = value.shape[: value.ndim - source.trailing]
-            value = value.reshape(lead + source.shape)
-            found[parameter] = value if source.is_copy else source.factor * value**source.power
-        return found
+        return {name: self.parameter(name, values) for name in self.direct}
+
+    def parameter(self, name: str, values: Values) -> np.ndarray:
+        """One of them."""
+        assert self.direct is not None
+        source = self.direct[name]
+        if source.node is None:
+            return source.factor
+        value = values[source.node]
+        value = value.reshape(value.shape[: value.ndim - source.trailing] + source.shape)
+        return value if source.is_copy else source.factor * value**source.power
 
     def at_labels(
         self, values: Values, candidate: np.ndarray
@@ -152,6 +153,8 @@ def by_label(blanket: Blanket, child: Child, pair: Pair) -> ByLabel | None:
 def read_directly(way: ByLabel, neutral: np.ndarray, above: set[str]) -> Values | None:
     """Find out whether every parameter is one node looked up by label, and the node enters in order.
 
+    The node is that of the blanket, which may also be the label itself.
+
     Returns
     -------
     dict or None
@@ -164,7 +167,9 @@ def read_directly(way: ByLabel, neutral: np.ndarray, above: set[str]) -> Values 
     state = _example(way, above)
     dist, keys = way.at_labels(state, state[name])
     wanted = _FAMILIES.get(type(dist))
-    if wanted is None or dist.invalid is not None or not _is_in_order(way, keys):
+    if wanted is None or dist.invalid is not None:
+        return None
+    if name != way.groups.label and not _is_in_order(way, keys):
         return None
     entered: dict[str, tuple[str, Tracer]] = {}
     for node in hidden:

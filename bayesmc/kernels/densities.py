@@ -57,8 +57,7 @@ def compare(
     """
     now = blanket.current(values, members)
     shape = now.shape[: now.ndim - len(blanket.event_shape)]
-    none = dead is None or not dead.any()
-    if not none:
+    if dead is not None and dead.any():
         new = instead(dead, new, now)
     state = blanket.placed(values, np.stack([now, new]), members)
     own = np.broadcast_to(blanket.own_log(state, members), (2, *shape))

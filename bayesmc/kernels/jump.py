@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.kernels.adaptation import SCALE_DECAY, best_rate, chance
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import accepted, compare, instead
-from bayesmc.kernels.proposed import to_stored
+from bayesmc.kernels.proposal import to_stored
 from bayesmc.kernels.random_walk import counted, picked
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values

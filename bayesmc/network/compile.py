@@ -221,10 +221,16 @@ def _discover_stochastic(
         unsampled=isinstance(dist, Density) and not dist.can_sample,
     )
     bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
-    if bad is not None:
+    if bad is not None and not _overflows(dist):
         raise bad
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
+
+
+def _overflows(dist: Distribution) -> bool:
+    """Whether bad parameters over- or underflowed, as under draws from a vague prior, here and there."""
+    assert dist.invalid is not None and dist.problem is not None
+    return dist.problem.is_overflow and bool(dist.invalid.size > 1 and not dist.invalid.all())
 
 
 def _reachable(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import DensityError, ParameterError
+from bayesmc.errors import DensityError
 from bayesmc.network import Model, Observed, Problem
 from bayesmc.network.model import invalid_error
 from bayesmc.shapes import Shape, broadcast_shapes
@@ -89,10 +89,15 @@ class Term:
         raise.
         """
         node = self.model[self.name]
+        if dist.invalid is None:  # the short way, for the innermost of all loops
+            known = value if node.domain is None else node.domain.to_support(value)
+            result = dist.log_prob_unchecked(known)
+            if not result.size or result.max() < np.inf:
+                return result if self.mask is None else np.where(self.mask, result, 0.0)
         result = self.model.log_density(self.name, dist, value)
         if dist.invalid is not None:
             lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
-            if _is_fault(dist.problem):
+            if dist.problem is None or not dist.problem.is_overflow:
                 error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
                 if error is not None:
                     raise error
@@ -231,15 +236,6 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
 
 def _shown(name: str, value: np.ndarray) -> str:
     return f"{name} = {np.array2string(value, precision=6, threshold=6)}"
-
-
-def _is_fault(problem: ParameterError | None) -> bool:
-    """Whether a parameter was refused for what it is, not because it over- or underflowed on the way."""
-    value = None if problem is None else problem.value
-    if value is None:
-        return True
-    array = np.asarray(value, dtype=float)
-    return bool((np.isfinite(array) & (array != 0)).all())
 
 
 def _ancestors(

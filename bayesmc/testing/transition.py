@@ -25,6 +25,7 @@ import scipy.special
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import ShapeError
 from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.tables import TableSweep
 from bayesmc.network import BayesNet, FactorGraph, pose
 from bayesmc.shapes import owned
 from bayesmc.testing.branches import FEW, Branches, StateSpace, Stepper
@@ -45,12 +46,15 @@ class KernelMatrix:
     resolution : float
         The coarsest step of the random numbers it draws: single probabilities are good to a few of these,
         2**-53 for most kernels, 2**-31 for table look-ups.
+    parts : tuple of KernelMatrix
+        Of a kernel that draws several nodes or blocks in turn, each of these updates, read by itself.
     """
 
     names: tuple[str, ...]
     label: str
     matrix: np.ndarray
     resolution: float
+    parts: tuple[KernelMatrix, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,11 @@ class Sweep:
         for kernel in self.kernels:
             matrix = matrix @ kernel.matrix
         return owned(matrix)
+
+    @property
+    def updates(self) -> tuple[KernelMatrix, ...]:
+        """The single updates of the sweep, in their order: kernels, or the parts of those that have any."""
+        return tuple(part for kernel in self.kernels for part in kernel.parts or (kernel,))
 
     @property
     def resolution(self) -> float:
@@ -246,4 +255,12 @@ def _read(space: StateSpace, kernel: Kernel) -> KernelMatrix:
     matrix = np.zeros((len(space.codes),) * 2)
     np.add.at(matrix, (tree.start, tree.outcome), tree.weight)
     resolution = 1.0 / min((n for n in stepper.ranges if n > FEW), default=1 << 53)
-    return KernelMatrix(tuple(kernel.names), kernel.label, owned(matrix), resolution)
+    parts = tuple(_read(space, part) for part in _parts(space, kernel))
+    return KernelMatrix(tuple(kernel.names), kernel.label, owned(matrix), resolution, parts)
+
+
+def _parts(space: StateSpace, kernel: Kernel) -> list[Kernel]:
+    """The updates of a sweep of table look-ups, in the order in which they are drawn."""
+    if not isinstance(kernel, TableSweep) or len(kernel.conditionals) == 1:
+        return []
+    return [TableSweep(space.target, [c]) for group in kernel.groups for c in group.part]

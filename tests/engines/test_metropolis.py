@@ -134,7 +134,7 @@ def test_elements_that_are_not_independent_move_in_turn() -> None:
     net = bmc.BayesNet(plates={"i": 2})
     net.add("x", bmc.Normal(0.0, 1.0), plates="i")
     net.add("y", lambda x: bmc.Normal(x.sum("i"), 0.5))
-    posterior = ask(net, {"y": 3.0}, {"x": lambda x: bmc.Normal(x, 1.0)}, draws=4000)
+    posterior = ask(net, {"y": 3.0}, {"x": lambda x: bmc.Normal(x, 1.0)}, draws=2000)
     assert_mean(posterior, "x", [3.0 / 2.25] * 2)
     x = posterior["x"]
     product = (x[..., 0] * x[..., 1]).mean(axis=1)
@@ -157,12 +157,12 @@ def test_a_joint_block_of_a_dict() -> None:
         }
 
     exact = bmc.infer(net, evidence, engine=bmc.Exact())
-    posterior = ask(net, evidence, {("k", "x"): block}, draws=3000)
+    posterior = ask(net, evidence, {("k", "x"): block}, draws=1500)
     assert_mean(posterior, "k", exact.mean("k"))
     z = (posterior.mean("x") - exact.mean("x"))[0] / posterior.mcse("x")[0]
     assert abs(z) < LIMIT
     assert (posterior["x"][..., 1] == 2.5).all()
-    prior = ask(net, evidence, {("k", "x"): "prior"}, draws=3000)
+    prior = ask(net, evidence, {("k", "x"): "prior"}, draws=1500)
     assert_mean(prior, "k", exact.mean("k"))
 
 
@@ -215,6 +215,33 @@ def test_transition_matrices_keep_the_posterior() -> None:
         error = np.sqrt((pi[:, None] ** 2 * matrix * (1 - matrix)).sum(axis=0) / count)
         assert (np.abs(pi @ matrix - pi) < 4.5 * error).all(), proposal
         assert (np.diag(matrix) < 0.999).all()
+
+
+def test_integers_walk() -> None:
+    net = bmc.BayesNet()
+    net.add("n", bmc.Poisson(6.0))
+    net.add("k", lambda n: bmc.Binomial(n, 0.5))
+    posterior = ask(net, {"k": 4}, {"n": RandomWalk(3)}, draws=2000)
+    assert_mean(posterior, "n", 4.0 + 3.0)  # what was missed is Poisson(3)
+    assert (np.abs(np.diff(posterior["n"], axis=1)) <= 3).all()
+
+
+def test_factor_graphs() -> None:
+    """Variables have no density of their own; what proposes from it is refused."""
+    graph = bmc.FactorGraph()
+    graph.variable("x", "positive")
+    graph.variable("s", 3)
+    graph.factor(lambda x, s: -((x - s) ** 2) - 0.5 * x, scope=("x", "s"))
+    x, s = np.meshgrid(np.linspace(1e-4, 9.0, 4001), np.arange(3.0))
+    weight = np.exp(-((x - s) ** 2) - 0.5 * x)
+    for proposal in ({}, {"x": RandomWalk(1.0)}, {"x": bmc.Exponential(1.0), "s": "prior"}):
+        if "s" in proposal:
+            with pytest.raises(ModelError, match="variable of a factor graph"):
+                ask(graph, {}, proposal)
+            proposal = {"x": bmc.Exponential(1.0)}
+        posterior = ask(graph, {}, proposal)
+        assert_mean(posterior, "x", (weight * x).sum() / weight.sum())
+        assert_mean(posterior, "s", (weight * s).sum() / weight.sum())
 
 
 # ---- defaults -----------------------------------------------------------------------------------

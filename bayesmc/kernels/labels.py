@@ -1,0 +1,416 @@
+"""Labels of mixtures: the full conditionals of all elements as one matrix product, then a draw of each.
+
+Log densities of every element at every state are features of the data times coefficients of the states
+(``label_terms``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
+for next come out of the same pass. A sweep whose products would cancel (components narrow beside the
+spread of the data) or whose parameters are lost goes to ``Enumerate``, which works on residuals.
+
+References
+----------
+Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 22; Diebolt and Robert (1994), JRSS B 56.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Categorical
+from bayesmc.errors import BayesmcError, ZeroProbabilityError
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.conjugate_data import Groups
+from bayesmc.kernels.conjugate_labels import hidden_above
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.label_terms import IMPOSSIBLE, LabelTerm, LostParameters, example_of, label_term
+from bayesmc.kernels.verify import check_ratio
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Values
+from bayesmc.structure.traced import Untraceable, traced_term
+from bayesmc.tracing import TracedCall, Tracer
+
+#: sum of the sizes of the products in a log density, from which on rounding could reach 1e-9 of it
+_LARGEST = 2.0**19
+#: log odds that neither overflow nor, added up, reach infinity
+_STEEP = 600.0
+#: numbers in a chunk of log densities, and least elements of one
+_CHUNK, _NARROW = 1 << 14, 512
+_ZERO = 0.1 * IMPOSSIBLE
+
+
+class Labels(Kernel):
+    """Draws a finite plated node whose children's log densities are features times coefficients.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    terms : sequence of LabelTerm
+        Its children.
+    debug : bool
+        Check log densities against the model's in every step.
+    """
+
+    label = "enumerate"
+
+    def __init__(self, blanket: Blanket, terms: Sequence[LabelTerm], debug: bool = False) -> None:
+        self.blanket, self.terms, self.debug = blanket, tuple(terms), debug
+        self.names = (blanket.name,)
+        domain = blanket.node.domain
+        assert domain is not None
+        self.states, self.dtype = domain.size, domain.dtype
+        self.match = f"{domain.size} states, as one matrix product"
+        self.members = blanket.classes[0]
+        self._plain = Enumerate(blanket)
+        self._layout()
+        self._prior = _Prior(blanket, self.members)
+        self._buffers: dict[tuple[int, int], _Buffers] = {}
+        self._codes = np.arange(self.states, dtype=self.dtype)[:, None, None]
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        name = self.blanket.name
+        chains = len(values[name])
+        try:
+            table, steep = self._table(values, chains)
+        except (LostParameters, np.linalg.LinAlgError):
+            return self._plain.step(values, memory, rng, warmup)
+        by_element = self._prior.by_element(values)
+        if self.debug:
+            self._check(values, table, by_element)
+        groups = self._fed()
+        label = np.empty((chains, self._features.shape[1]), dtype=self.dtype)
+        sums = self._draw(table, steep, by_element, rng, label, groups is not None)
+        shape = values[name].shape
+        if self.members is None:
+            label = label.reshape(shape)
+        new = self.blanket.moved(values, label, self.members)
+        if groups is not None:
+            groups.feed(new, sums)
+        return {name: new}, memory
+
+    # ---- log densities -------------------------------------------------------------------------
+
+    def log_density(self, values: Values) -> np.ndarray:
+        """Log full conditionals up to constants, shape ``(states, chains, elements)``.
+
+        Impossible states have at most a tenth of ``IMPOSSIBLE``.
+        """
+        table, _ = self._table(values, len(values[self.blanket.name]))
+        return self._product(table, self._prior.by_element(values))
+
+    def _product(self, table: np.ndarray, by_element: np.ndarray | None) -> np.ndarray:
+        log = table @ self._features
+        return log if by_element is None else log + by_element
+
+    def _layout(self) -> None:
+        """Stack the features of all children; find the row of ones that the prior multiplies."""
+        parts, self._at = [], []
+        start = 0
+        for term in self.terms:
+            parts.append(term.features)
+            self._at.append(start)
+            start += len(term.features)
+        whole = (a for a, t in zip(self._at, self.terms, strict=True) if t.term.mask is None)
+        self._one = next(whole, start)
+        if self._one == start:
+            parts.append(np.ones((1, parts[0].shape[1])))
+        features = parts[0] if len(parts) == 1 else np.concatenate(parts)
+        self._features = features if self.members is None else features[:, self.members]
+        self._most = np.abs(self._features).max(axis=1, initial=1.0)
+        may_vanish = np.zeros(len(self._features), dtype=bool)
+        may_vanish[self._one] = True
+        for at, term in zip(self._at, self.terms, strict=True):
+            may_vanish[at + term.ones : at + len(term.features)] = term.indicators
+        self._may_vanish = may_vanish
+
+    def _table(self, values: Values, chains: int) -> tuple[np.ndarray, bool]:
+        """Coefficients ``(states, chains, features)``, and whether any state may be impossible."""
+        table = np.zeros((self.states, chains, len(self._features)))
+        for at, term in zip(self._at, self.terms, strict=True):
+            c = term.coefficients(values)
+            constant = c.constant
+            if term.ones == 1 and constant.shape[-1] != 1:
+                constant = constant.sum(axis=-1, keepdims=True)
+            middle = at + term.ones
+            table[:, :, at:middle] = constant.swapaxes(0, 1)
+            table[:, :, middle : middle + c.rows.shape[-1]] = c.rows.swapaxes(0, 1)
+        common = self._prior.common(values)
+        if common is not None:
+            table[:, :, self._one] += common
+        if (np.abs(table) @ self._most).max() < _LARGEST:
+            return table, self._prior.steep
+        finite = np.where(self._may_vanish & (table < _ZERO), 0.0, table)
+        if not (np.abs(finite) @ self._most).max() < _LARGEST:
+            raise LostParameters
+        return np.maximum(table, 3 * IMPOSSIBLE), True
+
+    # ---- draws ---------------------------------------------------------------------------------
+
+    def _draw(
+        self,
+        table: np.ndarray,
+        steep: bool,
+        by_element: np.ndarray | None,
+        rng: np.random.Generator,
+        label: np.ndarray,
+        summing: bool,
+    ) -> np.ndarray:
+        """Fill in labels ``(chains, elements)``; the features' sums ``(chains, states, features)``."""
+        states, chains, count = table.shape
+        flat = table.reshape(-1, count)
+        odds = (table[1:] - table[0]).reshape(-1, count)
+        sums = np.zeros((states * chains, count))
+        for part, buffers in self._chunks(chains):
+            features = self._features[:, part]
+            own = None if by_element is None else by_element[..., part]
+            drawn = label[:, part]
+            if steep or not buffers.odds(odds, features, own):
+                if buffers.tilted(flat, features, own) < _ZERO:
+                    raise ZeroProbabilityError(
+                        f"node {self.blanket.name!r}: no state has positive probability given the "
+                        "others; the chain is at an impossible configuration"
+                    )
+            buffers.draw(rng, drawn)
+            if summing:
+                sums += buffers.summed(drawn, self._codes, features)
+        return sums.reshape(states, chains, count).swapaxes(0, 1)
+
+    def _chunks(self, chains: int) -> list[tuple[slice, _Buffers]]:
+        """Equal parts of the elements: a short one at the end would cost as many calls as a long one."""
+        n = self._features.shape[1]
+        width = max(_CHUNK // (chains * self.states), _NARROW)
+        count = max(-(-n // width), 1)
+        ends = [n * i // count for i in range(count + 1)]
+        found = []
+        for start, end in zip(ends, ends[1:], strict=False):
+            key = (chains, end - start)
+            if key not in self._buffers:
+                self._buffers[key] = _Buffers(self.states, *key)
+            found.append((slice(start, end), self._buffers[key]))
+        return found
+
+    def _fed(self) -> Groups | None:
+        """The sums that conjugate kernels ask for, if they are of these features."""
+        if len(self.terms) > 1 or self.members is not None:
+            return None
+        groups = self.terms[0].groups
+        fits = groups is not None and groups.used and groups.rows == len(self._features)
+        return groups if fits else None
+
+    def _check(self, values: Values, table: np.ndarray, by_element: np.ndarray | None) -> None:
+        """Refuse log densities that are not the model's."""
+        found = self._product(table, by_element)
+        axes = len(self.blanket.node.plates) if self.members is None else 1
+        candidate = np.arange(self.states, dtype=self.dtype).reshape((-1, 1) + (1,) * axes)
+        if self.members is not None:
+            candidate = np.broadcast_to(candidate, (self.states, 1, len(self.members)))
+        log = self.blanket.log_density(values, candidate, self.members)
+        shape = self.blanket.current(values, self.members).shape
+        log = np.broadcast_to(log, (self.states, *shape)).reshape(found.shape)
+        best = log.argmax(axis=0)[None]
+        top = np.take_along_axis(log, best, axis=0)
+        here = found - np.take_along_axis(found, best, axis=0)
+        zero = log == -np.inf
+        target = np.where(zero, 0.0, log - top)
+        here = np.where(zero & (here < _ZERO), 0.0, here)
+        sizes = np.where(zero, 0.0, np.abs(log)) + np.abs(top)
+        check_ratio(self.blanket.name, self.match, target, here, sizes)
+
+
+class _Buffers:
+    """Room for one chunk, filled anew each time and never handed out."""
+
+    def __init__(self, states: int, chains: int, width: int) -> None:
+        self.log = np.empty((states, chains, width))
+        self.flat = self.log.reshape(-1, width)
+        self.log_odds = self.log[1:]
+        self.flat_odds = self.log_odds.reshape(-1, width)
+        self.level = np.empty((chains, width))
+        self.passed = np.empty((states - 1, chains, width), dtype=bool)
+        self.bytes = self.passed.view(np.uint8)
+        self.hot = np.empty((states, chains, width))
+        self.flat_hot = self.hot.reshape(-1, width)
+
+    def odds(self, table: np.ndarray, features: np.ndarray, own: np.ndarray | None) -> bool:
+        """Cumulative odds against the first state; False where these could overflow."""
+        np.dot(table, features, out=self.flat_odds)
+        if own is not None:
+            self.log_odds += own[1:] - own[0]
+        if not self.log_odds.max(initial=0.0) < _STEEP:
+            return False
+        np.exp(self.log_odds, out=self.log_odds)
+        self.log[0] = 1.0
+        self._cumulate()
+        return True
+
+    def tilted(self, table: np.ndarray, features: np.ndarray, own: np.ndarray | None) -> float:
+        """Cumulative densities relative to the likeliest state; the least log density of that."""
+        np.dot(table, features, out=self.flat)
+        if own is not None:
+            self.log += own
+        top = self.log.max(axis=0)
+        self.log -= top
+        np.exp(self.log, out=self.log)
+        self._cumulate()
+        return float(top.min(initial=0.0))
+
+    def draw(self, rng: np.random.Generator, label: np.ndarray) -> None:
+        """States drawn from the cumulative densities: how many of these a uniform number passes."""
+        rng.random(out=self.level)
+        self.level *= self.log[-1]
+        np.greater_equal(self.level, self.log[:-1], out=self.passed)
+        if len(self.passed) == 1:
+            label[...] = self.bytes[0]
+        elif len(self.passed) == 2:
+            np.add(self.bytes[0], self.bytes[1], out=label)
+        else:
+            np.sum(self.bytes, axis=0, dtype=label.dtype, out=label)
+
+    def summed(self, label: np.ndarray, codes: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Sums of the features by state: ``(states * chains, features)``."""
+        np.equal(label, codes, out=self.hot)
+        return np.dot(self.flat_hot, features.T)
+
+    def _cumulate(self) -> None:
+        for k in range(1, len(self.log)):
+            np.add(self.log[k], self.log[k - 1], out=self.log[k])
+
+
+class _Prior:
+    """Log prior probabilities of the states: common to all elements, or of every element."""
+
+    def __init__(self, blanket: Blanket, members: np.ndarray | None) -> None:
+        self.blanket, self.members = blanket, members
+        own = blanket.own
+        domain = blanket.node.domain
+        assert domain is not None
+        axes = len(blanket.node.plates)
+        self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape((-1,) + (1,) * (1 + axes))
+        self.steep = False
+        self._weights = _weights_of(blanket)
+        self._kept: np.ndarray | None = None
+        target = blanket.target
+        log = self._evaluated(example_of(target))
+        self._is_common = log.shape[2:] == (1,) * axes
+        above = set() if own is None else hidden_above(target, own)
+        if not above:
+            self._kept = self._shaped(self._evaluated({**target.known}))
+            self.steep = bool((self._kept < _ZERO).any())
+
+    def common(self, values: Values) -> np.ndarray | None:
+        """Shape (states, chains or 1), or None where elements differ."""
+        if not self._is_common:
+            return None
+        if self._kept is not None:
+            return self._kept
+        if self._weights is not None:
+            return np.maximum(np.log(values[self._weights].T), IMPOSSIBLE)
+        return self._shaped(self._evaluated(values))
+
+    def by_element(self, values: Values) -> np.ndarray | None:
+        """Shape (states, chains or 1, elements), or None where they are alike."""
+        if self._is_common:
+            return None
+        if self._kept is not None:
+            return self._kept
+        found = self._shaped(self._evaluated(values))
+        self.steep = bool((found < _ZERO).any())
+        return found
+
+    def _evaluated(self, values: Values) -> np.ndarray:
+        state: dict[str, Any] = {**values, self.blanket.name: self._candidate}
+        log = self.blanket.own_log(state)
+        missing = 2 + len(self.blanket.node.plates) - log.ndim
+        return log.reshape((*log.shape[:1], *(1,) * missing, *log.shape[1:])) if missing else log
+
+    def _shaped(self, log: np.ndarray) -> np.ndarray:
+        log = np.maximum(log, IMPOSSIBLE)
+        if self._is_common:
+            return log.reshape(log.shape[:2])
+        full = np.broadcast_to(log, log.shape[:2] + self.blanket.node.plate_shape)
+        flat = full.reshape((*log.shape[:2], -1))
+        return flat if self.members is None else flat[..., self.members]
+
+
+def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
+    """The kernel of a mixture's labels, where the model has that form.
+
+    A finite node in plates, all of whose children are known and depend on these plates through the node
+    alone, with log densities that are features times coefficients. None where it is not so.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    debug : bool
+        Check log densities against the model's in every step (slow).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.labels import label_kernel
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.blanket import Blanket
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet(plates={"kind": 2, "i": 5})
+    >>> net.add("level", bmc.Normal(0.0, 3.0), plates="kind")
+    >>> net.add("label", bmc.Categorical([0.5, 0.5]), plates="i")
+    >>> net.add("x", lambda label, level: bmc.Normal(level[label], 1.0), plates="i")
+    >>> target = target_of(pose(net, {"x": [0.0, 4.0, 0.5, -0.5, 3.5]}))
+    >>> kernel = label_kernel(Blanket(target, "label"))
+    >>> state = {"level": np.array([[0.0, 4.0]]), "label": np.zeros((1, 5), dtype=np.uint8)}
+    >>> log = kernel.log_density({**target.known, **state})
+    >>> (log[1] - log[0]).round(6).tolist()  # log odds of the second kind
+    [[-8.0, 8.0, -6.0, -10.0, 6.0]]
+    """
+    node = blanket.node
+    if node.domain is None or not 2 <= node.domain.size <= 255 or not node.plates:
+        return None
+    if blanket.path or len(blanket.classes) != 1 or not blanket.children:
+        return None
+    found = []
+    with np.errstate(all="ignore"):
+        for child in blanket.children:
+            term = label_term(blanket, child)
+            if term is None:
+                return None
+            found.append(term)
+        kernel = Labels(blanket, found, debug)
+        return kernel if _is_right(kernel) else None
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _weights_of(blanket: Blanket) -> str | None:
+    """The node that holds the probabilities themselves, one row for all elements."""
+    own, target = blanket.own, blanket.target
+    above = [] if own is None else sorted(hidden_above(target, own))
+    if own is None or len(above) != 1 or target.model[above[0]].plates:
+        return None
+    if target.model[above[0]].event_shape != (blanket.node.domain.size,):  # type: ignore[union-attr]
+        return None
+    try:
+        result = traced_term(target, (above[0],), own).result
+    except Untraceable:
+        return None
+    if not isinstance(result, TracedCall) or result.function is not Categorical:
+        return None
+    value = result.traced.get("probs")
+    alone = len(result.traced) == 1 and isinstance(value, Tracer) and value.is_copy
+    return above[0] if alone and value.whole_event else None  # type: ignore[union-attr]
+
+
+def _is_right(kernel: Labels) -> bool:
+    """Whether log densities at a reachable state are the model's."""
+    state = example_of(kernel.blanket.target)
+    try:
+        table, _ = kernel._table(state, 1)
+        kernel._check(state, table, kernel._prior.by_element(state))
+    except (LostParameters, np.linalg.LinAlgError):
+        return True  # nothing to compare there: such states go to the plain kernel
+    except BayesmcError:
+        return False
+    return True
