@@ -9,9 +9,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from examples import (
+    bimodal_mixture,
     central_limit,
     diagnosis,
     expectation_and_marginal,
+    faithful_gibbs,
+    ising_denoising,
+    kernels_as_chains,
     markov_chains,
     old_faithful,
     parzen,
@@ -23,7 +27,7 @@ from examples import (
 NETS = (diagnosis, old_faithful)
 FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
-    markov_chains,
+    markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
 )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +10,19 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc import testing
+from bayesmc.markov import MarkovChain
 from examples import (
+    bimodal_mixture,
     central_limit,
     compare,
     data_faithful,
     demo,
     diagnosis,
     expectation_and_marginal,
+    faithful_gibbs,
+    ising_denoising,
+    kernels_as_chains,
     markov_chains,
     old_faithful,
     parzen,
@@ -269,3 +276,168 @@ def test_markov_chains_are_what_the_figure_says_of_them() -> None:
     first = int(np.argmax(distances <= markov_chains.EPS))
     lower, upper = climber.mixing_time_bounds(markov_chains.EPS)
     assert lower <= climber.mixing_time(markov_chains.EPS) == first <= upper < markov_chains.STEPS
+
+
+def test_random_walks_do_what_the_figure_says_of_them() -> None:
+    """Acceptance within 5 errors of the exact rate, from the spread of chains (false alarms: 5e-3)."""
+    crossed = {}
+    for width in bimodal_mixture.WIDTHS:
+        posterior = bimodal_mixture.explored(width, 2_000)
+        rates = posterior.acceptance["x"]
+        error = rates.std(ddof=1) / np.sqrt(len(rates))
+        assert abs(rates.mean() - bimodal_mixture.acceptance(width)) < 5 * error
+        shares = bimodal_mixture.right_hill(posterior)
+        crossed[width] = ((shares > 0) & (shares < 1)).mean()
+        assert (posterior.rhat("x") > 1.3) == (width < 500)
+    assert crossed == {1: 0.0, 8: 0.0, 500: 1.0}
+    density = np.exp(bimodal_mixture.TARGET.log_prob(bimodal_mixture.GRID))
+    assert np.trapezoid(density, bimodal_mixture.GRID) == pytest.approx(1.0, abs=1e-9)
+    assert bimodal_mixture.acceptance(1e-3) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_ising_graph_has_the_energy_of_the_formula() -> None:
+    """The graph's log density beside sums over slices, for both kinds of noise."""
+    rng = np.random.default_rng(1)
+    x = rng.choice([-1, 1], size=(3, 4, 5))
+    pairs = (x[:, 1:] * x[:, :-1]).sum(axis=(1, 2)) + (x[:, :, 1:] * x[:, :, :-1]).sum(axis=(1, 2))
+    for noise, seen in ising_denoising.noisy(x[0], rng).items():
+        pixels = (seen - x) ** 2 / (-2 * ising_denoising.SIGMA**2)
+        if noise == "flips":
+            odds = np.log((1 - ising_denoising.FLIPPED) / ising_denoising.FLIPPED)
+            pixels = 0.5 * odds * x * seen
+        expected = ising_denoising.J * pairs + pixels.sum(axis=(1, 2))
+        graph = ising_denoising.ising(seen, noise)
+        assert len(graph.factors) == 2
+        np.testing.assert_allclose(graph.log_prob({"x": x}), expected)
+
+
+@pytest.mark.parametrize("noise", ["Gaussian", "flips"])
+def test_sweeps_clean_the_image(noise: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("BAYESMC_DATA", raising=False)
+    clean = ising_denoising.image()
+    assert clean.shape == (82, 100) and set(np.unique(clean)) == {-1, 1}
+    seen = ising_denoising.noisy(clean, np.random.default_rng(5))[noise]
+    drawn = ising_denoising.sweeps(ising_denoising.ising(seen, noise))
+    assert drawn.shape == (15, 82, 100) and drawn.mean(axis=0)[0].min() >= -1
+    shown = ising_denoising.stages(seen, drawn).values()
+    before, first, fifth, average = (ising_denoising.error(pixels, clean) for pixels in shown)
+    assert first > before > 1.5 * fifth > 3 * average
+    assert ising_denoising.error(clean, clean) == 0 and ising_denoising.error(-clean, clean) == 1
+
+
+def test_horse_is_denoised_nearly_as_well_as_by_the_exact_mode(
+    reference_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The published noisy image; its exact MAP has 1.9 % wrong pixels, a long average should not have many
+    more."""
+    monkeypatch.setenv("BAYESMC_DATA", str(reference_data))
+    clean = ising_denoising.image()
+    with np.load(reference_data / "ising" / "horse.dev.npz") as arrays:
+        seen = arrays["noisy_small_p10"].astype(int)
+    references = json.loads((reference_data / "ising" / "ising.dev.ref.json").read_text())
+    reference = references["denoise"]["small_p10_J0.5"]
+    assert reference["error_noisy"] == pytest.approx(ising_denoising.error(seen, clean))
+    monkeypatch.setattr(ising_denoising, "FLIPPED", reference["p"])
+    assert reference["J"] == ising_denoising.J
+    drawn = ising_denoising.sweeps(ising_denoising.ising(seen, "flips"), 100)
+    average = ising_denoising.error(drawn[20:].mean(axis=0), clean)
+    assert average < 1.3 * reference["error_MAP"]
+
+
+def test_mixture_of_waits_is_the_reference(reference_data: Path) -> None:
+    """Means within 5 combined errors, spreads within 10 %, of a run of 64 chains (false alarms: 1e-5)."""
+    text = (reference_data / "mixtures" / "mixtures.dev.ref.json").read_text()
+    reference = json.loads(text)["faithful_waiting_bayes_K2"]
+    priors = dict(zip(("m0", "s0", "a0", "b0"), (
+        faithful_gibbs.WAIT_MEAN, faithful_gibbs.WAIT_SD, faithful_gibbs.SHAPE, faithful_gibbs.SCALE,
+    ), strict=True))  # fmt: skip
+    assert reference["priors"] == pytest.approx(priors)
+    make, evidence = faithful_gibbs.MODELS[0]
+    found = faithful_gibbs.answers(faithful_gibbs.learnt(make(), evidence, 1_500))
+    names = {"share": "w", "mean wait": "mu", "sd of waits": "sigma"}
+    for name, (mean, spread, error) in found.items():
+        for k in (0, 1):
+            expected = reference["summary"][f"{names[name]}[{k + 1}]"]
+            assert abs(mean[k] - expected["mean"]) < 5 * np.hypot(error[k], expected["mcse"]), name
+            assert spread[k] == pytest.approx(expected["sd"], rel=0.1)
+
+
+@pytest.mark.parametrize("model", [1, 2], ids=["independent", "normal-inverse-wishart"])
+def test_gaussian_mixtures_agree_with_a_sampler_by_hand(model: int) -> None:
+    """Full conditionals of the textbook in plain NumPy; means within 5 combined errors (2e-3 in all)."""
+    make, evidence = faithful_gibbs.MODELS[model]
+    found = faithful_gibbs.answers(faithful_gibbs.learnt(make(), evidence, 600))
+    draws = _mixture_by_hand(np.random.default_rng(2), joined=model == 2)
+    for name, values in draws.items():
+        mean, _, error = found[name]
+        batches = values.reshape(20, -1, 2).mean(
+            axis=1
+        )  # of 100 draws, far longer than they remember
+        theirs = batches.std(axis=0, ddof=1) / np.sqrt(20)
+        assert np.all(np.abs(mean - values.mean(axis=0)) < 5 * np.hypot(error, theirs)), name
+
+
+def test_every_parameter_of_the_mixtures_has_a_closed_form() -> None:
+    for make, evidence in faithful_gibbs.MODELS:
+        table = {row.node: row for row in bmc.explain(make(), evidence, bmc.Gibbs()).table}
+        for name in table.keys() - evidence.keys() - {"label"}:
+            assert table[name].kernel == "conjugate", table[name]
+        assert table["label"].kernel == "enumerate"
+
+
+def test_kernels_keep_the_posterior_as_the_figure_says() -> None:
+    """Exact matrices: the law, balance of single updates, and a chain with two laws."""
+    law = kernels_as_chains.posterior_law()
+    net, wet = kernels_as_chains.wet_grass(), kernels_as_chains.WET
+    for name, engine in kernels_as_chains.ENGINES.items():
+        sweep = testing.exact_sweep(net, wet, engine())
+        off = 1e-12 if sweep.resolution < 1e-15 else 1e-8  # table look-ups have 31 bits
+        chain = MarkovChain(sweep.matrix)
+        np.testing.assert_allclose(chain.stationary[0], law, rtol=0, atol=off, err_msg=name)
+        assert not chain.is_reversible() and len(sweep.updates) == 3
+        for update in sweep.updates:
+            assert MarkovChain(update.matrix).is_reversible(law, 100 * off)
+        random = kernels_as_chains.in_random_order(sweep)
+        lower, upper = random.mixing_time_bounds(kernels_as_chains.EPS)
+        assert lower <= random.mixing_time(kernels_as_chains.EPS) <= upper
+        counts = kernels_as_chains.simulated(engine, sweep, 50_000)
+        assert counts.sum() == 50_000
+        assert testing.transition_p_value(sweep.matrix, counts) > 1e-4  # at a fixed seed
+    assert list(sweep.elements) == list(kernels_as_chains.HIDDEN)
+
+
+def _mixture_by_hand(rng: np.random.Generator, joined: bool) -> dict[str, np.ndarray]:
+    """2000 draws of the parameters of two clusters, ordered by their waits; joined: kappa = 1."""
+    from scipy.stats import invwishart
+
+    y, centre = faithful_gibbs.TIMES, faithful_gibbs.CENTRE
+    label = (y[:, 1] > 68).astype(int)
+    mean = np.array([y[label == k].mean(axis=0) for k in (0, 1)])
+    cov = np.stack([np.cov(y[label == k].T) for k in (0, 1)])
+    found = []
+    for _ in range(2_200):
+        counts = np.bincount(label, minlength=2)
+        weights = rng.dirichlet(1.0 + counts)
+        log = np.empty((2, len(y)))
+        for k in (0, 1):
+            mine = y[label == k]
+            scatter = faithful_gibbs.SCATTER + (mine - mean[k]).T @ (mine - mean[k])
+            if joined:
+                scatter = scatter + np.outer(mean[k] - centre, mean[k] - centre)
+            df = faithful_gibbs.DF + counts[k] + joined
+            cov[k] = invwishart.rvs(df, scatter, random_state=rng)
+            prior = np.linalg.inv(cov[k] if joined else faithful_gibbs.SPREAD)
+            each = np.linalg.inv(cov[k])
+            spread = np.linalg.inv(prior + counts[k] * each)
+            mean[k] = rng.multivariate_normal(
+                spread @ (prior @ centre + each @ mine.sum(axis=0)), spread
+            )
+            off = y - mean[k]
+            log[k] = np.log(weights[k]) - 0.5 * np.linalg.slogdet(cov[k])[1]
+            log[k] -= 0.5 * np.einsum("ni,ij,nj->n", off, each, off)
+        label = (rng.random(len(y)) < 1 / (1 + np.exp(log[0] - log[1]))).astype(int)
+        correlation = cov[:, 0, 1] / np.sqrt(cov[:, 0, 0] * cov[:, 1, 1])
+        row = [weights, mean[:, 1], np.sqrt(cov[:, 1, 1]), mean[:, 0], correlation]
+        found.append(np.array(row)[:, np.argsort(mean[:, 1])])
+    names = ("share", "mean wait", "sd of waits", "mean length", "correlation")
+    return dict(zip(names, np.moveaxis(np.array(found[200:]), 1, 0), strict=True))

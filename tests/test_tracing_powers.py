@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bayesmc.tracing import Tracer, claims
+from bayesmc.tracing import Tracer, axes, claims
 
 SHAPES = {"x": (2, 3), "z": (3,)}  # x is a vector in a plate, z three scalars
 EVENTS = {"x": 1, "z": 0}
@@ -491,3 +491,49 @@ def test_a_wrong_rule_is_caught(rule: str, monkeypatch: pytest.MonkeyPatch) -> N
     assert found is not None
     monkeypatch.undo()
     assert lie(found) is None  # it is the rule that lied
+
+
+# ---- axes --------------------------------------------------------------------------------------------
+
+
+def random_key(rng: np.random.Generator, shape: tuple[int, ...]) -> tuple[Any, ...]:
+    parts: list[Any] = [
+        None, Ellipsis, slice(None), slice(None), slice(None, None, -1), 0, np.int64(1),
+        np.array([1, 0]), np.array([[1], [0]]), [0, 1, 1],
+    ]  # fmt: skip
+    key = [parts[rng.integers(len(parts))] for _ in range(rng.integers(5))]
+    if shape and rng.random() < 0.2:
+        key.append(rng.random(shape[-1]) < 0.6)
+    return tuple(key)
+
+
+def test_what_a_key_leaves_alone_stays_where_it_was() -> None:
+    """Axes before the span keep their place from the left, axes behind it from the right."""
+    rng = np.random.default_rng(0)
+    tried = spared = 0
+    for _ in range(6000):
+        shape = tuple(rng.integers(2, 5, size=rng.integers(5)))
+        key = random_key(rng, shape)
+        value = np.arange(np.prod(shape, dtype=int)).reshape(shape)
+        try:
+            result = value[key]
+        except IndexError:
+            continue
+        span = axes.index_span(key, value.ndim)
+        if result.size == 0 or span is None:
+            continue
+        tried += 1
+        at = np.unravel_index(result, shape) if shape else ()
+        for k, size in enumerate(shape):
+            places = []
+            if k < span[0] and span != axes.KEPT:
+                places.append(k)
+            if k >= span[1]:
+                places.append(result.ndim - value.ndim + k)
+            for place in places:
+                spared += 1
+                assert result.shape[place] == size
+                along = np.arange(size).reshape((-1,) + (1,) * (result.ndim - 1 - place))
+                assert (at[k] == along).all(), (shape, key)
+    assert tried > 3000
+    assert spared > 1500

@@ -114,7 +114,7 @@ class Wishart(_MatrixFamily):
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         lower = bartlett(rng, self.df[..., None] - np.arange(self._size), shape)
-        return gram(self._root @ lower)
+        return gram(self._root @ lower)[0]
 
     def _log_density(self, root: np.ndarray) -> np.ndarray:
         trace = _squares(self._root, root)
@@ -180,7 +180,7 @@ class InverseWishart(_MatrixFamily):
         # reversed), its inverse is M M' with M = U'^-1, which again is lower triangular.
         d = self._size
         lower = bartlett(rng, self.df[..., None] - np.arange(d - 1, -1, -1.0), shape)
-        return gram(_divide(self._root, lower))
+        return gram(_divide(self._root, lower))[0]
 
     def _log_density(self, root: np.ndarray) -> np.ndarray:
         trace = _squares(root, self._root)
@@ -224,13 +224,18 @@ def bartlett(rng: np.random.Generator, df: np.ndarray, shape: Shape) -> np.ndarr
     return lower
 
 
-def gram(lower: np.ndarray) -> np.ndarray:
-    """``lower @ lower.T``, symmetric to the last bit and positive definite after rounding, too."""
+def gram(lower: np.ndarray) -> tuple[np.ndarray, bool]:
+    """``lower @ lower.T``, symmetric to the last bit and positive definite after rounding, too.
+
+    The second value says whether it is that product, or some pivots were looked at and perhaps raised.
+    """
     product = _symmetric_product(lower)
     # rounding can lose a pivot only where some row lies close to the span of those above it
     pivots = lower.diagonal(0, -2, -1)
     close = pivots * pivots < _CLOSE**2 * product.diagonal(0, -2, -1)
-    return _raised(lower, product, close) if close.any() else product
+    if close.any():
+        return _raised(lower, product, close), False
+    return product, True
 
 
 def _raised(lower: np.ndarray, product: np.ndarray, close: np.ndarray) -> np.ndarray:

@@ -14,9 +14,11 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError, ZeroProbabilityError
+from bayesmc.kernels.enumerate import draw_states
 from bayesmc.kernels.slice import is_half_line
 from bayesmc.network import CompiledNode
 from bayesmc.shapes import Shape
+from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
 
 #: how far draws go from the prior mean, for successive attempts
@@ -152,7 +154,10 @@ def _drawn(
     rng: np.random.Generator,
 ) -> np.ndarray:
     if node.name not in target.terms:
-        return _of_support(node, count, rng)
+        log = _alone(target, node, values, count)
+        if log is None:
+            return _of_support(node, count, rng)
+        return draw_states(log, rng, node.name).astype(node.domain.dtype)  # type: ignore[union-attr]
     dist, _ = target.model.evaluate(node.name, values)
     try:
         draws = target.model.sample_stored(node.name, dist, rng, (count,))
@@ -161,6 +166,26 @@ def _drawn(
     if node.domain is not None or node.is_discrete:
         return draws
     return _shrunk(dist, draws, spread, (count, *node.value_shape), len(node.event_shape))
+
+
+def _alone(
+    target: Target, node: CompiledNode, values: Values, count: int
+) -> np.ndarray | None:
+    """What factors of a finite variable alone say of its states, shape ``(states, count, *plates)``."""
+    if node.domain is None:
+        return None
+    blanket = Blanket(target, node.name)
+    state = {**target.known}
+    log: np.ndarray = np.zeros((node.domain.size, 1, *(1 for _ in node.plates)))
+    states = np.arange(node.domain.size, dtype=node.domain.dtype).reshape(log.shape)
+    state[node.name] = np.broadcast_to(states, (node.domain.size, 1, *node.plate_shape))
+    found = False
+    for child in blanket.children:
+        rows = len(child.relation.rows)
+        if set(child.term.scope) <= {node.name, *target.known} and rows <= 1:
+            log = log + blanket.child_log(child, state)
+            found = True
+    return np.broadcast_to(log, (node.domain.size, count, *node.plate_shape)) if found else None
 
 
 def _shrunk(

@@ -13,6 +13,7 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 2-3, 11.3; Plummer, J
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,9 +23,11 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_children import Partner, partner_of
-from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Kind, Naturals, split_prior
+from bayesmc.kernels.conjugate_components import PlanarStep, planar_step
+from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Naturals, split_prior
 from bayesmc.kernels.conjugate_labels import hidden_above
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
+from bayesmc.kernels.precisions import keep_precision
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
@@ -100,8 +103,18 @@ class Conjugate(Kernel):
         """New values of one class of elements."""
         now = self.blanket.current(values, members)
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
+        quick = self._quick
+        if quick is not None and not self.debug:
+            new = quick.draw(values, rng)
+            if new is not None:
+                return new
         naturals, bounds = self._naturals(values, part)
-        drawn = self.kind.draw(naturals, bounds, rng, shape)
+        if isinstance(self.kind, Covariance):
+            drawn, precision = self.kind.with_precision(naturals, rng, shape)
+            if precision is not None and members is None:
+                keep_precision(self.blanket.target, self.blanket.name, drawn, precision)
+        else:
+            drawn = self.kind.draw(naturals, bounds, rng, shape)
         if drawn is not None and not self.debug:
             return drawn
         posterior = self.kind.posterior(naturals, bounds, self.power)
@@ -110,6 +123,15 @@ class Conjugate(Kernel):
         if self.debug:
             self._check(values, members, posterior, now, drawn)
         return drawn
+
+    @cached_property
+    def _quick(self) -> PlanarStep | None:
+        """A way round arrays, looked up at the first step."""
+        alone = len(self.partners) == 1 and self.blanket.classes == (None,)
+        if not alone or not self._constant:
+            return None
+        prior, bounds = self._prior({**self.blanket.target.known}, 0, None)
+        return None if bounds is not None else planar_step(self.partners[0], prior)
 
     def _naturals(self, values: Values, part: int) -> tuple[Naturals, Bounds | None]:
         """Natural parameters of the full conditional: the prior's and what children add."""

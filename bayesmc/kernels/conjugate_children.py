@@ -63,6 +63,7 @@ class Partner:
         self._slope: np.ndarray | None = None
         self._fixed: Naturals | None = None
         self._way: ByLabel | None = None
+        self.is_mean_by_label = False
         with marking_invalid(), np.errstate(all="ignore"):
             self._settle()
 
@@ -72,12 +73,19 @@ class Partner:
             return self._fixed
         return self._natural(values, members)
 
+    @property
+    def way(self) -> ByLabel | None:
+        """How it is summed by label, if it is."""
+        return self._way
+
     # ---- evaluating ---------------------------------------------------------------------------
 
     def _natural(self, values: Values, members: np.ndarray | None) -> Naturals:
         if self._counts is not None:
             count = self._counts.at(values).count
             return (count.reshape((len(count), -1)),)
+        if self.is_mean_by_label:
+            return self._by_label(values)
         steps = self.kind.name == "mean" and self._slope is None
         e = self._evaluated(values, members, steps)
         if self.kind.name == "mean":
@@ -102,6 +110,15 @@ class Partner:
             return e.sum(squares), e.sum(np.vecdot(rows, residual))
         weighted = _last(rows * np.sqrt(count)[..., None])
         return e.outer(weighted), e.sum(_last(np.vecdot(rows, residual)), 1)
+
+    def _by_label(self, values: Values) -> Naturals:
+        """The same for vectors whose mean is this node itself, element k under label k."""
+        assert self._way is not None
+        precision, data = self._way.precision(values), self._way.groups.at(values)
+        d = precision.matrix.shape[-1]
+        count = data.count.reshape((len(data.count), -1, 1, 1))
+        total = data.total.reshape((len(count), -1, d))
+        return count * precision.matrix, np.matvec(precision.matrix, total)
 
     @cached_property
     def _counts(self) -> Groups | None:
@@ -194,6 +211,16 @@ class Partner:
             # the mean varies with this node and the label alone
             dist, _ = self._way.at_labels(example, self._moved)
             self._slope = slope_of(dist, len(self.term.shape), self._steps)
+            self.is_mean_by_label = self._is_itself(self._slope)
+
+    def _is_itself(self, slope: np.ndarray) -> bool:
+        """Whether the mean of vectors is the node's value under each label."""
+        assert self._way is not None
+        if not self.blanket.event_shape or not self.blanket.node.plates or not self._event_ndim:
+            return False
+        unit = np.eye(len(self._steps)).reshape((len(slope), *(1,) * (slope.ndim - 2), -1))
+        at_zero = self._way.parameter("loc", {})
+        return bool((slope == unit).all() and not np.any(at_zero))
 
     def _find_slope(self, above: set[str], members: np.ndarray | None) -> None:
         """Slopes are constant where the mean is affine in all that is hidden together."""

@@ -7,6 +7,7 @@ pairs is written once. Nothing here knows priors.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, cached_property
 from typing import Protocol
 from weakref import WeakKeyDictionary
 
@@ -84,23 +85,42 @@ class Elements:
 class Grouped:
     """Values of a child summed by its label: the last plate axis runs through the labels.
 
-    Attributes
+    Parameters
     ----------
-    count : ndarray, shape (chains, *ones, labels)
+    sums : ndarray, shape (chains, *ones, labels, rows)
+        How many, their sum from a centre, and products about it if anybody needs these.
+    centre : ndarray
+    event_ndim : int
     """
 
-    def __init__(
-        self,
-        count: np.ndarray,
-        first: np.ndarray,
-        second: np.ndarray | None,
-        centre: np.ndarray,
-        event_ndim: int,
-    ) -> None:
-        self.event_ndim = event_ndim
-        self.count = count
-        self._wide = count[..., None] if event_ndim else count
-        self._first, self._second, self._centre = first, second, centre
+    def __init__(self, sums: np.ndarray, centre: np.ndarray, event_ndim: int) -> None:
+        self.sums, self._centre, self.event_ndim = sums, centre, event_ndim
+
+    @cached_property
+    def count(self) -> np.ndarray:
+        """How many, shape (chains, *ones, labels)."""
+        return self.sums[..., 0]
+
+    @cached_property
+    def rows(self) -> list[list[float]]:
+        """The sums of all chains' labels, one after the other."""
+        return self.sums.reshape(-1, self.sums.shape[-1]).tolist()
+
+    @cached_property
+    def _wide(self) -> np.ndarray:
+        return self.count[..., None] if self.event_ndim else self.count
+
+    @cached_property
+    def _first(self) -> np.ndarray:
+        if not self.event_ndim:
+            return self.sums[..., 1]
+        return self.sums[..., 1 : 1 + self._centre.shape[0]]
+
+    @cached_property
+    def _second(self) -> np.ndarray:
+        if not self.event_ndim:
+            return self.sums[..., 2]
+        return self.sums.take(_unpacking(self._centre.shape[0]), axis=-1)
 
     @property
     def total(self) -> np.ndarray:
@@ -110,7 +130,6 @@ class Grouped:
         return self._first - self._wide * (loc - self._centre)
 
     def squares(self, loc: np.ndarray) -> np.ndarray:
-        assert self._second is not None
         off = loc - self._centre
         squares = self._second - off * (2.0 * self._first - self.count * off)
         return np.maximum(squares, 0.0)  # an empty label must not have a negative sum by rounding
@@ -126,7 +145,6 @@ class Grouped:
         return into.sum(self._scatter(loc), 2)
 
     def _scatter(self, loc: np.ndarray) -> np.ndarray:
-        assert self._second is not None
         off = loc - self._centre
         cross = off[..., :, None] * (
             self._first[..., None, :] - 0.5 * self.count[..., None, None] * off[..., None, :]
@@ -157,6 +175,7 @@ class Groups:
         self.values = flat - self.centre
         self._features: np.ndarray | None = None
         self._kept: tuple[np.ndarray | None, bool, Grouped | None] = (None, False, None)
+        self._ones = (1,) * (self.plates - 1)
 
     def at(self, values: Values) -> Grouped:
         """The sums for the labels of a state."""
@@ -202,17 +221,18 @@ class Groups:
 
     def _grouped(self, sums: np.ndarray) -> Grouped:
         """Sums ``(chains, states, rows)`` with one axis for every plate, the labels on the last."""
-        sums = sums.reshape((len(sums), *(1,) * (self.plates - 1), *sums.shape[1:]))
-        if not self.event_ndim:
-            second = sums[..., 2] if self.second else None
-            return Grouped(sums[..., 0], sums[..., 1], second, self.centre, 0)
-        d = self.values.shape[-1]
-        full = None
-        if self.second:
-            i, j = np.tril_indices(d)
-            full = np.empty((*sums.shape[:-1], d, d))
-            full[..., i, j] = full[..., j, i] = sums[..., d + 1 :]
-        return Grouped(sums[..., 0], sums[..., 1 : d + 1], full, self.centre, 1)
+        if self._ones:
+            sums = sums.reshape((len(sums), *self._ones, *sums.shape[1:]))
+        return Grouped(sums, self.centre, self.event_ndim)
+
+
+@cache
+def _unpacking(d: int) -> np.ndarray:
+    """Where the products stand in a row of sums, as a symmetric matrix."""
+    i, j = np.tril_indices(d)
+    place = np.empty((d, d), dtype=np.intp)
+    place[i, j] = place[j, i] = 1 + d + np.arange(len(i))
+    return place
 
 
 def sums_by_label(label: np.ndarray, features: np.ndarray, states: int) -> np.ndarray:

@@ -31,6 +31,8 @@ from bayesmc.distributions.wishart import bartlett, gram
 from bayesmc.kernels.precisions import Precision, from_root
 from bayesmc.shapes import Shape
 
+#: numbers up to which Python's floats are faster than arrays
+_FEW = 24
 Naturals = tuple[np.ndarray, ...]
 #: lower and upper end of a truncated full conditional
 Bounds = tuple[Any, Any]
@@ -238,6 +240,8 @@ class Shares(Kind):
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
         counts = naturals[0]
+        if counts.size <= _FEW and counts.size == math.prod(shape) * counts.shape[-1]:
+            return _few_shares(counts, rng, shape)
         if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
             return None
         draw = rng.standard_gamma(counts, shape + counts.shape[-1:])
@@ -268,8 +272,8 @@ class Covariance(Kind):
 
     def with_precision(
         self, naturals: Naturals, rng: np.random.Generator, shape: Shape
-    ) -> tuple[np.ndarray, Precision]:
-        """A draw, and its precision from the same factors.
+    ) -> tuple[np.ndarray, Precision | None]:
+        """A draw, and its precision from the same factors (None where rounding spoils these).
 
         If the scale is ``R R'`` and B is Bartlett's triangle, the draw is ``M M'`` with ``M = R B^-1``,
         and its precision ``N N'`` with ``N = R'^-1 B'``.
@@ -281,7 +285,8 @@ class Covariance(Kind):
         uppers[1] = bartlett(rng, df[..., None] - _falling(d), shape).swapaxes(-1, -2)
         over_root, over_noise = np.linalg.inv(uppers)
         factor = (over_noise @ uppers[0]).swapaxes(-1, -2)
-        return gram(factor), from_root(over_root @ uppers[1])
+        draw, exact = gram(factor)
+        return draw, from_root(over_root @ uppers[1]) if exact else None
 
 
 #: all kinds, in the order in which they are tried for a flat prior
@@ -346,6 +351,21 @@ class RootOf(Distribution):
 
 def _covers(bounds: Bounds, low: float, high: float) -> bool:
     return bool(np.all(bounds[0] <= low) and np.all(bounds[1] >= high))
+
+
+def _few_shares(counts: np.ndarray, rng: np.random.Generator, shape: Shape) -> np.ndarray | None:
+    """The same in floats, which for few numbers are faster than arrays."""
+    size = counts.shape[-1]
+    numbers = counts.ravel().tolist()
+    if not min(numbers) >= 1.0:
+        return None
+    gammas = [rng.standard_gamma(a) for a in numbers]
+    drawn = []
+    for start in range(0, len(gammas), size):
+        row = gammas[start : start + size]
+        total = sum(row)
+        drawn += [g / total for g in row]
+    return np.array(drawn).reshape(shape + (size,))
 
 
 @cache

@@ -18,6 +18,7 @@ from bayesmc.kernels.conjugate_data import Groups, groups_of
 from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, padded
 from bayesmc.kernels.conjugate_pairs import Pair
 from bayesmc.kernels.conjugate_sums import ByElement, Collector
+from bayesmc.kernels.precisions import Precision, kept_precision, precision_of
 from bayesmc.network.model import arguments_of, call
 from bayesmc.plates import Lookups, PlateArray
 from bayesmc.structure.blanket import Blanket, Child
@@ -91,6 +92,19 @@ class ByLabel:
         value = values[source.node]
         value = value.reshape(value.shape[: value.ndim - source.trailing] + source.shape)
         return value if source.is_copy else source.factor * value**source.power
+
+    def precision(self, values: Values) -> Precision:
+        """Of vectors by label, batch ``(lead, labels or 1)``."""
+        assert self.direct is not None
+        source = self.direct["cov"]
+        if source.node is None or not source.is_copy:
+            cov = self.parameter("cov", values)
+            return precision_of(cov.reshape((len(cov), -1, *cov.shape[-2:])))
+        cov = values[source.node]
+        found = kept_precision(self.blanket.target, source.node, cov)
+        if source.trailing == 3:
+            return found
+        return found.reshaped((-1, 1))
 
     def at_labels(
         self, values: Values, candidate: np.ndarray

@@ -29,12 +29,11 @@ class Enumerate(Kernel):
         blanket = self.blanket
         state = values
         for members in blanket.classes:
-            axes = len(blanket.node.plates) if members is None else 1
-            candidate = self.states.reshape((-1, 1) + (1,) * axes)
+            now = blanket.current(state, members)
+            candidate = self.states.reshape((-1,) + (1,) * now.ndim)
             if members is not None:
                 candidate = np.broadcast_to(candidate, (len(self.states), 1, len(members)))
             log = blanket.log_density(state, candidate, members)
-            now = blanket.current(state, members)
             log = np.broadcast_to(log, (len(self.states), *now.shape))
             new = draw_states(log, rng, blanket.name).astype(self.states.dtype)
             state = {**state, blanket.name: blanket.moved(state, new, members)}

@@ -22,7 +22,8 @@ from bayesmc.distributions import Poisson
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Groups, groups_of
 from bayesmc.kernels.conjugate_evaluation import padded
 from bayesmc.kernels.conjugate_labels import ByLabel, hidden_above, is_known, read_directly
-from bayesmc.kernels.precisions import Precision, kept_precision, precision_of
+from bayesmc.kernels.conjugate_planar import planar_coefficients
+from bayesmc.kernels.precisions import Precision, precision_of
 from bayesmc.network.model import arguments_of, call
 from bayesmc.structure.blanket import Blanket, Child
 from bayesmc.structure.target import Target, Values
@@ -89,6 +90,7 @@ class LabelTerm:
         self._labels = np.arange(self.states, dtype=domain.dtype).reshape(labels)
         self.groups: Groups | None = None
         self._way: ByLabel | None = None
+        self._means: str | None = None
         self._above = hidden_above(target, self.term)
         self._unique: np.ndarray | None = None
         self._family: _Family | None = None
@@ -106,6 +108,16 @@ class LabelTerm:
         if self._way is not None:
             return self._family.coefficients(_Direct(self._way, values), self.centre)
         return self._family.coefficients(_Called(self, self.at_labels(values)), self.centre)
+
+    def planar(self, values: Values, chains: int) -> list[list[float]] | None:
+        """Coefficients by chain and state for normals in the plane whose parameters are nodes, or None."""
+        if self._means is None or self._way is None:
+            return None
+        loc = values[self._means]
+        precision = self._way.precision(values)
+        if precision.batch != (chains, self.states) or len(loc) != chains:
+            return None
+        return planar_coefficients(precision.entries, (loc - self.centre).reshape(-1, 2).tolist())
 
     def at_labels(self, values: Values) -> Distribution:
         """The child's distribution for every state of the label."""
@@ -192,6 +204,9 @@ class LabelTerm:
         way = ByLabel(self.blanket, self.child, groups)
         if read_directly(way, np.asarray(self._labels), self._above) is not None:
             self._way = way
+            loc = way.direct.get("loc") if way.direct is not None else None
+            if self.centre.shape == (2,) and loc is not None and loc.is_copy and loc.trailing == 2:
+                self._means = loc.node
         return True
 
     def _few_values(self, value: np.ndarray, mask: np.ndarray | None) -> bool:
@@ -297,14 +312,7 @@ class _Direct:
         return found.reshape((len(found), -1, *found.shape[found.ndim - event_ndim :]))
 
     def precision(self) -> Precision:
-        assert self.way.direct is not None
-        source = self.way.direct["cov"]
-        if source.node is None or not source.is_copy:
-            return precision_of(self.get("cov", 2))
-        cov = self.values[source.node]
-        found = kept_precision(self.way.blanket.target, source.node, cov)
-        batch = cov.shape[:-2]
-        return found.reshaped((batch[0] if batch else 1, batch[1] if len(batch) > 1 else 1))
+        return self.way.precision(self.values)
 
 
 @dataclass(frozen=True, eq=False)

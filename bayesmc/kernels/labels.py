@@ -12,6 +12,8 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 22; Diebolt and Rober
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -22,6 +24,7 @@ from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_data import Groups
 from bayesmc.kernels.conjugate_labels import hidden_above
+from bayesmc.kernels.conjugate_planar import FEW
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.label_terms import IMPOSSIBLE, LabelTerm, LostParameters, example_of, label_term
 from bayesmc.kernels.verify import check_ratio
@@ -64,7 +67,7 @@ class Labels(Kernel):
         self._plain = Enumerate(blanket)
         self._layout()
         self._prior = _Prior(blanket, self.members)
-        self._buffers: dict[tuple[int, int], _Buffers] = {}
+        self._parts: dict[int, list[tuple[slice, np.ndarray, _Buffers]]] = {}
         self._codes = np.arange(self.states, dtype=self.dtype)[:, None, None]
 
     def step(
@@ -73,7 +76,7 @@ class Labels(Kernel):
         name = self.blanket.name
         chains = len(values[name])
         try:
-            table, steep = self._table(values, chains)
+            table = self._table(values, chains)
         except (LostParameters, np.linalg.LinAlgError):
             return self._plain.step(values, memory, rng, warmup)
         by_element = self._prior.by_element(values)
@@ -81,7 +84,7 @@ class Labels(Kernel):
             self._check(values, table, by_element)
         groups = self._fed()
         label = np.empty((chains, self._features.shape[1]), dtype=self.dtype)
-        sums = self._draw(table, steep, by_element, rng, label, groups is not None)
+        sums = self._draw(table, by_element, rng, label, groups is not None)
         shape = values[name].shape
         if self.members is None:
             label = label.reshape(shape)
@@ -97,11 +100,11 @@ class Labels(Kernel):
 
         Impossible states have at most a tenth of ``IMPOSSIBLE``.
         """
-        table, _ = self._table(values, len(values[self.blanket.name]))
+        table = self._table(values, len(values[self.blanket.name]))
         return self._product(table, self._prior.by_element(values))
 
-    def _product(self, table: np.ndarray, by_element: np.ndarray | None) -> np.ndarray:
-        log = table @ self._features
+    def _product(self, table: _Table, by_element: np.ndarray | None) -> np.ndarray:
+        log = table.rows @ self._features
         return log if by_element is None else log + by_element
 
     def _layout(self) -> None:
@@ -124,9 +127,14 @@ class Labels(Kernel):
         for at, term in zip(self._at, self.terms, strict=True):
             may_vanish[at + term.ones : at + len(term.features)] = term.indicators
         self._may_vanish = may_vanish
+        self._most_floats = self._most.tolist()
 
-    def _table(self, values: Values, chains: int) -> tuple[np.ndarray, bool]:
-        """Coefficients ``(states, chains, features)``, and whether any state may be impossible."""
+    def _table(self, values: Values, chains: int) -> _Table:
+        """The coefficients of a state; raises ``LostParameters`` where products would cancel."""
+        if chains * self.states <= FEW:
+            quick = self._planar(values, chains)
+            if quick is not None:
+                return quick
         table = np.zeros((self.states, chains, len(self._features)))
         for at, term in zip(self._at, self.terms, strict=True):
             c = term.coefficients(values)
@@ -140,56 +148,75 @@ class Labels(Kernel):
         if common is not None:
             table[:, :, self._one] += common
         if (np.abs(table) @ self._most).max() < _LARGEST:
-            return table, self._prior.steep
+            return _Table(table, self._prior.steep)
         finite = np.where(self._may_vanish & (table < _ZERO), 0.0, table)
         if not (np.abs(finite) @ self._most).max() < _LARGEST:
             raise LostParameters
-        return np.maximum(table, 3 * IMPOSSIBLE), True
+        return _Table(np.maximum(table, 3 * IMPOSSIBLE), True)
+
+    def _planar(self, values: Values, chains: int) -> _Table | None:
+        """The same in floats for few components in the plane, or None."""
+        logs = self._prior.floats(values, chains)
+        rows = None if logs is None else self.terms[0].planar(values, chains)
+        if rows is None:
+            return None
+        for row, log in zip(rows, logs, strict=True):  # type: ignore[arg-type]
+            row[0] += log
+            size = 0.0
+            for a, most in zip(row, self._most_floats, strict=True):
+                size += abs(a) * most
+            if not size < _LARGEST:
+                return None
+        table = np.array(rows)
+        if chains == 1:
+            return _Table(table[:, None], False)
+        return _Table(table.reshape(chains, self.states, -1).swapaxes(0, 1).copy(), False)
 
     # ---- draws ---------------------------------------------------------------------------------
 
     def _draw(
         self,
-        table: np.ndarray,
-        steep: bool,
+        table: _Table,
         by_element: np.ndarray | None,
         rng: np.random.Generator,
         label: np.ndarray,
         summing: bool,
     ) -> np.ndarray:
         """Fill in labels ``(chains, elements)``; the features' sums ``(chains, states, features)``."""
-        states, chains, count = table.shape
-        flat = table.reshape(-1, count)
-        odds = (table[1:] - table[0]).reshape(-1, count)
-        sums = np.zeros((states * chains, count))
-        for part, buffers in self._chunks(chains):
-            features = self._features[:, part]
+        chains, total = len(label), None
+        for part, features, buffers in self._chunks(chains):
             own = None if by_element is None else by_element[..., part]
-            drawn = label[:, part]
-            if steep or not buffers.odds(odds, features, own):
-                if buffers.tilted(flat, features, own) < _ZERO:
+            if table.steep or self._prior.steep or not buffers.odds(table.odds, features, own):
+                if buffers.tilted(table.flat, features, own) < _ZERO:
                     raise ZeroProbabilityError(
                         f"node {self.blanket.name!r}: no state has positive probability given the "
                         "others; the chain is at an impossible configuration"
                     )
+            drawn = label[:, part]
             buffers.draw(rng, drawn)
             if summing:
-                sums += buffers.summed(drawn, self._codes, features)
-        return sums.reshape(states, chains, count).swapaxes(0, 1)
+                sums = buffers.summed(drawn, self._codes, features)
+                total = sums if total is None else total + sums
+        if total is None:
+            return np.zeros((chains, self.states, len(self._features)))
+        return total.reshape(self.states, chains, -1).swapaxes(0, 1)
 
-    def _chunks(self, chains: int) -> list[tuple[slice, _Buffers]]:
+    def _chunks(self, chains: int) -> list[tuple[slice, np.ndarray, _Buffers]]:
         """Equal parts of the elements: a short one at the end would cost as many calls as a long one."""
-        n = self._features.shape[1]
-        width = max(_CHUNK // (chains * self.states), _NARROW)
-        count = max(-(-n // width), 1)
-        ends = [n * i // count for i in range(count + 1)]
-        found = []
-        for start, end in zip(ends, ends[1:], strict=False):
-            key = (chains, end - start)
-            if key not in self._buffers:
-                self._buffers[key] = _Buffers(self.states, *key)
-            found.append((slice(start, end), self._buffers[key]))
-        return found
+        if chains not in self._parts:
+            n = self._features.shape[1]
+            width = max(_CHUNK // (chains * self.states), _NARROW)
+            count = max(-(-n // width), 1)
+            ends = [n * i // count for i in range(count + 1)]
+            sizes = {b - a for a, b in itertools.pairwise(ends)}
+            buffers = {size: _Buffers(self.states, chains, size) for size in sizes}
+            self._parts = {
+                chains: [
+                    (slice(a, b), self._features[:, a:b], buffers[b - a])
+                    for a, b in itertools.pairwise(ends)
+                ]
+            }
+        return self._parts[chains]
 
     def _fed(self) -> Groups | None:
         """The sums that conjugate kernels ask for, if they are of these features."""
@@ -199,7 +226,7 @@ class Labels(Kernel):
         fits = groups is not None and groups.used and groups.rows == len(self._features)
         return groups if fits else None
 
-    def _check(self, values: Values, table: np.ndarray, by_element: np.ndarray | None) -> None:
+    def _check(self, values: Values, table: _Table, by_element: np.ndarray | None) -> None:
         """Refuse log densities that are not the model's."""
         found = self._product(table, by_element)
         axes = len(self.blanket.node.plates) if self.members is None else 1
@@ -219,6 +246,21 @@ class Labels(Kernel):
         check_ratio(self.blanket.name, self.match, target, here, sizes)
 
 
+class _Table:
+    """Coefficients of every state: ``rows`` (states, chains, features), and their differences to the first.
+
+    Attributes
+    ----------
+    steep : bool
+        Whether any state may be impossible.
+    """
+
+    def __init__(self, rows: np.ndarray, steep: bool) -> None:
+        self.rows, self.steep = rows, steep
+        self.flat = rows.reshape(-1, rows.shape[-1])
+        self.odds = (rows[1:] - rows[0]).reshape(-1, rows.shape[-1])
+
+
 class _Buffers:
     """Room for one chunk, filled anew each time and never handed out."""
 
@@ -235,12 +277,13 @@ class _Buffers:
 
     def odds(self, table: np.ndarray, features: np.ndarray, own: np.ndarray | None) -> bool:
         """Cumulative odds against the first state; False where these could overflow."""
+        log_odds = self.log_odds
         np.dot(table, features, out=self.flat_odds)
         if own is not None:
-            self.log_odds += own[1:] - own[0]
-        if not self.log_odds.max(initial=0.0) < _STEEP:
+            log_odds += own[1:] - own[0]
+        if not log_odds.max() < _STEEP:
             return False
-        np.exp(self.log_odds, out=self.log_odds)
+        np.exp(log_odds, out=log_odds)
         self.log[0] = 1.0
         self._cumulate()
         return True
@@ -308,6 +351,15 @@ class _Prior:
         if self._weights is not None:
             return np.maximum(np.log(values[self._weights].T), IMPOSSIBLE)
         return self._shaped(self._evaluated(values))
+
+    def floats(self, values: Values, chains: int) -> list[float] | None:
+        """The common ones of every chain and state, where they are the logarithms of a node's value."""
+        if not self._is_common or self._weights is None:
+            return None
+        try:
+            return list(map(math.log, values[self._weights].ravel().tolist()))
+        except ValueError:  # of zero
+            return None
 
     def by_element(self, values: Values) -> np.ndarray | None:
         """Shape (states, chains or 1, elements), or None where they are alike."""
@@ -407,7 +459,7 @@ def _is_right(kernel: Labels) -> bool:
     """Whether log densities at a reachable state are the model's."""
     state = example_of(kernel.blanket.target)
     try:
-        table, _ = kernel._table(state, 1)
+        table = kernel._table(state, 1)
         kernel._check(state, table, kernel._prior.by_element(state))
     except (LostParameters, np.linalg.LinAlgError):
         return True  # nothing to compare there: such states go to the plain kernel

@@ -6,39 +6,71 @@ per sweep, or handed in by the kernel that drew the covariances from their facto
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from bayesmc.structure.target import Target
 
+#: elements 00, 10 and 11 of a matrix of two rows, and half its log determinant
+Entry = tuple[float, float, float, float]
 
-@dataclass(frozen=True, eq=False)
+
 class Precision:
-    """Of covariances ``(..., d, d)``.
+    """Of covariances ``(*batch, d, d)``, as arrays and, where d is 2, as Python's floats.
 
-    Attributes
+    Parameters
     ----------
-    root : ndarray, shape (..., d, d)
-        ``root @ root.T`` is the precision.
-    matrix : ndarray, shape (..., d, d)
-        The precision, symmetric.
-    half_log_det : ndarray, shape (...)
-        Half the log determinant of the precision.
+    batch : tuple of int
+    arrays : tuple of ndarray, optional
+        The precisions ``(*batch, d, d)``, and half their log determinants ``(*batch)``.
+    entries : list, optional
+        The same as floats, matrix by matrix.
     """
 
-    root: np.ndarray
-    matrix: np.ndarray
-    half_log_det: np.ndarray
+    def __init__(
+        self,
+        batch: tuple[int, ...],
+        arrays: tuple[np.ndarray, np.ndarray] | None = None,
+        entries: list[Entry] | None = None,
+    ) -> None:
+        self.batch = batch
+        self._arrays, self._entries = arrays, entries
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The precisions, ``(*batch, d, d)``."""
+        return self._made[0]
+
+    @property
+    def half_log_det(self) -> np.ndarray:
+        """Half the log determinants of the precisions, ``(*batch)``."""
+        return self._made[1]
+
+    @cached_property
+    def entries(self) -> list[Entry]:
+        """One after the other as floats."""
+        if self._entries is not None:
+            return self._entries
+        matrix, half = self._made
+        flat = matrix.reshape(-1, 4).tolist()
+        halves = half.ravel().tolist()
+        return [(a, b, c, h) for (a, _, b, c), h in zip(flat, halves, strict=True)]
 
     def reshaped(self, batch: tuple[int, ...]) -> Precision:
         """The same with another batch shape."""
-        if self.half_log_det.shape == batch:
-            return self
-        shape = batch + self.root.shape[-2:]
-        half = self.half_log_det.reshape(batch)
-        return Precision(self.root.reshape(shape), self.matrix.reshape(shape), half)
+        matrix, half = self._made
+        return Precision(batch, (matrix.reshape(batch + matrix.shape[-2:]), half.reshape(batch)))
+
+    @cached_property
+    def _made(self) -> tuple[np.ndarray, np.ndarray]:
+        if self._arrays is not None:
+            return self._arrays
+        assert self._entries is not None
+        table = np.array(self._entries)
+        matrix = table[:, (0, 1, 1, 2)].reshape((*self.batch, 2, 2))
+        return matrix, table[:, 3].reshape(self.batch)
 
 
 def precision_of(cov: np.ndarray) -> Precision:
@@ -64,15 +96,16 @@ def precision_of(cov: np.ndarray) -> Precision:
 def from_root(root: np.ndarray) -> Precision:
     """Precisions ``root @ root.T`` from triangles with positive diagonals."""
     half = np.log(root.diagonal(0, -2, -1)).sum(axis=-1)
-    return Precision(root, root @ root.swapaxes(-1, -2), half)
+    return Precision(half.shape, (root @ root.swapaxes(-1, -2), half))
 
 
 def kept_precision(target: Target, node: str, cov: np.ndarray) -> Precision:
     """The precision of a node's value, made once for every array."""
-    kept = _KEPT.setdefault(target, {})
-    found = kept.get(node)
+    kept = _KEPT.get(target)
+    found = None if kept is None else kept.get(node)
     if found is None or found[0] is not cov:
-        found = kept[node] = cov, precision_of(cov)
+        found = cov, precision_of(cov)
+        keep_precision(target, node, *found)
     return found[1]
 
 

@@ -139,6 +139,7 @@ def refuse_invalid(dist: Distribution) -> None:
 
 
 def refuse_infinite(log: np.ndarray) -> None:
+    """Raise where a proposal has no density at what it drew itself."""
     if not np.isfinite(log).all():
         found = log[~np.isfinite(log)].flat[0]
         raise DensityError(

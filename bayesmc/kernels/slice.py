@@ -135,7 +135,7 @@ class Slice(Kernel):
         self.on_logs = support is not None and is_half_line(support)
 
     def start(self, values: Values, chains: int) -> Memory:
-        spread = np.ones(self.blanket.node.value_shape)
+        spread = np.ones(values[self.blanket.name].shape[1:])
         return {"width": spread, "moved": np.zeros_like(spread), "count": 0}
 
     def step(

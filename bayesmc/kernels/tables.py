@@ -23,7 +23,6 @@ from bayesmc.structure.target import Target, Values
 
 #: conditionals of more states are drawn by binary search
 _COMPARED = 6
-_BITS = 31
 #: table entries of a group: positions are computed in float32, which holds whole numbers up to 2**24
 _GROUP_ENTRIES = 1 << 22
 #: conditionals of a group: its matrix of strides stays small beside the states that it multiplies
@@ -101,10 +100,10 @@ class TableSweep(Kernel):
         for row, name in enumerate(self.rows):
             codes[row] = values[name]
         draws = sum(group.count for group in self.groups)
-        bits = _random_bits(rng, (draws, chains))
+        levels = np.ascontiguousarray(rng.random((chains, draws)).T)
         begin = 0
         for group in self.groups:
-            group.draw(codes, bits[begin : begin + group.count])
+            group.draw(codes, levels[begin : begin + group.count])
             begin += group.count
         new = codes[: len(self.names)].astype(self.dtype)
         new.flags.writeable = False
@@ -191,33 +190,33 @@ class _Group:
             if (self.rows == np.arange(first, first + self.count)).all():
                 self.rows = slice(first, first + self.count)
 
-    def draw(self, codes: np.ndarray, bits: np.ndarray) -> None:
+    def draw(self, codes: np.ndarray, levels: np.ndarray) -> None:
         """Replace the states of its nodes in ``codes`` (nodes and a row of ones, chains)."""
         read = codes if self.columns is None else codes[self.columns]
         index = (self.strides @ read).astype(np.intp)
         if self.impossible is not None:
             self._check(index)
-        new = self._search(index, bits) if self.width > 1 else self._compare(index, bits)
+        new = self._search(index, levels) if self.width > 1 else self._compare(index, levels)
         if self.rows is not None:
             codes[self.rows] = new
             return
         for rows, states, drawn in zip(self.written, self.states, new, strict=True):
             codes[rows] = states[:, drawn]
 
-    def _compare(self, index: np.ndarray, bits: np.ndarray) -> np.ndarray:
-        new = np.zeros(bits.shape, dtype=np.uint8)
+    def _compare(self, index: np.ndarray, levels: np.ndarray) -> np.ndarray:
+        new = np.zeros(levels.shape, dtype=np.uint8)
         for count, edges in self.edges:
-            passed = bits[:count] >= edges.take(index[:count])
+            passed = levels[:count] >= edges.take(index[:count])
             new[:count] += passed.view(np.uint8)
         return new
 
-    def _search(self, index: np.ndarray, bits: np.ndarray) -> np.ndarray:
+    def _search(self, index: np.ndarray, levels: np.ndarray) -> np.ndarray:
         """Binary search in the row of each draw; the row's last edge is never exceeded."""
         _, edges = self.edges[0]
         at = index.copy()
         step = self.width // 2
         while step:
-            at += step * (bits >= edges.take(at + (step - 1)))
+            at += step * (levels >= edges.take(at + (step - 1)))
             step //= 2
         return at - index
 
@@ -336,29 +335,17 @@ def _searched(part: Sequence[Conditional], width: int) -> list[tuple[int, np.nda
     """All edges, each row padded to ``width`` with what no draw exceeds."""
     padded = []
     for c in part:
-        rows = np.full((len(c.probs), width), 1 << _BITS, dtype=np.uint32)
+        rows = np.full((len(c.probs), width), np.inf)
         rows[:, : c.states - 1] = _thresholds(c.probs)
         padded.append(rows.ravel())
     return [(len(part), np.concatenate(padded))]
 
 
 def _thresholds(probs: np.ndarray) -> np.ndarray:
-    """Cumulative rows as integers of ``_BITS`` bits, shape (rows, states - 1).
-
-    States of probability zero have no width at all.
-    """
+    """Cumulative rows, shape (rows, states - 1); states of probability zero have no width at all."""
     cumulative = np.cumsum(probs, axis=1)
     last = cumulative[:, -1:]
-    edges = np.rint(cumulative / np.where(last > 0, last, 1.0) * float(1 << _BITS))
-    edges = edges.astype(np.uint32)
+    edges = cumulative / np.where(last > 0, last, 1.0)
     top = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
-    edges[np.arange(probs.shape[1]) >= top[:, None]] = 1 << _BITS
+    edges[np.arange(probs.shape[1]) >= top[:, None]] = np.inf
     return edges[:, :-1]
-
-
-def _random_bits(rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
-    """Independent uniform integers below ``2**_BITS``: cheaper than floats, and as fine as needed."""
-    count = math.prod(shape)
-    words = rng.bit_generator.random_raw((count + 1) // 2).view(np.uint32)[:count]
-    words >>= np.uint32(32 - _BITS)
-    return words.reshape(shape)

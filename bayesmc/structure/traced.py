@@ -37,9 +37,11 @@ class Traced:
     @property
     def sources(self) -> frozenset[str]:
         """Names that the result varies with; ``x[0]`` through the first lookup, ``x[*]`` through all of x."""
-        if isinstance(self.result, TracedCall):
-            return frozenset().union(*map(_sources, self.result.traced.values()))
-        return _sources(self.result)
+        if not isinstance(self.result, TracedCall):
+            return _sources(self.result, 0)
+        ndims = getattr(self.result.function, "parameter_ndim", {})
+        found = (_sources(v, ndims.get(k, 0)) for k, v in self.result.traced.items())
+        return frozenset().union(*found)
 
 
 class Untraceable(Exception):
@@ -116,6 +118,8 @@ def _made(links: Any, values: Mapping[str, Any], function: Any, keys: list[Any])
         result = function(*arguments)
     except Exception as error:
         raise Untraceable(str(error)) from error
+    if any(argument.keys_changed for argument in made):
+        raise Untraceable("an index is changed after it was used")
     for argument in made:
         keys.extend(argument.keys)
     if len([a for a in made if a.keys]) > 1:
@@ -167,11 +171,12 @@ def _same_keys(
     return all(k in found for k in wanted)
 
 
-def _sources(value: Any) -> frozenset[str]:
+def _sources(value: Any, event_ndim: int) -> frozenset[str]:
+    """Sources of a parameter with some event axes; elements out of their places count as all of them."""
     if isinstance(value, Tracer):
-        return value.sources
-    if isinstance(value, (list, tuple)):
-        return frozenset().union(*map(_sources, value))
+        return value.at_plates(event_ndim).sources
     if isinstance(value, TracedCall):
-        return frozenset().union(*map(_sources, value.arguments.values()))
+        value = list(value.arguments.values())
+    if isinstance(value, (list, tuple)):
+        return frozenset().union(*(_sources(v, event_ndim) for v in value))
     return frozenset()

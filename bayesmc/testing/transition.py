@@ -45,7 +45,7 @@ class KernelMatrix:
         Row-stochastic: from row to column.
     resolution : float
         The coarsest step of the random numbers it draws: single probabilities are good to a few of these,
-        2**-53 for most kernels, 2**-31 for table look-ups.
+        2**-53 for all but lattices.
     parts : tuple of KernelMatrix
         Of a kernel that draws several nodes or blocks in turn, each of these updates, read by itself.
     """
@@ -123,7 +123,7 @@ def transition_matrix(
     ((0, 0), (0, 1), (1, 0), (1, 1))
     >>> chain = MarkovChain(matrix, states)
     >>> exact = bmc.infer(net, {"c": 1}, engine=bmc.Exact()).probabilities("a", "b").ravel()
-    >>> bool(np.allclose(chain.stationary[0], exact, atol=1e-8))
+    >>> bool(np.allclose(chain.stationary[0], exact, atol=1e-12))
     True
     """
     sweep = exact_sweep(net, evidence, engine)

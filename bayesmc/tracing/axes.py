@@ -91,41 +91,20 @@ def covering(axis: Any, ndim: int) -> Span:
 def index_span(key: Any, ndim: int) -> Span:
     """The axes that ``value[key]`` touches; arrays in the key bring their own axes in their place."""
     keys = list(key) if isinstance(key, tuple) else [key]
-    consumed = 0
-    for k in keys:
-        if k is None or k is Ellipsis or isinstance(k, slice):
-            consumed += isinstance(k, slice)
-        elif type(k) in (int, np.ndarray) or isinstance(k, (np.integer, np.ndarray, list)):
-            array = np.asarray(k)
-            if array.dtype.kind not in "iub":
-                return None
-            consumed += array.ndim if array.dtype == bool else 1
-        else:
-            return None
+    widths = [_axes_taken(k) for k in keys]
+    if None in widths:
+        return None
     if not any(k is Ellipsis for k in keys):
-        keys.append(Ellipsis)
+        keys, widths = [*keys, Ellipsis], [*widths, 0]
+    rest = ndim - sum(w for w in widths if w is not None)
     at, low, high = 0, ndim, 0
-    groups, inside = 0, False  # runs of arrays: NumPy sends the axes of several runs to the front
-    arrays = any(not (k is None or k is Ellipsis or isinstance(k, (slice, int))) for k in keys)
-    for k in keys:
-        wide = 0
-        if k is Ellipsis:
-            at += ndim - consumed
-        elif k is None:
-            low, high = min(low, at), max(high, at)
-        elif isinstance(k, slice):
-            wide = 1
-            if k != slice(None):
-                low, high = min(low, at), max(high, at + 1)
-        else:
-            array = np.asarray(k)
-            wide = array.ndim if array.dtype == bool else 1
+    for k, width in zip(keys, widths, strict=True):
+        wide = rest if k is Ellipsis else width or 0
+        untouched = k is Ellipsis or (isinstance(k, slice) and k == slice(None))
+        if not untouched:
             low, high = min(low, at), max(high, at + wide)
         at += wide
-        picks = arrays and not (k is None or k is Ellipsis or isinstance(k, slice))
-        groups += picks and not inside
-        inside = picks
-    if groups > 1:
+    if _scattered(keys):
         low = 0
     return KEPT if (low, high) == (ndim, 0) else (low, high)
 
@@ -187,6 +166,29 @@ def behind_after(span: Span, value: StandIn, ndim: int) -> int | None:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _axes_taken(key: Any) -> int | None:
+    """Axes of a value that one part of a key is about; None if it is no part that is known."""
+    if key is None or key is Ellipsis:
+        return 0
+    if isinstance(key, slice) or type(key) is int or isinstance(key, np.integer):
+        return 1
+    if not isinstance(key, (np.ndarray, list)):
+        return None
+    array = np.asarray(key)
+    if array.dtype == bool:
+        return array.ndim
+    return 1 if array.dtype.kind in "iu" else None
+
+
+def _scattered(keys: list[Any]) -> bool:
+    """Whether arrays stand apart in a key: NumPy sends their axes to the front, whole numbers' among them."""
+    basic = [k is None or k is Ellipsis or isinstance(k, slice) for k in keys]
+    if all(b or type(k) is int for b, k in zip(basic, keys, strict=True)):
+        return False
+    runs = sum(not b and (i == 0 or basic[i - 1]) for i, b in enumerate(basic))
+    return runs > 1
 
 
 def _with_plates(found: list[Any]) -> list[Any]:

@@ -12,6 +12,7 @@ Every row of a test has its own data. Kernels get them in one of three ways:
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -50,12 +51,15 @@ class Model:
         Nodes that statistics look at; all hidden ones by default.
     draw : callable, optional
         ``draw(rng, n)``: hidden nodes from their prior, where the net cannot be drawn forwards.
+    respond : callable, optional
+        ``respond(state, rng)``: data, in the same case.
     """
 
     net: Any
     seen: tuple[str, ...]
     moved: tuple[str, ...] = ()
     draw: Callable[[np.random.Generator, int], Rows] | None = None
+    respond: Callable[[Rows, np.random.Generator], Rows] | None = None
 
     @property
     def compiled(self) -> Any:
@@ -82,14 +86,14 @@ class Model:
 
     def prior(self, rng: np.random.Generator, rows: int) -> Rows:
         if self.draw is not None:
-            with running():
-                return self.draw(rng, rows)
+            return self.draw(rng, rows)
         return self._forward({}, self.hidden, rng, rows)
 
     def data(self, state: Rows, rng: np.random.Generator | int = 0) -> Rows:
         rng = np.random.default_rng(rng) if isinstance(rng, int) else rng
-        rows = len(next(iter(state.values())))
-        return self._forward(state, self.seen, rng, rows)
+        if self.respond is not None:
+            return self.respond(state, rng)
+        return self._forward(state, self.seen, rng, _rows(state))
 
     def _forward(
         self, given: Rows, names: Sequence[str], rng: np.random.Generator, rows: int
@@ -123,11 +127,14 @@ class Model:
         for name in self.moved or self.hidden:
             found |= {
                 f"first of {name}": lambda s, y, n=name: self._free(n, s)[:, 0],
-                f"last of {name}": lambda s, y, n=name: self._free(n, s)[:, -1],
                 f"square of {name}": lambda s, y, n=name: (self._free(n, s) ** 2).mean(axis=1),
-                f"product of {name}": lambda s, y, n=name: self._free(n, s)[:, 0] * self._free(n, s)[:, -1],
                 f"{name} and {first}": fit(name),
             }
+            if math.prod(self.compiled[name].value_shape) > 1:
+                found |= {
+                    f"last of {name}": lambda s, y, n=name: self._free(n, s)[:, -1],
+                    f"product of {name}": lambda s, y, n=name: self._free(n, s)[:, :2].prod(axis=1),
+                }
         return found
 
     def _free(self, name: str, state: Rows) -> np.ndarray:
@@ -164,6 +171,13 @@ class Case:
         How it gets data: ``given``, ``moving`` or ``posed``.
     warmup : int
         Steps in which it adapts before it is tested.
+    statistics : dict
+        Of its own, besides those of the model.
+    sizes : dict
+        Options of the tests, where errors are harder to see than elsewhere.
+    members : int
+        Rows that a kernel moves in dependence of each other: an ensemble is then one state of the tests,
+        every member with data of its own, so that all are independent under the joint law.
     """
 
     model: Model
@@ -173,21 +187,25 @@ class Case:
     how: str = "given"
     warmup: int = 0
     statistics: Mapping[str, Statistic] = field(default_factory=dict)
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    members: int = 1
 
     def geweke(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
-        sizes = {"draws": 60 * LONGER, "chains": 80, **sizes}
+        own = {k: v for k, v in self.sizes.items() if k in ("draws", "chains")}
+        sizes = {"draws": 60, "chains": 80, **own, **sizes}
+        sizes["draws"] *= LONGER
         kernel, _ = self._kernels(fault, sizes["chains"])
-        statistics = {**self.model.statistics(), **self.statistics}
         return geweke_test(
-            self.model.prior, self.model.data, kernel, statistics, rng=seed + SHIFT, **sizes
+            self._prior, self._data, kernel, self._statistics(), rng=seed + SHIFT, **sizes
         )
 
     def ranks(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
-        sizes = {"steps": 4, "replications": 1000 * LONGER, **sizes}
+        own = {k: v for k, v in self.sizes.items() if k in ("steps", "replications", "thinning")}
+        sizes = {"steps": 4, "replications": 1000, **own, **sizes}
+        sizes["replications"] *= LONGER
         kernel, reverse = self._kernels(fault, sizes["replications"])
-        statistics = {**self.model.statistics(), **self.statistics}
         return rank_test(
-            self.model.prior, self.model.data, kernel, statistics, reverse_kernel=reverse,
+            self._prior, self._data, kernel, self._statistics(), reverse_kernel=reverse,
             alpha=ALPHA, rng=seed + SHIFT, **sizes,
         )  # fmt: skip
 
@@ -203,6 +221,38 @@ class Case:
 
     # ---- private -------------------------------------------------------------------------------
 
+    def _prior(self, rng: np.random.Generator, rows: int) -> Rows:
+        return self._grouped(self.model.prior(rng, rows * self.members))
+
+    def _data(self, state: Rows, rng: np.random.Generator) -> Rows:
+        return self._grouped(self.model.data(self._flat(state), rng))
+
+    def _grouped(self, rows: Rows) -> Rows:
+        """Members of an ensemble side by side, on a second axis."""
+        if self.members == 1:
+            return rows
+        return {n: v.reshape(-1, self.members, *v.shape[1:]) for n, v in rows.items()}
+
+    def _flat(self, rows: Rows) -> Rows:
+        if self.members == 1:
+            return rows
+        return {n: v.reshape(-1, *v.shape[2:]) for n, v in rows.items()}
+
+    def _statistics(self) -> dict[str, Statistic]:
+        """Of ensembles: means over their members, and products of two."""
+        plain = {**self.model.statistics(), **self.statistics}
+        if self.members == 1:
+            return plain
+        found: dict[str, Statistic] = {}
+        for name, statistic in plain.items():
+
+            def each(s: Rows, y: Rows, statistic: Statistic = statistic) -> np.ndarray:
+                return statistic(self._flat(s), self._flat(y)).reshape(-1, self.members)
+
+            found[f"{name}, mean"] = lambda s, y, each=each: each(s, y).mean(axis=1)
+            found[f"{name}, two members"] = lambda s, y, each=each: each(s, y)[:, :2].prod(axis=1)
+        return found
+
     def _kernels(self, fault: str, rows: int) -> tuple[Callable, Callable]:
         make = self.faults[fault] if fault else self.make
         if self.how == "posed":
@@ -210,11 +260,20 @@ class Case:
         target = self.model.target(self.how)
         with running():
             kernel = make(target)
-            memory = self._adapted(kernel, target, rows)
+            memory = self._adapted(kernel, target, rows * self.members)
             other, theirs = kernel, memory
             if self.reverse is not None:
                 other, theirs = self.reverse(make, target, memory)
-        return _stepping(target, kernel, memory), _stepping(target, other, theirs)
+        return self._stepping(target, kernel, memory), self._stepping(target, other, theirs)
+
+    def _stepping(self, target: Target, kernel: Kernel, memory: Memory) -> Callable:
+        def step(state: Rows, data: Rows, rng: np.random.Generator) -> Rows:
+            with running():
+                values = _placed(target, self._flat(state), self._flat(data))
+                new, _ = kernel.step(values, memory, rng, False)
+            return {**state, **self._grouped({n: new[n] for n in state if n in new})}
+
+        return step
 
     def _adapted(self, kernel: Kernel, target: Target, rows: int) -> Memory:
         """The memory after the warmup, which has draws of its own."""
@@ -230,29 +289,33 @@ class Case:
         return kernel.end_warmup(memory)
 
     def _posed(self, make: Make, backwards: bool) -> Callable:
-        made: dict[Any, tuple[Target, Kernel, Memory]] = {}
+        made: dict[bytes, tuple[Target, Kernel, Memory]] = {}
 
         def one(data: Rows, row: int) -> tuple[Target, Kernel, Memory]:
-            key = tuple(v[row].tobytes() for v in data.values())
-            if key not in made:
-                target = target_of(pose(self.model.net, self.model.user(data, row)))
-                state = self.model.prior(np.random.default_rng(1), 1)
-                kernel = make(target)
-                memory = kernel.start({**target.known, **state}, 1)
-                if backwards and self.reverse is not None:
-                    kernel, memory = self.reverse(make, target, memory)
-                made[key] = target, kernel, kernel.end_warmup(memory)
-            return made[key]
+            target = target_of(pose(self.model.net, self.model.user(data, row)))
+            state = self.model.prior(np.random.default_rng(1), 1)
+            kernel = make(target)
+            memory = kernel.start({**target.known, **state}, 1)
+            if backwards and self.reverse is not None:
+                kernel, memory = self.reverse(make, target, memory)
+            return target, kernel, kernel.end_warmup(memory)
 
         def step(state: Rows, data: Rows, rng: np.random.Generator) -> Rows:
-            parts = []
+            keys = [b"".join(v[row].tobytes() for v in data.values()) for row in range(_rows(state))]
+            alike: dict[bytes, list[int]] = {}
+            for row, key in enumerate(keys):
+                alike.setdefault(key, []).append(row)
+            found = {n: v.copy() for n, v in state.items()}
             with running():
-                for row in range(len(next(iter(state.values())))):
-                    target, kernel, memory = one(data, row)
-                    values = _placed(target, {n: v[row : row + 1] for n, v in state.items()}, {})
+                for key, rows in alike.items():
+                    if key not in made:
+                        made[key] = one(data, rows[0])
+                    target, kernel, memory = made[key]
+                    values = _placed(target, {n: v[rows] for n, v in state.items()}, {})
                     new, _ = kernel.step(values, memory, rng, False)
-                    parts.append({n: new.get(n, values[n]) for n in state})
-            return {n: np.concatenate([p[n] for p in parts]) for n in state}
+                    for name in found.keys() & new.keys():
+                        found[name][rows] = new[name]
+            return found
 
         return step
 
@@ -281,6 +344,10 @@ def mixture(prior: Any, child: Callable[..., Any], points: int = 12) -> bmc.Baye
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _rows(state: Rows) -> int:
+    return len(next(iter(state.values())))
+
+
 def _flat(value: np.ndarray) -> np.ndarray:
     return value.reshape(len(value), -1).astype(float)
 
@@ -289,12 +356,3 @@ def _placed(target: Target, state: Rows, data: Rows) -> Values:
     values = {**target.known, **data, **state}
     target.refresh(values, target.chain)
     return values
-
-
-def _stepping(target: Target, kernel: Kernel, memory: Memory) -> Callable:
-    def step(state: Rows, data: Rows, rng: np.random.Generator) -> Rows:
-        with running():
-            new, _ = kernel.step(_placed(target, state, data), memory, rng, False)
-        return {**state, **{n: new[n] for n in state if n in new}}
-
-    return step

@@ -22,6 +22,13 @@ from bayesmc.structure.target import Target, Values, target_of
 ALPHA = 1e-4
 
 
+@pytest.fixture(autouse=True)
+def _as_in_a_sweep():
+    """Engines silence floating-point warnings around all kernels."""
+    with np.errstate(all="ignore"):
+        yield
+
+
 def asia() -> BayesNet:
     """Lauritzen and Spiegelhalter (1988)."""
     net = bmc.BayesNet()

@@ -1,8 +1,8 @@
 """Random walks and jumps of one node: where they must end up, and that an error in them would show.
 
 Chains are compared with exact posteriors by means over 128 or more independent chains, in standard errors
-of their own spread: |z| < 4.5 in some 60 comparisons, a false alarm with probability 4e-4 over all fixed seeds.
-Rank tests are at 1e-3 each.
+of their own spread: |z| < 4.5 in some 60 comparisons, a false alarm with probability 4e-4 over all
+fixed seeds. Rank tests are at 1e-3 each.
 """
 
 from __future__ import annotations

@@ -1,0 +1,214 @@
+"""Several like functions called as one: the group becomes a batch axis, before the plates.
+
+Terms and deterministic nodes are alike where their functions are, up to numbers, and what they read has the
+same shapes. The first of them then stands for all: its parents' names stand for arrays in which the parents
+of all are stacked. Numbers by which the functions differ (``t=t``) are stacked, too, but functions need not
+broadcast over those as they do over parents. So it is tried in several ways, and what does not give what the
+functions give one by one is not used.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError
+from bayesmc.network import Model
+from bayesmc.network.align import Aligner
+from bayesmc.structure.likeness import Skeleton, same_number, with_numbers
+from bayesmc.structure.target import Target, Term, Values
+
+#: stands for a parent that only lengthens the batch
+GROUP = "\0group"
+#: relative error that rounding may make
+_EXACT = 1e-12
+#: states on which functions are compared
+_STATES = 6
+#: event axes that numbers may meet
+_EVENT_NDIM = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LikeFunctions:
+    """Terms or deterministic nodes whose functions differ in numbers at most.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The group; the first stands for all.
+    skeletons : tuple of Skeleton
+        Of their functions.
+    """
+
+    names: tuple[str, ...]
+    skeletons: tuple[Skeleton, ...]
+
+    @cached_property
+    def varying(self) -> dict[int, tuple[Any, ...]]:
+        """The numbers by which the functions differ, by their places in the skeletons."""
+        columns = enumerate(zip(*(s.numbers for s in self.skeletons), strict=True))
+        return {
+            k: these
+            for k, these in columns
+            if not all(same_number(these[0], other) for other in these)
+        }
+
+    def mask(self, target: Target) -> np.ndarray | None:
+        """The elements that count, of terms ``(group, *plates)``; None where all do."""
+        terms = [target.terms[n] for n in self.names]
+        if all(t.mask is None for t in terms):
+            return None
+        return np.stack([np.ones(t.shape, bool) if t.mask is None else t.mask for t in terms])
+
+    def as_one(
+        self, target: Target, model: Model, gathered: Values, states: Values
+    ) -> Model | None:
+        """A model in which the first function has the numbers of all; None where none agrees with them.
+
+        Parameters
+        ----------
+        model : Model
+            The target's, or one in which others have been replaced.
+        gathered, states : dict
+            Values by the names of the first, the group before the plates; and by everybody's own names.
+        """
+        alone = [_evaluated(target, target.model, n, states) for n in self.names]
+        for scalars, after_plates in itertools.product(range(_EVENT_NDIM), (True, False)):
+            try:
+                tried = self._replaced(target, model, scalars, after_plates)
+                together = _evaluated(target, tried, self.names[0], gathered)
+                shape = np.broadcast_shapes(*(a[:, None].shape for a in alone))
+                full = np.broadcast_to(together, (shape[0], len(alone), *shape[2:]))
+            except (BayesmcError, ValueError):
+                continue  # the numbers do not broadcast in this way
+            rows = [np.broadcast_to(a, full[:, 0].shape) for a in alone]
+            if all(close(full[:, i], row) for i, row in enumerate(rows)):
+                return tried
+        return None
+
+    def _replaced(self, target: Target, model: Model, scalars: int, after_plates: bool) -> Model:
+        """The model with the numbers of all in the first function.
+
+        Parameters
+        ----------
+        scalars : int
+            How many event axes scalars are to meet.
+        after_plates : bool
+            Whether the axes of arrays come after the plates, as those of an unplated parent's event do.
+        """
+        name = self.names[0]
+        term = target.terms.get(name)
+        plates = len(model[name].plate_shape if term is None else term.shape)
+        numbers = list(self.skeletons[0].numbers)
+        for k, these in self.varying.items():
+            own = np.ndim(these[0])
+            if not own:
+                axes = plates + scalars
+            else:
+                axes = plates + own if after_plates else max(plates, own)
+            numbers[k] = _column(these, axes)
+        link = (GROUP, Aligner((), (), 0, None))
+        if term is not None and term.is_potential:
+            potential, links = model.potentials[name]
+            function = _longer(with_numbers(potential.function, numbers))
+            made = replace(potential, function=function), (*links, link)
+            return replace(model, potentials={**model.potentials, name: made}, cache={})
+        node = model[name]
+        assert node.declaration.function is not None
+        function = _longer(with_numbers(node.declaration.function, numbers))
+        declaration = replace(node.declaration, function=function)
+        node = replace(node, declaration=declaration, links=(*node.links, link))
+        return replace(model, nodes={**model.nodes, name: node}, cache={})
+
+
+def gather(
+    target: Target, slots: Mapping[str, Sequence[str]], values: Mapping[str, np.ndarray], count: int
+) -> Values:
+    """Values of what each name stands for, one name for all or one for each; the group before the plates."""
+    found: Values = {GROUP: np.zeros(count)}
+    for name, sources in slots.items():
+        trailing = len(target.model[name].value_shape)
+        found[name] = stack_arrays([values[n] for n in sources], trailing)
+    return found
+
+
+def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:
+    """Arrays ``(*lead, *trailing)`` as one, the new axis in between: of size one for a single hidden one."""
+    first = arrays[0]
+    lead = first.ndim - trailing
+    if len(arrays) == 1:
+        return first if not lead else first.reshape(*first.shape[:lead], 1, *first.shape[lead:])
+    if any(a.shape != first.shape for a in arrays):  # some of them are known
+        arrays = np.broadcast_arrays(*arrays)
+        first = arrays[0]
+        lead = first.ndim - trailing
+    if not first.ndim:
+        return np.array(arrays)
+    rows = np.concatenate(arrays).reshape(len(arrays), *first.shape)
+    return rows.swapaxes(0, 1) if lead == 1 else np.moveaxis(rows, 0, lead)
+
+
+def in_model(target: Target, model: Model, terms: Mapping[str, Term]) -> Target:
+    """The target with other functions."""
+    problem = replace(target.problem, model=model, cache={})
+    own = {name: replace(term, model=model) for name, term in terms.items()}
+    return replace(target, problem=problem, terms=own, _below={})
+
+
+def some_states(target: Target) -> Values | None:
+    """Reachable values of all nodes, ``(states, *plates, *event)``; None where they cannot be had."""
+    model = target.model
+    values: Values = dict(target.known)
+    for name in target.chain:
+        shape = model[name].value_shape
+        full = np.broadcast_to(model.probe[name], model.probe_shape + shape)
+        values[name] = full.reshape(-1, *shape)[:_STATES]
+    try:
+        with marking_invalid(), np.errstate(all="ignore"):
+            target.refresh(values, target.chain)
+    except BayesmcError:
+        return None
+    return values
+
+
+def close(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal up to rounding; infinities in the same places."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    with np.errstate(invalid="ignore"):
+        near = np.abs(a - b) <= _EXACT * (1.0 + np.abs(b))
+    return bool((near | (a == b)).all())
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _evaluated(target: Target, model: Model, name: str, values: Values) -> np.ndarray:
+    """A deterministic node's value or a term's log factors, as part of a model."""
+    term = target.terms.get(name)
+    with marking_invalid(), np.errstate(all="ignore"):
+        if term is None:
+            return model.evaluate(name, values)[0]
+        return np.asarray(replace(term, model=model, mask=None).log(values))
+
+
+def _longer(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with one more argument, which only lengthens the batch."""
+
+    def call(*values: Any) -> Any:
+        return function(*values[:-1])
+
+    return call
+
+
+def _column(numbers: Sequence[Any], axes: int) -> np.ndarray:
+    """Numbers of a group ``(group, *shape)``, as arrays with that many axes after the group's."""
+    rows = np.stack([np.asarray(n) for n in numbers])
+    rows = rows.reshape(len(rows), *(1,) * (axes - rows.ndim + 1), *rows.shape[1:])
+    rows.flags.writeable = False
+    return rows

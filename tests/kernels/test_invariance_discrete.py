@@ -1,0 +1,333 @@
+"""Kernels of discrete nodes leave their posteriors invariant: enumeration, tables, fields, blocks, jumps.
+
+Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``BAYESMC_SEED``
+shifts them, and makes the tests longer. Each test is shown to fail on a kernel with a deliberate error. All
+models have three overlapping categories, or more.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.joint_states import JointStates, TabulatedStates, joint_states
+from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.lattice import SiteCounts, SiteSums, lattice_kernel
+from bayesmc.kernels.tables import RowSums, TableSweep, table_kernel, table_kernels
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target
+from tests.kernels.invariance import Case, Make, Model, Rows, Statistic, each_fault
+
+TESTS = ("geweke", "ranks")
+CENTRES = np.array([-1.0, 0.0, 1.5])
+SHARES = [0.2, 0.3, 0.5]
+RING, NEXT = np.arange(5), (np.arange(5) + 1) % 5
+RNG = np.random.default_rng(4)
+
+
+def backwards(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
+    """The kernel whose elements of different colours move in the other order."""
+    kernel: Any = make(target)
+    kernel.blanket.classes = kernel.blanket.classes[::-1]
+    return kernel, memory
+
+
+# ---- models ------------------------------------------------------------------------------------------
+
+
+def labels() -> Model:
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("z", bmc.Categorical(SHARES), plates="i")
+    net.add("y", lambda z: bmc.Normal(CENTRES[z], 1.0), plates="i")
+    return Model(net, ("y",))
+
+
+def ring(sd: float = 0.5) -> Model:
+    """Neighbours share data: elements of three colours."""
+    net = bmc.BayesNet(plates={"i": 5, "pair": 5})
+    net.add("z", bmc.Categorical(SHARES), plates="i")
+    net.add("y", lambda z: bmc.Normal(z[RING] + 0.7 * z[NEXT], sd), plates="pair")
+    return Model(net, ("y",))
+
+
+def _table(*shape: int) -> np.ndarray:
+    return RNG.dirichlet(np.full(shape[-1], 1.5), shape[:-1])
+
+
+def net_of_tables() -> Model:
+    net = bmc.BayesNet()
+    net.table("a", [], _table(3))
+    net.table("b", ["a"], _table(3, 3))
+    net.table("c", ["a"], _table(3, 8))
+    net.table("d", ["b", "c"], _table(3, 8, 3))
+    net.table("y", ["c", "d"], _table(8, 3, 3))
+    net.table("w", ["a", "d"], _table(3, 3, 2))
+    return Model(net, ("y", "w"))
+
+
+def plate_of_tables() -> Model:
+    first, second = _table(3, 3), _table(3, 3)
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("g", bmc.Categorical(SHARES))
+    net.add("z", lambda g: bmc.Categorical(first[g]), plates="i")
+    net.add("y", lambda z: bmc.Categorical(second[z]), plates="i")
+    return Model(net, ("y",))
+
+
+FIELD = np.indices((3,) * 5).reshape(5, -1).T.astype(np.uint8)
+PAIR = np.array([[1.5, 0.0, -0.4], [0.2, 0.5, 0.0], [0.0, 0.3, 1.6]])
+PIXEL = np.array([0.2, 0.5, 0.75])
+
+
+def field() -> Model:
+    """A ring of sites with three states, each with a pixel of two."""
+    fg = bmc.FactorGraph("field", plates={"site": 5})
+    fg.variable("s", 3, plates="site")
+    fg.variable("y", 2, plates="site")
+    fg.factor(PAIR, scope=("s", "s"), index=(RING, NEXT))
+    fg.factor(np.log(np.stack([1 - PIXEL, PIXEL], axis=1)), scope=("s", "y"), index=(RING, RING))
+    log = PAIR[FIELD[:, RING], FIELD[:, NEXT]].sum(axis=1)
+    law = np.exp(log) / np.exp(log).sum()
+
+    def draw(rng: np.random.Generator, rows: int) -> Rows:
+        return {"s": FIELD[rng.choice(len(FIELD), size=rows, p=law)]}
+
+    def respond(state: Rows, rng: np.random.Generator) -> Rows:
+        return {"y": (rng.random(state["s"].shape) < PIXEL[state["s"]]).astype(np.uint8)}
+
+    return Model(fg, ("y",), draw=draw, respond=respond)
+
+
+def tied(plates: bool) -> Model:
+    """Two labels that the data see by their sum alone."""
+    net = bmc.BayesNet(plates={"i": 4} if plates else None)
+    own: dict[str, Any] = {"plates": "i"} if plates else {}
+    table = _table(5, 3)
+    net.add("g", bmc.Categorical(SHARES))
+    net.add("z", lambda g: bmc.Categorical(_rows_of(FIRST, g)), **own)
+    net.add("w", bmc.Categorical(SHARES), **own)
+    if plates:
+        net.add("y", lambda z, w: bmc.Normal(1.0 * z + w, 0.5), **own)
+    else:
+        net.add("y", lambda z, w: bmc.Categorical(table[z + w]))
+    return Model(net, ("y",), ("z", "w"))
+
+
+FIRST = _table(3, 3)
+
+
+def _rows_of(table: np.ndarray, index: Any) -> Any:
+    return table[index]
+
+
+def ordered() -> Model:
+    """More states than are jumped between at random."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("z", bmc.Categorical(np.arange(1.0, 13.0) / 78), plates="i")
+    net.add("y", lambda z: bmc.Normal(0.5 * z, 1.0), plates="i")
+    return Model(net, ("y",))
+
+
+def counts() -> Model:
+    net = bmc.BayesNet(plates={"k": 3, "i": 8})
+    net.add("n", bmc.Poisson([2.0, 3.0, 5.0]), plates="k")
+    net.add("label", bmc.Categorical(SHARES), plates="i")
+    net.add("y", lambda n, label: bmc.Normal(1.0 * n[label], 4.0), plates="i")
+    return Model(net, ("y",), ("n",))
+
+
+def tallies() -> Model:
+    net = bmc.BayesNet(plates={"k": 3})
+    net.add("n", bmc.Multinomial(6, SHARES), plates="k")
+    net.add("y", lambda n: bmc.Normal(n[..., 0] * 1.0 - n[..., 1], 3.0), plates="k")
+    return Model(net, ("y",))
+
+
+# ---- kernels, right and wrong ------------------------------------------------------------------------
+
+
+def enumerate_(colours: bool = True, prior: bool = True) -> Make:
+    def make(target: Target) -> Kernel:
+        blanket = Blanket(target, "z")
+        if not prior:
+            blanket.own = None
+        if not colours:
+            blanket.classes = (None,)
+        return Enumerate(blanket)
+
+    return make
+
+
+def sweep(power: float = 1.0) -> Make:
+    def make(target: Target) -> Kernel:
+        (kernel,), left = table_kernels(target, [(n,) for n in "abcd"] + [("b", "d")])
+        assert isinstance(kernel, TableSweep) and not left
+        return TableSweep(target, [_tempered(c, power) for c in kernel.conditionals])
+
+    return make
+
+
+def _tempered(conditional: Any, power: float) -> Any:
+    probs = conditional.probs**power
+    return dataclasses.replace(conditional, probs=probs / probs.sum(axis=1, keepdims=True))
+
+
+def sweep_backwards(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
+    kernel: Any = make(target)
+    kernel.groups = kernel.groups[::-1]
+    return kernel, memory
+
+
+def row_sums(terms: slice = slice(None)) -> Make:
+    def make(target: Target) -> Kernel:
+        kernel = table_kernel(Blanket(target, "z"))
+        assert isinstance(kernel, RowSums)
+        kernel.parts = kernel.parts[terms]
+        return kernel
+
+    return make
+
+
+def lattice(kind: type[Kernel], colours: bool = True) -> Make:
+    def make(target: Target) -> Kernel:
+        blanket = Blanket(target, "s")
+        assert len(blanket.classes) == 3
+        if not colours:
+            blanket.classes = (None,)
+        kernel = lattice_kernel(blanket)
+        assert isinstance(kernel, kind)
+        return kernel
+
+    return make
+
+
+def lattice_backwards(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
+    blanket = Blanket(target, "s")
+    blanket.classes = blanket.classes[::-1]
+    return lattice_kernel(blanket), memory  # type: ignore[return-value]
+
+
+def joint(kind: type[Kernel], terms: slice = slice(None), power: float = 1.0) -> Make:
+    def make(target: Target) -> Kernel:
+        if kind is TableSweep:
+            found: Any = joint_states(target, ("z", "w"))
+            assert isinstance(found, TableSweep)
+            return TableSweep(target, [_tempered(c, power) for c in found.conditionals])
+        if kind is JointStates:
+            found = JointStates(target, ("z", "w"))
+            found.terms = found.terms[terms]
+            return found
+        found = TabulatedStates(target, ("z", "w"), _around(target))
+        found.rows = found.rows[terms]
+        return found
+
+    return make
+
+
+def _around(target: Target) -> Any:
+    from bayesmc.kernels.conditionals import FiniteTerms
+
+    return FiniteTerms(target).around(("z", "w"))
+
+
+class Upwards(Jump):
+    """Jumps up five times as often as down; around a circle of states in one direction alone."""
+
+    def _jumped(self, now: Any, memory: Any, rng: Any, shape: Any) -> Any:
+        node = self.blanket.node
+        if self.anywhere:
+            new = (now.astype(np.int64) + 1) % node.domain.size  # type: ignore[union-attr]
+            return new.astype(now.dtype), np.zeros(shape, dtype=bool)
+        if node.event_shape:
+            change = np.array([1, -1, 0]) * np.where(rng.random(shape) < 5 / 6, 1, -1)[..., None]
+            return now + change, (now + change < 0).any(axis=-1)
+        new = now.astype(np.int64) + np.where(rng.random(shape) < 5 / 6, 1, -1)
+        if node.domain is None:
+            return new, new < 0
+        dead = (new < 0) | (new >= node.domain.size)
+        return np.where(dead, now, new).astype(now.dtype), dead
+
+
+class Uncorrected(Jump):
+    """Draws from the node's own density are accepted as if they were jumps."""
+
+    def _proposed(self, values: Any, memory: Any, rng: Any) -> Any:
+        new, dead, drawn = super()._proposed(values, memory, rng)
+        return new, dead, np.zeros_like(drawn)
+
+
+def jump(name: str, kind: type[Jump] = Jump, colours: bool = True, **options: Any) -> Make:
+    def make(target: Target) -> Kernel:
+        blanket = Blanket(target, name)
+        if not colours:
+            blanket.classes = (None,)
+        return kind(blanket, **options)
+
+    return make
+
+
+def of_jumps(name: str, **options: Any) -> dict[str, Make]:
+    faults = {"upwards": jump(name, Upwards, **options)}
+    return faults if options else faults | {"uncorrected": jump(name, Uncorrected)}
+
+
+def alike(name: str) -> dict[str, Statistic]:
+    """How many neighbours are in the same state."""
+    return {"alike": lambda s, y: (s[name][:, RING] == s[name][:, NEXT]).sum(axis=1)}
+
+
+CASES = {
+    "enumerate": Case(labels(), enumerate_(), {"no prior": enumerate_(prior=False)}),
+    "enumerate by colours": Case(
+        ring(), enumerate_(), {"colours merged": enumerate_(colours=False)}, backwards,
+        statistics=alike("z"),
+    ),
+    "table": Case(
+        net_of_tables(), sweep(), {"tempered": sweep(0.6)}, sweep_backwards, how="moving"
+    ),
+    "table of the evidence": Case(
+        net_of_tables(), sweep(), {"tempered": sweep(0.6)}, sweep_backwards, how="posed"
+    ),
+    "table rows": Case(
+        plate_of_tables(), row_sums(), {"no prior": row_sums(slice(1, None))}, how="moving"
+    ),
+    "field": Case(
+        field(), lattice(SiteSums), {"colours merged": lattice(SiteSums, False)},
+        lattice_backwards, how="moving", statistics=alike("s"),
+    ),
+    "field of counts": Case(
+        field(), lattice(SiteCounts), {"colours merged": lattice(SiteCounts, False)},
+        lattice_backwards, how="posed", statistics=alike("s"), sizes={"replications": 2000},
+    ),
+    "joint states": Case(
+        tied(True), joint(JointStates), {"no prior": joint(JointStates, slice(1, None))}
+    ),
+    "joint states, tabulated terms": Case(
+        tied(False), joint(TabulatedStates), {"no prior": joint(TabulatedStates, slice(1, None))},
+        how="moving",
+    ),
+    "joint states, one table": Case(
+        tied(False), joint(TableSweep), {"tempered": joint(TableSweep, power=0.6)}, how="moving"
+    ),
+    "jump anywhere": Case(labels(), jump("z"), of_jumps("z")),
+    "jump by colours": Case(
+        ring(1.5), jump("z"), {"colours merged": jump("z", colours=False)}, backwards,
+        statistics=alike("z"), sizes={"draws": 150, "steps": 5, "replications": 8000},
+    ),
+    "jump in order": Case(ordered(), jump("z"), of_jumps("z"), warmup=20),
+    "jump of counts": Case(counts(), jump("n"), of_jumps("n"), warmup=20),
+    "jump of a given size": Case(counts(), jump("n", size=2), of_jumps("n", size=2)),
+    "jump of tallies": Case(tallies(), jump("n"), of_jumps("n"), warmup=20),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("test", TESTS)
+@pytest.mark.parametrize(("name", "fault"), each_fault(CASES))
+def test_kernel(name: str, fault: str, test: str) -> None:
+    CASES[name].check(test, fault)
