@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from benchmarks import bench_exact, bench_gaussian, bench_scale, bench_weighting
+import sys
+
+from benchmarks import bench_exact, bench_gaussian, bench_gibbs, bench_scale, bench_weighting
 from benchmarks.harness import data_folder, peer_python
 
 if __name__ == "__main__":
@@ -16,3 +18,5 @@ if __name__ == "__main__":
         bench_gaussian.main()
     else:
         print(f"no networks at {data_folder()}: set BAYESMC_DATA to time them")
+    print()
+    bench_gibbs.main(sys.argv[1:])

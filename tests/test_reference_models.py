@@ -210,7 +210,6 @@ QUICK = (
 )
 
 
-
 @pytest.mark.parametrize("name", QUICK)
 def test_posterior_is_as_published(name: str, reference_data: Path):
     # the seed is fixed; at a fresh one, 4 standard errors are left by 1 parameter in 16,000

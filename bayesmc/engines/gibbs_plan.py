@@ -180,23 +180,29 @@ def _finite(
     return kernels, (*tight, *deterministic_constraints(target, blocks, terms))
 
 
-def _numbers(
-    target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]
-) -> list[Kernel]:
+def _numbers(target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]) -> list[Kernel]:
     """Kernels of nodes without a closed form that have too many values to try."""
     kernels: list[Kernel] = []
     left = []
     for name in names:
-        support = target.model[name].support
-        if support is None or support.kind not in _BOXES:
-            kernels.append(AdaptiveWalk(blankets[name]))
-        else:
+        if _kind(target, blankets[name]) in _BOXES:
             left.append(name)
+        else:
+            kernels.append(AdaptiveWalk(blankets[name]))
     for group in _together(target, blankets, left):
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
             left = [n for n in left if n not in group]
     return kernels + [Slice(blankets[n]) for n in left]
+
+
+def _kind(target: Target, blanket: Blanket) -> str:
+    """The kind of a node's support, its bounds apart."""
+    support = blanket.node.support
+    if support is None:  # the bounds depend on parents
+        assert blanket.own is not None
+        support = blanket.own.distribution({**target.model.probe, **target.known})[0].support
+    return support.kind
 
 
 def _together(
@@ -209,6 +215,8 @@ def _together(
         size = math.prod(node.event_shape)
         if node.plates or node.is_discrete or blankets[name].own is None or size > _FACTOR_SIZE:
             continue
+        if node.support is None or node.support.kind in ("circle", "product"):
+            continue  # bounds that move, or turns
         mine = {id(t) for t in target.terms_of((name,))}
         merged = [name]
         for group in list(groups):

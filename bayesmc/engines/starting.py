@@ -168,9 +168,7 @@ def _drawn(
     return _shrunk(dist, draws, spread, (count, *node.value_shape), len(node.event_shape))
 
 
-def _alone(
-    target: Target, node: CompiledNode, values: Values, count: int
-) -> np.ndarray | None:
+def _alone(target: Target, node: CompiledNode, values: Values, count: int) -> np.ndarray | None:
     """What factors of a finite variable alone say of its states, shape ``(states, count, *plates)``."""
     if node.domain is None:
         return None

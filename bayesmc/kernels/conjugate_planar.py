@@ -28,7 +28,11 @@ Entry = tuple[float, float, float, float]
 
 
 def planar_covariances(
-    df: float, scale: Sequence[Pair], sums: list[list[float]], offs: list[Pair], rng: np.random.Generator
+    df: float,
+    scale: Sequence[Pair],
+    sums: list[list[float]],
+    offs: list[Pair],
+    rng: np.random.Generator,
 ) -> tuple[list[list[list[float]]] | np.ndarray, list[Entry] | None] | None:
     """Draws of inverse-Wishart covariances.
 
@@ -117,7 +121,5 @@ def planar_coefficients(entries: Sequence[Entry], offs: Sequence[Pair]) -> list[
     found = []
     for (p00, p10, p11, half), (a, b) in zip(entries, offs, strict=True):
         h0, h1 = p00 * a + p10 * b, p10 * a + p11 * b
-        found.append(
-            [half - 0.5 * (h0 * a + h1 * b), h0, h1, -0.5 * p00, -p10, -0.5 * p11]
-        )
+        found.append([half - 0.5 * (h0 * a + h1 * b), h0, h1, -0.5 * p00, -p10, -0.5 * p11])
     return found

@@ -42,7 +42,9 @@ class GaussianBlock(Kernel):
 
     label = "conjugate block"
 
-    def __init__(self, target: Target, blankets: Mapping[str, Blanket], debug: bool = False) -> None:
+    def __init__(
+        self, target: Target, blankets: Mapping[str, Blanket], debug: bool = False
+    ) -> None:
         self.target = target
         self.names = tuple(blankets)
         self.debug = debug
@@ -117,7 +119,9 @@ class GaussianBlock(Kernel):
         for x in joined:
             gauss.append(np.vecdot(linear, x) - 0.5 * np.vecdot(x, np.matvec(dense, x)))
             sizes.append(np.abs(np.vecdot(linear, x)) + np.abs(np.vecdot(x, np.matvec(dense, x))))
-        check_ratio(", ".join(self.names), self.match, logs[1] - logs[0], gauss[1] - gauss[0], sum(sizes))
+        check_ratio(
+            ", ".join(self.names), self.match, logs[1] - logs[0], gauss[1] - gauss[0], sum(sizes)
+        )
 
 
 class _Sums:
@@ -629,13 +633,9 @@ def _meets(target: Target, name: str, group: Sequence[str]) -> bool:
     return any(id(t) in mine for other in group for t in target.terms_of((other,)))
 
 
-def _jointly_affine(
-    target: Target, names: Sequence[str], blankets: Mapping[str, Blanket]
-) -> bool:
+def _jointly_affine(target: Target, names: Sequence[str], blankets: Mapping[str, Blanket]) -> bool:
     for term in target.terms_of(tuple(names)):
-        entering = tuple(
-            n for n in names if any(c.term is term for c in blankets[n].children)
-        )
+        entering = tuple(n for n in names if any(c.term is term for c in blankets[n].children))
         lookups = [
             n
             for n in entering

@@ -10,15 +10,22 @@ Terms in which states do not differ are left out.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy import special
 
-from bayesmc.distributions import Distribution, Exponential, Gamma, LogNormal, MvNormal, Normal
-from bayesmc.distributions import Poisson
+from bayesmc.distributions import (
+    Distribution,
+    Exponential,
+    Gamma,
+    LogNormal,
+    MvNormal,
+    Normal,
+    Poisson,
+)
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Groups, groups_of
 from bayesmc.kernels.conjugate_evaluation import padded
 from bayesmc.kernels.conjugate_labels import ByLabel, hidden_above, is_known, read_directly

@@ -26,7 +26,13 @@ from bayesmc.kernels.conjugate_data import Groups
 from bayesmc.kernels.conjugate_labels import hidden_above
 from bayesmc.kernels.conjugate_planar import FEW
 from bayesmc.kernels.enumerate import Enumerate
-from bayesmc.kernels.label_terms import IMPOSSIBLE, LabelTerm, LostParameters, example_of, label_term
+from bayesmc.kernels.label_terms import (
+    IMPOSSIBLE,
+    LabelTerm,
+    LostParameters,
+    example_of,
+    label_term,
+)
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
@@ -330,7 +336,9 @@ class _Prior:
         domain = blanket.node.domain
         assert domain is not None
         axes = len(blanket.node.plates)
-        self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape((-1,) + (1,) * (1 + axes))
+        self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape(
+            (-1,) + (1,) * (1 + axes)
+        )
         self.steep = False
         self._weights = _weights_of(blanket)
         self._kept: np.ndarray | None = None

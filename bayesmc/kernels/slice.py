@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.support import Support
+from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.structure.blanket import Blanket
@@ -34,6 +35,7 @@ def slice_move(
     rng: np.random.Generator,
     low: Any = -np.inf,
     high: Any = np.inf,
+    growth: int = _GROWTH,
 ) -> np.ndarray:
     """One step from every element of ``x``, each on its own slice.
 
@@ -45,6 +47,8 @@ def slice_move(
         Size of the first interval, broadcasts to ``x``.
     low, high : float or ndarray
         Bounds of the support.
+    growth : int
+        Widths by which an interval may grow; 0 where the first holds everything.
 
     Raises
     ------
@@ -63,8 +67,8 @@ def slice_move(
     ends, going = ends[1:], (found[1:] > level) & inside[1:]
     step = np.stack([np.broadcast_to(-width, x.shape), np.broadcast_to(width, x.shape)])
     # the growth that is allowed is split at random, so that the way back is as likely
-    first = np.floor(_GROWTH * rng.random(x.shape))
-    left_over = np.stack([first, _GROWTH - 1 - first])
+    first = np.floor(growth * rng.random(x.shape))
+    left_over = np.stack([first, growth - 1 - first])
     while True:
         going &= left_over > 0
         if not going.any():
@@ -171,7 +175,11 @@ class Slice(Kernel):
         width = memory["width"][at]
         if members is not None:
             width = width.ravel()[members]
-        low, high = self._bounds(values, members, component)
+        support = self._support(values, component)
+        low, high = self._bounds(support, members)
+        growth = _GROWTH
+        if support.kind == "circle":  # one turn holds everything
+            width, growth = np.full(width.shape, 2 * np.pi), 0
         if self.is_integer:  # a number uniform in the cell of each integer
             x = x + rng.random(x.shape)
             high = high + 1.0
@@ -201,31 +209,34 @@ class Slice(Kernel):
             return np.broadcast_to(log, tried.shape)
 
         try:
-            moved = slice_move(log_density, x, width, rng, low, high)
+            moved = slice_move(log_density, x, width, rng, low, high, growth)
         except DensityError as error:
             raise DensityError(f"node {blanket.name!r}: {error}") from error
         if self.is_integer:
             moved = np.floor(moved)
         if self.on_logs:
             moved = start + np.exp(moved)
+        if support.kind == "circle":
+            moved = transform_of(support).constrain(moved)
         if not component:
             return moved.astype(now.dtype, copy=False)
         new = now.copy()
         new[at] = moved
         return new
 
-    def _bounds(
-        self, values: Values, members: np.ndarray | None, component: tuple[int, ...]
-    ) -> tuple[Any, Any]:
-        """Bounds of the support given the parents, broadcasting to ``(chains, *plates)`` or the class."""
+    def _support(self, values: Values, component: tuple[int, ...]) -> Support:
+        """Where one component may lie, given the parents."""
         blanket = self.blanket
         if blanket.own is None:
             support = blanket.node.support
         else:
             support = blanket.own.distribution(values)[0].support
         assert support is not None
-        if support.kind == "product":
-            support = _part(support, component[0])
+        return _part(support, component[0]) if support.kind == "product" else support
+
+    def _bounds(self, support: Support, members: np.ndarray | None) -> tuple[Any, Any]:
+        """Bounds of a support, broadcasting to ``(chains, *plates)`` or the class."""
+        blanket = self.blanket
         if support.kind not in ("interval", "integers"):
             return -np.inf, np.inf
         ends = []

@@ -197,9 +197,7 @@ class Blanket:
         lead = value.shape[: value.ndim - len(self.node.value_shape)]
         return value.reshape(*lead, self.size, *self.event_shape)
 
-    def _filled(
-        self, value: np.ndarray, candidate: np.ndarray, members: np.ndarray
-    ) -> np.ndarray:
+    def _filled(self, value: np.ndarray, candidate: np.ndarray, members: np.ndarray) -> np.ndarray:
         lead = candidate.shape[: candidate.ndim - 1 - len(self.event_shape)]
         flat = self._flat(value)
         lead = np.broadcast_shapes(lead, flat.shape[:1])

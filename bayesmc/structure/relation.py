@@ -139,9 +139,7 @@ class Relation:
         full = np.broadcast_to(array, lead + self.shape)
         return full.reshape(*lead, -1)[..., members]
 
-    def _by_plates(
-        self, array: np.ndarray, lead: int, members: np.ndarray | None
-    ) -> np.ndarray:
+    def _by_plates(self, array: np.ndarray, lead: int, members: np.ndarray | None) -> np.ndarray:
         """Sum over everything but the plates that are not coupled: members differ in those alone."""
         kept = tuple(p for p in self.plates if p not in self.coupled)
         extra = tuple(lead + i for i, p in enumerate(self.term_plates) if p not in kept)
@@ -182,9 +180,7 @@ def segment_sum(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray
     else:
         index = index.reshape(1, -1)
     offsets = (np.arange(total) * count)[:, None]
-    summed = np.bincount(
-        (index + offsets).ravel(), weights=values.ravel(), minlength=total * count
-    )
+    summed = np.bincount((index + offsets).ravel(), weights=values.ravel(), minlength=total * count)
     return summed.reshape(*lead, count)
 
 
@@ -204,9 +200,7 @@ def relation_of(target: Target, name: str, term: Term) -> Relation:
     coupled = tuple(p for p in node.plates if p not in term.plates)
     if not all(carriers[p] for p in entering):
         coupled = node.plates
-    whole = Relation(
-        "whole", node.plates, node.plate_shape, term.plates, coupled=coupled
-    )
+    whole = Relation("whole", node.plates, node.plate_shape, term.plates, coupled=coupled)
     if len(entering) != 1 or model[entering[0]].plates != node.plates or not carriers[entering[0]]:
         return whole
     return _looked_up(target, name, term, entering[0], whole)
@@ -242,15 +236,15 @@ def _indexed(target: Target, name: str, term: Term) -> Relation | None:
     node = target.model[name]
     if name in potential.scope and not (set(target.below((name,))) & set(potential.scope)):
         rows = tuple(
-            np.asarray(at) for parent, at in zip(potential.scope, index, strict=True) if parent == name
+            np.asarray(at)
+            for parent, at in zip(potential.scope, index, strict=True)
+            if parent == name
         )
         return Relation("rows", node.plates, node.plate_shape, ("index",), rows=rows)
     return Relation("whole", node.plates, node.plate_shape, ("index",), coupled=node.plates)
 
 
-def _looked_up(
-    target: Target, name: str, term: Term, source: str, whole: Relation
-) -> Relation:
+def _looked_up(target: Target, name: str, term: Term, source: str, whole: Relation) -> Relation:
     """A lookup or rows, if tracing proves it."""
     model = target.model
     node = model[name]

@@ -68,9 +68,7 @@ def traced_term(target: Target, names: tuple[str, ...], term: Term) -> Traced:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _call(
-    target: Target, names: tuple[str, ...], term: Term
-) -> tuple[Any, list[tuple[Any, ...]]]:
+def _call(target: Target, names: tuple[str, ...], term: Term) -> tuple[Any, list[tuple[Any, ...]]]:
     model = target.model
     values: dict[str, Any] = {**model.probe, **target.known}
     for name in names:
@@ -156,9 +154,7 @@ def _same_keys(
         above.add(name)
         if not target.model[name].is_stochastic:
             todo += target.model[name].parents
-    everyone = tuple(
-        n for n in target.chain if n in above and target.model[n].domain is None
-    )
+    everyone = tuple(n for n in target.chain if n in above and target.model[n].domain is None)
     try:
         _, again = _call(target, everyone, term)
     except Untraceable:

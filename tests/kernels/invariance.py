@@ -70,7 +70,9 @@ class Model:
         """The posed model with placeholders for data, or with data that are hidden."""
         if how == "moving":
             return target_of(pose(self.net, {}), also=self._stochastic())
-        return target_of(pose(self.net, self.user(self.data(self.prior(np.random.default_rng(0), 1)))))
+        return target_of(
+            pose(self.net, self.user(self.data(self.prior(np.random.default_rng(0), 1))))
+        )
 
     def _stochastic(self) -> list[str]:
         model = pose(self.net, {}).model
@@ -171,6 +173,8 @@ class Case:
         How it gets data: ``given``, ``moving`` or ``posed``.
     warmup : int
         Steps in which it adapts before it is tested.
+    pilots : int, optional
+        Rows that it adapts with, where its memory does not depend on their number.
     statistics : dict
         Of its own, besides those of the model.
     sizes : dict
@@ -186,6 +190,7 @@ class Case:
     reverse: Callable[[Make, Target, Memory], tuple[Kernel, Memory]] | None = None
     how: str = "given"
     warmup: int = 0
+    pilots: int | None = None
     statistics: Mapping[str, Statistic] = field(default_factory=dict)
     sizes: Mapping[str, int] = field(default_factory=dict)
     members: int = 1
@@ -260,7 +265,7 @@ class Case:
         target = self.model.target(self.how)
         with running():
             kernel = make(target)
-            memory = self._adapted(kernel, target, rows * self.members)
+            memory = self._adapted(kernel, target, self.pilots or rows * self.members)
             other, theirs = kernel, memory
             if self.reverse is not None:
                 other, theirs = self.reverse(make, target, memory)
@@ -301,7 +306,9 @@ class Case:
             return target, kernel, kernel.end_warmup(memory)
 
         def step(state: Rows, data: Rows, rng: np.random.Generator) -> Rows:
-            keys = [b"".join(v[row].tobytes() for v in data.values()) for row in range(_rows(state))]
+            keys = [
+                b"".join(v[row].tobytes() for v in data.values()) for row in range(_rows(state))
+            ]
             alike: dict[bytes, list[int]] = {}
             for row, key in enumerate(keys):
                 alike.setdefault(key, []).append(row)

@@ -112,7 +112,9 @@ def several() -> Model:
     net.add("label", bmc.Categorical(SHARES), plates="i")
     net.add(
         "y",
-        lambda a, s, v, u, label: bmc.Normal(a + s * CENTRES[label] + v[..., 0] * v[..., 1], 0.3 + u),
+        lambda a, s, v, u, label: bmc.Normal(
+            a + s * CENTRES[label] + v[..., 0] * v[..., 1], 0.3 + u
+        ),
         plates="i",
     )
     return Model(net, ("y",), ("a", "s", "v", "u"))
@@ -177,7 +179,9 @@ class Careless(Slice):
             slice._shrink = shrink
 
 
-def _first_point(log: Any, x: np.ndarray, level: Any, left: Any, right: Any, rng: Any) -> np.ndarray:
+def _first_point(
+    log: Any, x: np.ndarray, level: Any, left: Any, right: Any, rng: Any
+) -> np.ndarray:
     return left + rng.random(x.shape) * (right - left)
 
 
@@ -192,7 +196,9 @@ class LastFirst(Slice):
         return {name: state[name]}, memory
 
 
-def sliced(name: str = "x", kind: type[Slice] = Slice, of: type[Blanket] = Blanket, **has: Any) -> Make:
+def sliced(
+    name: str = "x", kind: type[Slice] = Slice, of: type[Blanket] = Blanket, **has: Any
+) -> Make:
     def make(target: Target) -> Kernel:
         blanket = of(target, name)
         for attribute, value in has.items():
@@ -261,7 +267,7 @@ ONE_NODE = {
     "walk, matrices": Case(matrices(), walk(), VOLUME, warmup=30),
     "walk, colours": Case(
         ring(), walk(), {"merged": walk(colours=False, scale=1.5, adaptive=False)}, backwards, warmup=30,
-        sizes={"draws": 150},
+        sizes={"draws": 150, "chains": 200},
     ),
     "walk, own scale": Case(
         half_line(), walk(**OWN_SCALE), {"drift": walk(kind=Drifting, **OWN_SCALE)}
@@ -332,7 +338,7 @@ SCALES = {"scale": [0.8, 0.4, 0.4, 0.4], "unconstrained": False, "adaptive": Fal
 SEVERAL = {
     "factor slice": Case(
         several(), factors(), {"a prior forgotten": factors(np.s_[1:])},
-        last_direction_first, warmup=33, sizes={"draws": 30, "chains": 60, "replications": 500},
+        last_direction_first, warmup=33, pilots=60, sizes={"draws": 30, "chains": 60, "replications": 500},
     ),
     "block walk": Case(few(), together(), {"no volume": together(NoBlockVolume)}, warmup=30),
     "block walk, own scale": Case(

@@ -104,7 +104,9 @@ def _wrong(pair: Pair) -> Pair:
     right = pair.statistic
 
     def unwhitened(e: Any, residual: Any) -> Any:
-        return right(e, residual) / (2.0 if pair.child is bmc.MvNormal else e.get("scale")[..., None])
+        return right(e, residual) / (
+            2.0 if pair.child is bmc.MvNormal else e.get("scale")[..., None]
+        )
 
     def half_a_shape(e: Any) -> Any:
         power, coefficient = right(e)
@@ -265,7 +267,9 @@ class _Wide(GaussianBlock):
 
 MODELS = {"coupled": _coupled(), "grown": _grown(), "vectors": _vectors()}
 BLOCKS = {
-    name: Case(m, _block(m), {"wide": _block(m, _Wide), "no prior": _block(m, terms=slice(1, None))})
+    name: Case(
+        m, _block(m), {"wide": _block(m, _Wide), "no prior": _block(m, terms=slice(1, None))}
+    )
     for name, m in MODELS.items()
 }
 #: a kernel that forgets the data draws from the prior, to which Geweke's test has no objection

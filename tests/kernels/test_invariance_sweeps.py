@@ -1,0 +1,165 @@
+"""Whole sweeps of Gibbs sampling leave their posterior invariant: mixtures of overlapping components.
+
+All of weights, labels, means and scales move. Geweke's test and the rank test at a chance of false alarm of
+1e-4 each, at fixed seeds; ``BAYESMC_SEED`` shifts them, and makes the tests longer. A sweep is irreversible:
+the rank test gets the one in reverse order. Each test is shown to fail on a sweep with an error in one kernel.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.engines.gibbs import GibbsSampler
+from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
+from bayesmc.kernels.conjugate_pairs import PAIRS
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.network import pose
+from bayesmc.structure.target import Target
+from tests.kernels.invariance import Case, Make, Model
+
+COV = np.array([[1.0, 0.4], [0.4, 0.7]])
+CENTRES = np.array([[-1.0, 0.0], [0.0, 1.0], [1.5, 0.0]])
+POINTS = 12
+
+
+def mixture(scale: Any, child: Callable[..., Any], vectors: bool = False) -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"k": 3, "i": POINTS})
+    net.add("weights", bmc.Dirichlet([1.0, 2.0, 1.5]))
+    net.add(
+        "mean",
+        bmc.MvNormal(CENTRES, COV) if vectors else bmc.Normal(CENTRES[:, 0], 1.0),
+        plates="k",
+    )
+    net.add("scale", scale, plates="k")
+    net.add("label", lambda weights: bmc.Categorical(weights), plates="i")
+    net.add("y", lambda mean, scale, label: child(mean[label], scale[label]), plates="i")
+    return net
+
+
+NETS: dict[str, Callable[[], bmc.BayesNet]] = {
+    "variances": lambda: mixture(
+        bmc.InverseGamma(3.0, 2.0), lambda m, s: bmc.Normal(m, np.sqrt(s))
+    ),
+    "precisions": lambda: mixture(bmc.Gamma(3.0, 2.0), lambda m, s: bmc.Normal(m, s**-0.5)),
+    "covariances": lambda: mixture(
+        bmc.InverseWishart(5.0, COV), lambda m, s: bmc.MvNormal(m, s), vectors=True
+    ),
+    "standard deviations": lambda: mixture(  # not conjugate: a slice
+        bmc.LogNormal(0.0, 0.5), lambda m, s: bmc.Normal(m, s)
+    ),
+}
+
+
+class Sweep(Kernel):
+    """One sweep of the engine's sampler."""
+
+    def __init__(self, sampler: GibbsSampler) -> None:
+        self.sampler = sampler
+        self.names = ("weights", "mean", "scale", "label")
+
+    def start(self, values: Any, chains: int) -> Any:
+        return {"each": [k.start(values, chains) for k in self.sampler.kernels]}
+
+    def step(self, values: Any, memory: Any, rng: Any, warmup: bool) -> Any:
+        inside = {n: values[n] for n in self.sampler.target.chain}
+        state = {"values": inside, "memory": memory["each"], "chains": len(values["mean"])}
+        after = self.sampler.step(state, rng, warmup)
+        return after["values"], {"each": after["memory"]}
+
+    def end_warmup(self, memory: Any) -> Any:
+        ends = zip(self.sampler.kernels, memory["each"], strict=True)
+        return {"each": [k.end_warmup(m) for k, m in ends]}
+
+
+def shapes(factor: float) -> Callable[[Conjugate], Kernel]:
+    """Makes the scales' kernel count each point's degrees of freedom so many times."""
+
+    def with_error(pair: Any) -> Any:
+        right = pair.statistic
+        if pair.kind == "covariance":
+            return dataclasses.replace(pair, statistic=lambda e: factor * right(e))
+        return dataclasses.replace(pair, statistic=lambda e: (factor * right(e)[0], right(e)[1]))
+
+    def wrong(kernel: Conjugate) -> Kernel:
+        pairs = [with_error(p) if p.kind in ("scale", "covariance") else p for p in PAIRS]
+        found = conjugate_kernel(kernel.blanket, pairs=pairs)
+        assert isinstance(found, Conjugate)
+        return found
+
+    return wrong
+
+
+def without_weights(kernel: Enumerate) -> Kernel:
+    """The labels' kernel, all labels as likely beforehand."""
+    kernel.blanket.own = None
+    return kernel
+
+
+def sweep(net: Any, errors: Mapping[str, Callable] | None = None, backwards: bool = False) -> Make:
+    """The sweep of a posed target; where its data are hidden, that of a net in which they have a child."""
+
+    def make(target: Target) -> Kernel:
+        problem = target.problem
+        if "y" in target.chain:
+            anchored = net()
+            last = (lambda y: bmc.Bernoulli(0.5 + 0.0 * _number(y)))  # fmt: skip
+            anchored.add("seen", last, plates="i")
+            problem = pose(anchored, {"seen": np.zeros(POINTS, dtype=int)})
+        plan = plan_of(problem)
+        sampler = GibbsSampler(plan)
+        kernels = [k for k in sampler.kernels if k.names != ("y",)]
+        assert sorted(n for k in kernels for n in k.names) == ["label", "mean", "scale", "weights"]
+        for name, error in (errors or {}).items():
+            kernels = [error(k) if k.names == (name,) else k for k in kernels]
+        sampler.kernels = kernels[::-1] if backwards else kernels
+        return Sweep(sampler)
+
+    return make
+
+
+def _number(y: Any) -> Any:
+    return y[..., 0] if np.ndim(y) and np.shape(y)[-1:] == (2,) else y
+
+
+def case(name: str, how: str) -> Case:
+    net = NETS[name]
+    errors: dict[str, Mapping[str, Callable]] = {"labels": {"label": without_weights}}
+    if name != "standard deviations":
+        errors["half a shape"] = {"scale": shapes(0.5)}
+        errors["three shapes"] = {"scale": shapes(3.0)}  # so wrong that few rows show it
+
+    def reverse(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
+        kernel = make(target)
+        assert isinstance(kernel, Sweep)
+        kernel.sampler.kernels = kernel.sampler.kernels[::-1]
+        return kernel, {"each": memory["each"][::-1]}
+
+    return Case(
+        Model(net(), ("y",)), sweep(net), {n: sweep(net, e) for n, e in errors.items()}, reverse, how,
+        warmup=20 if how == "moving" else 0,
+    )  # fmt: skip
+
+
+ALL = [(n, f) for n in NETS for f in ("", "labels")]
+CONJUGATE = ("variances", "precisions", "covariances")
+
+
+@pytest.mark.parametrize("test", ["geweke", "ranks"])
+@pytest.mark.parametrize(("name", "fault"), [*ALL, *((n, "half a shape") for n in CONJUGATE)])
+def test_sweep(name: str, fault: str, test: str) -> None:
+    case(name, "moving").check(test, fault)
+
+
+@pytest.mark.parametrize("fault", ["", "three shapes"])
+@pytest.mark.parametrize("name", CONJUGATE)
+def test_sweep_with_what_is_kept_of_the_evidence(name: str, fault: str) -> None:
+    """Data are summed by label: every row has a posed problem of its own."""
+    case(name, "posed").check("ranks", fault, replications=80)
