@@ -69,9 +69,8 @@ class Plan:
             if name not in by_name:
                 forward = name in self.target.forward and node.is_stochastic
                 barren = forward and self.target.seen(name) is None
-                kernel = "forward" if barren else ""
                 why = "nothing observed depends on it" if barren else treatment(self.problem, name)
-                rows.append(Treatment(name, kernel, why, plates))
+                rows.append(Treatment(name, "forward" if barren else "", why, plates))
                 continue
             kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
             why = "; then ".join(dict.fromkeys(w for w in words if w))

@@ -102,8 +102,8 @@ class CollapsedBlock(Kernel):
         for name in self.alone:
             if name in slow:
                 continue
-            new, own = self.alone[name].step(state, memory["alone"][name], rng, warmup)
-            state = {**state, **new}
+            found, own = self.alone[name].step(state, memory["alone"][name], rng, warmup)
+            state = {**state, **found}
             self.target.refresh(state, (name,))
             memory = {**memory, "alone": {**memory["alone"], name: own}}
         for name in slow:

@@ -110,6 +110,7 @@ class Conjugate(Kernel):
                 return new
         naturals, bounds = self._naturals(values, part)
         if isinstance(self.kind, Covariance):
+            drawn: np.ndarray | None
             drawn, precision = self.kind.with_precision(naturals, rng, shape)
             if precision is not None and members is None:
                 keep_precision(self.blanket.target, self.blanket.name, drawn, precision)

@@ -32,7 +32,7 @@ class PlanarStep:
         self.way, self.prior = way, prior
         self.name = way.blanket.name
         self.labels = way.groups.states
-        self.centre = way.groups.centre.tolist()
+        self.centre: list[float] = way.groups.centre.tolist()  # type: ignore[assignment]
 
     def draw(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
         """New values, or None before anything was drawn where floats do not pay or do not do."""
@@ -55,7 +55,9 @@ class PlanarCovariances(PlanarStep):
 
     def _drawn(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray | None:
         sums = self.way.groups.at(values).rows
-        offs = (values[self.means] - self.way.groups.centre).reshape(-1, 2).tolist()
+        offs: list[list[float]] = (
+            (values[self.means] - self.way.groups.centre).reshape(-1, 2).tolist()
+        )
         if len(offs) != len(sums):
             return None
         found = planar_covariances(self.df, self.scale, sums, offs, rng)

@@ -31,7 +31,7 @@ def planar_covariances(
     df: float,
     scale: Sequence[Pair],
     sums: list[list[float]],
-    offs: list[Pair],
+    offs: Sequence[Pair],
     rng: np.random.Generator,
 ) -> tuple[list[list[list[float]]] | np.ndarray, list[Entry] | None] | None:
     """Draws of inverse-Wishart covariances.

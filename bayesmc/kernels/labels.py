@@ -208,7 +208,10 @@ class Labels(Kernel):
         return total.reshape(self.states, chains, -1).swapaxes(0, 1)
 
     def _chunks(self, chains: int) -> list[tuple[slice, np.ndarray, _Buffers]]:
-        """Equal parts of the elements: a short one at the end would cost as many calls as a long one."""
+        """Equal parts of the elements: a short one at the end would cost as many calls as a long one.
+
+        Features are copied: products with rows that lie apart in memory take three times as long.
+        """
         if chains not in self._parts:
             n = self._features.shape[1]
             width = max(_CHUNK // (chains * self.states), _NARROW)
@@ -218,7 +221,7 @@ class Labels(Kernel):
             buffers = {size: _Buffers(self.states, chains, size) for size in sizes}
             self._parts = {
                 chains: [
-                    (slice(a, b), self._features[:, a:b], buffers[b - a])
+                    (slice(a, b), np.ascontiguousarray(self._features[:, a:b]), buffers[b - a])
                     for a, b in itertools.pairwise(ends)
                 ]
             }

@@ -170,7 +170,7 @@ class Slice(Kernel):
         """The node's value (of a class) with one component moved."""
         blanket = self.blanket
         now = blanket.current(values, members)
-        at = (Ellipsis, *component)
+        at: Any = (Ellipsis, *component)
         x = now[at].astype(float)
         width = memory["width"][at]
         if members is not None:

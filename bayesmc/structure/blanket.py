@@ -202,7 +202,8 @@ class Blanket:
         flat = self._flat(value)
         lead = np.broadcast_shapes(lead, flat.shape[:1])
         full = np.array(np.broadcast_to(flat, lead + flat.shape[1:]))
-        full[(Ellipsis, members, *(slice(None),) * len(self.event_shape))] = candidate
+        place: Any = (Ellipsis, members, *(slice(None),) * len(self.event_shape))
+        full[place] = candidate
         return full.reshape(lead + self.node.value_shape)
 
 

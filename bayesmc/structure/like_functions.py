@@ -10,18 +10,20 @@ functions give one by one is not used.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import is_
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.network import Model
+from bayesmc.network import CompiledNode, Model
 from bayesmc.network.align import Aligner
-from bayesmc.structure.likeness import Skeleton, same_number, with_numbers
+from bayesmc.network.domain import Domain
+from bayesmc.structure.likeness import Skeleton, same_number, skeleton, with_numbers
 from bayesmc.structure.target import Target, Term, Values
 
 #: stands for a parent that only lengthens the batch
@@ -35,6 +37,101 @@ _EVENT_NDIM = 3
 
 
 @dataclass(frozen=True, eq=False)
+class Signature:
+    """What a term or a deterministic node is.
+
+    Attributes
+    ----------
+    key : hashable
+        Equal where functions are, up to numbers, and values have the same shapes and states.
+    skeleton : Skeleton
+        Of its function.
+    scope : tuple of str
+        What it reads: parents in the order of arguments, and itself.
+    """
+
+    key: Hashable
+    skeleton: Skeleton
+    scope: tuple[str, ...]
+
+
+class Signatures:
+    """Signatures of a target's terms and deterministic nodes, each found once."""
+
+    def __init__(self, target: Target) -> None:
+        self.target = target
+        self._found: dict[str, Signature | None] = {}
+
+    def of(self, name: str) -> Signature | None:
+        """The signature; None for what is called element by element or over the rows of an index."""
+        if name not in self._found:
+            self._found[name] = self._read(name)
+        return self._found[name]
+
+    def _read(self, name: str) -> Signature | None:
+        model = self.target.model
+        term = self.target.terms.get(name)
+        what: Hashable
+        if term is not None and term.is_potential:
+            potential, _ = model.potentials[name]
+            if potential.index is not None:
+                return None
+            found, scope = skeleton(potential.function), potential.parents
+            what = ("potential", potential.plates, potential.is_table)
+        else:
+            node = model[name]
+            declaration = node.declaration
+            if declaration.vectorize:
+                return None
+            found, scope = skeleton(declaration.function), (*node.parents, name)
+            what = tuple(
+                None if t is None else (t.shape, t.dtype.str, t.tobytes())
+                for t in (declaration.probs, node.table)
+            )
+        read = tuple(value_key(model[n]) for n in scope)
+        return Signature((found.key, what, read), found, scope)
+
+
+class Slots:
+    """What names stand for: of each one name for all of a group, or one for each.
+
+    Parameters
+    ----------
+    sources : dict
+        Name -> tuple of one name, or of one for each.
+    count : int
+        Size of the group.
+    """
+
+    def __init__(self, target: Target, sources: Mapping[str, Sequence[str]], count: int) -> None:
+        self.sources = {name: _once(these) for name, these in sources.items()}
+        self.count = count
+        self._group = np.zeros(count)
+        self._trailing = {name: len(target.model[name].value_shape) for name in self.sources}
+        known = target.known
+        self._known = {
+            name: [known[n] for n in these]
+            for name, these in self.sources.items()
+            if all(n in known for n in these)
+        }
+        self._fixed = {
+            name: stack_arrays(arrays, self._trailing[name]) for name, arrays in self._known.items()
+        }
+
+    def gathered(self, values: Mapping[str, np.ndarray]) -> Values:
+        """Values by these names, ``(*lead, group, *plates, *event)``; the group is 1 for a shared one."""
+        found: Values = {GROUP: self._group}
+        for name, these in self.sources.items():
+            arrays = [values[n] for n in these]
+            known = self._known.get(name)
+            if known is not None and all(map(is_, arrays, known)):
+                found[name] = self._fixed[name]
+            else:
+                found[name] = stack_arrays(arrays, self._trailing[name])
+        return found
+
+
+@dataclass(frozen=True, eq=False)
 class LikeFunctions:
     """Terms or deterministic nodes whose functions differ in numbers at most.
 
@@ -42,17 +139,17 @@ class LikeFunctions:
     ----------
     names : tuple of str
         The group; the first stands for all.
-    skeletons : tuple of Skeleton
-        Of their functions.
+    signatures : tuple of Signature
+        Theirs, with equal keys.
     """
 
     names: tuple[str, ...]
-    skeletons: tuple[Skeleton, ...]
+    signatures: tuple[Signature, ...]
 
     @cached_property
     def varying(self) -> dict[int, tuple[Any, ...]]:
         """The numbers by which the functions differ, by their places in the skeletons."""
-        columns = enumerate(zip(*(s.numbers for s in self.skeletons), strict=True))
+        columns = enumerate(zip(*(s.skeleton.numbers for s in self.signatures), strict=True))
         return {
             k: these
             for k, these in columns
@@ -105,7 +202,7 @@ class LikeFunctions:
         name = self.names[0]
         term = target.terms.get(name)
         plates = len(model[name].plate_shape if term is None else term.shape)
-        numbers = list(self.skeletons[0].numbers)
+        numbers = list(self.signatures[0].skeleton.numbers)
         for k, these in self.varying.items():
             own = np.ndim(these[0])
             if not own:
@@ -125,17 +222,6 @@ class LikeFunctions:
         declaration = replace(node.declaration, function=function)
         node = replace(node, declaration=declaration, links=(*node.links, link))
         return replace(model, nodes={**model.nodes, name: node}, cache={})
-
-
-def gather(
-    target: Target, slots: Mapping[str, Sequence[str]], values: Mapping[str, np.ndarray], count: int
-) -> Values:
-    """Values of what each name stands for, one name for all or one for each; the group before the plates."""
-    found: Values = {GROUP: np.zeros(count)}
-    for name, sources in slots.items():
-        trailing = len(target.model[name].value_shape)
-        found[name] = stack_arrays([values[n] for n in sources], trailing)
-    return found
 
 
 def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:
@@ -185,7 +271,23 @@ def close(a: np.ndarray, b: np.ndarray) -> bool:
     return bool((near | (a == b)).all())
 
 
+def value_key(node: CompiledNode) -> Hashable:
+    """What a node's values are: equal where shapes and states are."""
+    return node.plates, node.event_shape, node.is_discrete, _domain_key(node.domain)
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _once(names: Sequence[str]) -> tuple[str, ...]:
+    return (names[0],) if len(set(names)) == 1 else tuple(names)
+
+
+def _domain_key(domain: Domain | None) -> Hashable:
+    if domain is None:
+        return None
+    values = None if domain.values is None else (domain.values.dtype.str, domain.values.tobytes())
+    return domain.size, domain.low, values, domain.labels
 
 
 def _evaluated(target: Target, model: Model, name: str, values: Values) -> np.ndarray:

@@ -170,7 +170,7 @@ class Relation:
 
 
 def segment_sum(values: np.ndarray, index: np.ndarray, count: int) -> np.ndarray:
-    """Sums of ``values`` ``(*lead, n)`` by ``index`` ``(*broadcasts to lead, n)``, shape ``(*lead, count)``."""
+    """Sums of ``values (*lead, n)`` by ``index``, which broadcasts to them, shape ``(*lead, count)``."""
     lead = values.shape[:-1]
     total = math.prod(lead)
     if total == 0 or values.shape[-1] == 0:

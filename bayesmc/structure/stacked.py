@@ -15,26 +15,24 @@ from __future__ import annotations
 import itertools
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.network import CompiledNode
-from bayesmc.network.domain import Domain
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_functions import (
-    GROUP,
     LikeFunctions,
+    Signature,
+    Signatures,
+    Slots,
     close,
-    gather,
     in_model,
     some_states,
     stack_arrays,
+    value_key,
 )
-from bayesmc.structure.likeness import Skeleton, skeleton
 from bayesmc.structure.target import Target, Values
 
 #: nodes that are worth a group
@@ -57,33 +55,15 @@ class StackedBlanket:
         neighbours are those of all, ``(chains, group, *plates, *event)``, and so are its answers.
     """
 
-    def __init__(self, one: Blanket, blankets: Sequence[Blanket], slots: Mapping[str, Any]) -> None:
+    def __init__(self, one: Blanket, blankets: Sequence[Blanket], slots: Slots) -> None:
         self.one = one
         self.blankets = tuple(blankets)
         self.names = tuple(b.name for b in blankets)
-        self._slots = dict(slots)
-        model, known = one.target.model, one.target.known
-        self._trailing = {name: len(model[name].value_shape) for name in self._slots}
-        self._known = {
-            name: [known[n] for n in sources]
-            for name, sources in self._slots.items()
-            if all(n in known for n in sources)
-        }
-        self._fixed = {
-            name: stack_arrays(values, self._trailing[name]) for name, values in self._known.items()
-        }
+        self.slots = slots
 
     def gathered(self, values: Mapping[str, np.ndarray]) -> Values:
         """Values by the names of the first node's neighbours, the group as an axis after the chains."""
-        found: Values = {GROUP: np.zeros(len(self.names))}
-        for name, sources in self._slots.items():
-            arrays = [values[n] for n in sources]
-            known = self._known.get(name)
-            if known is not None and all(map(_is, arrays, known)):
-                found[name] = self._fixed[name]
-            else:
-                found[name] = stack_arrays(arrays, self._trailing[name])
-        return found
+        return self.slots.gathered(values)
 
     def spread(self, value: np.ndarray) -> Values:
         """Values of every node, from those of the group ``(chains, group, *plates, *event)``."""
@@ -93,7 +73,7 @@ class StackedBlanket:
 
     def current(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """The nodes' values ``(chains, group, *plates, *event)``."""
-        return stack_arrays([values[n] for n in self.names], self._trailing[self.one.name])
+        return stack_arrays([values[n] for n in self.names], len(self.one.node.value_shape))
 
     def log_density(self, values: Mapping[str, np.ndarray], candidate: np.ndarray) -> np.ndarray:
         """Log full conditionals of all nodes at candidate values, up to constants.
@@ -183,8 +163,8 @@ class _Form:
     ----------
     parts : tuple of str
         Deterministic nodes on its path, its own term and its children, like ones in like places.
-    skeletons : tuple of Skeleton
-        Of the parts' functions.
+    signatures : tuple of Signature
+        Of the parts.
     others : tuple of str
         All other nodes that the parts read, in the order in which they first appear.
     """
@@ -192,84 +172,50 @@ class _Form:
     key: Hashable
     blanket: Blanket
     parts: tuple[str, ...]
-    skeletons: tuple[Skeleton, ...]
+    signatures: tuple[Signature, ...]
     others: tuple[str, ...]
 
 
 class _Forms:
-    """Reads blankets; what functions are is found once for each."""
+    """Reads blankets; signatures get numbers, so that parts can be brought into one order."""
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self._skeletons: dict[str, Skeleton] = {}
+        self._signatures = Signatures(target)
         self._numbers: dict[Hashable, int] = {}
 
     def of(self, blanket: Blanket) -> _Form | None:
         """The form of a blanket; None where its node is updated in turns, or in other ways."""
-        node, target = blanket.node, self.target
-        if blanket.classes != (None,) or target.seen(blanket.name) is not None:
+        node = blanket.node
+        if blanket.classes != (None,) or self.target.seen(blanket.name) is not None:
             return None
         if any(c.relation.kind != "aligned" for c in blanket.children):
             return None
-        own = [] if blanket.own is None else [(self._part(blanket, blanket.own.name), "own")]
-        path = [(self._part(blanket, link), "link") for link in blanket.path]
-        children = [(self._part(blanket, c.term.name), "child") for c in blanket.children]
-        children.sort(key=lambda part: part[0][0])
-        ordered = [*path, *own, *children]
-        if any(number < 0 for (number, _, _), _ in ordered):
+        roles: dict[str, Hashable] = {link: i for i, link in enumerate(blanket.path)}
+        roles[blanket.name] = "self"
+        children = [(self._number(c.term.name, roles), c.term.name) for c in blanket.children]
+        own = () if blanket.own is None else (blanket.own.name,)
+        parts = (*blanket.path, *own, *(name for _, name in sorted(children, key=lambda c: c[0])))
+        found = [self._signatures.of(p) for p in parts]
+        signatures = tuple(s for s in found if s is not None)
+        if len(signatures) < len(parts):
             return None
-        parts = tuple(name for (_, name, _), _ in ordered)
-        others = tuple(dict.fromkeys(n for (_, _, scope), _ in ordered for n in scope))
+        read = [tuple(n for n in s.scope if n not in roles) for s in signatures]
+        others = tuple(dict.fromkeys(n for scope in read for n in scope))
         place = {n: i for i, n in enumerate(others)}
-        key = (
-            _value_key(node),
-            node.support,
-            tuple(
-                (number, role, tuple(place[n] for n in scope))
-                for (number, _, scope), role in ordered
-            ),
-        )
-        return _Form(key, blanket, parts, tuple(self._skeletons[p] for p in parts), others)
+        numbers = tuple(self._number(p, roles) for p in parts)
+        pattern = tuple(tuple(place[n] for n in scope) for scope in read)
+        shape = (len(blanket.path), len(own))
+        key = (value_key(node), node.support, shape, numbers, pattern)
+        return _Form(key, blanket, parts, signatures, others)
 
-    def _part(self, blanket: Blanket, name: str) -> tuple[int, str, list[str]]:
-        """A number for what a link or term is (-1 where it cannot be stacked), its name, others it reads."""
-        model, target = self.target.model, self.target
-        roles = {blanket.name: "self", **{link: i for i, link in enumerate(blanket.path)}}
-        term = target.terms.get(name)
-        if term is not None and term.is_potential:
-            potential, _ = model.potentials[name]
-            function: Any = potential.function
-            scope = list(potential.parents)
-            what: Hashable = ("potential", potential.plates, potential.is_table)
-            plain = potential.index is None
-        else:
-            node = model[name]
-            declaration = node.declaration
-            function, scope = declaration.function, [*node.parents, name]
-            tables = (declaration.probs, node.table)
-            what = (
-                _value_key(node),
-                tuple(None if t is None else (t.shape, t.dtype.str, t.tobytes()) for t in tables),
-            )
-            plain = not declaration.vectorize
-        if name not in self._skeletons:
-            self._skeletons[name] = skeleton(function)
-        read = tuple((roles.get(n), _value_key(model[n])) for n in scope)
-        key = (self._skeletons[name].key, what, read)
-        number = self._numbers.setdefault(key, len(self._numbers)) if plain else -1
-        return number, name, [n for n in scope if n not in roles]
-
-
-def _value_key(node: CompiledNode) -> Hashable:
-    """What a node's values are."""
-    return node.plates, node.event_shape, node.is_discrete, _domain_key(node.domain)
-
-
-def _domain_key(domain: Domain | None) -> Hashable:
-    if domain is None:
-        return None
-    values = None if domain.values is None else (domain.values.dtype.str, domain.values.tobytes())
-    return domain.size, domain.low, values, domain.labels
+    def _number(self, name: str, roles: Mapping[str, Hashable]) -> int:
+        """A number for what a part is, and where it reads the node and what is on its path."""
+        signature = self._signatures.of(name)
+        if signature is None:
+            return -1
+        key = (signature.key, tuple(roles.get(n) for n in signature.scope))
+        return self._numbers.setdefault(key, len(self._numbers))
 
 
 def _apart(group: Sequence[_Form]) -> Iterator[list[_Form]]:
@@ -292,36 +238,32 @@ def _stacked(target: Target, forms: Sequence[_Form], states: Values) -> StackedB
         one = _representative(target, forms, states)
         if one is None:
             return None
-        stack = StackedBlanket(one, [f.blanket for f in forms], _slots(forms))
+        slots = Slots(target, _sources(forms), len(forms))
+        stack = StackedBlanket(one, [f.blanket for f in forms], slots)
         return stack if _agrees(stack, states) else None
     except BayesmcError:  # at some state, perhaps one that is impossible
         return None
 
 
-def _slots(forms: Sequence[_Form]) -> dict[str, tuple[str, ...]]:
-    """What each name around the first node stands for: one name for all, or one for each."""
+def _sources(forms: Sequence[_Form], with_path: bool = False) -> dict[str, tuple[str, ...]]:
+    """What each name around the first node stands for."""
     first = forms[0]
-    slots = {first.blanket.name: tuple(f.blanket.name for f in forms)}
+    found = {first.blanket.name: tuple(f.blanket.name for f in forms)}
     for at, name in enumerate(first.others):
-        sources = tuple(f.others[at] for f in forms)
-        slots[name] = sources[:1] if len(set(sources)) == 1 else sources
-    return slots
+        found[name] = tuple(f.others[at] for f in forms)
+    for at, name in enumerate(first.blanket.path if with_path else ()):
+        found[name] = tuple(f.parts[at] for f in forms)
+    return found
 
 
 def _representative(target: Target, forms: Sequence[_Form], states: Values) -> Blanket | None:
     """The first node's blanket, where need be in a model whose functions have the numbers of all."""
     first = forms[0]
-    slots = _slots(forms)
-    slots |= {
-        name: tuple(f.parts[at] for f in forms)
-        for at, name in enumerate(first.parts)
-        if name in first.blanket.path
-    }
-    gathered = gather(target, slots, states, len(forms))
+    gathered = Slots(target, _sources(forms, with_path=True), len(forms)).gathered(states)
     model, terms = target.model, dict(target.terms)
     for at, name in enumerate(first.parts):
         alike = LikeFunctions(
-            tuple(f.parts[at] for f in forms), tuple(f.skeletons[at] for f in forms)
+            tuple(f.parts[at] for f in forms), tuple(f.signatures[at] for f in forms)
         )
         if name in terms:
             terms[name] = replace(terms[name], mask=alike.mask(target))
@@ -333,10 +275,6 @@ def _representative(target: Target, forms: Sequence[_Form], states: Values) -> B
     if model is target.model and all(terms[n].mask is t.mask for n, t in target.terms.items()):
         return first.blanket
     return Blanket(in_model(target, model, terms), first.blanket.name)
-
-
-def _is(a: Any, b: Any) -> bool:
-    return a is b
 
 
 def _agrees(stack: StackedBlanket, states: Values) -> bool:

@@ -85,8 +85,8 @@ class Term:
     def log_of(self, dist: Distribution, batch: Shape, value: np.ndarray) -> np.ndarray:
         """Log density of stored values under a distribution that was evaluated before.
 
-        Parameters that over- or underflowed have density zero; those out of their range are the model's fault and
-        raise.
+        Parameters that over- or underflowed have density zero; those out of their range are the model's
+        fault and raise.
         """
         node = self.model[self.name]
         if dist.invalid is None:  # the short way, for the innermost of all loops

@@ -90,7 +90,8 @@ def _call(target: Target, names: tuple[str, ...], term: Term) -> tuple[Any, list
             values[link] = np.broadcast_to(value, batch + node.value_shape)
         if term.is_potential:
             potential, links = model.potentials[term.name]
-            function, vectorize = potential.function, False
+            function: Any = potential.function
+            vectorize = False
         else:
             declaration = model[term.name].declaration
             links = model[term.name].links

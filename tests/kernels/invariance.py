@@ -17,7 +17,6 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,9 @@ SEED = os.environ.get("BAYESMC_SEED")
 SHIFT, LONGER = int(SEED or "0"), 8 if SEED else 1
 #: chance that a right kernel fails one test at a fresh seed
 ALPHA = 1e-4
+
+#: the two tests
+TESTS = ("geweke", "ranks")
 
 Rows = dict[str, np.ndarray]
 Statistic = Callable[[Rows, Rows], np.ndarray]
@@ -60,19 +62,22 @@ class Model:
     moved: tuple[str, ...] = ()
     draw: Callable[[np.random.Generator, int], Rows] | None = None
     respond: Callable[[Rows, np.random.Generator], Rows] | None = None
+    _targets: dict[str, Target] = field(default_factory=dict)
 
     @property
     def compiled(self) -> Any:
         return self.target("moving").model
 
-    @lru_cache  # noqa: B019: models live as long as the tests do
     def target(self, how: str) -> Target:
         """The posed model with placeholders for data, or with data that are hidden."""
-        if how == "moving":
-            return target_of(pose(self.net, {}), also=self._stochastic())
-        return target_of(
-            pose(self.net, self.user(self.data(self.prior(np.random.default_rng(0), 1))))
-        )
+        if how not in self._targets:
+            if how == "moving":
+                found = target_of(pose(self.net, {}), also=self._stochastic())
+            else:
+                placeholder = self.data(self.prior(np.random.default_rng(0), 1))
+                found = target_of(pose(self.net, self.user(placeholder)))
+            self._targets[how] = found
+        return self._targets[how]
 
     def _stochastic(self) -> list[str]:
         model = pose(self.net, {}).model
@@ -168,7 +173,7 @@ class Case:
     faults : dict
         Name -> a wrong kernel.
     reverse : callable, optional
-        The reverse of a kernel, and its memory: ``reverse(make, target, memory)``; by default the kernel itself.
+        ``reverse(make, target, memory)``: the reverse of a kernel, and its memory; by default the kernel itself.
     how : str
         How it gets data: ``given``, ``moving`` or ``posed``.
     warmup : int
@@ -197,7 +202,7 @@ class Case:
 
     def geweke(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
         own = {k: v for k, v in self.sizes.items() if k in ("draws", "chains")}
-        sizes = {"draws": 60, "chains": 80, **own, **sizes}
+        sizes = {"draws": 40, "chains": 120, **own, **sizes}
         sizes["draws"] *= LONGER
         kernel, _ = self._kernels(fault, sizes["chains"])
         return geweke_test(
@@ -337,6 +342,13 @@ def running() -> Iterator[None]:
 def each_fault(cases: Mapping[str, Case]) -> list[tuple[str, str]]:
     """All kernels with each of their faults, and each without."""
     return [(name, fault) for name, case in cases.items() for fault in ("", *case.faults)]
+
+
+def backwards(make: Make, target: Target, memory: Memory) -> tuple[Kernel, Memory]:
+    """The reverse of a kernel with a blanket: elements of different colours move in the other order."""
+    kernel: Any = make(target)
+    kernel.blanket.classes = kernel.blanket.classes[::-1]
+    return kernel, memory
 
 
 def mixture(prior: Any, child: Callable[..., Any], points: int = 12) -> bmc.BayesNet:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.kernels import gaussian_block
+from bayesmc.kernels import gaussian_layout
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
@@ -22,9 +22,8 @@ from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
-from tests.kernels.invariance import Case, Make, Model, each_fault, mixture
+from tests.kernels.invariance import TESTS, Case, Make, Model, each_fault, mixture
 
-TESTS = ("geweke", "ranks")
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
 
 # ---- every pair of the table, on three overlapping categories --------------------------------------
@@ -260,8 +259,8 @@ class _Wide(GaussianBlock):
     def step(self, values: Any, memory: Any, rng: Any, warmup: bool) -> Any:
         sums = self._summed(self._at_zero(values), len(values[self.names[0]]))
         noise = rng.standard_normal(sums.linear.shape)
-        mean, *_ = gaussian_block._solved(self.layout, sums, None)
-        draw, *_ = gaussian_block._solved(self.layout, sums, noise)
+        mean, *_ = gaussian_layout.solved(self.layout, sums, None)
+        draw, *_ = gaussian_layout.solved(self.layout, sums, noise)
         return self.layout.split(mean + 2.0 * (draw - mean), values), memory
 
 
@@ -310,7 +309,7 @@ class _NoDeterminant(GaussianBlock):
     def log_integral(self, values: Any, count: int) -> np.ndarray:
         sums = self._summed(self._at_zero(values), count)
         return sums.constant + 0.5 * np.vecdot(
-            sums.linear, gaussian_block._solved(self.layout, sums, None)[0]
+            sums.linear, gaussian_layout.solved(self.layout, sums, None)[0]
         )
 
 

@@ -22,20 +22,21 @@ from bayesmc.kernels.lattice import SiteCounts, SiteSums, lattice_kernel
 from bayesmc.kernels.tables import RowSums, TableSweep, table_kernel, table_kernels
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
-from tests.kernels.invariance import Case, Make, Model, Rows, Statistic, each_fault
+from tests.kernels.invariance import (
+    TESTS,
+    Case,
+    Make,
+    Model,
+    Rows,
+    Statistic,
+    backwards,
+    each_fault,
+)
 
-TESTS = ("geweke", "ranks")
 CENTRES = np.array([-1.0, 0.0, 1.5])
 SHARES = [0.2, 0.3, 0.5]
 RING, NEXT = np.arange(5), (np.arange(5) + 1) % 5
 RNG = np.random.default_rng(4)
-
-
-def backwards(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
-    """The kernel whose elements of different colours move in the other order."""
-    kernel: Any = make(target)
-    kernel.blanket.classes = kernel.blanket.classes[::-1]
-    return kernel, memory
 
 
 # ---- models ------------------------------------------------------------------------------------------

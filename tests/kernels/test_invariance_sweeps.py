@@ -2,7 +2,8 @@
 
 All of weights, labels, means and scales move. Geweke's test and the rank test at a chance of false alarm of
 1e-4 each, at fixed seeds; ``BAYESMC_SEED`` shifts them, and makes the tests longer. A sweep is irreversible:
-the rank test gets the one in reverse order. Each test is shown to fail on a sweep with an error in one kernel.
+the rank test gets the one in reverse order. Each test is shown to fail on a sweep with an error
+in one kernel.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from bayesmc.kernels.conjugate_pairs import PAIRS
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.network import pose
 from bayesmc.structure.target import Target
-from tests.kernels.invariance import Case, Make, Model
+from tests.kernels.invariance import TESTS, Case, Make, Model
 
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
 CENTRES = np.array([[-1.0, 0.0], [0.0, 1.0], [1.5, 0.0]])
@@ -110,8 +111,7 @@ def sweep(net: Any, errors: Mapping[str, Callable] | None = None, backwards: boo
         problem = target.problem
         if "y" in target.chain:
             anchored = net()
-            last = (lambda y: bmc.Bernoulli(0.5 + 0.0 * _number(y)))  # fmt: skip
-            anchored.add("seen", last, plates="i")
+            anchored.add("seen", lambda y: bmc.Bernoulli(0.5 + 0.0 * _number(y)), plates="i")
             problem = pose(anchored, {"seen": np.zeros(POINTS, dtype=int)})
         plan = plan_of(problem)
         sampler = GibbsSampler(plan)
@@ -152,7 +152,7 @@ ALL = [(n, f) for n in NETS for f in ("", "labels")]
 CONJUGATE = ("variances", "precisions", "covariances")
 
 
-@pytest.mark.parametrize("test", ["geweke", "ranks"])
+@pytest.mark.parametrize("test", TESTS)
 @pytest.mark.parametrize(("name", "fault"), [*ALL, *((n, "half a shape") for n in CONJUGATE)])
 def test_sweep(name: str, fault: str, test: str) -> None:
     case(name, "moving").check(test, fault)

@@ -13,6 +13,7 @@ import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.like_functions import Slots
 from bayesmc.structure.likeness import skeleton, with_numbers
 from bayesmc.structure.stacked import StackedBlanket, stacks
 from bayesmc.structure.target import Target, Values, target_of
@@ -405,10 +406,12 @@ def test_the_wrong_neighbours_are_noticed() -> None:
     net, evidence, _ = numbered()
     target, blankets = posed(net, evidence)
     stack = stacks(target, blankets, target.chain)[0][0]
-    at = next(n for n, s in stack._slots.items() if len(s) > 1 and n != stack.one.name)
-    turned = {**stack._slots, at: (*stack._slots[at][1:], stack._slots[at][0])}
-    assert worst_difference(target, StackedBlanket(stack.one, stack.blankets, turned), 1) > 1e-3
-    alike = StackedBlanket(stack.blankets[0], stack.blankets, stack._slots)
+    sources = stack.slots.sources
+    at = next(n for n, s in sources.items() if len(s) > 1 and n != stack.one.name)
+    turned = {**sources, at: (*sources[at][1:], sources[at][0])}
+    wrong = StackedBlanket(stack.one, stack.blankets, Slots(target, turned, len(stack.names)))
+    assert worst_difference(target, wrong, 1) > 1e-3
+    alike = StackedBlanket(stack.blankets[0], stack.blankets, stack.slots)
     assert worst_difference(target, alike, 1) > 1e-3
 
 

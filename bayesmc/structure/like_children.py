@@ -1,0 +1,183 @@
+"""Like children of one node evaluated as one: the emissions of a series, seen from the parameter they share.
+
+A parameter with a hundred children that came from one function would call it a hundred times for every value
+it tries. Here the children get a group axis, as if they were one child in one more plate.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError
+from bayesmc.network import Model
+from bayesmc.structure.blanket import Blanket, Child
+from bayesmc.structure.like_functions import GROUP, Signatures, in_model, some_states
+from bayesmc.structure.like_terms import FEWEST, LikeTerms, like_terms, repeated
+from bayesmc.structure.target import Values
+
+#: relative error that sums of many terms may have
+_ROUNDING = 1e-9
+
+
+class GroupedBlanket(Blanket):
+    """A blanket whose like children are evaluated as one; its answers are those of the single blanket."""
+
+    def __init__(self, blanket: Blanket, groups: Sequence[tuple[LikeTerms, Child]]) -> None:
+        vars(self).update(vars(blanket))
+        self.groups = tuple(groups)
+        taken = {n for terms, _ in groups for n in terms.names}
+        self.alone = tuple(c for c in self.children if c.term.name not in taken)
+        #: for each group a blanket that knows its functions
+        self._asked = [_in_model(blanket, terms.model) for terms, _ in groups]
+
+    def log_density(
+        self,
+        values: Mapping[str, np.ndarray],
+        candidate: np.ndarray,
+        members: np.ndarray | None = None,
+    ) -> np.ndarray:
+        state = self.placed(values, candidate, members)
+        total = self.own_log(state, members)
+        for child in self.alone:
+            total = total + self.child_log(child, state, members)
+        try:
+            for k in range(len(self.groups)):
+                total = total + self._group_log(k, state, members)
+        except BayesmcError:
+            for child in self.children:  # the group knows the first child's name only
+                self.child_log(child, state, members)
+            raise
+        return total
+
+    def _group_log(
+        self, k: int, state: Mapping[str, np.ndarray], members: np.ndarray | None
+    ) -> np.ndarray:
+        """The log factors of a group, summed for every element of the node."""
+        (terms, child), asked = self.groups[k], self._asked[k]
+        gathered = terms.gathered(state)
+        keys: tuple[Any, ...] = ()
+        if child.relation.kind != "lookup":
+            log = terms.term.log(gathered)
+        elif terms.term.is_potential:
+            log, keys = asked.potential_looked_up(child, gathered)
+        else:
+            dist, batch, keys = asked.distribution_looked_up(child, gathered)
+            log = terms.term.log_of(dist, batch, gathered[terms.term.name])
+        return child.relation.collect(terms.full(log), terms.shape, keys, members)
+
+
+def with_like_children(blanket: Blanket) -> Blanket:
+    """The blanket with like children evaluated as one; itself where too few are alike.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.blanket import Blanket
+    >>> from bayesmc.structure.like_children import with_like_children
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.LogNormal(0.0, 1.0))
+    >>> for t in range(8):
+    ...     net.add(f"y[{t}]", lambda rate, t=t: bmc.Poisson(rate * (1 + t)))
+    >>> target = target_of(pose(net, {f"y[{t}]": t for t in range(8)}))
+    >>> single = Blanket(target, "rate")
+    >>> grouped = with_like_children(single)
+    >>> [terms.names for terms, _ in grouped.groups]
+    [('y[0]', 'y[1]', 'y[2]', 'y[3]', 'y[4]', 'y[5]', 'y[6]', 'y[7]')]
+    >>> tried = np.array([[0.5], [2.0]])
+    >>> np.allclose(
+    ...     single.log_density(target.known, tried), grouped.log_density(target.known, tried)
+    ... )
+    True
+    """
+    found = _alike(blanket)
+    if not found:
+        return blanket
+    states = some_states(blanket.target)
+    if states is None:
+        return blanket
+    groups = []
+    for children in found:
+        group = _grouped(blanket, children, states)
+        if group is not None:
+            groups.append(group)
+    return GroupedBlanket(blanket, groups) if groups else blanket
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _in_model(blanket: Blanket, model: Model) -> Blanket:
+    asked = copy.copy(blanket)
+    asked.target = in_model(blanket.target, model, blanket.target.terms)
+    return asked
+
+
+def _alike(blanket: Blanket) -> list[list[Child]]:
+    """Children by what they are and how they depend on the node, where there are many."""
+    if len(blanket.children) < FEWEST:
+        return []
+    signatures = Signatures(blanket.target)
+    groups: dict[Hashable, list[Child]] = {}
+    for child in blanket.children:
+        signature = signatures.of(child.term.name)
+        if signature is None:
+            continue
+        scope, relation = signature.scope, child.relation
+        source = None if relation.source is None else scope.index(relation.source)
+        # the node, and what follows from it, in the same places
+        reached = tuple(n == blanket.name or n in blanket.path for n in scope)
+        how = (relation.kind, relation.foreign, relation.coupled, relation.term_plates)
+        key = (signature.key, reached, repeated(scope), source, how, len(relation.rows))
+        groups.setdefault(key, []).append(child)
+    return [g for g in groups.values() if len(g) >= FEWEST]
+
+
+def _grouped(
+    blanket: Blanket, children: Sequence[Child], states: Values
+) -> tuple[LikeTerms, Child] | None:
+    """Like children as one; None where that would not say what they say."""
+    try:
+        terms = like_terms(blanket.target, [c.term for c in children], states)
+        if terms is None:
+            return None
+        first = children[0].relation
+        rows = tuple(
+            np.concatenate(r) for r in zip(*(c.relation.rows for c in children), strict=True)
+        )
+        relation = replace(first, term_plates=(GROUP, *first.term_plates), rows=rows, _kept={})
+        group = terms, Child(terms.term, relation)
+        return group if _agrees(blanket, children, group, states) else None
+    except BayesmcError:  # at some state, perhaps one that is impossible
+        return None
+
+
+def _agrees(
+    blanket: Blanket, children: Sequence[Child], group: tuple[LikeTerms, Child], states: Values
+) -> bool:
+    """Whether the group says of some states what the children say one by one."""
+    only = GroupedBlanket(blanket, [group])
+    members = blanket.classes[0]
+    now = blanket.current(states, members)
+    with marking_invalid(), np.errstate(all="ignore"):
+        candidate = np.stack([now, np.roll(now, 1, axis=0)])
+        state = blanket.placed(states, candidate, members)
+        alone: Any = 0.0
+        size: Any = 0.0
+        for child in children:
+            log = blanket.child_log(child, state, members)
+            alone, size = alone + log, size + np.abs(log)
+        together = only._group_log(0, state, members)
+    shape = candidate.shape[: candidate.ndim - len(blanket.event_shape)]
+    alone, together, size = (np.broadcast_to(v, shape) for v in (alone, together, size))
+    with np.errstate(invalid="ignore"):
+        near = np.abs(alone - together) <= _ROUNDING * (1.0 + size)
+    return bool((near | (alone == together)).all())
