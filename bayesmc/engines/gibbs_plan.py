@@ -19,6 +19,7 @@ from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.gaussian_block import gaussian_blocks
 from bayesmc.kernels.joint_states import joint_states
+from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.lattice import lattice_kernel
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
@@ -186,6 +187,8 @@ def _numbers(target: Target, blankets: Mapping[str, Blanket], names: Sequence[st
     for name in names:
         if _kind(target, blankets[name]) in _BOXES:
             left.append(name)
+        elif target.model[name].is_discrete:  # vectors of counts
+            kernels.append(Jump(blankets[name]))
         else:
             kernels.append(AdaptiveWalk(blankets[name]))
     for group in _together(target, blankets, left):

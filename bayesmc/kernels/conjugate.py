@@ -23,7 +23,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_children import Partner, partner_of
-from bayesmc.kernels.conjugate_components import PlanarStep, planar_step
+from bayesmc.kernels.conjugate_components import CountedShares, PlanarStep, quick_step
 from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Naturals, split_prior
 from bayesmc.kernels.conjugate_labels import hidden_above
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
@@ -72,6 +72,10 @@ class Conjugate(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
+        if self._quick is not None and not self.debug:
+            new = self._quickly(values, rng)
+            if new is not None:
+                return {blanket.name: new}, memory
         state = values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
@@ -97,17 +101,19 @@ class Conjugate(Kernel):
 
     # ---- private -------------------------------------------------------------------------------
 
+    def _quickly(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
+        assert self._quick is not None
+        try:
+            return self._quick.draw(values, rng)
+        except np.linalg.LinAlgError as error:
+            raise self._degenerate(error) from error
+
     def _moved(
         self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
     ) -> np.ndarray:
         """New values of one class of elements."""
         now = self.blanket.current(values, members)
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
-        quick = self._quick
-        if quick is not None and not self.debug:
-            new = quick.draw(values, rng)
-            if new is not None:
-                return new
         naturals, bounds = self._naturals(values, part)
         if isinstance(self.kind, Covariance):
             drawn: np.ndarray | None
@@ -126,13 +132,13 @@ class Conjugate(Kernel):
         return drawn
 
     @cached_property
-    def _quick(self) -> PlanarStep | None:
+    def _quick(self) -> PlanarStep | CountedShares | None:
         """A way round arrays, looked up at the first step."""
         alone = len(self.partners) == 1 and self.blanket.classes == (None,)
         if not alone or not self._constant:
             return None
         prior, bounds = self._prior({**self.blanket.target.known}, 0, None)
-        return None if bounds is not None else planar_step(self.partners[0], prior)
+        return None if bounds is not None else quick_step(self.partners[0], prior)
 
     def _naturals(self, values: Values, part: int) -> tuple[Naturals, Bounds | None]:
         """Natural parameters of the full conditional: the prior's and what children add."""

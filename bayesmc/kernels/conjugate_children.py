@@ -81,8 +81,8 @@ class Partner:
     # ---- evaluating ---------------------------------------------------------------------------
 
     def _natural(self, values: Values, members: np.ndarray | None) -> Naturals:
-        if self._counts is not None:
-            count = self._counts.at(values).count
+        if self.counts is not None:
+            count = self.counts.at(values).count
             return (count.reshape((len(count), -1)),)
         if self.is_mean_by_label:
             return self._by_label(values)
@@ -121,7 +121,7 @@ class Partner:
         return count * precision.matrix, np.matvec(precision.matrix, total)
 
     @cached_property
-    def _counts(self) -> Groups | None:
+    def counts(self) -> Groups | None:
         """Where the child is itself the label of somebody's sums, how often each of its states came.
 
         Looked up at the first step, when all kernels have been made.

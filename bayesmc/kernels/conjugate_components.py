@@ -1,8 +1,8 @@
-"""The components of mixtures in the plane as quick steps: from a state to the floats of ``conjugate_planar``.
+"""Quick steps for mixtures of few components: from a state to Python's floats, round arrays.
 
-A step is quick where a node holds the means or the covariances of two-dimensional normals by label, its
-prior is constant, and components are few. Everywhere else, and with the same law, ``conjugate`` works on
-arrays.
+A step is quick where a node holds the means or the covariances of two-dimensional normals by label
+(``conjugate_planar`` has the formulas), or the weights of labels that somebody counts, and its prior is
+constant. Everywhere else, and with the same law, ``conjugate`` works on arrays.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from bayesmc.kernels.conjugate_children import Partner
+from bayesmc.kernels.conjugate_data import Groups
 from bayesmc.kernels.conjugate_kinds import Naturals
 from bayesmc.kernels.conjugate_labels import ByLabel
 from bayesmc.kernels.conjugate_planar import FEW, planar_covariances, planar_means
@@ -91,7 +92,29 @@ class PlanarMeans(PlanarStep):
         return np.array(drawn).reshape(chains, self.labels, 2)
 
 
-def planar_step(partner: Partner, prior: Naturals) -> PlanarStep | None:
+class CountedShares:
+    """Weights of labels under a constant Dirichlet prior, all of whose concentrations are at least 1."""
+
+    def __init__(self, groups: Groups, prior: list[float]) -> None:
+        self.groups, self.prior = groups, prior
+
+    def draw(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
+        """New values, or None before anything was drawn where floats do not pay."""
+        chains, states = len(values[self.groups.label]), self.groups.states
+        if chains * states > FEW:
+            return None
+        rows = self.groups.at(values).rows
+        gammas = [
+            rng.standard_gamma(a + row[0]) for a, row in zip(self.prior * chains, rows, strict=True)
+        ]
+        if chains == 1:
+            total = sum(gammas)
+            return np.array([[g / total for g in gammas]])
+        found = np.array(gammas).reshape(chains, states)
+        return found / found.sum(axis=-1, keepdims=True)
+
+
+def quick_step(partner: Partner, prior: Naturals) -> PlanarStep | CountedShares | None:
     """The quick step of a node under its constant prior, where there is one.
 
     Parameters
@@ -101,6 +124,10 @@ def planar_step(partner: Partner, prior: Naturals) -> PlanarStep | None:
     prior : tuple of ndarray
         Natural parameters.
     """
+    if partner.counts is not None:
+        weights = prior[0].ravel().tolist()
+        fits = len(weights) == partner.counts.states and min(weights) >= 1.0
+        return CountedShares(partner.counts, weights) if fits else None
     way = partner.way
     if way is None or way.direct is None or set(way.direct) != {"loc", "cov"}:
         return None

@@ -31,8 +31,6 @@ from bayesmc.distributions.wishart import bartlett, gram
 from bayesmc.kernels.precisions import Precision, from_root
 from bayesmc.shapes import Shape
 
-#: numbers up to which Python's floats are faster than arrays
-_FEW = 24
 Naturals = tuple[np.ndarray, ...]
 #: lower and upper end of a truncated full conditional
 Bounds = tuple[Any, Any]
@@ -240,8 +238,6 @@ class Shares(Kind):
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
         counts = naturals[0]
-        if counts.size <= _FEW and counts.size == math.prod(shape) * counts.shape[-1]:
-            return _few_shares(counts, rng, shape)
         if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
             return None
         draw = rng.standard_gamma(counts, shape + counts.shape[-1:])
@@ -351,21 +347,6 @@ class RootOf(Distribution):
 
 def _covers(bounds: Bounds, low: float, high: float) -> bool:
     return bool(np.all(bounds[0] <= low) and np.all(bounds[1] >= high))
-
-
-def _few_shares(counts: np.ndarray, rng: np.random.Generator, shape: Shape) -> np.ndarray | None:
-    """The same in floats, which for few numbers are faster than arrays."""
-    size = counts.shape[-1]
-    numbers = counts.ravel().tolist()
-    if not min(numbers) >= 1.0:
-        return None
-    gammas = [rng.standard_gamma(a) for a in numbers]
-    drawn = []
-    for start in range(0, len(gammas), size):
-        row = gammas[start : start + size]
-        total = sum(row)
-        drawn += [g / total for g in row]
-    return np.array(drawn).reshape(shape + (size,))
 
 
 @cache

@@ -14,6 +14,7 @@ on why one at a time mixes slowly.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 

@@ -229,7 +229,12 @@ def _affine_sources(target: Target, term: Term, above: Sequence[str]) -> set[str
     loc = result.arguments.get("loc") if isinstance(result, TracedCall) else None
     if not isinstance(loc, Tracer):
         return set()
-    return {s.split("[")[0] for s in loc.sources} if loc.is_affine else None
+    return {n for s in loc.sources for n in above if _may_be(s, n)} if loc.is_affine else None
+
+
+def _may_be(source: str, name: str) -> bool:
+    """Whether a source may be a node, or a lookup in it: ``x[0]`` may be either."""
+    return source == name or (source.startswith(f"{name}[") and source.endswith("]"))
 
 
 def _hidden_above(target: Target, term: Term) -> list[str] | None:

@@ -15,6 +15,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -168,10 +169,7 @@ class Labels(Kernel):
             return None
         for row, log in zip(rows, logs, strict=True):  # type: ignore[arg-type]
             row[0] += log
-            size = 0.0
-            for a, most in zip(row, self._most_floats, strict=True):
-                size += abs(a) * most
-            if not size < _LARGEST:
+            if not sum(map(mul, map(abs, row), self._most_floats)) < _LARGEST:
                 return None
         table = np.array(rows)
         if chains == 1:

@@ -173,7 +173,7 @@ class Case:
     faults : dict
         Name -> a wrong kernel.
     reverse : callable, optional
-        ``reverse(make, target, memory)``: the reverse of a kernel, and its memory; by default the kernel itself.
+        ``reverse(make, target, memory)``: the reverse of a kernel, and its memory; by default itself.
     how : str
         How it gets data: ``given``, ``moving`` or ``posed``.
     warmup : int
@@ -199,6 +199,7 @@ class Case:
     statistics: Mapping[str, Statistic] = field(default_factory=dict)
     sizes: Mapping[str, int] = field(default_factory=dict)
     members: int = 1
+    _memories: dict[tuple[str, int], Memory] = field(default_factory=dict)
 
     def geweke(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
         own = {k: v for k, v in self.sizes.items() if k in ("draws", "chains")}
@@ -270,7 +271,10 @@ class Case:
         target = self.model.target(self.how)
         with running():
             kernel = make(target)
-            memory = self._adapted(kernel, target, self.pilots or rows * self.members)
+            pilots = self.pilots or rows * self.members
+            if (fault, pilots) not in self._memories:
+                self._memories[fault, pilots] = self._adapted(kernel, target, pilots)
+            memory = self._memories[fault, pilots]
             other, theirs = kernel, memory
             if self.reverse is not None:
                 other, theirs = self.reverse(make, target, memory)

@@ -44,7 +44,7 @@ class Careless(Slice):
 
     def step(self, values: Any, memory: Any, rng: Any, warmup: bool) -> Any:
         if warmup:
-            return {}, memory
+            return {self.blanket.name: values[self.blanket.name]}, memory
         shrink, slice._shrink = slice._shrink, _first_point
         try:
             return super().step(values, memory, rng, warmup)
@@ -81,25 +81,29 @@ def sliced(
     return make
 
 
+def last_first(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
+    return sliced(kind=LastFirst)(target), memory
+
+
 CARELESS = {"careless": sliced(kind=Careless)}
 
 ONE_NODE = {
-    "slice, line": Case(models.line(), sliced(), CARELESS, warmup=20),
-    "slice, half line": Case(
+    "line": Case(models.line(), sliced(), CARELESS, warmup=20),
+    "half line": Case(
         models.half_line(), sliced(), {**CARELESS, "no Jacobian": sliced(of=Tilted)}, warmup=20
     ),
-    "slice, bounded": Case(models.bounded(), sliced(), CARELESS, warmup=20),
-    "slice, bounds of parents": Case(models.moving_bounds("x"), sliced(), CARELESS, warmup=20),
-    "slice, bound of others": Case(
+    "bounded": Case(models.bounded(), sliced(), CARELESS, warmup=20),
+    "bounds of parents": Case(models.moving_bounds("x"), sliced(), CARELESS, warmup=20),
+    "bound of others": Case(
         models.moving_bounds("top"), sliced("top"), {"no Jacobian": sliced("top", of=Tilted)}, warmup=20
     ),
-    "slice, circle": Case(models.circle(), sliced(), CARELESS, warmup=20),
-    "slice, integers": Case(models.integers(), sliced(), CARELESS, warmup=20),
-    "slice, integers with bounds of parents": Case(models.moving_integers(), sliced(), CARELESS, warmup=20),
-    "slice, components": Case(
-        models.pairs(), sliced(), CARELESS, lambda make, target, memory: (sliced(kind=LastFirst)(target), memory)
+    "circle": Case(models.circle(), sliced(), CARELESS, warmup=20),
+    "integers": Case(models.integers(), sliced(), CARELESS, warmup=20),
+    "integers with bounds of parents": Case(models.moving_integers(), sliced(), CARELESS, warmup=20),
+    "components": Case(models.pairs(), sliced(), CARELESS, last_first),
+    "colours": Case(
+        models.ring(), sliced(), {"merged": sliced(classes=(None,))}, backwards, warmup=20
     ),
-    "slice, colours": Case(models.ring(), sliced(), {"merged": sliced(classes=(None,))}, backwards, warmup=20),
 }  # fmt: skip
 
 
@@ -129,7 +133,7 @@ def last_direction_first(make: Make, target: Target, memory: Any) -> tuple[Kerne
 FACTORS = {
     "factor slice": Case(
         models.several(), factors(), {"a prior forgotten": factors(np.s_[1:])},
-        last_direction_first, warmup=33, pilots=60, sizes={"draws": 30, "chains": 60, "replications": 500},
+        last_direction_first, warmup=33, pilots=60, sizes={"draws": 20, "chains": 120, "replications": 500},
     ),
 }  # fmt: skip
 

@@ -59,22 +59,22 @@ VOLUME = {"no volume": walk(kind=NoVolume)}
 OWN_SCALE = {"scale": 0.8, "unconstrained": False, "adaptive": False}
 
 ONE_NODE = {
-    "walk, line": Case(models.line(), walk(), DRIFT, warmup=30),
-    "walk, half line": Case(models.half_line(), walk(), VOLUME, warmup=30),
-    "walk, bounded": Case(models.bounded(), walk(), VOLUME, warmup=30),
-    "walk, bounds of parents": Case(models.moving_bounds("x"), walk(), VOLUME, warmup=30, sizes={"draws": 150}),
-    "walk, circle": Case(models.circle(), walk(), DRIFT, warmup=30),
-    "walk, simplex": Case(models.simplex(), walk(), VOLUME, warmup=30),
-    "walk, matrices": Case(models.matrices(), walk(), VOLUME, warmup=30),
-    "walk, colours": Case(
-        models.ring(), walk(), {"merged": walk(colours=False, scale=1.5, adaptive=False)}, backwards, warmup=30,
-        sizes={"draws": 150, "chains": 200},
+    "line": Case(models.line(), walk(), DRIFT, warmup=30),
+    "half line": Case(models.half_line(), walk(), VOLUME, warmup=30),
+    "bounded": Case(models.bounded(), walk(), VOLUME, warmup=30),
+    "bounds of parents": Case(
+        models.moving_bounds("x"), walk(), VOLUME, warmup=30, sizes={"draws": 150}
     ),
-    "walk, own scale": Case(
+    "circle": Case(models.circle(), walk(), DRIFT, warmup=30),
+    "simplex": Case(models.simplex(), walk(), VOLUME, warmup=30),
+    "matrices": Case(models.matrices(), walk(), VOLUME, warmup=30),
+    "colours": Case(
+        models.ring(), walk(), {"merged": walk(colours=False, scale=1.5, adaptive=False)}, backwards,
+        warmup=30, sizes={"draws": 150, "chains": 200},
+    ),
+    "own scale": Case(
         models.half_line(), walk(**OWN_SCALE), {"drift": walk(kind=Drifting, **OWN_SCALE)}
     ),
-}  # fmt: skip
-
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.starting import start_states
 from bayesmc.errors import DensityError, ZeroProbabilityError
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
-from bayesmc.kernels.conjugate_components import PlanarCovariances, PlanarMeans
+from bayesmc.kernels.conjugate_components import CountedShares, PlanarCovariances, PlanarMeans
 from bayesmc.kernels.conjugate_data import sums_by_label
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.labels import Labels, label_kernel
@@ -497,13 +497,19 @@ def test_a_mean_that_is_not_the_node_itself_takes_no_quick_step() -> None:
         assert isinstance(kernel, Conjugate) and kernel._quick is None
 
 
-def test_few_shares_are_those_of_the_arrays() -> None:
-    _, kernels, values = sweep(3, 4)
-    kernel = kernels[2]
-    counts = np.array([[3.0, 1.0, 8.0], [1.5, 2.0, 400.0]])
-    few = kernel.kind.draw((counts,), None, np.random.default_rng(0), (2,))
-    many = kernel.kind.draw((np.tile(counts, (6, 1)),), None, np.random.default_rng(0), (12,))
-    assert few is not None and many is not None
-    np.testing.assert_allclose(few, many[:2], rtol=1e-13)
+def test_quick_shares_are_those_of_the_arrays() -> None:
+    for chains in (1, 4):
+        label, kernels, values = sweep(3, chains)
+        values = {**values, "label": stepped(label, values)}
+        kernel = kernels[2]
+        assert isinstance(kernel._quick, CountedShares)
+        quick = kernel.step(values, {}, np.random.default_rng(7), False)[0]["weights"]
+        kernel._quick = None
+        slow = kernel.step(values, {}, np.random.default_rng(7), False)[0]["weights"]
+        np.testing.assert_allclose(quick, slow, rtol=1e-12)
+
+
+def test_small_concentrations_are_left_to_the_family() -> None:
+    _, kernels, _ = sweep(3, 1)
     small = np.array([[0.5, 1.0, 8.0]])
-    assert kernel.kind.draw((small,), None, np.random.default_rng(0), (1,)) is None
+    assert kernels[2].kind.draw((small,), None, np.random.default_rng(0), (1,)) is None
