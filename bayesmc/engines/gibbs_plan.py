@@ -20,13 +20,17 @@ from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.gaussian_block import gaussian_blocks
 from bayesmc.kernels.joint_states import joint_states
 from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.labels import label_kernel
 from bayesmc.kernels.lattice import lattice_kernel
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
+from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import table_kernel, table_kernels
 from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
+from bayesmc.structure.like_children import with_like_children
+from bayesmc.structure.stacked import stacks
 from bayesmc.structure.target import Target, target_of
 
 #: components that move together along learnt directions, at most
@@ -130,7 +134,7 @@ def _planned(problem: Problem, debug: bool) -> Plan:
     blankets = {name: Blanket(target, name) for name in target.chain}
     blocks = gaussian_blocks(target, blankets, debug)
     joined = {n for b in blocks for n in b.names}
-    kernels, constraints = _finite(target, blankets)
+    kernels, constraints = _finite(target, blankets, debug)
     refusals: dict[str, str] = {}
     numbers = []
     for name in target.chain:
@@ -154,7 +158,7 @@ def _planned(problem: Problem, debug: bool) -> Plan:
 
 
 def _finite(
-    target: Target, blankets: Mapping[str, Blanket]
+    target: Target, blankets: Mapping[str, Blanket], debug: bool
 ) -> tuple[list[Kernel], tuple[str, ...]]:
     """Kernels of finite nodes, and those that these may leave stuck."""
     names = [n for n in target.chain if target.model[n].domain is not None]
@@ -171,12 +175,19 @@ def _finite(
     wanted = [(n,) for n in names if n not in lattices] + blocks
     tabulated, left = table_kernels(target, wanted, terms)
     kernels += tabulated
+    alone = []
     for block in left:
         if len(block) > 1:
             kernels.append(joint_states(target, block, terms))
+        elif (kernel := table_kernel(blankets[block[0]], terms)) is not None:
+            kernels.append(kernel)
+        elif (kernel := label_kernel(blankets[block[0]], debug)) is not None:
+            kernels.append(kernel)
         else:
-            blanket = blankets[block[0]]
-            kernels.append(table_kernel(blanket, terms) or Enumerate(blanket))
+            alone.append(block[0])
+    groups, alone = stacks(target, blankets, alone)
+    kernels += [Stacked(group, Enumerate) for group in groups]
+    kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
     return kernels, (*tight, *deterministic_constraints(target, blocks, terms))
 
 
@@ -191,11 +202,13 @@ def _numbers(target: Target, blankets: Mapping[str, Blanket], names: Sequence[st
             kernels.append(Jump(blankets[name]))
         else:
             kernels.append(AdaptiveWalk(blankets[name]))
+    stacked, left = stacks(target, blankets, left)
+    kernels += [Stacked(group, Slice) for group in stacked]
     for group in _together(target, blankets, left):
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
             left = [n for n in left if n not in group]
-    return kernels + [Slice(blankets[n]) for n in left]
+    return kernels + [Slice(with_like_children(blankets[n])) for n in left]
 
 
 def _kind(target: Target, blanket: Blanket) -> str:

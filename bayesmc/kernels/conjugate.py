@@ -134,7 +134,8 @@ class Conjugate(Kernel):
     @cached_property
     def _quick(self) -> PlanarStep | CountedShares | None:
         """A way round arrays, looked up at the first step."""
-        alone = len(self.partners) == 1 and self.blanket.classes == (None,)
+        classes = self.blanket.classes
+        alone = len(self.partners) == 1 and len(classes) == 1 and classes[0] is None
         if not alone or not self._constant:
             return None
         prior, bounds = self._prior({**self.blanket.target.known}, 0, None)

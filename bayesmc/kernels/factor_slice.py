@@ -21,6 +21,7 @@ from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.slice import slice_move
 from bayesmc.network import CompiledNode
+from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.target import Target, Values
 
 #: sweeps at which the directions are learnt anew, in powers of two from here
@@ -42,7 +43,7 @@ class FactorSlice(Kernel):
     def __init__(self, target: Target, names: tuple[str, ...]) -> None:
         self.target = target
         self.names = names
-        self.terms = target.terms_of(names)
+        self.terms = TermSum(target, target.terms_of(names))
         self.path = target.below(names)
         self.shapes = [target.model[n].value_shape for n in names]
         self.sizes = [int(np.prod(s, dtype=int)) for s in self.shapes]
@@ -130,7 +131,7 @@ class FactorSlice(Kernel):
             state.update(self._split(np.where(inside[..., None], x, now))[0])
         for link in self.path:
             state[link], _ = self.target.model.evaluate(link, state)
-        log = np.broadcast_to(self.target.log_density(state, self.terms) + volume, x.shape[:-1])
+        log = np.broadcast_to(self.terms.log_density(state) + volume, x.shape[:-1])
         return log if inside.all() else np.where(inside, log, -np.inf)
 
     def _widened(self, memory: Memory, k: int, step: float) -> Memory:

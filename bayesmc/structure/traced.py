@@ -39,8 +39,10 @@ class Traced:
         """Names that the result varies with; ``x[0]`` through the first lookup, ``x[*]`` through all of x."""
         if not isinstance(self.result, TracedCall):
             return _sources(self.result, 0)
-        ndims = getattr(self.result.function, "parameter_ndim", {})
-        found = (_sources(v, ndims.get(k, 0)) for k, v in self.result.traced.items())
+        found = (
+            _sources(v, _event_axes(self.result.function, k))
+            for k, v in self.result.traced.items()
+        )
         return frozenset().union(*found)
 
 
@@ -166,6 +168,13 @@ def _same_keys(
     wanted = [tuple(np.asarray(k).tobytes() for k in pair) for pair in keys]
     found = [tuple(np.asarray(k).tobytes() for k in pair) for pair in again]
     return all(k in found for k in wanted)
+
+
+def _event_axes(family: Any, parameter: str) -> int:
+    """Axes that one value of a parameter has, whatever it is given as."""
+    ndims = getattr(family, "parameter_ndim", {})
+    others = {"scale_tril": 2, "scale_diag": 1, "logits": ndims.get("probs", 0)}
+    return ndims.get(parameter, others.get(parameter, 0))
 
 
 def _sources(value: Any, event_ndim: int) -> frozenset[str]:

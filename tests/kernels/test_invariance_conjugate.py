@@ -286,7 +286,7 @@ def test_block(name: str, test: str, fault: str) -> None:
 
 @pytest.mark.parametrize(("name", "fault"), each_fault(KEPT_BLOCKS))
 def test_block_with_what_is_kept_of_the_evidence(name: str, fault: str) -> None:
-    KEPT_BLOCKS[name].check("ranks", fault, replications=60)
+    KEPT_BLOCKS[name].check("ranks", fault, replications=40)
 
 
 # ---- scales with a block integrated out --------------------------------------------------------------

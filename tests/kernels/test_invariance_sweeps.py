@@ -103,7 +103,7 @@ HALF_A_SHAPE = {
     "scale": with_pairs("scale", lambda right: lambda e: (0.5 * right(e)[0], right(e)[1])),
     "covariance": with_pairs("covariance", lambda right: lambda e: 0.5 * right(e)),
 }
-SHIFTED = with_pairs("mean", lambda right: lambda e, residual: right(e, residual) + 0.7)
+SHIFTED = with_pairs("mean", lambda right: lambda e, residual: right(e, residual) + 1.5)
 
 
 def without_weights(kernel: Enumerate) -> Kernel:
