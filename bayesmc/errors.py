@@ -76,12 +76,12 @@ class ParameterError(BayesmcError, ValueError):
 
     @property
     def is_overflow(self) -> bool:
-        """Whether the value is infinite, NaN or zero: it over- or underflowed on the way, as vague priors
-        make it, rather than being wrong for what it is.
+        """Whether the value is infinite or zero: it over- or underflowed on the way, as vague priors make it,
+        rather than being wrong for what it is.
         """
         if not isinstance(self.value, (int, float)) and not hasattr(self.value, "dtype"):
             return False
-        return all(v != v or v in (math.inf, -math.inf, 0) for v in _numbers(self.value))
+        return all(v in (math.inf, -math.inf, 0) for v in _numbers(self.value))
 
 
 def _numbers(value: Any) -> list[Any]:

@@ -25,6 +25,7 @@ from bayesmc.errors import (
     BayesmcError,
     ConvergenceWarning,
     InterruptWarning,
+    ReducibleWarning,
     UnsupportedError,
 )
 from bayesmc.network import Model, Problem
@@ -222,6 +223,19 @@ class ChainEngine(Engine):
         band = getattr(sampler, "acceptance_band", _BAND)
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
+
+
+def warn_of_ties(engine: str, names: Sequence[str]) -> None:
+    """Warn that zeros in tables may hold chains."""
+    shown = ", ".join(map(repr, names[:6]))
+    if len(names) > 6:
+        shown += f" and {len(names) - 6} more"
+    warnings.warn(
+        f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
+        "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
+        ReducibleWarning,
+        stacklevel=5,
+    )
 
 
 def known_values(problem: Problem) -> dict[str, np.ndarray]:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.engines.base import Treatment
-from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.chains import ChainEngine, warn_of_ties
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.gibbs_plan import Plan, plan_of
 from bayesmc.engines.starting import start_states
-from bayesmc.errors import ReducibleWarning
 from bayesmc.network import Problem
 from bayesmc.network.forward import Pass, run
 from bayesmc.structure.target import Values
@@ -79,13 +77,7 @@ class Gibbs(ChainEngine):
     def sampler(self, problem: Problem) -> GibbsSampler:
         plan = plan_of(problem, self.debug)
         if plan.constraints:
-            warnings.warn(
-                f"Gibbs: zero probabilities tie {_listed(plan.constraints)} together, so a chain may not "
-                "reach every configuration that is possible; compare with Exact() or "
-                "LikelihoodWeighting(draws)",
-                ReducibleWarning,
-                stacklevel=5,
-            )
+            warn_of_ties("Gibbs", plan.constraints)
         return GibbsSampler(plan)
 
 
@@ -139,11 +131,3 @@ class GibbsSampler:
             if rate is not None:
                 found[", ".join(kernel.names)] = rate
         return found
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(map(repr, names[:6]))
-    return shown if len(names) <= 6 else f"{shown} and {len(names) - 6} more"

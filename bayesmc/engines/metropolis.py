@@ -9,12 +9,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.chains import ChainEngine, warn_of_ties
 from bayesmc.engines.metropolis_plan import Plan, plan_of
 from bayesmc.engines.metropolis_proposals import RandomWalk, check_specification
 from bayesmc.engines.starting import start_states
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.coupling import deterministic_constraints
 from bayesmc.kernels.ensemble import BlockWalk, stragglers
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
@@ -116,7 +117,12 @@ class MetropolisHastings(ChainEngine):
         return self._plan(problem).describe()
 
     def sampler(self, problem: Problem) -> MetropolisSampler:
-        return MetropolisSampler(self._plan(problem), self.warmup, self.thinning)
+        plan = self._plan(problem)
+        jointly = {n for key in self._given if isinstance(key, tuple) for n in key}
+        tied = [n for n in deterministic_constraints(plan.target, ()) if n not in jointly]
+        if tied:
+            warn_of_ties("MetropolisHastings", tied)
+        return MetropolisSampler(plan, self.warmup, self.thinning)
 
     def continues(self, other: Any) -> bool:
         if type(other) is not type(self) or list(other._given) != list(self._given):

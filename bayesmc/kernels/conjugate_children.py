@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesmc.distributions import Categorical, Distribution
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements, Groups, counted
 from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, slope_of
 from bayesmc.kernels.conjugate_kinds import Kind, Naturals
@@ -235,10 +236,16 @@ class Partner:
         loc = result.arguments["loc"] if isinstance(result, TracedCall) else None
         if not (isinstance(loc, Tracer) and loc.is_affine):
             return
-        state = {n: np.zeros((1, *target.model[n].value_shape)) for n in order}
-        state = {**target.known, **state}
-        target.refresh(state, order)
-        dist, _, _ = self._distribution(state, members, True)
+        # values that can be: the noise may depend on some of these nodes, too
+        state = {**target.known}
+        for n in order:
+            shape = target.model[n].value_shape
+            state[n] = np.asarray(target.model.probe[n], dtype=float).reshape(-1, *shape)[:1]
+        try:
+            target.refresh(state, order)
+            dist, _, _ = self._distribution(state, members, True)
+        except BayesmcError:
+            return
         slope = slope_of(dist, len(self.term.shape), self._steps)
         if np.isfinite(slope).all():
             self._slope = slope

@@ -13,10 +13,12 @@ import numpy as np
 
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped, transform_of
+from bayesmc.errors import ShapeError
 from bayesmc.kernels.adaptation import Steps, chance
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import accepted, compare, instead
 from bayesmc.network import Model
+from bayesmc.shapes import broadcasts_to
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
 
@@ -87,7 +89,13 @@ class AdaptiveWalk(Kernel):
         self.free_shape = walked(support, node.event_shape, unconstrained).unconstrained_shape
         size = math.prod(self.free_shape)
         if scale is not None:
-            full = np.broadcast_to(scale, node.plate_shape + self.free_shape)
+            wanted = node.plate_shape + self.free_shape
+            if not broadcasts_to(np.shape(scale), wanted):
+                raise ShapeError(
+                    f"RandomWalk: the scale for node {node.name!r} has shape {np.shape(scale)}, which does "
+                    f"not fit {wanted}; give one number, or one for each number that walks"
+                )
+            full = np.broadcast_to(scale, wanted)
             scale = full.reshape(blanket.size, size)
         self.steps = Steps(size, scale, adaptive)
         if not adaptive:

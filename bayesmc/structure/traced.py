@@ -40,8 +40,7 @@ class Traced:
         if not isinstance(self.result, TracedCall):
             return _sources(self.result, 0)
         found = (
-            _sources(v, _event_axes(self.result.function, k))
-            for k, v in self.result.traced.items()
+            _sources(v, _event_axes(self.result.function, k)) for k, v in self.result.traced.items()
         )
         return frozenset().union(*found)
 

@@ -203,7 +203,7 @@ class Case:
 
     def geweke(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
         own = {k: v for k, v in self.sizes.items() if k in ("draws", "chains")}
-        sizes = {"draws": 40, "chains": 120, **own, **sizes}
+        sizes = {"draws": 30, "chains": 160, **own, **sizes}
         sizes["draws"] *= LONGER
         kernel, _ = self._kernels(fault, sizes["chains"])
         return geweke_test(

@@ -116,13 +116,16 @@ def test_one_node(name: str, fault: str, test: str) -> None:
 # ---- several nodes along learnt directions -------------------------------------------------------------
 
 
-def factors(terms: Any = np.s_[:]) -> Make:
-    def make(target: Target) -> Kernel:
-        kernel = FactorSlice(target, ("a", "s", "v", "u"))
-        kernel.terms = kernel.terms[terms]
-        return kernel
+class Forgetful(FactorSlice):
+    """Forgets the prior of one node."""
 
-    return make
+    def _log(self, values: Any, x: np.ndarray) -> np.ndarray:
+        prior = self.target.terms["a"].log({**values, **self._split(x)[0]})
+        return super()._log(values, x) - prior
+
+
+def factors(kind: type[FactorSlice] = FactorSlice) -> Make:
+    return lambda target: kind(target, ("a", "s", "v", "u"))
 
 
 def last_direction_first(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
@@ -132,7 +135,7 @@ def last_direction_first(make: Make, target: Target, memory: Any) -> tuple[Kerne
 
 FACTORS = {
     "factor slice": Case(
-        models.several(), factors(), {"a prior forgotten": factors(np.s_[1:])},
+        models.several(), factors(), {"a prior forgotten": factors(Forgetful)},
         last_direction_first, warmup=33, pilots=60, sizes={"draws": 20, "chains": 120, "replications": 500},
     ),
 }  # fmt: skip
@@ -177,7 +180,8 @@ STACKED = {
         like_nodes(), stacked("x", Slice), {"careless": stacked("x", Careless)}, how="moving", warmup=20
     ),
     "labels": Case(
-        like_nodes(), stacked("z", Enumerate), {"no prior": stacked("z", Enumerate, False)}, how="moving"
+        like_nodes(), stacked("z", Enumerate), {"no prior": stacked("z", Enumerate, False)}, how="moving",
+        sizes={"replications": 4000},
     ),
 }  # fmt: skip
 

@@ -267,7 +267,10 @@ class _Wide(GaussianBlock):
 MODELS = {"coupled": _coupled(), "grown": _grown(), "vectors": _vectors()}
 BLOCKS = {
     name: Case(
-        m, _block(m), {"wide": _block(m, _Wide), "no prior": _block(m, terms=slice(1, None))}
+        m,
+        _block(m),
+        {"wide": _block(m, _Wide), "no prior": _block(m, terms=slice(1, None))},
+        sizes={"replications": 3000},
     )
     for name, m in MODELS.items()
 }

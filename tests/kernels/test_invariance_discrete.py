@@ -332,11 +332,11 @@ CASES = {
     ),
     "field": Case(
         field(), lattice(SiteSums), {"colours merged": lattice(SiteSums, False)},
-        lattice_backwards, how="moving", statistics=alike("s"),
+        lattice_backwards, how="moving", statistics=alike("s"), sizes={"replications": 3000},
     ),
     "field of counts": Case(
         field(), lattice(SiteCounts), {"colours merged": lattice(SiteCounts, False)},
-        lattice_backwards, how="posed", statistics=alike("s"), sizes={"replications": 2000},
+        lattice_backwards, how="posed", statistics=alike("s"), sizes={"replications": 3000},
     ),
     "joint states": Case(
         tied(True), joint(JointStates), {"no prior": joint(JointStates, slice(1, None))}
@@ -353,7 +353,9 @@ CASES = {
         ring(1.5), jump("z"), {"colours merged": jump("z", colours=False)}, backwards,
         statistics=alike("z"), sizes={"draws": 150, "steps": 5, "replications": 8000},
     ),
-    "jump in order": Case(ordered(), jump("z"), of_jumps("z"), warmup=20),
+    "jump in order": Case(
+        ordered(), jump("z"), of_jumps("z"), warmup=20, sizes={"replications": 8000}
+    ),
     "jump of counts": Case(counts(), jump("n"), of_jumps("n"), warmup=20),
     "jump of a given size": Case(counts(), jump("n", size=2), of_jumps("n", size=2)),
     "jump of tallies": Case(tallies(), jump("n"), of_jumps("n"), warmup=20),

@@ -127,11 +127,12 @@ SCALES = {"scale": [0.8, 0.4, 0.4, 0.4], "unconstrained": False, "adaptive": Fal
 SEVERAL = {
     "block walk": Case(models.few(), together(), {"no volume": together(NoBlockVolume)}, warmup=30),
     "block walk, own scale": Case(
-        models.few(), together(**SCALES), {"drift": together(DriftingBlock, **SCALES)}
+        models.few(), together(**SCALES), {"drift": together(DriftingBlock, **SCALES)},
+        sizes={"draws": 120},
     ),
     "ensembles": Case(
         models.two(), ensembles(), {"own half": ensembles(OwnHalf), "no volume": ensembles(NoBlockVolume)},
-        members=4, warmup=30, sizes={"draws": 100, "replications": 2000},
+        members=4, warmup=30, sizes={"draws": 100, "replications": 8000},
     ),
 }  # fmt: skip
 
@@ -179,7 +180,7 @@ def proposed(key: Any, given: Any, right: bool = True) -> Make:
 
 def of_proposal(model: Model, key: Any, given: Any, **options: Any) -> Case:
     faults = {"no Hastings correction": proposed(key, given, right=False)}
-    sizes = {"draws": 150, "chains": 120, "replications": 3000}
+    sizes = {"draws": 150, "chains": 200, "replications": 3000}
     return Case(model, proposed(key, given), faults, sizes=sizes, **options)
 
 
