@@ -226,7 +226,7 @@ def _checked(engine: Any) -> Any:
         )
     if not isinstance(engine, Engine):
         raise TypeError(
-            f"engine={engine!r} is not an engine; use Exact(), LikelihoodWeighting(draws), ..."
+            f"engine={engine!r} is not an engine; use Exact(), Gibbs(draws), LikelihoodWeighting(draws), ..."
         )
     return engine
 

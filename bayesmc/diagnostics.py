@@ -125,8 +125,8 @@ def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray
     block : int
         Draws of a chain come in turn from this many members of an ensemble. Neighbours are then nearly
         independent while draws ``block`` apart are not, so errors are those of the means of blocks, an
-        effective size is a variance over a squared error (at most the number of draws), and R-hat
-        compares the means of blocks. Draws after the last whole block do not count.
+        effective size is a variance over a squared error (at most the number of draws). R-hat compares
+        ensembles with the spread of the draws within them. Draws after the last whole block do not count.
 
     Notes
     -----
@@ -170,7 +170,7 @@ def _figure(kind: str, values: np.ndarray, block: int) -> float:
     if np.isnan(values).any():
         return float("nan")
     if kind == "rhat":
-        return _rhat(_block_means(values, block))
+        return _rhat(values)
     if kind != "mcse":
         return _ess(kind, values, block)
     if values.min() == values.max():  # rounding makes their standard deviation positive

@@ -91,7 +91,7 @@ def _disagreement(judged: _Judged) -> Iterator[str]:
     )
     others = _others([value > MAX_RHAT for value in judged.rhat.values()], judged.looked)
     yield (
-        f"the chains have not mixed: R-hat of {worst!r} is {rhat:.3g} ({still}{others}); use more warmup= "
+        f"the chains have not mixed: R-hat of {worst!r} is {rhat:.3f} ({still}{others}); use more warmup= "
         "and draws= (infer(..., resume=posterior) adds draws), or another engine"
     )
 

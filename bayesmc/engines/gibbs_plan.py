@@ -74,7 +74,7 @@ class Plan:
             if name not in by_name:
                 forward = name in self.target.forward and node.is_stochastic
                 barren = forward and self.target.seen(name) is None
-                why = "nothing observed depends on it" if barren else treatment(self.problem, name)
+                why = "nothing observed depends on it" if barren else self._given(name)
                 rows.append(Treatment(name, "forward" if barren else "", why, plates))
                 continue
             kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
@@ -85,6 +85,13 @@ class Plan:
             colour = f"{number[name]}" + (f" (elements: {classes})" if classes > 1 else "")
             rows.append(Treatment(name, " + ".join(dict.fromkeys(kinds)), why, plates, colour))
         return rows
+
+    def _given(self, name: str) -> str:
+        """What is said of a node that no kernel moves."""
+        seen = self.target.seen(name)
+        if seen is None:
+            return treatment(self.problem, name)
+        return "observed" if seen.mask is None else "observed in part; the rest is drawn forward"
 
     def in_short(self) -> str:
         """How many nodes each kind of kernel moves."""

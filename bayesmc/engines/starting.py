@@ -25,7 +25,7 @@ from bayesmc.structure.target import Target, Values
 _SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 0.0)
 _ATTEMPTS = 8
 #: numbers of one node drawn at once, at most, where possible states are rare
-_MOST = 1 << 21
+_MOST = 1 << 19
 #: the most that draws of a half line go from the middle
 _FROM_ZERO = 0.9
 #: supports that hold every point between two of theirs

@@ -77,6 +77,8 @@ class FactorSlice(Kernel):
             try:
                 t = slice_move(log_density, np.zeros(len(x)), width, rng)
             except DensityError as error:
+                if "node" in str(error):
+                    raise
                 raise DensityError(f"nodes {', '.join(map(repr, self.names))}: {error}") from error
             x = x + t[:, None] * direction
             if warmup:

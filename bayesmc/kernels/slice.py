@@ -183,7 +183,7 @@ class Slice(Kernel):
         if self.is_integer:  # a number uniform in the cell of each integer
             x = x + rng.random(x.shape)
             high = high + 1.0
-        start, here = low, x
+        start, end, here = low, high, x
         if self.on_logs:  # scales differ by factors: near zero an additive step would take forever
             x = np.log(x - start)
             low = high = np.inf
@@ -191,12 +191,13 @@ class Slice(Kernel):
 
         def log_density(tried: np.ndarray) -> np.ndarray:
             if self.is_integer:
-                tried = np.floor(tried)
+                tried = np.floor(tried).astype(now.dtype)
             logs = tried
             inside: Any = True
             if self.on_logs:
                 tried = start + np.exp(tried)
-                inside = (tried > start) & (tried < np.inf)
+            if not self.is_integer:  # a density may be infinite at a bound, which rounding can reach
+                inside = (tried > start) & (tried < end)
                 tried = np.where(inside, tried, here)
             if not component:
                 candidate = tried
@@ -205,13 +206,17 @@ class Slice(Kernel):
                 candidate[at] = tried
             log = blanket.log_density(values, candidate, members)
             if self.on_logs:
-                log = np.where(inside, log + logs, -np.inf)
+                log = log + logs
+            if not self.is_integer:
+                log = np.where(inside, log, -np.inf)
             return np.broadcast_to(log, tried.shape)
 
         try:
             moved = slice_move(log_density, x, width, rng, low, high, growth)
         except DensityError as error:
-            raise DensityError(f"node {blanket.name!r}: {error}") from error
+            if f"{blanket.name!r}" in str(error):
+                raise
+            raise DensityError(f"node {blanket.name!r}: {error}", error.index) from error
         if self.is_integer:
             moved = np.floor(moved)
         if self.on_logs:

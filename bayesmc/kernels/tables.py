@@ -91,6 +91,13 @@ class TableSweep(Kernel):
         self.dtypes = [d.dtype for d in domains if d is not None]
         self.dtype = max(self.dtypes, key=lambda d: d.itemsize)
 
+    def words(self, name: str) -> tuple[str, str]:
+        with_it = [c.names for c in self.conditionals if name in c.names and len(c.names) > 1]
+        if not with_it:
+            return self.label, self.match
+        others = dict.fromkeys(n for names in with_it for n in names if n != name)
+        return self.label, f"{self.match}, jointly with {', '.join(others)}"
+
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
