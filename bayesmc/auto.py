@@ -201,9 +201,15 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
             "engine=bmc.Exact() answers all the same"
         )
     refused = {"Exact": why_not}
-    plan = plan_of(problem)
     weighting = LikelihoodWeighting()
     forward = weighting.refusal(problem)
+    no_plan = Gibbs().refusal(problem)
+    if no_plan is not None:
+        if forward is not None:
+            raise UnsupportedError(f"infer: no engine can answer. {why_not}. {forward}. {no_plan}")
+        refused["Gibbs"] = no_plan
+        return weighting, ("every hidden node can be sampled given its parents",), refused
+    plan = plan_of(problem)
     if plan.kernels and (forward is not None or not plan.constraints):
         if forward is not None:
             refused["LikelihoodWeighting"] = forward

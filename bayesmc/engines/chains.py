@@ -24,7 +24,9 @@ from bayesmc.engines.weighted import check_count, no_memory
 from bayesmc.errors import (
     BayesmcError,
     ConvergenceWarning,
+    DensityError,
     InterruptWarning,
+    ParameterError,
     ReducibleWarning,
     UnsupportedError,
 )
@@ -277,7 +279,11 @@ class _Loop:
             # a sampler may write into its state, and the earlier posterior stays as it is
             return copy.deepcopy(self.last.state)
         with marking_invalid(), np.errstate(all="ignore"):
-            state = self.sampler.start(self.rng, self.engine.chains)
+            try:
+                state = self.sampler.start(self.rng, self.engine.chains)
+            except (DensityError, ParameterError) as error:
+                error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
+                raise
             self.phase = " (warmup)"
             for _ in range(self.engine.warmup):
                 stop.check()

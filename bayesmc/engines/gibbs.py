@@ -13,6 +13,7 @@ from bayesmc.engines.chains import ChainEngine, warn_of_ties
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.gibbs_plan import Plan, plan_of
 from bayesmc.engines.starting import start_states
+from bayesmc.errors import UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.network.forward import Pass, run
 from bayesmc.structure.target import Values
@@ -66,6 +67,10 @@ class Gibbs(ChainEngine):
     label: ClassVar[str] = "Gibbs sampling"
 
     def refusal(self, problem: Problem) -> str | None:
+        try:
+            plan_of(problem, self.debug)
+        except UnsupportedError as error:
+            return f"Gibbs has no kernel for this net: {error}"
         return None
 
     def describe(self, problem: Problem) -> dict[str, str]:

@@ -26,6 +26,8 @@ from bayesmc.structure.target import Target, Values
 
 #: sweeps of the warmup that are watched
 _WATCH_FROM, _WATCH_TO = 40, 240
+#: sweeps of the watch without which nothing is called slow
+_ENOUGH = 50
 #: lags, and the autocorrelations there that count as slow
 _SLOW = ((1, 0.6), (10, 0.1))
 #: components of a block that is worth it
@@ -85,7 +87,7 @@ class CollapsedBlock(Kernel):
     def start(self, values: Values, chains: int) -> Memory:
         return {
             "sweep": 0,
-            "slow": dict.fromkeys(self.blankets, True),
+            "slow": dict.fromkeys(self.blankets, False),
             "width": dict.fromkeys(self.blankets, 1.0),
             "step": dict.fromkeys(self.blankets, 0.0),
             "series": {n: np.zeros((0, chains)) for n in self.blankets},
@@ -119,6 +121,7 @@ class CollapsedBlock(Kernel):
 
     def end_warmup(self, memory: Memory) -> Memory:
         alone = {n: k.end_warmup(memory["alone"][n]) for n, k in self.alone.items()}
+        memory = self._decided(memory)  # a short warmup may end within the watch
         return {**memory, "alone": alone}
 
     # ---- private -------------------------------------------------------------------------------
@@ -168,8 +171,14 @@ class CollapsedBlock(Kernel):
         series = {}
         for name, seen in memory["series"].items():
             series[name] = np.vstack([seen, self.transforms[name].unconstrain(state[name])])
-        if sweep < _WATCH_TO:
-            return {**memory, "series": series}
+        memory = {**memory, "series": series}
+        return memory if sweep < _WATCH_TO else self._decided(memory)
+
+    def _decided(self, memory: Memory) -> Memory:
+        """Which nodes are slow, if enough was seen of them to tell."""
+        series = memory["series"]
+        if min(len(seen) for seen in series.values()) < _ENOUGH:
+            return memory
         slow = {
             name: any(_autocorrelation(seen, lag) > limit for lag, limit in _SLOW)
             for name, seen in series.items()

@@ -196,7 +196,9 @@ class Slice(Kernel):
             inside: Any = True
             if self.on_logs:
                 tried = start + np.exp(tried)
-            if not self.is_integer:  # a density may be infinite at a bound, which rounding can reach
+            if (
+                not self.is_integer
+            ):  # a density may be infinite at a bound, which rounding can reach
                 inside = (tried > start) & (tried < end)
                 tried = np.where(inside, tried, here)
             if not component:

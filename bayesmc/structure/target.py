@@ -49,10 +49,6 @@ class Term:
         """The nodes it reads directly, its own among them."""
         return self.parents if self.is_potential else (*self.parents, self.name)
 
-    @property
-    def has_density(self) -> bool:
-        return not self.is_potential
-
     def distribution(self, values: Mapping[str, np.ndarray]) -> tuple[Distribution, Shape]:
         """A node's distribution given its parents, and the batch shape of those."""
         return self.model.evaluate(self.name, values)

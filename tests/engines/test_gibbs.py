@@ -181,7 +181,8 @@ def test_vague_priors_do_not_keep_chains_from_starting() -> None:
     x = np.array([-1.5, -0.5, 0.5, 1.5])
     net.add("r", lambda a, b, effect: bmc.Binomial(20, logits=a + b * x + effect), plates="i")
     posterior = bmc.infer(net, {"r": [3, 8, 11, 17]}, engine=bmc.Gibbs(200, 200), rng=0)
-    assert abs(posterior.mean("a")) < 2 and 0 < posterior.mean("b") < 4
+    # shares .15 .4 .55 .85: a slope near 1.1 on the logit scale; the prior has |a|, |b| near 1000
+    assert abs(posterior.mean("a")) < 0.6 and 0.5 < posterior.mean("b") < 2.0
 
 
 def test_impossible_evidence_names_the_culprit() -> None:
@@ -273,5 +274,6 @@ def test_nodes_that_nothing_observed_depends_on_are_drawn_afresh() -> None:
     net.table("c", ["b"], [[0.9999, 0.0001], [0.0001, 0.9999]])
     net.add("y", lambda a: bmc.Normal(a, 2.0))
     posterior = bmc.infer(net, {"y": 0.5}, engine=bmc.Gibbs(2000, 10), rng=0)
+    # 8,000 independent draws: five standard errors, a false alarm in two million
     assert posterior.ess("c") > 4000
     assert abs(posterior.mean("c") - 0.5) < 5 * 0.5 / np.sqrt(8000)

@@ -157,7 +157,9 @@ def _key(pair: Pair) -> tuple[str, str, str]:
 
 def _case(prior: Any, child: Callable[[Any], Any], how: str, fault: Callable[[Pair], Pair]) -> Case:
     model = Model(mixture(prior, child), ("y",), ("x",))
-    return Case(model, _kernel(), {"wrong": _kernel([fault(p) for p in PAIRS])}, how=how)
+    wrong = _kernel([fault(p) for p in PAIRS])
+    # draws are independent given the data: short chains do
+    return Case(model, _kernel(), {"wrong": wrong}, how=how, sizes={"draws": 15, "chains": 240})
 
 
 @pytest.mark.parametrize("fault", ["", "wrong"])
