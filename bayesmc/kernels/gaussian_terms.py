@@ -31,6 +31,8 @@ class BlockTerm:
         self.own = term.name in layout.names
         self.d = math.prod(self.node.event_shape)
         self.count = math.prod(term.shape)
+        #: elements that count
+        self.seen = self.count if term.mask is None else int(term.mask.sum())
         self.children: dict[str, Child] = {}
         for name, blanket in blankets.items():
             for child in blanket.children:
@@ -71,10 +73,10 @@ class BlockTerm:
         uniform = self._uniform_scale(dist)
         if fixed and not self.frozen and uniform is not None:
             if self.summed is None:
-                self.summed = _first(self._sums(*self._rows(base, dist), spots))
+                self.summed = _first(self._sums(*self._masked(*self._rows(base, dist)), spots))
             weight = uniform**-2.0
             precision, linear, constant = self.summed
-            constant = weight * constant - self.count * np.log(uniform)
+            constant = weight * constant - self.seen * np.log(uniform)
             sums.add(weight[:, None] * precision, weight[:, None] * linear, constant)
             return
         rows = self.kept
@@ -97,7 +99,7 @@ class BlockTerm:
 
     def _uniform_scale(self, dist: Any) -> np.ndarray | None:
         """The noise of a scalar term where it is the same for all its elements, shape (chains or 1,)."""
-        if self.d != 1 or isinstance(dist, MvNormal) or self.term.mask is not None:
+        if self.d != 1 or isinstance(dist, MvNormal):
             return None
         scale = dist.scale
         plates = len(self.term.shape)
@@ -168,9 +170,15 @@ class BlockTerm:
             joint = joint / scale[..., None]
             log_scale = np.log(scale).sum(axis=-1)
         if self.term.mask is not None:
-            joint = joint * self.term.mask.reshape(-1, 1, 1)
             log_scale = log_scale * self.term.mask.reshape(-1)
-        return (joint[..., :-1], joint[..., -1]), log_scale.sum(axis=-1)
+        return self._masked(joint[..., :-1], joint[..., -1]), log_scale.sum(axis=-1)
+
+    def _masked(self, rows: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of elements that do not count as zeros."""
+        mask = self.term.mask
+        if mask is None:
+            return rows, rest
+        return rows * mask.reshape(-1, 1, 1), rest * mask.reshape(-1, 1)
 
     def _spots(self, keys: Any) -> tuple[np.ndarray, np.ndarray]:
         """Positions of the columns ``(lead, elements, columns)``, and entries of their pairs."""

@@ -182,7 +182,7 @@ CASES = (
         "test1",
         dyes,
         cdfs=lambda data: dyes_cdfs(data["y"]),
-        settings={"chains": 64, "draws": 3000, "warmup": 2000},
+        settings=MANY_CHAINS,
         remark="six batches hardly tell their variance from zero, and near zero a batch's mean and "
         "the precision hold each other fast",
     ),

@@ -272,9 +272,10 @@ class Case:
         with running():
             kernel = make(target)
             pilots = self.pilots or rows * self.members
-            if (fault, pilots) not in self._memories:
-                self._memories[fault, pilots] = self._adapted(kernel, target, pilots)
-            memory = self._memories[fault, pilots]
+            key = (fault, pilots)
+            if key not in self._memories:
+                self._memories[key] = self._adapted(kernel, target, pilots)
+            memory = self._memories[key]
             other, theirs = kernel, memory
             if self.reverse is not None:
                 other, theirs = self.reverse(make, target, memory)

@@ -85,24 +85,25 @@ def last_first(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
     return sliced(kind=LastFirst)(target), memory
 
 
+WARM = {"warmup": 20, "pilots": 100}
 CARELESS = {"careless": sliced(kind=Careless)}
 
 ONE_NODE = {
-    "line": Case(models.line(), sliced(), CARELESS, warmup=20),
+    "line": Case(models.line(), sliced(), CARELESS, **WARM),
     "half line": Case(
-        models.half_line(), sliced(), {**CARELESS, "no Jacobian": sliced(of=Tilted)}, warmup=20
+        models.half_line(), sliced(), {**CARELESS, "no Jacobian": sliced(of=Tilted)}, **WARM
     ),
-    "bounded": Case(models.bounded(), sliced(), CARELESS, warmup=20),
-    "bounds of parents": Case(models.moving_bounds("x"), sliced(), CARELESS, warmup=20),
+    "bounded": Case(models.bounded(), sliced(), CARELESS, **WARM),
+    "bounds of parents": Case(models.moving_bounds("x"), sliced(), CARELESS, **WARM),
     "bound of others": Case(
-        models.moving_bounds("top"), sliced("top"), {"no Jacobian": sliced("top", of=Tilted)}, warmup=20
+        models.moving_bounds("top"), sliced("top"), {"no Jacobian": sliced("top", of=Tilted)}, **WARM
     ),
-    "circle": Case(models.circle(), sliced(), CARELESS, warmup=20),
-    "integers": Case(models.integers(), sliced(), CARELESS, warmup=20),
-    "integers with bounds of parents": Case(models.moving_integers(), sliced(), CARELESS, warmup=20),
+    "circle": Case(models.circle(), sliced(), CARELESS, **WARM),
+    "integers": Case(models.integers(), sliced(), CARELESS, **WARM),
+    "integers with bounds of parents": Case(models.moving_integers(), sliced(), CARELESS, **WARM),
     "components": Case(models.pairs(), sliced(), CARELESS, last_first),
     "colours": Case(
-        models.ring(), sliced(), {"merged": sliced(classes=(None,))}, backwards, warmup=20
+        models.ring(), sliced(), {"merged": sliced(classes=(None,))}, backwards, **WARM
     ),
 }  # fmt: skip
 
@@ -177,7 +178,7 @@ def stacked(letter: str, kind: Any, prior: bool = True) -> Make:
 
 STACKED = {
     "numbers": Case(
-        like_nodes(), stacked("x", Slice), {"careless": stacked("x", Careless)}, how="moving", warmup=20
+        like_nodes(), stacked("x", Slice), {"careless": stacked("x", Careless)}, how="moving", **WARM
     ),
     "labels": Case(
         like_nodes(), stacked("z", Enumerate), {"no prior": stacked("z", Enumerate, False)}, how="moving",

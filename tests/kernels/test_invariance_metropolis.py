@@ -180,7 +180,7 @@ def proposed(key: Any, given: Any, right: bool = True) -> Make:
 
 def of_proposal(model: Model, key: Any, given: Any, **options: Any) -> Case:
     faults = {"no Hastings correction": proposed(key, given, right=False)}
-    sizes = {"draws": 100, "chains": 240, "replications": 5000}
+    sizes = {"draws": 100 if isinstance(key, tuple) else 50, "chains": 240, "replications": 5000}
     return Case(model, proposed(key, given), faults, sizes=sizes, **options)
 
 
