@@ -140,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         errors = "   ".join(f"{s} {error(p, clean):.1%}" for s, p in shown[noise].items())
         print(f"  {noise:8}  {errors}")
     print(
-        "  the start is random, and so are all neighbours in the first sweep; five make the shape"
+        "  a chain starts from the pixels one by one; five sweeps make the shape, averages the edges"
     )
     picture.save(draw(clean, shown), options.out, "ising_denoising")
 

@@ -321,7 +321,7 @@ def test_sweeps_clean_the_image(noise: str, monkeypatch: pytest.MonkeyPatch) -> 
     assert drawn.shape == (15, 82, 100) and drawn.mean(axis=0)[0].min() >= -1
     shown = ising_denoising.stages(seen, drawn).values()
     before, first, fifth, average = (ising_denoising.error(pixels, clean) for pixels in shown)
-    assert first > before > 1.5 * fifth > 3 * average
+    assert before > first > 1.5 * fifth > 3 * average
     assert ising_denoising.error(clean, clean) == 0 and ising_denoising.error(-clean, clean) == 1
 
 

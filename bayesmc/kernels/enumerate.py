@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesmc.errors import ZeroProbabilityError
+from bayesmc.errors import ModelError, ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
@@ -33,11 +33,33 @@ class Enumerate(Kernel):
             candidate = self.states.reshape((-1,) + (1,) * now.ndim)
             if members is not None:
                 candidate = np.broadcast_to(candidate, (len(self.states), 1, len(members)))
-            log = blanket.log_density(state, candidate, members)
+            try:
+                log = blanket.log_density(state, candidate, members)
+            except ModelError:
+                log = self._possible(state, candidate, now, members)
             log = np.broadcast_to(log, (len(self.states), *now.shape))
             new = draw_states(log, rng, blanket.name).astype(self.states.dtype)
             state = {**state, blanket.name: blanket.moved(state, new, members)}
         return {blanket.name: state[blanket.name]}, memory
+
+    def _possible(
+        self,
+        state: Values,
+        candidate: np.ndarray,
+        now: np.ndarray,
+        members: np.ndarray | None,
+    ) -> np.ndarray:
+        """Log full conditionals where a child's function fails at states that are impossible anyway."""
+        blanket = self.blanket
+        full = np.broadcast_to(candidate, (len(self.states), *now.shape))
+        own = blanket.own_log(
+            {**state, blanket.name: blanket.filled(state, full, members)}, members
+        )
+        impossible = np.broadcast_to(own, full.shape) == -np.inf
+        if not impossible.any():
+            return blanket.log_density(state, candidate, members)  # the fault is another
+        log = blanket.log_density(state, np.where(impossible, now, full), members)
+        return np.where(impossible, -np.inf, log)
 
 
 def draw_states(log: np.ndarray, rng: np.random.Generator, name: str) -> np.ndarray:

@@ -221,16 +221,17 @@ def _discover_stochastic(
         unsampled=isinstance(dist, Density) and not dist.can_sample,
     )
     bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
-    if bad is not None and not _overflows(dist):
+    if bad is not None and not _overflows(dist, batch, plates):
         raise bad
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
 
 
-def _overflows(dist: Distribution) -> bool:
-    """Whether bad parameters over- or underflowed, as under draws from a vague prior, here and there."""
+def _overflows(dist: Distribution, batch: Shape, plates: Shape) -> bool:
+    """Whether bad parameters over- or underflowed for some draws of the parents, as vague priors make them."""
     assert dist.invalid is not None and dist.problem is not None
-    return dist.problem.is_overflow and bool(dist.invalid.size > 1 and not dist.invalid.all())
+    full = np.broadcast_to(dist.invalid, batch + plates).reshape(math.prod(batch), -1)
+    return dist.problem.is_overflow and not full.all(axis=0).any()
 
 
 def _reachable(

@@ -78,6 +78,15 @@ class Blanket:
         flat[:, members] = new
         return flat.reshape(values[self.name].shape)
 
+    def filled(
+        self,
+        values: Mapping[str, np.ndarray],
+        candidate: np.ndarray,
+        members: np.ndarray | None,
+    ) -> np.ndarray:
+        """The node's whole value at a candidate, lead axes in front."""
+        return candidate if members is None else self._filled(values[self.name], candidate, members)
+
     def log_density(
         self,
         values: Mapping[str, np.ndarray],

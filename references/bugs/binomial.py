@@ -180,7 +180,9 @@ _COUPLED = _FUNNEL + "; their mean ties all plots together, so that each is upda
 
 CASES = (
     jags_case("seeds", "test1", seeds, settings=MOST_CHAINS, remark=_FUNNEL),
-    jags_case("seeds", "test2", seeds_zero, settings={"chains": 64, "draws": 1000}, remark=_COUPLED),
+    jags_case(
+        "seeds", "test2", seeds_zero, settings={"chains": 64, "draws": 1000}, remark=_COUPLED
+    ),
     jags_case(
         "seeds",
         "test3",

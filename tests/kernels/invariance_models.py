@@ -86,7 +86,7 @@ def ring() -> Model:
 
 def several() -> Model:
     """Nodes of all kinds that share their data."""
-    net = bmc.BayesNet(plates={"i": 8})
+    net = bmc.BayesNet(plates={"i": 4})
     net.add("a", bmc.StudentT(5.0, 0.0, 1.0))
     net.add("s", bmc.Gamma(3.0, 2.0))
     net.add("v", bmc.MvNormal([0.0, 0.5], COV))

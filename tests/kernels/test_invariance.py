@@ -137,7 +137,7 @@ def last_direction_first(make: Make, target: Target, memory: Any) -> tuple[Kerne
 FACTORS = {
     "factor slice": Case(
         models.several(), factors(), {"a prior forgotten": factors(Forgetful)},
-        last_direction_first, warmup=33, pilots=60, sizes={"draws": 20, "chains": 120, "replications": 500},
+        last_direction_first, warmup=33, pilots=60, sizes={"draws": 12, "chains": 200, "replications": 500},
     ),
 }  # fmt: skip
 
