@@ -228,7 +228,7 @@ def _discover_stochastic(
 
 
 def _overflows(dist: Distribution, batch: Shape, plates: Shape) -> bool:
-    """Whether bad parameters over- or underflowed for some draws of the parents, as vague priors make them."""
+    """Whether bad parameters over- or underflowed for some draws of the parents (vague priors do it)."""
     assert dist.invalid is not None and dist.problem is not None
     full = np.broadcast_to(dist.invalid, batch + plates).reshape(math.prod(batch), -1)
     return dist.problem.is_overflow and not full.all(axis=0).any()

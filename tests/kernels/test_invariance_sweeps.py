@@ -168,7 +168,7 @@ def case(name: str, how: str) -> Case:
 
     return Case(
         Model(net(), ("y",)), sweep(net), {n: sweep(net, e) for n, e in errors.items()}, reverse, how,
-        warmup=20 if how == "moving" else 0,
+        warmup=20 if how == "moving" else 0, sizes={"replications": 2000},
     )  # fmt: skip
 
 
