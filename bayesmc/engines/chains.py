@@ -114,6 +114,10 @@ class ChainEngine(Engine):
         """What moves the chains of a posed problem."""
         raise NotImplementedError
 
+    def tied(self, problem: Problem) -> Sequence[str]:
+        """Nodes among which zeros in tables may hold the chains."""
+        return ()
+
     def continues(self, other: Any) -> bool:
         """Whether this engine goes on as ``other`` would have: its options but ``draws`` are the same."""
         if type(other) is not type(self):
@@ -136,6 +140,9 @@ class ChainEngine(Engine):
         if resume is not None:
             self._refuse_another(resume, problem, names, summed)
         sampler = self.sampler(problem)
+        tied = self.tied(problem)
+        if tied:
+            _warn_of_ties(type(self).__name__, tied)
         try:
             held = self._held(problem, sampler, names, summed, resume)
             loop = _Loop(sampler, self, stream(seed, Purpose.INFER), problem)
@@ -227,7 +234,16 @@ class ChainEngine(Engine):
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 
 
-def warn_of_ties(engine: str, names: Sequence[str]) -> None:
+def known_values(problem: Problem) -> dict[str, np.ndarray]:
+    """Stored values that no chain moves: inputs, and nodes that are wholly observed."""
+    seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
+    return {**problem.inputs, **seen}
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
     """Warn that zeros in tables may hold chains."""
     shown = ", ".join(map(repr, names[:6]))
     if len(names) > 6:
@@ -236,17 +252,8 @@ def warn_of_ties(engine: str, names: Sequence[str]) -> None:
         f"{engine}: zero probabilities tie {shown} together, so a chain may not reach every configuration "
         "that is possible; compare with Exact() or LikelihoodWeighting(draws)",
         ReducibleWarning,
-        stacklevel=5,
+        stacklevel=4,
     )
-
-
-def known_values(problem: Problem) -> dict[str, np.ndarray]:
-    """Stored values that no chain moves: inputs, and nodes that are wholly observed."""
-    seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
-    return {**problem.inputs, **seen}
-
-
-# ---- private ------------------------------------------------------------------------------------
 
 
 class _Loop:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.engines.base import Treatment
-from bayesmc.engines.chains import ChainEngine, warn_of_ties
+from bayesmc.engines.chains import ChainEngine
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.gibbs_plan import Plan, plan_of
 from bayesmc.engines.starting import start_states
@@ -79,10 +79,11 @@ class Gibbs(ChainEngine):
     def table(self, problem: Problem) -> list[Treatment]:
         return plan_of(problem, self.debug).table()
 
+    def tied(self, problem: Problem) -> Sequence[str]:
+        return plan_of(problem, self.debug).constraints
+
     def sampler(self, problem: Problem) -> GibbsSampler:
         plan = plan_of(problem, self.debug)
-        if plan.constraints:
-            warn_of_ties("Gibbs", plan.constraints)
         return GibbsSampler(plan)
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.engines.chains import ChainEngine, warn_of_ties
+from bayesmc.engines.chains import ChainEngine
 from bayesmc.engines.metropolis_plan import Plan, plan_of
 from bayesmc.engines.metropolis_proposals import RandomWalk, check_specification
 from bayesmc.engines.starting import start_states
@@ -117,12 +117,12 @@ class MetropolisHastings(ChainEngine):
         return self._plan(problem).describe()
 
     def sampler(self, problem: Problem) -> MetropolisSampler:
-        plan = self._plan(problem)
+        return MetropolisSampler(self._plan(problem), self.warmup, self.thinning)
+
+    def tied(self, problem: Problem) -> Sequence[str]:
         jointly = {n for key in self._given if isinstance(key, tuple) for n in key}
-        tied = [n for n in deterministic_constraints(plan.target, ()) if n not in jointly]
-        if tied:
-            warn_of_ties("MetropolisHastings", tied)
-        return MetropolisSampler(plan, self.warmup, self.thinning)
+        found = deterministic_constraints(self._plan(problem).target, ())
+        return [n for n in found if n not in jointly]
 
     def continues(self, other: Any) -> bool:
         if type(other) is not type(self) or list(other._given) != list(self._given):
