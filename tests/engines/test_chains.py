@@ -519,7 +519,7 @@ def test_members_apart_do_not_hide_an_ensemble_apart() -> None:
     x = rng.normal(size=(4, 1000, 40)) + 5.0 * np.tile(np.arange(5.0), 200)[:, None]
     assert poor_mixing(posterior_of(x, 5), frozenset()) == []
     x[3, :, 17] += 8.0  # a standard deviation of the draws
-    (message,) = poor_mixing(posterior_of(x, 5), frozenset())
+    message, *_ = poor_mixing(posterior_of(x, 5), frozenset())
     assert "R-hat of 'x[17]'" in message
 
 
