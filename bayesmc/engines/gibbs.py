@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar
-
-import numpy as np
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.chains import ChainEngine
-from bayesmc.engines.forward import fast_steps
-from bayesmc.engines.gibbs_plan import Plan, plan_of
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.engines.sweep import SweepSampler
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Problem
-from bayesmc.network.forward import Pass, run
-from bayesmc.structure.target import Values
 
 
 @dataclass(frozen=True)
@@ -82,58 +77,6 @@ class Gibbs(ChainEngine):
     def tied(self, problem: Problem) -> Sequence[str]:
         return plan_of(problem, self.debug).constraints
 
-    def sampler(self, problem: Problem) -> GibbsSampler:
+    def sampler(self, problem: Problem) -> SweepSampler:
         plan = plan_of(problem, self.debug)
-        return GibbsSampler(plan)
-
-
-class GibbsSampler:
-    """One sweep: every kernel in turn, deterministic nodes recomputed after each."""
-
-    def __init__(self, plan: Plan) -> None:
-        self.plan = plan
-        self.target = plan.target
-        self.kernels = plan.kernels
-        problem = plan.problem
-        bare = replace(problem.model, potentials={})  # none reads what is drawn forward
-        steps = dict(
-            zip(bare.nodes, fast_steps(bare, problem.observed, problem.inputs), strict=True)
-        )
-        self.forward = [steps[n] for n in self.target.forward]
-        self.forward_nodes = self.target.forward
-
-    def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
-        values = start_states(self.target, chains, rng)
-        inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
-        return {
-            "values": inside,
-            "memory": [k.start(values, chains) for k in self.kernels],
-            "chains": chains,
-        }
-
-    def step(self, state: Mapping[str, Any], rng: np.random.Generator, warmup: bool) -> Any:
-        values: Values = {**self.target.known, **state["values"]}
-        memories = list(state["memory"])
-        for i, kernel in enumerate(self.kernels):
-            new, memories[i] = kernel.step(values, memories[i], rng, warmup)
-            values.update(new)
-            self.target.refresh(values, kernel.names)
-        return {**state, "values": {n: values[n] for n in state["values"]}, "memory": memories}
-
-    def end_warmup(self, state: Mapping[str, Any]) -> Any:
-        frozen = [k.end_warmup(m) for k, m in zip(self.kernels, state["memory"], strict=True)]
-        return {**state, "memory": frozen}
-
-    def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
-        values: Values = {**self.target.known, **state["values"]}
-        if self.forward:
-            values = run(self.forward, Pass(rng, (state["chains"],), values)).values
-        return values
-
-    def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        found = {}
-        for kernel, memory in zip(self.kernels, state["memory"], strict=True):
-            rate = kernel.acceptance(memory)
-            if rate is not None:
-                found[", ".join(kernel.names)] = rate
-        return found
+        return SweepSampler(plan.target, plan.kernels)

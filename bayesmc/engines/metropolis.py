@@ -12,7 +12,7 @@ import numpy as np
 from bayesmc.engines.chains import ChainEngine
 from bayesmc.engines.metropolis_plan import Plan, plan_of
 from bayesmc.engines.metropolis_proposals import RandomWalk, check_specification
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.sweep import SweepSampler, block_name
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.coupling import deterministic_constraints
@@ -20,7 +20,6 @@ from bayesmc.kernels.ensemble import BlockWalk, stragglers
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.network import Problem
-from bayesmc.network.forward import Pass, run, step_for
 from bayesmc.structure.target import Values
 
 #: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
@@ -169,10 +168,8 @@ class MetropolisHastings(ChainEngine):
         return f"MetropolisHastings({options})"
 
 
-class MetropolisSampler:
-    """One sweep: every kernel in turn, deterministic nodes recomputed after each.
-
-    Rows of the state are members of ensembles, those of a chain one after the other.
+class MetropolisSampler(SweepSampler):
+    """Sweeps of ensembles; rows of the state are their members, those of a chain one after the other.
 
     Parameters
     ----------
@@ -182,56 +179,33 @@ class MetropolisSampler:
     """
 
     def __init__(self, plan: Plan, warmup: int = 0, thinning: int = 1) -> None:
-        self.target = plan.target
-        self.kernels = plan.kernels
+        super().__init__(plan.target, plan.kernels)
         self.ensemble = plan.ensemble
         self.warmup, self.thinning = warmup, thinning
-        model, observed = self.target.model, self.target.observed
-        self.forward = [step_for(model, model[n], observed) for n in self.target.forward]
-        self.forward_nodes = self.target.forward
-        bands = {_block(k): _band(k) for k in self.kernels}
+        bands = {block_name(k): _band(k) for k in self.kernels}
         self.acceptance_band: dict[str, tuple[float, float] | None] = bands
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
-        rows = chains * self.ensemble
-        values = start_states(self.target, rows, rng)
-        inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
-        memory = [kernel.start(values, rows) for kernel in self.kernels]
-        return {"values": inside, "memory": memory, "sweep": 0, "chains": chains}
+        return {**self._started(rng, chains, chains * self.ensemble), "sweep": 0}
 
     def step(self, state: Mapping[str, Any], rng: np.random.Generator, warmup: bool) -> Any:
-        values: Values = {**self.target.known, **state["values"]}
-        memory = list(state["memory"])
-        for i, kernel in enumerate(self.kernels):
-            new, memory[i] = kernel.step(values, memory[i], rng, warmup)
-            values.update(new)
-            self.target.refresh(values, kernel.names)
         sweep = state["sweep"] + 1
-        now = {n: values[n] for n in state["values"]}
-        found = {**state, "values": now, "memory": memory, "sweep": sweep}
+        found = {**super().step(state, rng, warmup), "sweep": sweep}
         if warmup and self.ensemble > 1 and self._is_rescue(sweep):
             return self._rescued(found, rng)
         return found
 
     def end_warmup(self, state: Mapping[str, Any]) -> Any:
-        memory = [k.end_warmup(m) for k, m in zip(self.kernels, state["memory"], strict=True)]
-        return {**state, "memory": memory, "sweep": 0}
+        return {**super().end_warmup(state), "sweep": 0}
 
     def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
         member = (state["sweep"] // self.thinning - 1) % self.ensemble
         now = {n: v[member :: self.ensemble] for n, v in state["values"].items()}
-        values: Values = {**self.target.known, **now}
-        if self.forward:
-            values = run(self.forward, Pass(rng, (state["chains"],), values)).values
-        return values
+        return self._completed(now, state["chains"], rng)
 
     def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        found = {}
-        for kernel, memory in zip(self.kernels, state["memory"], strict=True):
-            rate = kernel.acceptance(memory)
-            if rate is not None:
-                found[_block(kernel)] = rate.reshape(-1, self.ensemble).mean(axis=1)
-        return found
+        rates = super().acceptance(state)
+        return {n: r.reshape(-1, self.ensemble).mean(axis=1) for n, r in rates.items()}
 
     def _is_rescue(self, sweep: int) -> bool:
         """Whether stragglers are brought back: at some sweeps in the first half of the warmup."""
@@ -263,10 +237,6 @@ class MetropolisSampler:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _block(kernel: Kernel) -> str:
-    return ", ".join(kernel.names)
 
 
 def _band(kernel: Kernel) -> tuple[float, float] | None:

@@ -152,10 +152,10 @@ def test_the_same_seed_gives_the_same_draws() -> None:
 
 
 def test_interrupted_chains_keep_what_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bayesmc.engines.gibbs import GibbsSampler
+    from bayesmc.engines.sweep import SweepSampler
 
     net, evidence = mixture()
-    step, calls = GibbsSampler.step, []
+    step, calls = SweepSampler.step, []
 
     def interrupted(self, state, rng, warmup):
         calls.append(1)
@@ -163,7 +163,7 @@ def test_interrupted_chains_keep_what_they_have(monkeypatch: pytest.MonkeyPatch)
             raise KeyboardInterrupt
         return step(self, state, rng, warmup)
 
-    monkeypatch.setattr(GibbsSampler, "step", interrupted)
+    monkeypatch.setattr(SweepSampler, "step", interrupted)
     with pytest.warns(bmc.errors.InterruptWarning, match="25 draws"):
         part = bmc.infer(net, evidence, engine=bmc.Gibbs(50, warmup=10), rng=1)
     assert part["mean"].shape == (4, 25, 3)

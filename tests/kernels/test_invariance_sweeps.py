@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.gibbs import GibbsSampler
 from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.engines.sweep import SweepSampler
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.conjugate_pairs import PAIRS
@@ -65,7 +65,7 @@ CONJUGATE = ("variances", "precisions", "covariances")
 class Sweep(Kernel):
     """One sweep of the engine's sampler."""
 
-    def __init__(self, sampler: GibbsSampler) -> None:
+    def __init__(self, sampler: SweepSampler) -> None:
         self.sampler = sampler
         self.names = ("weights", "mean", "scale", "label")
 
@@ -135,7 +135,7 @@ def sweep(net: Any, errors: Mapping[str, Callable] | None = None, backwards: boo
             anchored.add("seen", lambda y: bmc.Bernoulli(0.5 + 0.0 * _number(y)), plates="i")
             problem = pose(anchored, {"seen": np.zeros(POINTS, dtype=int)})
         plan = plan_of(problem)
-        sampler = GibbsSampler(plan)
+        sampler = SweepSampler(plan.target, plan.kernels)
         kernels = [k for k in sampler.kernels if k.names != ("y",)]
         assert sorted(n for k in kernels for n in k.names) == ["label", "mean", "scale", "weights"]
         for name, error in (errors or {}).items():

@@ -1,0 +1,86 @@
+"""A sweep: every kernel in turn on one state, deterministic nodes recomputed after each.
+
+What the kernels are, and how rows of the state make chains, is each engine's affair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.forward import fast_steps
+from bayesmc.engines.starting import start_states
+from bayesmc.kernels.base import Kernel
+from bayesmc.network.forward import Pass, run
+from bayesmc.structure.target import Target, Values
+
+
+class SweepSampler:
+    """A ``chains.Sampler`` that moves a state by kernels.
+
+    Parameters
+    ----------
+    target : Target
+    kernels : sequence of Kernel
+        In the order of a sweep.
+    """
+
+    def __init__(self, target: Target, kernels: Sequence[Kernel]) -> None:
+        self.target = target
+        self.kernels = list(kernels)
+        problem = target.problem
+        bare = replace(problem.model, potentials={})  # none reads what is drawn forward
+        steps = fast_steps(bare, problem.observed, problem.inputs)
+        by_name = dict(zip(bare.nodes, steps, strict=True))
+        self._forward = [by_name[n] for n in target.forward]
+        self.forward_nodes = target.forward
+
+    def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
+        return self._started(rng, chains, chains)
+
+    def step(self, state: Mapping[str, Any], rng: np.random.Generator, warmup: bool) -> Any:
+        values: Values = {**self.target.known, **state["values"]}
+        memory = list(state["memory"])
+        for i, kernel in enumerate(self.kernels):
+            new, memory[i] = kernel.step(values, memory[i], rng, warmup)
+            values.update(new)
+            self.target.refresh(values, kernel.names)
+        return {**state, "values": {n: values[n] for n in state["values"]}, "memory": memory}
+
+    def end_warmup(self, state: Mapping[str, Any]) -> Any:
+        memory = [k.end_warmup(m) for k, m in zip(self.kernels, state["memory"], strict=True)]
+        return {**state, "memory": memory}
+
+    def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
+        return self._completed(state["values"], state["chains"], rng)
+
+    def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        rates = {
+            block_name(kernel): kernel.acceptance(memory)
+            for kernel, memory in zip(self.kernels, state["memory"], strict=True)
+        }
+        return {name: rate for name, rate in rates.items() if rate is not None}
+
+    # ---- for engines whose rows are no chains --------------------------------------------------
+
+    def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:
+        """A state of ``rows`` rows for ``chains`` chains."""
+        values = start_states(self.target, rows, rng)
+        inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
+        memory = [kernel.start(values, rows) for kernel in self.kernels]
+        return {"values": inside, "memory": memory, "chains": chains}
+
+    def _completed(
+        self, values: Mapping[str, np.ndarray], chains: int, rng: np.random.Generator
+    ) -> Values:
+        """All nodes' values: what is known, what the chains say, and what is drawn forward from these."""
+        known: Values = {**self.target.known, **values}
+        return run(self._forward, Pass(rng, (chains,), known)).values if self._forward else known
+
+
+def block_name(kernel: Kernel) -> str:
+    """What a kernel's acceptance rate stands under."""
+    return ", ".join(kernel.names)
