@@ -145,7 +145,11 @@ def _discover(
     arguments, batch = arguments_of(links, probe)
     result = _call_batched(declaration, links, probe, shape, batch + plates)
     if isinstance(result, Distribution):
-        return _discover_stochastic(declaration, links, plates, result, batch, shape, count, rng)
+        node, value = _discover_stochastic(
+            declaration, links, plates, result, batch, shape, count, rng
+        )
+        _refuse_parameters(node, result, probe, batch)
+        return node, value
     return _discover_deterministic(declaration, links, plates, result, batch, probe, shape)
 
 
@@ -220,18 +224,37 @@ def _discover_stochastic(
         support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
     )
-    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
-    if bad is not None and not _overflows(dist, batch, plates):
-        raise bad
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
 
 
-def _overflows(dist: Distribution, batch: Shape, plates: Shape) -> bool:
-    """Whether bad parameters over- or underflowed for some draws of the parents (vague priors do it)."""
+def _refuse_parameters(
+    node: CompiledNode, dist: Distribution, probe: Mapping[str, np.ndarray], batch: Shape
+) -> None:
+    """Raise for parameters out of range, unless they over- or underflowed, as vague priors make them:
+    for some draws of the parents, or for all of those tried where the arithmetic says so itself.
+    """
+    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
+    if bad is None:
+        return
     assert dist.invalid is not None and dist.problem is not None
-    full = np.broadcast_to(dist.invalid, batch + plates).reshape(math.prod(batch), -1)
-    return dist.problem.is_overflow and not full.all(axis=0).any()
+    full = np.broadcast_to(dist.invalid, batch + node.plate_shape).reshape(math.prod(batch), -1)
+    by_parents = not full.all(axis=0).any() or _overflows(node, probe, batch)
+    if not (dist.problem.is_overflow and by_parents):
+        raise bad
+
+
+def _overflows(node: CompiledNode, probe: Mapping[str, np.ndarray], batch: Shape) -> bool:
+    """Whether a parent is infinite already, or the function's arithmetic over- or underflows on them."""
+    if any(np.isinf(probe[name].astype(float)).any() for name, _ in node.links):
+        return True
+    arguments, _ = arguments_of(node.links, probe)
+    try:
+        with np.errstate(over="raise", under="raise"):
+            call(node.declaration, arguments, batch + node.plate_shape, node.links)
+    except BayesmcError as error:
+        return isinstance(error.__cause__, FloatingPointError)
+    return False
 
 
 def _reachable(
