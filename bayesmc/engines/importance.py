@@ -10,10 +10,17 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.engines.forward import fast_steps
-from bayesmc.engines.proposal import check_specification, read_proposals
+from bayesmc.engines.proposal import (
+    FUNCTION,
+    as_function,
+    bound,
+    check_specification,
+    check_targets,
+)
 from bayesmc.engines.proposing import proposal_steps
 from bayesmc.engines.weighted import WeightedEngine, check_count, treatment
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import ModelError, UnsupportedError
+from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.network import Problem
 from bayesmc.network.forward import Step, refuse_unsampled
 
@@ -77,18 +84,18 @@ class Importance(WeightedEngine):
 
     def __post_init__(self) -> None:
         check_count(self, "draws", self.draws, "100_000")
-        checked = MappingProxyType(check_specification(self.proposal))
+        checked = MappingProxyType(_check_given(self.proposal))
         object.__setattr__(self, "proposal", checked)
 
     def refusal(self, problem: Problem) -> str | None:
         self.steps(problem)  # raises where a proposal does not fit the net or the evidence
-        given = {n for key in self.proposal for n in ((key,) if isinstance(key, str) else key)}
+        given = {n for key in self.proposal for n in names_of(key)}
         reason = refuse_unsampled(problem.model, given | problem.observed.keys(), "Importance")
         return None if reason is None else f"{reason}, or propose it"
 
     def describe(self, problem: Problem) -> dict[str, str]:
         found = {name: treatment(problem, name) for name in problem.model.nodes}
-        for proposal in read_proposals(problem, self.proposal):
+        for proposal in _read(problem, self.proposal):
             for name in proposal.names:
                 others = ", ".join(repr(n) for n in proposal.names if n != name)
                 how = f" jointly with {others}" if others else ""
@@ -104,7 +111,7 @@ class Importance(WeightedEngine):
             return fast_steps(model, problem.observed, problem.inputs)
         bare = replace(model, potentials={})  # potentials find their places in the new order
         plain = fast_steps(bare, problem.observed, problem.inputs)
-        proposals = read_proposals(problem, self.proposal)
+        proposals = _read(problem, self.proposal)
         return proposal_steps(problem, dict(zip(model.nodes, plain, strict=True)), proposals)
 
     def known(self, problem: Problem) -> dict[str, np.ndarray]:
@@ -145,3 +152,30 @@ class Importance(WeightedEngine):
     def __repr__(self) -> str:
         keys = ", ".join(f"{key!r}: ..." for key in self.proposal)
         return f"Importance(draws={self.draws}, proposal={{{keys}}})"
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _check_given(proposal: Any) -> dict[Key, Any]:
+    given = check_specification("Importance", proposal, FUNCTION)
+    for key, spec in given.items():
+        as_function("Importance", key, spec, FUNCTION)
+    return given
+
+
+def _read(problem: Problem, specification: Mapping[Key, Any]) -> list[Proposal]:
+    """Proposals read against a problem; none may look at what it is to draw."""
+    found = []
+    for key, spec in specification.items():
+        check_targets("Importance", problem, key)
+        function = as_function("Importance", key, spec, FUNCTION)
+        proposal = bound("Importance", problem.model, key, function)
+        if not proposal.is_independent:
+            own = next(p for p in proposal.parents if p in proposal.names)
+            raise ModelError(
+                f"{proposal.what}: it names {own!r}, which it is to draw; name evidence, inputs or nodes "
+                "drawn before"
+            )
+        found.append(proposal)
+    return found

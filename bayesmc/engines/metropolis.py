@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesmc.engines.chains import ChainEngine
 from bayesmc.engines.metropolis_plan import Plan, plan_of
-from bayesmc.engines.metropolis_proposals import RandomWalk, check_specification
+from bayesmc.engines.metropolis_proposals import RandomWalk, check_given
 from bayesmc.engines.sweep import SweepSampler, block_name
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
@@ -106,7 +106,7 @@ class MetropolisHastings(ChainEngine):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checked = MappingProxyType(check_specification(self.proposal))
+        checked = MappingProxyType(check_given(self.proposal))
         object.__setattr__(self, "proposal", checked)
 
     def refusal(self, problem: Problem) -> str | None:

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bayesmc.engines.metropolis_proposals import Key, RandomWalk, Read, read_proposals
+from bayesmc.engines.metropolis_proposals import RandomWalk, Read, read_proposals
 from bayesmc.engines.weighted import treatment
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk, parts_of
 from bayesmc.kernels.jump import Jump
-from bayesmc.kernels.proposal import Conditional
+from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.network import Problem
@@ -77,7 +77,7 @@ def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
         {*problem.observed, *target.chain},
         "MetropolisHastings",
     )
-    given = {n for key in read for n in _names(key)}
+    given = {n for key in read for n in names_of(key)}
     kernels = [_asked_for(target, key, what) for key, what in read.items()]
     rest = [n for n in target.chain if n not in given]
     discrete = [n for n in rest if problem.model[n].is_discrete]
@@ -98,10 +98,6 @@ def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _names(key: Key) -> tuple[str, ...]:
-    return key if isinstance(key, tuple) else (key,)
-
-
 def _inside(problem: Problem, read: Mapping[Key, Read]) -> list[str]:
     """Nodes of the chain whether or not anything observed depends on them.
 
@@ -109,9 +105,9 @@ def _inside(problem: Problem, read: Mapping[Key, Read]) -> list[str]:
     """
     found: list[str] = []
     for key, what in read.items():
-        found += _names(key)
-        if isinstance(what, Conditional):
-            found += what.declaration.parents
+        found += names_of(key)
+        if isinstance(what, Proposal):
+            found += what.parents
     found += [n for n, node in problem.model.nodes.items() if node.is_stochastic and node.unsampled]
     return list(dict.fromkeys(found))
 

@@ -1,29 +1,26 @@
-"""Proposals of Metropolis-Hastings, as a user writes them and as they are read.
-
-A proposal is read like a node: its argument names are what it depends on, aligned as for its target; here
-they may be the target itself, and any other current value. How it moves a chain is the kernels' affair.
+"""Proposals of Metropolis-Hastings: functions, which may name any current value, their target's too, and
+those that have a name. How they move a chain is the kernels' affair.
 """
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import as_distribution
-from bayesmc.errors import EvidenceError, ModelError, UnknownNodeError
-from bayesmc.kernels.proposal import Conditional, Parts
+from bayesmc.engines.proposal import (
+    FUNCTION,
+    as_function,
+    bound,
+    check_specification,
+    check_targets,
+)
+from bayesmc.errors import ModelError
+from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.random_walk import some_support
 from bayesmc.network import Model, Problem
-from bayesmc.network.align import Aligner
-from bayesmc.network.node import Declaration, bind
-from bayesmc.network.store import unknown
-
-#: a node's name, or several that move as one
-Key = str | tuple[str, ...]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -127,36 +124,19 @@ class Independence:
 
 
 #: what a proposal is read as: a function, a walk, or None for the nodes' own densities
-Read = Conditional | RandomWalk | None
+Read = Proposal | RandomWalk | None
+
+_ENGINE = "MetropolisHastings"
+_ACCEPTED = f"{FUNCTION}, RandomWalk(scale), Independence(distribution) or 'prior'"
 
 
-def check_specification(proposal: Any) -> dict[Key, Any]:
+def check_given(proposal: Any) -> dict[Key, Any]:
     """A copy of what a user gave as proposals, refused where it cannot be one whatever the net."""
-    if proposal is None:
-        return {}
-    if not isinstance(proposal, Mapping):
-        raise TypeError(
-            f"MetropolisHastings(proposal={proposal!r}): give a dict from node name to a function of named "
-            "nodes that returns a distribution, RandomWalk(scale), Independence(distribution) or 'prior'"
-        )
-    seen: set[str] = set()
-    for key, given in proposal.items():
-        names = (key,) if isinstance(key, str) else key
-        if not isinstance(names, tuple) or not names or not all(isinstance(n, str) for n in names):
-            raise TypeError(
-                f"MetropolisHastings: the key {key!r} of proposal= is no node name; give a name, or a "
-                "tuple of names that move as one"
-            )
-        for name in names:
-            if name in seen:
-                raise ModelError(
-                    f"MetropolisHastings: {name!r} has two proposals; every node is moved by one, so keep "
-                    "one of them"
-                )
-            seen.add(name)
-        if not _is_named(given):
-            _as_function(key, given)
-    return dict(proposal)
+    given = check_specification(_ENGINE, {} if proposal is None else proposal, _ACCEPTED)
+    for key, spec in given.items():
+        if not _is_named(spec):
+            as_function(_ENGINE, key, _plain(spec), _ACCEPTED)
+    return given
 
 
 def read_proposals(problem: Problem, specification: Mapping[Key, Any]) -> dict[Key, Read]:
@@ -177,86 +157,33 @@ def _is_named(given: Any) -> bool:
     return isinstance(given, RandomWalk) or (isinstance(given, str) and given == "prior")
 
 
-def _as_function(key: Key, given: Any) -> Callable[..., Any]:
-    """The function of a proposal; a distribution (for a block, also a dict of them) is a constant one."""
-    spec = given.distribution if isinstance(given, Independence) else given
-    if isinstance(key, tuple) and isinstance(spec, Mapping):
-        return lambda: spec
-    distribution = as_distribution(spec)
-    if distribution is not None:
-        return lambda: distribution
-    if not callable(spec) or isinstance(spec, type):
-        raise TypeError(
-            f"MetropolisHastings: the proposal for {key!r} is {spec!r}; give a function of named nodes that "
-            "returns a distribution, RandomWalk(scale), Independence(distribution) or 'prior'"
-        )
-    return spec
+def _plain(given: Any) -> Any:
+    return given.distribution if isinstance(given, Independence) else given
 
 
 def _read(problem: Problem, key: Key, given: Any) -> Read:
-    names = key if isinstance(key, tuple) else (key,)
-    what = f"MetropolisHastings: proposal for {key!r}"
-    for name in names:
-        _check_target(problem, name, what)
+    check_targets(_ENGINE, problem, key)
+    what = f"{_ENGINE}: proposal for {key!r}"
     if isinstance(given, RandomWalk):
         _check_walk(problem.model, key, given, what)
         return given
     if isinstance(given, str):
-        _check_own(problem.model, names, what)
+        _check_own(problem.model, names_of(key), what)
         return None
-    return _conditional(problem.model, key, given, what)
-
-
-def _conditional(model: Model, key: Key, given: Any, what: str) -> Conditional:
-    """A user's function, bound to the nodes that it names."""
-    names = key if isinstance(key, tuple) else (key,)
-    function = _as_function(key, given)
-    _check_signature(function, what)
-    parents, bound = bind(what, function, None)
-    for parent in parents:
-        if parent not in model.nodes:
-            raise UnknownNodeError(
-                f"{what}: its argument {parent!r} is no node ({_unknown(model, parent)}); for a constant use "
-                f"a default, {parent}={parent}"
-            )
-        if isinstance(given, Independence) and parent in names:
-            raise ModelError(
-                f"{what}: an Independence proposal names {parent!r}, which it is to propose; give the "
-                "function itself, without Independence"
-            )
-    plates: tuple[str, ...] = ()
-    if isinstance(key, tuple):
-        bound = _jointly(bound, names)
-    else:
-        plates = model[key].plates
-    label = key if isinstance(key, str) else ", ".join(key)
-    declaration = Declaration(label, "function", parents, plates, function=bound)
-    links = tuple(
-        (p, Aligner(plates, model[p].plates, len(model[p].event_shape), model[p].domain))
-        for p in parents
-    )
-    return Conditional(key, names, declaration, links)
-
-
-def _check_target(problem: Problem, name: str, what: str) -> None:
-    node = problem.model.nodes.get(name)
-    if node is None:
-        raise UnknownNodeError(f"{what}: {_unknown(problem.model, name)}")
-    if node.kind != "stochastic":
-        kind = {"fixed": "fixed by do()", "input": "an input"}.get(node.kind, "deterministic")
-        raise ModelError(f"{what}: {name!r} is {kind} and never moves; propose a stochastic node")
-    seen = problem.observed.get(name)
-    if seen is not None and seen.mask is None:
-        raise EvidenceError(
-            f"{what}: {name!r} is observed, so there is nothing to move; leave out the proposal or the "
-            "evidence"
+    function = as_function(_ENGINE, key, _plain(given), _ACCEPTED)
+    proposal = bound(_ENGINE, problem.model, key, function)
+    if isinstance(given, Independence) and not proposal.is_independent:
+        own = next(p for p in proposal.parents if p in proposal.names)
+        raise ModelError(
+            f"{what}: an Independence proposal names {own!r}, which it is to propose; give the function "
+            "itself, without Independence"
         )
+    return proposal
 
 
 def _check_walk(model: Model, key: Key, walk: RandomWalk, what: str) -> None:
     """Refuse a random walk on values that have no such steps."""
-    names = key if isinstance(key, tuple) else (key,)
-    for name in names:
+    for name in names_of(key):
         node, support = model[name], some_support(model, name)
         if node.is_discrete:
             labelled = node.domain is not None and node.domain.labels is not None
@@ -290,48 +217,3 @@ def _check_own(model: Model, names: tuple[str, ...], what: str) -> None:
                 f"{what}: {name!r} is a Density without sample=, so it cannot be proposed from; give one, or "
                 "a function or RandomWalk(scale)"
             )
-
-
-def _check_signature(function: Callable[..., Any], what: str) -> None:
-    """Argument names are all that says what a proposal depends on, so they must be readable."""
-    try:
-        arguments = inspect.signature(function).parameters.values()
-    except (TypeError, ValueError):
-        raise ModelError(
-            f"{what}: the arguments of {function!r} cannot be read; wrap it in a function whose arguments "
-            "are the nodes it needs"
-        ) from None
-    for argument in arguments:
-        if argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
-            raise ModelError(
-                f"{what}: *{argument.name} is refused, since argument names say what a proposal depends on; "
-                "name the nodes"
-            )
-
-
-def _unknown(model: Model, name: str) -> str:
-    return unknown({n: c.declaration for n, c in model.nodes.items()}, name)
-
-
-def _jointly(function: Callable[..., Any], names: tuple[str, ...]) -> Callable[..., Any]:
-    """A block's function, with a dict of distributions in one piece."""
-
-    def joint(*arguments: Any) -> Any:
-        result = function(*arguments)
-        if not isinstance(result, Mapping):
-            return result
-        if set(result) != set(names):
-            raise ModelError(
-                f"the function returns distributions for {sorted(map(str, result))}, but the block is "
-                f"{list(names)}; give one for each"
-            )
-        parts = {}
-        for name, part in result.items():
-            parts[name] = as_distribution(part)
-            if parts[name] is None:
-                raise ModelError(
-                    f"the function returns {type(part).__name__} for {name!r}; return a distribution"
-                )
-        return Parts(parts)  # type: ignore[arg-type]
-
-    return joint

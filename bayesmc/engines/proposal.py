@@ -1,158 +1,135 @@
-"""Proposals of importance sampling, as a user writes them and as they are read.
+"""Proposals as a user writes them, read against a problem: the same for every engine that takes some.
 
-A proposal is read like a node: its argument names are what it depends on, aligned as for its target. What is
-drawn from it, and when, is ``proposing``'s affair.
+A proposal is read like a node: its argument names are what it depends on, aligned as for its target. Which
+arguments make sense, and what is drawn when, is the engine's affair; ``kernels.proposal`` says what a read
+proposal can be asked.
 """
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any
 
-from bayesmc.distributions import Distribution, as_distribution
+from bayesmc.distributions import as_distribution
 from bayesmc.errors import EvidenceError, ModelError, UnknownNodeError
+from bayesmc.kernels.proposal import Key, Parts, Proposal, names_of
 from bayesmc.network import Model, Problem
 from bayesmc.network.align import Aligner
 from bayesmc.network.node import Declaration, bind
 from bayesmc.network.store import unknown
 
-#: a node's name, or several that are drawn jointly
-Key = str | tuple[str, ...]
+#: what every engine takes as a proposal, in words
+FUNCTION = "a function of named nodes that returns a distribution"
 
 
-@dataclass(frozen=True, eq=False)
-class Proposal:
-    """One proposal, read against a problem.
-
-    Attributes
-    ----------
-    key : str or tuple of str
-        As the user wrote it; a tuple is a joint block.
-    names : tuple of str
-        Nodes it draws.
-    declaration : Declaration
-        Its function and the names of what that takes, in order.
-    links : tuple of (str, Aligner)
-    """
-
-    key: Key
-    names: tuple[str, ...]
-    declaration: Declaration
-    links: tuple[tuple[str, Aligner], ...]
-
-    @property
-    def parents(self) -> tuple[str, ...]:
-        return self.declaration.parents
-
-    @property
-    def what(self) -> str:
-        """What messages call it."""
-        return f"proposal for {self.key!r}"
-
-
-def check_specification(proposal: Any) -> dict[Key, Any]:
-    """A copy of what a user gave as proposals, refused where it cannot be one whatever the net."""
-    if not isinstance(proposal, Mapping):
-        raise TypeError(
-            f"Importance(proposal={proposal!r}): give a dict from node name to a function of named nodes "
-            "that returns a distribution"
-        )
-    seen: set[str] = set()
-    for key, spec in proposal.items():
-        names = (key,) if isinstance(key, str) else key
-        if not isinstance(names, tuple) or not names or not all(isinstance(n, str) for n in names):
-            raise TypeError(
-                f"Importance: the key {key!r} of proposal= is no node name; give a name, or a tuple of "
-                "names that are drawn jointly"
-            )
-        for name in names:
-            if name in seen:
-                raise ModelError(
-                    f"Importance: {name!r} has two proposals; one node is drawn once, so keep one of them"
-                )
-            seen.add(name)
-        _as_function(key, spec)
-    return dict(proposal)
-
-
-def read_proposals(problem: Problem, specification: Mapping[Key, Any]) -> list[Proposal]:
-    """Proposals read against a problem; every fault names the proposal.
+def check_specification(engine: str, proposal: Any, accepted: str) -> dict[Key, Any]:
+    """A copy of what a user gave as proposals, its keys looked at.
 
     Raises
     ------
-    UnknownNodeError, EvidenceError, ModelError
-        A target or an argument that cannot be one.
+    TypeError
+        No mapping, or a key that is neither a name nor a tuple of names.
+    ModelError
+        Two proposals for one node.
     """
-    return [_read(problem, key, spec) for key, spec in specification.items()]
+    if not isinstance(proposal, Mapping):
+        raise TypeError(
+            f"{engine}(proposal={proposal!r}): give a dict from node name to {accepted}"
+        )
+    seen: set[str] = set()
+    for key in proposal:
+        if not key or not all(isinstance(n, str) for n in names_of(key)):
+            raise TypeError(
+                f"{engine}: the key {key!r} of proposal= is no node name; give a name, or a tuple of names "
+                "that are proposed jointly"
+            )
+        for name in names_of(key):
+            if name in seen:
+                raise ModelError(
+                    f"{engine}: {name!r} has two proposals; every node is drawn by one, so keep one of them"
+                )
+            seen.add(name)
+    return dict(proposal)
 
 
-class Parts(Distribution):
-    """Independent distributions of several nodes, as a block's function may return them."""
+def as_function(engine: str, key: Key, given: Any, accepted: str) -> Callable[..., Any]:
+    """The function of a proposal; a distribution (for a block, also a dict of them) is a constant one.
 
-    def __init__(self, parts: Mapping[str, Distribution]) -> None:
-        self.parts = dict(parts)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _as_function(key: Key, spec: Any) -> Callable[..., Any]:
-    """The function of a proposal; a distribution (for a block, also a dict of them) is a constant one."""
-    if isinstance(key, tuple) and isinstance(spec, Mapping):
-        return lambda: spec
-    distribution = as_distribution(spec)
+    Raises
+    ------
+    TypeError
+        Something else.
+    """
+    if isinstance(key, tuple) and isinstance(given, Mapping):
+        return lambda: given
+    distribution = as_distribution(given)
     if distribution is not None:
         return lambda: distribution
-    if not callable(spec):
+    if not callable(given) or isinstance(given, type):
         raise TypeError(
-            f"Importance: the proposal for {key!r} is {spec!r}; give a function of named nodes that "
-            "returns a distribution, or a distribution"
+            f"{engine}: the proposal for {key!r} is {given!r}; give {accepted}, or a distribution"
         )
-    return spec
+    return given
 
 
-def _read(problem: Problem, key: Key, spec: Any) -> Proposal:
-    model = problem.model
-    names = key if isinstance(key, tuple) else (key,)
-    what = f"proposal for {key!r}"
-    for name in names:
-        _check_target(problem, name, what)
-    function = _as_function(key, spec)
+def check_targets(engine: str, problem: Problem, key: Key) -> None:
+    """Refuse targets that are never drawn.
+
+    Raises
+    ------
+    UnknownNodeError, ModelError, EvidenceError
+    """
+    what = f"{engine}: proposal for {key!r}"
+    for name in names_of(key):
+        node = problem.model.nodes.get(name)
+        if node is None:
+            raise UnknownNodeError(f"{what}: {_unknown(problem.model, name)}")
+        if node.kind != "stochastic":
+            kind = {"fixed": "fixed by do()", "input": "an input"}.get(node.kind, "deterministic")
+            raise ModelError(
+                f"{what}: {name!r} is {kind} and never drawn; propose a stochastic node"
+            )
+        seen = problem.observed.get(name)
+        if seen is not None and seen.mask is None:
+            raise EvidenceError(
+                f"{what}: {name!r} is observed, so there is nothing to draw; leave out the proposal or the "
+                "evidence"
+            )
+
+
+def bound(engine: str, model: Model, key: Key, function: Callable[..., Any]) -> Proposal:
+    """A user's function, bound to the nodes that its arguments name.
+
+    Raises
+    ------
+    ModelError
+        Arguments that cannot be read.
+    UnknownNodeError
+        An argument that is no node.
+    """
+    what = f"{engine}: proposal for {key!r}"
     _check_signature(function, what)
-    parents, bound = bind(what, function, None)
+    parents, call = bind(what, function, None)
     for parent in parents:
-        _check_argument(problem, parent, names, what)
-    plates: tuple[str, ...] = ()
+        if parent not in model.nodes:
+            raise UnknownNodeError(
+                f"{what}: its argument {parent!r} is no node ({_unknown(model, parent)}); for a constant use "
+                f"a default, {parent}={parent}"
+            )
+    names = names_of(key)
     if isinstance(key, tuple):
-        bound = _jointly(bound, names)
-    else:
-        plates = model[key].plates
-    label = key if isinstance(key, str) else ", ".join(key)
-    declaration = Declaration(label, "function", parents, plates, function=bound)
+        call = _jointly(call, names)
+    plates = () if isinstance(key, tuple) else model[key].plates
     links = tuple(
         (p, Aligner(plates, model[p].plates, len(model[p].event_shape), model[p].domain))
         for p in parents
     )
-    return Proposal(key, names, declaration, links)
+    declaration = Declaration(", ".join(names), "function", parents, plates, function=call)
+    return Proposal(engine, key, names, declaration, links)
 
 
-def _check_target(problem: Problem, name: str, what: str) -> None:
-    node = problem.model.nodes.get(name)
-    if node is None:
-        raise UnknownNodeError(f"Importance: {what}: {_unknown(problem.model, name)}")
-    if node.kind != "stochastic":
-        kind = {"fixed": "fixed by do()", "input": "an input"}.get(node.kind, "deterministic")
-        raise ModelError(
-            f"Importance: {what}: {name!r} is {kind} and never drawn; propose a stochastic node"
-        )
-    seen = problem.observed.get(name)
-    if seen is not None and seen.mask is None:
-        raise EvidenceError(
-            f"Importance: {what}: {name!r} is observed, so there is nothing to draw; leave out the "
-            "proposal or the evidence"
-        )
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _check_signature(function: Callable[..., Any], what: str) -> None:
@@ -161,28 +138,15 @@ def _check_signature(function: Callable[..., Any], what: str) -> None:
         arguments = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         raise ModelError(
-            f"Importance: {what}: the arguments of {function!r} cannot be read; wrap it in a function "
-            "whose arguments are the nodes it needs"
+            f"{what}: the arguments of {function!r} cannot be read; wrap it in a function whose arguments "
+            "are the nodes it needs"
         ) from None
     for argument in arguments:
         if argument.kind in (argument.VAR_POSITIONAL, argument.VAR_KEYWORD):
             raise ModelError(
-                f"Importance: {what}: *{argument.name} is refused, since argument names say what a "
-                "proposal depends on; name the nodes"
+                f"{what}: *{argument.name} is refused, since argument names say what a proposal depends on; "
+                "name the nodes"
             )
-
-
-def _check_argument(problem: Problem, parent: str, names: tuple[str, ...], what: str) -> None:
-    if parent in names:
-        raise ModelError(
-            f"Importance: {what}: it names {parent!r}, which it is to draw; name evidence, inputs or "
-            "nodes drawn before"
-        )
-    if parent not in problem.model.nodes:
-        raise UnknownNodeError(
-            f"Importance: {what}: its argument {parent!r} is no node ({_unknown(problem.model, parent)}); "
-            f"for a constant use a default, {parent}={parent}"
-        )
 
 
 def _unknown(model: Model, name: str) -> str:

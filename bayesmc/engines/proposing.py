@@ -7,23 +7,22 @@ needs itself.
 
 from __future__ import annotations
 
-import math
-import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.engines.proposal import Parts, Proposal
-from bayesmc.errors import (
-    BayesmcError,
-    CycleError,
-    DensityError,
-    ModelError,
-    ShapeError,
-    SupportWarning,
-    UnsupportedError,
+from bayesmc.errors import CycleError
+from bayesmc.kernels.proposal import (
+    Parts,
+    Proposal,
+    blaming,
+    check_kind,
+    check_vector,
+    cut,
+    refuse_infinite,
+    to_stored,
+    warn_of_gaps,
 )
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.forward import (
@@ -34,7 +33,7 @@ from bayesmc.network.forward import (
     potential_factors,
     with_factors,
 )
-from bayesmc.network.model import arguments_of, call, fit, invalid_error
+from bayesmc.network.model import fit, invalid_error
 from bayesmc.network.ordering import topological_order
 from bayesmc.shapes import Shape
 
@@ -76,8 +75,8 @@ class Propose:
         self._compared: set[str] = set()
 
     def __call__(self, state: Pass) -> None:
-        with _blaming(self.proposal):
-            dist, batch = self._distribution(state)
+        with blaming(self.proposal):
+            dist, batch = self.proposal.distribution(self.model, state.values)
             if isinstance(dist, Parts):
                 for node in self.nodes:
                     self._draw(node, dist.parts[node.name], batch, state)
@@ -86,25 +85,13 @@ class Propose:
             else:
                 self._draw_split(dist, batch, state)
 
-    def _distribution(self, state: Pass) -> tuple[Distribution, Shape]:
-        declaration, links = self.proposal.declaration, self.proposal.links
-        arguments, batch = arguments_of(links, state.values)
-        plates = tuple(self.model.sizes[p] for p in declaration.plates)
-        dist = call(declaration, arguments, batch + plates, links)
-        if not isinstance(dist, Distribution):
-            raise ModelError(
-                f"the function returns an array of shape {np.shape(dist)}; return the distribution to "
-                "draw from"
-            )
-        return dist, batch
-
     def _draw(self, node: CompiledNode, dist: Distribution, batch: Shape, state: Pass) -> None:
         """Draw a node whose distribution has its batch and plates."""
-        _check_kind(node.name, node.is_discrete, node.event_shape, dist)
+        check_kind(node, dist)
         fit(node.declaration, dist, batch, node.plate_shape)
         if node.name not in self._compared:
             self._compared.add(node.name)
-            self._warn_of_gaps(node, dist)
+            warn_of_gaps(self.proposal, node, dist)
         alive = _alive(state)
         error = invalid_error(node, dist, alive, state.batch)
         if error is not None:
@@ -115,7 +102,7 @@ class Propose:
         if seen is not None:  # partly observed: only the missing elements were drawn
             assert seen.mask is not None
             log_q = np.where(seen.mask, 0.0, log_q)
-        values, outside = _stored(node, draws)
+        values, outside = to_stored(node, draws)
         if seen is not None:
             assert seen.mask is not None
             outside = outside & ~seen.mask
@@ -129,22 +116,9 @@ class Propose:
         values.flags.writeable = False
         state.values[node.name] = values
 
-    def _warn_of_gaps(self, node: CompiledNode, dist: Distribution) -> None:
-        """Warn where the proposal never reaches what its target may be, as far as supports tell."""
-        never = _never_proposed(node, dist)
-        if never is not None:
-            warnings.warn(
-                f"importance sampling: {self.proposal.what} is on {dist.support.describe()} and never gives "
-                f"{never}, which {node.name!r} may take; what is never proposed is missing from all answers, "
-                "and no weight shows it: propose from a distribution that covers the node's support",
-                SupportWarning,
-                stacklevel=2,
-            )
-
     def _draw_split(self, dist: Distribution, batch: Shape, state: Pass) -> None:
         """Draw a block as one vector and split it in order."""
-        sizes = [math.prod(node.value_shape) for node in self.nodes]
-        self._check_vector(dist, sum(sizes))
+        check_vector(self.nodes, dist, self.observed.keys())
         fit(self.proposal.declaration, dist, batch, ())
         alive = _alive(state)
         if dist.invalid is not None:
@@ -153,10 +127,8 @@ class Propose:
                 raise dist.problem
         draws = dist.sample_to(state.rng, state.batch)
         outside = np.zeros(state.batch, dtype=bool)
-        for node, part in zip(
-            self.nodes, np.split(draws, np.cumsum(sizes)[:-1], axis=-1), strict=True
-        ):
-            values, beyond = _stored(node, part.reshape(state.batch + node.value_shape))
+        for node, part in zip(self.nodes, cut(self.nodes, draws), strict=True):
+            values, beyond = to_stored(node, part)
             outside |= beyond.reshape((*state.batch, -1)).any(axis=-1)
             values = np.ascontiguousarray(values)
             values.flags.writeable = False
@@ -164,98 +136,17 @@ class Propose:
         log_q = np.broadcast_to(dist.log_prob(draws), state.batch)
         self._divide(log_q, outside, alive, state)
 
-    def _check_vector(self, dist: Distribution, size: int) -> None:
-        parts = ", ".join(f"{node.name} {math.prod(node.value_shape)}" for node in self.nodes)
-        if dist.event_shape != (size,):
-            raise ShapeError(
-                f"the distribution draws values of shape {dist.event_shape}, but the block has {size} "
-                f"components ({parts}); return one vector of them, or a dict from name to distribution"
-            )
-        for node in self.nodes:
-            _check_kind(node.name, node.is_discrete, (), dist, shaped=False)
-            if node.name in self.observed:
-                raise UnsupportedError(
-                    f"{node.name!r} is partly observed, and a vector cannot be drawn in part; propose "
-                    "its missing elements by a dict from name to distribution"
-                )
-
     def _divide(
         self, log_q: np.ndarray, outside: np.ndarray, alive: np.ndarray, state: Pass
     ) -> None:
         """Divide the weight by q; draws outside the target's values have p = 0."""
-        ok = np.isfinite(log_q)
-        if not ok.all():
-            bad = ~ok & alive
-            if bad.any():
-                raise DensityError(
-                    f"the log density at one of its own draws is {log_q[bad].flat[0]}; sample= and "
-                    "log_prob of a proposal must describe the same, finite density"
-                )
-            log_q = np.where(ok, log_q, 0.0)
-        state.weigh(-log_q)
+        refuse_infinite(np.where(alive, log_q, 0.0))
+        state.weigh(-np.where(np.isfinite(log_q), log_q, 0.0))
         if outside.any():
             state.weigh(np.where(outside, -np.inf, 0.0))
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-@contextmanager
-def _blaming(proposal: Proposal) -> Iterator[None]:
-    """What goes wrong inside is the proposal's fault, not the node's."""
-    try:
-        yield
-    except BayesmcError as error:
-        node = f"node {proposal.declaration.name!r}"
-        text = str(error)
-        rest = text.removeprefix(node) if text.startswith(node) else f": {text}"
-        error.args = (f"Importance: {proposal.what}{rest}", *error.args[1:])
-        raise
-
-
-def _never_proposed(node: CompiledNode, dist: Distribution) -> str | None:
-    """Values of a target, in words, that no draw of its proposal can have; None if none is known."""
-    if node.domain is None:
-        known = node.support is not None and node.support.is_constant
-        if not known or dist.support.covers(node.support):  # type: ignore[arg-type]
-            return None
-        return f"others of the {node.support.describe()}"  # type: ignore[union-attr]
-    values = node.domain.low + np.arange(node.domain.size)
-    with np.errstate(all="ignore"):
-        at = values.reshape((-1,) + (1,) * len(dist.batch_shape))
-        reached = np.isfinite(dist.log_prob(at)).reshape(len(values), -1).any(axis=1)
-    missed = [node.domain.states[k] for k in np.flatnonzero(~reached)]
-    return (
-        ", ".join(map(repr, missed[:5])) + (", ..." if len(missed) > 5 else "") if missed else None
-    )
-
-
-def _check_kind(
-    name: str, is_discrete: bool, event_shape: Shape, dist: Distribution, shaped: bool = True
-) -> None:
-    """A draw must be a value of the target's kind, or its density p is no density of that draw."""
-    if bool(dist.is_discrete) != is_discrete:
-        kinds = {True: "discrete", False: "continuous"}
-        raise ModelError(
-            f"{name!r} is {kinds[is_discrete]}, but {type(dist).__name__} is "
-            f"{kinds[not is_discrete]}; propose a {kinds[is_discrete]} distribution"
-        )
-    if shaped and dist.event_shape != event_shape:
-        raise ShapeError(
-            f"{type(dist).__name__} draws values of shape {dist.event_shape}, but one value of {name!r} "
-            f"has shape {event_shape}"
-        )
-
-
-def _stored(node: CompiledNode, draws: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Draws as stored values, and which are no value of a finite node (shape batch and plates)."""
-    if node.domain is None:
-        return draws, np.zeros(draws.shape[: draws.ndim - len(node.event_shape)], dtype=bool)
-    positions = draws - node.domain.low
-    outside = (positions < 0) | (positions >= node.domain.size)
-    if outside.any():
-        positions = np.where(outside, 0, positions)
-    return positions.astype(node.domain.dtype), outside
 
 
 def _alive(state: Pass) -> np.ndarray:

@@ -10,20 +10,21 @@ Hastings (1970), Biometrika 57; Koller and Friedman (2009), sec. 12.3.4.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import BroadcastError, ShapeError, UnsupportedError
+from bayesmc.errors import BroadcastError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import Block, accepted, compare, instead
 from bayesmc.kernels.proposal import (
-    Conditional,
     Parts,
+    Proposal,
     blaming,
     check_kind,
+    check_vector,
+    cut,
     refuse_infinite,
     to_stored,
     to_support,
@@ -42,26 +43,26 @@ class Proposed(Kernel):
     Parameters
     ----------
     blanket : Blanket
-    conditional : Conditional or None
+    proposal : Proposal or None
         None: from the node's own density given its parents.
     """
 
-    def __init__(self, blanket: Blanket, conditional: Conditional | None = None) -> None:
+    def __init__(self, blanket: Blanket, proposal: Proposal | None = None) -> None:
         self.blanket = blanket
         self.names = (blanket.name,)
-        self.conditional = conditional
-        self.label = "proposed by a function" if conditional else "proposed from its own density"
-        if conditional is not None and not conditional.declaration.parents:
+        self.proposal = proposal
+        self.label = "proposed by a function" if proposal else "proposed from its own density"
+        if proposal is not None and not proposal.parents:
             self.label = "proposed from one distribution"
 
     def start(self, values: Values, chains: int) -> Memory:
-        if self.conditional is not None:
-            with blaming(self.conditional):
+        if self.proposal is not None:
+            with blaming(self.proposal):
                 dist = self._distribution(values)
                 check_kind(self.blanket.node, dist)
                 self._check_elements(values, dist)
-            if self.conditional.is_independent:
-                warn_of_gaps(self.conditional, self.blanket.node, dist)
+            if self.proposal.is_independent:
+                warn_of_gaps(self.proposal, self.blanket.node, dist)
         return {"accepted": np.zeros(chains), "moves": 0}
 
     def step(
@@ -70,10 +71,10 @@ class Proposed(Kernel):
         blanket, name = self.blanket, self.blanket.name
         state, share, count = values, np.zeros(len(values[name])), 0
         for members in blanket.classes:
-            with blaming(self.conditional):
-                proposal, dead, forward = self._drawn(state, rng)
-            new, forward = picked(proposal, forward, members, blanket)
-            _, dead = picked(proposal, dead, members, blanket)
+            with blaming(self.proposal):
+                drawn, dead, forward = self._drawn(state, rng)
+            new, forward = picked(drawn, forward, members, blanket)
+            _, dead = picked(drawn, dead, members, blanket)
             found = compare(blanket, state, new, members, dead)
             log_ratio = found.own + found.rest - forward
             log_ratio = log_ratio + self._backward(state, found.new, members)
@@ -92,8 +93,8 @@ class Proposed(Kernel):
     # ---- private -------------------------------------------------------------------------------
 
     def _distribution(self, values: Values) -> Distribution:
-        if self.conditional is not None:
-            return self.conditional.result(self.blanket.target.model, values)
+        if self.proposal is not None:
+            return self.proposal.fitted(self.blanket.target.model, values)
         assert self.blanket.own is not None
         return self.blanket.own.distribution(values)[0]
 
@@ -113,11 +114,11 @@ class Proposed(Kernel):
     def _backward(self, values: Values, new: np.ndarray, members: np.ndarray | None) -> np.ndarray:
         """Log density of proposing the old values from the new ones."""
         blanket = self.blanket
-        conditional, name = self.conditional, blanket.name
+        proposal, name = self.proposal, blanket.name
         state = values
-        if conditional is not None and {name, *blanket.path} & set(conditional.declaration.parents):
+        if proposal is not None and {name, *blanket.path} & set(proposal.parents):
             state = blanket.placed(values, new, members)
-        with blaming(conditional):
+        with blaming(proposal):
             dist = self._distribution(state)
             now = values[name]
             log = dist.log_prob(to_support(blanket.node, now))
@@ -160,46 +161,47 @@ class ProposedBlock(Kernel):
     ----------
     target : Target
     names : sequence of str
-    conditional : Conditional or None
+    proposal : Proposal or None
         None: from the nodes' own densities, parents first.
     """
 
     def __init__(
-        self, target: Target, names: Sequence[str], conditional: Conditional | None = None
+        self, target: Target, names: Sequence[str], proposal: Proposal | None = None
     ) -> None:
         self.block = Block(target, names)
         self.names = tuple(names)
         self.target = target
         self.nodes = [target.model[name] for name in names]
-        self.conditional = conditional
+        self.proposal = proposal
         self.label = (
-            "proposed jointly by a function" if conditional else "proposed from their own densities"
+            "proposed jointly by a function" if proposal else "proposed from their own densities"
         )
 
     def start(self, values: Values, chains: int) -> Memory:
-        if self.conditional is not None:
-            with blaming(self.conditional):
-                dist = self.conditional.result(self.target.model, values)
+        if self.proposal is not None:
+            with blaming(self.proposal):
+                dist = self.proposal.fitted(self.target.model, values)
                 parts = dist.parts if isinstance(dist, Parts) else {}
                 for node in self.nodes:
                     if node.name in parts:
                         check_kind(node, parts[node.name])
                 if not parts:
-                    self._check_vector(dist)
+                    partly = {n for n in self.names if self.target.seen(n) is not None}
+                    check_vector(self.nodes, dist, partly)
             for node in self.nodes:
-                if node.name in parts and self.conditional.is_independent:
-                    warn_of_gaps(self.conditional, node, parts[node.name])
+                if node.name in parts and self.proposal.is_independent:
+                    warn_of_gaps(self.proposal, node, parts[node.name])
         return {"accepted": np.zeros(chains), "moves": 0}
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
-        with blaming(self.conditional):
+        with blaming(self.proposal):
             new, dead, forward = self._drawn(values, rng)
         new = {n: instead(dead, v, values[n]) for n, v in new.items()}
         _, log = self.block.log(values)
         state, grown = self.block.log(values, lambda name, _: (new[name], 0.0))
-        with blaming(self.conditional):
+        with blaming(self.proposal):
             backward = self._log_density(state, values)
         log_ratio = np.where(dead, -np.inf, grown - log + backward - forward)
         accept = accepted(log_ratio, rng)
@@ -217,16 +219,16 @@ class ProposedBlock(Kernel):
         self, values: Values, rng: np.random.Generator
     ) -> tuple[Values, np.ndarray, np.ndarray]:
         """Stored proposals, which chains have one that is no value of a node, and log densities."""
-        if self.conditional is None:
+        if self.proposal is None:
             return self._from_own(values, rng)
-        dist = self.conditional.result(self.target.model, values)
+        dist = self.proposal.fitted(self.target.model, values)
         chains = len(values[self.names[0]])
         if not isinstance(dist, Parts):
             draws = dist.sample_to(rng, (chains,))
             log = np.broadcast_to(dist.log_prob(draws), (chains,))
             refuse_infinite(log)
             new, dead = {}, np.zeros(chains, dtype=bool)
-            for node, part in zip(self.nodes, self._cut(draws), strict=True):
+            for node, part in zip(self.nodes, cut(self.nodes, draws), strict=True):
                 new[node.name], outside = to_stored(node, part)
                 dead |= outside.reshape(chains, -1).any(axis=1)
             return new, dead, log
@@ -245,9 +247,9 @@ class ProposedBlock(Kernel):
 
     def _log_density(self, given: Values, values: Values) -> np.ndarray:
         """Log density of proposing ``values`` from the state ``given``."""
-        if self.conditional is None:
+        if self.proposal is None:
             return self._own_log(values)
-        dist = self.conditional.result(self.target.model, given)
+        dist = self.proposal.fitted(self.target.model, given)
         if not isinstance(dist, Parts):
             flat = [
                 to_support(n, values[n.name]).reshape(len(values[n.name]), -1) for n in self.nodes
@@ -301,28 +303,3 @@ class ProposedBlock(Kernel):
         flat = log.reshape(len(log), -1)
         free = self.target.free_elements(node.name)
         return (flat if free is None else flat[:, free]).sum(axis=1)
-
-    def _cut(self, draws: np.ndarray) -> list[np.ndarray]:
-        """A vector's components as values of the nodes, in order."""
-        sizes = [math.prod(node.value_shape) for node in self.nodes]
-        pieces = np.split(draws, np.cumsum(sizes)[:-1], axis=-1)
-        return [
-            piece.reshape(len(draws), *node.value_shape)
-            for node, piece in zip(self.nodes, pieces, strict=True)
-        ]
-
-    def _check_vector(self, dist: Distribution) -> None:
-        size = sum(math.prod(node.value_shape) for node in self.nodes)
-        parts = ", ".join(f"{node.name} {math.prod(node.value_shape)}" for node in self.nodes)
-        if dist.event_shape != (size,):
-            raise ShapeError(
-                f"the distribution draws values of shape {dist.event_shape}, but the block has {size} "
-                f"components ({parts}); return one vector of them, or a dict from name to distribution"
-            )
-        for node in self.nodes:
-            check_kind(node, dist, shaped=False)
-            if self.target.seen(node.name) is not None:
-                raise UnsupportedError(
-                    f"{node.name!r} is partly observed, and a vector cannot be drawn in part; propose "
-                    "its missing elements by a dict from name to distribution"
-                )

@@ -391,7 +391,8 @@ REFUSED: dict[str, tuple[dict[Any, Any], type[Exception], str]] = {
         "it names 'v', which it is to draw",
     ),
     "starred": ({"p": lambda *a: NORMAL}, ModelError, r"\*a is refused"),
-    "unreadable": ({"p": dict}, ModelError, "the arguments of .* cannot be read; wrap it"),
+    "unreadable": ({"p": max}, ModelError, "the arguments of .* cannot be read; wrap it"),
+    "a class": ({"p": dict}, TypeError, "the proposal for .p. is <class .dict.>; give a function"),
     "a cycle": (
         {"p": lambda k: bmc.Beta(1.0, 1.0), "k": lambda p: bmc.Bernoulli(p)},
         CycleError,

@@ -412,7 +412,7 @@ def chain_net() -> bmc.BayesNet:
 FAULTS: dict[str, tuple[Any, type[Exception], str]] = {
     "unknown node": ({"q": "prior"}, UnknownNodeError, "'q'"),
     "observed": ({"y": "prior"}, EvidenceError, "observed"),
-    "deterministic": ({"double": "prior"}, ModelError, "never moves"),
+    "deterministic": ({"double": "prior"}, ModelError, "never drawn"),
     "input": ({"u": "prior"}, ModelError, "an input"),
     "unknown argument": ({"s": lambda q: bmc.Normal(q, 1.0)}, UnknownNodeError, "argument 'q'"),
     "starred": ({"s": lambda *a: bmc.Normal(0.0, 1.0)}, ModelError, "refused"),
