@@ -8,14 +8,11 @@ the slope between a shorter and a longer call: what a call costs once is printed
 
 from __future__ import annotations
 
-import json
-import subprocess
 import sys
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -28,6 +25,7 @@ from benchmarks.harness import (
     HERE,
     SelfTimed,
     Timing,
+    Worker,
     data_folder,
     interleave,
     network,
@@ -67,18 +65,12 @@ def main(arguments: Sequence[str] = ()) -> None:
     bench_waiting.main(arguments)
 
 
-class Fused:
-    """The samplers fused by numba, in the peers' environment, asked over a pipe."""
+class Fused(Worker):
+    """The samplers fused by numba, in the peers' environment."""
 
     def __init__(self, python: Any) -> None:
-        self._process = subprocess.Popen(
-            [str(python), "-m", "benchmarks.floors.gibbs_fused"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
-            cwd=HERE.parent,
-        )
+        command = [str(python), "-m", "benchmarks.floors.gibbs_fused"]
+        super().__init__("the fused samplers", command, cwd=HERE.parent)
 
     def timed(self, job: str, size: int, sweeps: int) -> SelfTimed:
         """An entry for ``interleave``; the first call compiles and is not counted."""
@@ -87,33 +79,7 @@ class Fused:
 
     def seconds(self, job: str, size: int, sweeps: int) -> float:
         """Seconds for so many sweeps. ``RuntimeError`` where there is no numba."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        try:
-            print(
-                json.dumps({"job": job, "size": size, "sweeps": sweeps}),
-                file=self._process.stdin,
-                flush=True,
-            )
-            return float(json.loads(self._process.stdout.readline())["seconds"])
-        except (BrokenPipeError, json.JSONDecodeError) as error:
-            raise RuntimeError("the fused samplers ended: is numba installed?") from error
-
-    def __enter__(self) -> Fused:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        try:
-            self._process.stdin.close()
-        except BrokenPipeError:
-            pass
-        self._process.wait(timeout=60)
-        self._process.stdout.close()
+        return float(self.ask(job=job, size=size, sweeps=sweeps)["seconds"])
 
 
 def _fused(stack: ExitStack) -> Fused | None:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Any, Self
 
 from benchmarks import THREADS
 
@@ -88,7 +89,77 @@ def reached(floor: float, peer: float, baseline: float) -> bool:
     return peer / floor >= (1.0 - TOLERANCE) * baseline
 
 
-class Peer:
+class Worker:
+    """A process that answers one line of JSON with another. Use it as a context: it ends with it.
+
+    Parameters
+    ----------
+    name
+        What messages call it.
+    command, cwd, env
+        As ``subprocess.Popen`` takes them.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        cwd: Path | None = None,
+        env: Mapping[str, str] | None = None,
+    ) -> None:
+        self.name = name
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            cwd=cwd,
+            env=env,
+        )
+
+    def ask(self, **question: Any) -> dict[str, Any]:
+        """The reply to a question; ``RuntimeError`` where the process has ended or failed."""
+        assert self._process.stdin is not None
+        try:
+            print(json.dumps(question), file=self._process.stdin, flush=True)
+        except BrokenPipeError:
+            pass  # the missing reply says so
+        return self.reply()
+
+    def reply(self) -> dict[str, Any]:
+        """The next line that the process prints."""
+        assert self._process.stdout is not None
+        line = self._process.stdout.readline()
+        if not line:
+            raise RuntimeError(
+                f"{self.name} ended (exit status {self._process.wait()}); "
+                "is its environment complete? Run `make peers`"
+            )
+        found = json.loads(line)
+        if "error" in found:
+            raise RuntimeError(f"{self.name} failed: {found['error']}")
+        return found
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        assert self._process.stdin is not None and self._process.stdout is not None
+        try:
+            self._process.stdin.close()
+        except BrokenPipeError:
+            pass
+        self._process.wait(timeout=60)
+        self._process.stdout.close()
+
+
+class Peer(Worker):
     """A peer library in its own environment, one job on one network, asked over a pipe.
 
     ``job`` is one of ``lw-pgmpy``, ``lw-pyagrum``, ``exact-pyagrum``; the protocol is that of
@@ -103,65 +174,25 @@ class Peer:
             raise FileNotFoundError(
                 f"the peer {job} has no environment; run `make peers`, or name one in BAYESMC_PEERS"
             )
-        self.job = job
         script = HERE / "peers" / "server.py"
-        self._process = subprocess.Popen(
+        super().__init__(
+            f"the peer {job}",
             [str(python), str(script), job, str(network), str(draws)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            text=True,
             env={name: value for name, value in os.environ.items() if name not in THREADS},
         )
-        self._reply()
+        self.reply()
 
     def seconds(self, evidence: Mapping[str, str]) -> float:
         """Seconds for one run with this evidence."""
-        return float(self._ask(evidence, answer=False)["seconds"])
+        return float(self.ask(evidence=dict(evidence), answer=False)["seconds"])
 
     def marginals(self, evidence: Mapping[str, str]) -> dict[str, dict[str, float]]:
         """The peer's answer: node to state label to probability."""
-        return self._ask(evidence, answer=True)["marginals"]
+        return self.ask(evidence=dict(evidence), answer=True)["marginals"]
 
     def timed(self, *evidence: Mapping[str, str]) -> SelfTimed:
         """An entry for :func:`interleave` that asks each evidence in turn and times all of them."""
         return SelfTimed(lambda: sum(self.seconds(one) for one in evidence))
-
-    def __enter__(self) -> Peer:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.close()
-        self._process.wait(timeout=60)
-        self._process.stdout.close()
-
-    def _ask(self, evidence: Mapping[str, str], answer: bool) -> dict:
-        assert self._process.stdin is not None
-        print(
-            json.dumps({"evidence": dict(evidence), "answer": answer}),
-            file=self._process.stdin,
-            flush=True,
-        )
-        return self._reply()
-
-    def _reply(self) -> dict:
-        assert self._process.stdout is not None
-        line = self._process.stdout.readline()
-        if not line:
-            raise RuntimeError(
-                f"the peer {self.job} ended (exit status {self._process.wait()}); "
-                "is its environment complete? Run `make peers`"
-            )
-        reply = json.loads(line)
-        if "error" in reply:
-            raise RuntimeError(f"the peer {self.job} failed: {reply['error']}")
-        return reply
 
 
 def peer_python() -> Path | None:

@@ -25,7 +25,6 @@ from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_children import Partner, partner_of
 from bayesmc.kernels.conjugate_components import CountedShares, PlanarStep, quick_step
 from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Naturals, split_prior
-from bayesmc.kernels.conjugate_labels import hidden_above
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.precisions import keep_precision
 from bayesmc.kernels.slice import slice_move
@@ -432,4 +431,4 @@ def _prior_words(blanket: Blanket) -> str:
 def _prior_is_hidden(blanket: Blanket) -> bool:
     """Whether the prior's parameters change from sweep to sweep."""
     assert blanket.own is not None
-    return bool(hidden_above(blanket.target, blanket.own))
+    return bool(blanket.target.hidden_above(blanket.own))

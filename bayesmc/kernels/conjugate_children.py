@@ -23,8 +23,6 @@ from bayesmc.kernels.conjugate_kinds import Kind, Naturals
 from bayesmc.kernels.conjugate_labels import (
     ByLabel,
     by_label,
-    hidden_above,
-    is_known,
     read_directly,
 )
 from bayesmc.kernels.conjugate_pairs import Pair
@@ -178,7 +176,7 @@ class Partner:
 
     def _known_data(self) -> Elements | None:
         target = self.blanket.target
-        if not is_known(target, self.term.name):
+        if not target.is_known(self.term.name):
             return None
         with np.errstate(all="ignore"):
             return self._data_of(target.known[self.term.name])
@@ -191,9 +189,9 @@ class Partner:
         if not alone or len(self.blanket.classes) > 1:
             return
         target, name = self.blanket.target, self.blanket.name
-        above = hidden_above(target, self.term)
+        above = target.hidden_above(self.term)
         members = self.blanket.classes[0]
-        if above == {name} and is_known(target, self.term.name):
+        if above == (name,) and target.is_known(self.term.name):
             value = np.broadcast_to(self._neutral, (1, *self.blanket.node.value_shape))
             self._fixed = self._natural({**target.known, name: value}, members)
             return
@@ -204,7 +202,7 @@ class Partner:
         elif self.kind.name == "mean":
             self._find_slope(above, members)
 
-    def _read_directly(self, above: set[str]) -> None:
+    def _read_directly(self, above: tuple[str, ...]) -> None:
         """Leave out calls of the function where its parameters are plain nodes by label."""
         assert self._way is not None
         example = read_directly(self._way, self._neutral, above)
@@ -223,14 +221,13 @@ class Partner:
         at_zero = self._way.parameter("loc", {})
         return bool((slope == unit).all() and not np.any(at_zero))
 
-    def _find_slope(self, above: set[str], members: np.ndarray | None) -> None:
+    def _find_slope(self, above: tuple[str, ...], members: np.ndarray | None) -> None:
         """Slopes are constant where the mean is affine in all that is hidden together."""
         target = self.blanket.target
         if any(target.model[n].is_discrete for n in above):
             return
-        order = tuple(n for n in target.chain if n in above)
         try:
-            result = traced_term(target, order, self.term).result
+            result = traced_term(target, above, self.term).result
         except Untraceable:
             return
         loc = result.arguments["loc"] if isinstance(result, TracedCall) else None
@@ -238,11 +235,11 @@ class Partner:
             return
         # values that can be: the noise may depend on some of these nodes, too
         state = {**target.known}
-        for n in order:
+        for n in above:
             shape = target.model[n].value_shape
             state[n] = np.asarray(target.model.probe[n], dtype=float).reshape(-1, *shape)[:1]
         try:
-            target.refresh(state, order)
+            target.refresh(state, above)
             dist, _, _ = self._distribution(state, members, True)
         except BayesmcError:
             return

@@ -22,7 +22,7 @@ from bayesmc.kernels.precisions import Precision, kept_precision, precision_of
 from bayesmc.network.model import arguments_of, call
 from bayesmc.plates import Lookups, PlateArray
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.target import Target, Term, Values
+from bayesmc.structure.target import Values
 from bayesmc.structure.traced import Untraceable, traced_term
 from bayesmc.tracing import TracedCall, Tracer
 
@@ -142,7 +142,7 @@ class _Source:
 def by_label(blanket: Blanket, child: Child, pair: Pair) -> ByLabel | None:
     """The way by labels, where it is found to be right and worth while."""
     target, model, term = blanket.target, blanket.target.model, child.term
-    if child.relation.kind not in ("aligned", "lookup") or not is_known(target, term.name):
+    if child.relation.kind not in ("aligned", "lookup") or not target.is_known(term.name):
         return None
     own = set(term.plates)
     if not own or own & set(blanket.node.plates):
@@ -164,7 +164,7 @@ def by_label(blanket: Blanket, child: Child, pair: Pair) -> ByLabel | None:
     return found
 
 
-def read_directly(way: ByLabel, neutral: np.ndarray, above: set[str]) -> Values | None:
+def read_directly(way: ByLabel, neutral: np.ndarray, above: tuple[str, ...]) -> Values | None:
     """Find out whether every parameter is one node looked up by label, and the node enters in order.
 
     The node is that of the blanket, which may also be the label itself.
@@ -209,34 +209,13 @@ def read_directly(way: ByLabel, neutral: np.ndarray, above: set[str]) -> Values 
     return state
 
 
-def is_known(target: Target, name: str) -> bool:
-    """Whether a node's values never change (of a partly seen one in the chain they do)."""
-    return name in target.known and name not in target.chain
-
-
-def hidden_above(target: Target, term: Term) -> set[str]:
-    """Hidden stochastic nodes that a term's function varies with, through deterministic ones, too."""
-    todo, found, seen = list(term.parents), set(), set()
-    while todo:
-        name = todo.pop()
-        if name in seen or name in target.known and name not in target.chain:
-            continue
-        seen.add(name)
-        node = target.model[name]
-        if node.is_stochastic:
-            found.add(name)
-        else:
-            todo += node.parents
-    return found
-
-
 # ---- private ------------------------------------------------------------------------------------
 
 
 def _suffices(way: ByLabel) -> bool:
     """Whether parameters at every label are those of the elements with that label."""
     target, term = way.blanket.target, way.child.term
-    state = _example(way, hidden_above(target, term))
+    state = _example(way, target.hidden_above(term))
     states = way.groups.states
     label = np.random.default_rng(0).permutation(np.arange(math.prod(term.shape)) % states)
     label = label.reshape(term.shape)
@@ -269,7 +248,7 @@ def _agrees(full: np.ndarray, short: np.ndarray, label: np.ndarray, event_ndim: 
     return bool(((full == short) | (np.isnan(full) & np.isnan(short))).all())
 
 
-def _example(way: ByLabel, above: set[str]) -> Values:
+def _example(way: ByLabel, above: tuple[str, ...]) -> Values:
     """One reachable value of every hidden node, and what follows from them."""
     target = way.blanket.target
     state: Values = dict(target.known)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -43,13 +43,14 @@ class BlockTerm:
         self.dynamic = next(
             (n for n, c in self.children.items() if c.relation.kind == "lookup"), None
         )
-        above = _hidden_above(target, term)
-        sources = None if above is None or self.dynamic else _affine_sources(target, term, above)
+        above = target.hidden_above(term)
+        discrete = any(target.model[n].is_discrete for n in above)
+        sources = None if discrete or self.dynamic else _affine_sources(target, term, above)
         #: coefficients never change; nor does anything else but the noise; nor does that
         self.constant = sources is not None
         self.fixed = sources is not None and sources <= set(layout.names)
         self.fixed &= self.own or term.name not in target.chain  # a hidden child's value changes
-        self.frozen = self.fixed and set(above or ()) <= set(layout.names)
+        self.frozen = self.fixed and set(above) <= set(layout.names)
         self.kept: Any = None
         self.slopes: np.ndarray | None = None
         self.summed: Any = None
@@ -226,12 +227,12 @@ class BlockTerm:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _affine_sources(target: Target, term: Term, above: Sequence[str]) -> set[str] | None:
+def _affine_sources(target: Target, term: Term, above: tuple[str, ...]) -> set[str] | None:
     """The hidden nodes that a term's mean is jointly affine in; None where it is not in some."""
     if not above:
         return set()
     try:
-        result = traced_term(target, tuple(above), term).result
+        result = traced_term(target, above, term).result
     except Untraceable:
         return None
     loc = result.arguments.get("loc") if isinstance(result, TracedCall) else None
@@ -243,24 +244,6 @@ def _affine_sources(target: Target, term: Term, above: Sequence[str]) -> set[str
 def _may_be(source: str, name: str) -> bool:
     """Whether a source may be a node, or a lookup in it: ``x[0]`` may be either."""
     return source == name or (source.startswith(f"{name}[") and source.endswith("]"))
-
-
-def _hidden_above(target: Target, term: Term) -> list[str] | None:
-    """Hidden continuous nodes above a term; None where a discrete one is among them."""
-    todo, seen, found = list(term.parents), set(), []
-    while todo:
-        name = todo.pop()
-        if name in seen or name in target.known:
-            continue
-        seen.add(name)
-        node = target.model[name]
-        if not node.is_stochastic:
-            todo += node.parents
-        elif node.is_discrete:
-            return None
-        else:
-            found.append(name)
-    return [n for n in target.chain if n in found]
 
 
 def _first(arrays: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:

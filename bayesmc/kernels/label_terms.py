@@ -28,7 +28,7 @@ from bayesmc.distributions import (
 )
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Groups, groups_of
 from bayesmc.kernels.conjugate_evaluation import padded
-from bayesmc.kernels.conjugate_labels import ByLabel, hidden_above, is_known, read_directly
+from bayesmc.kernels.conjugate_labels import ByLabel, read_directly
 from bayesmc.kernels.conjugate_planar import planar_coefficients
 from bayesmc.kernels.precisions import Precision, precision_of
 from bayesmc.network.model import arguments_of, call
@@ -98,7 +98,7 @@ class LabelTerm:
         self.groups: Groups | None = None
         self._way: ByLabel | None = None
         self._means: str | None = None
-        self._above = hidden_above(target, self.term)
+        self._above = target.hidden_above(self.term)
         self._unique: np.ndarray | None = None
         self._family: _Family | None = None
         self.centre: np.ndarray = np.zeros(())
@@ -288,7 +288,7 @@ def label_term(blanket: Blanket, child: Child) -> LabelTerm | None:
     own = set(blanket.node.plates)
     if child.relation.kind != "aligned" or term.is_potential or not own <= set(term.plates):
         return None
-    if not is_known(target, term.name):
+    if not target.is_known(term.name):
         return None
     if [p for p in term.parents if own & set(target.model[p].plates)] != [blanket.name]:
         return None

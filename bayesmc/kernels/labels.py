@@ -24,7 +24,6 @@ from bayesmc.distributions import Categorical
 from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_data import Groups
-from bayesmc.kernels.conjugate_labels import hidden_above
 from bayesmc.kernels.conjugate_planar import FEW
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.label_terms import (
@@ -346,7 +345,7 @@ class _Prior:
         target = blanket.target
         log = self._evaluated(example_of(target))
         self._is_common = log.shape[2:] == (1,) * axes
-        above = set() if own is None else hidden_above(target, own)
+        above = () if own is None else target.hidden_above(own)
         if not above:
             self._kept = self._shaped(self._evaluated({**target.known}))
             self.steep = bool((self._kept < _ZERO).any())
@@ -448,7 +447,7 @@ def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
 def _weights_of(blanket: Blanket) -> str | None:
     """The node that holds the probabilities themselves, one row for all elements."""
     own, target = blanket.own, blanket.target
-    above = [] if own is None else sorted(hidden_above(target, own))
+    above = () if own is None else target.hidden_above(own)
     if own is None or len(above) != 1 or target.model[above[0]].plates:
         return None
     if target.model[above[0]].event_shape != (blanket.node.domain.size,):  # type: ignore[union-attr]

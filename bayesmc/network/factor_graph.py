@@ -21,13 +21,14 @@ from bayesmc.errors import (
     PlateError,
     QueryError,
 )
+from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.evidence import Observed, read_evidence, read_inputs
 from bayesmc.network.factor_batch import read_factor, variable_declaration
 from bayesmc.network.factor_scope import factor_scopes, hidden_elements
 from bayesmc.network.full_conditional import full_conditional
 from bayesmc.network.graph_view import FactorRecord, GraphView, VariableRecord
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Potential, plate_size
+from bayesmc.network.node import Declaration, Potential
 from bayesmc.network.store import ModelStore
 
 
@@ -74,28 +75,10 @@ class FactorGraph:
     def __init__(
         self, name: str | None = None, plates: Mapping[str, int | Sequence[Any]] | None = None
     ) -> None:
-        if name is not None and not isinstance(name, str):
-            raise ModelError(
-                f"FactorGraph({name!r}): the name is a string; plates are given as plates="
-            )
-        if plates is not None and not isinstance(plates, Mapping):
-            raise PlateError(
-                f"FactorGraph(plates={plates!r}): give a dict from plate name to size or labels"
-            )
+        self._plates = DeclaredPlates.read("FactorGraph", name, plates, open_sizes=False)
         self.name = name
         self._declarations: dict[str, Declaration] = {}
         self._potentials: dict[str, Potential] = {}
-        self._sizes: dict[str, int] = {}
-        self._labels: dict[str, tuple[Any, ...]] = {}
-        for plate, size in (plates or {}).items():
-            count = plate_size(plate, size)
-            if count is None:
-                raise PlateError(
-                    f"FactorGraph(plates={{{plate!r}: None}}): no data will tell its size; give it"
-                )
-            self._sizes[plate] = count
-            if not isinstance(size, (int, np.integer)):
-                self._labels[plate] = tuple(size)
         self._kept_store: ModelStore | None = None
         self._kept_view: GraphView | None = None
         self._question: tuple[Any, Model, dict[str, Observed], dict[str, np.ndarray]] | None = None
@@ -110,8 +93,7 @@ class FactorGraph:
     ) -> FactorGraph:
         """The graph of a net given evidence, both read already; ``net.to_factor_graph`` is the way in."""
         graph = cls(model.name)
-        graph._sizes = dict(model.sizes)
-        graph._labels = dict(model.labels)
+        graph._plates = DeclaredPlates("FactorGraph", dict(model.sizes), dict(model.labels))
         graph._question = (net, model, dict(observed), dict(inputs))
         return graph
 
@@ -155,7 +137,7 @@ class FactorGraph:
         """
         self._refuse_closed("variable")
         self._refuse_name("variable", name)
-        own = self._own_plates(f"variable {name!r}", plates)
+        own = self._plates.of(f"variable {name!r}", plates)
         self._declarations[name] = variable_declaration(name, support, own, event_shape)
         self._changed()
 
@@ -216,9 +198,9 @@ class FactorGraph:
                 count += 1
             name = f"factor_{count}"
         self._refuse_name("factor", name)
-        own = None if plates is None else self._own_plates(f"factor {name!r}", plates)
+        own = None if plates is None else self._plates.of(f"factor {name!r}", plates)
         self._potentials[name] = read_factor(
-            name, log_potential, scope, index, own, self._declarations, self._sizes
+            name, log_potential, scope, index, own, self._declarations, self.plates
         )
         self._changed()
 
@@ -243,7 +225,7 @@ class FactorGraph:
     @property
     def plates(self) -> dict[str, int]:
         """Plate name -> size."""
-        return dict(self._sizes)
+        return {p: n for p, n in self._plates.sizes.items() if n is not None}
 
     @property
     def variables(self) -> Mapping[str, VariableRecord]:
@@ -397,15 +379,15 @@ class FactorGraph:
         plates: Mapping[str, int] | None = None,
     ) -> Model:
         """The validated snapshot that engines run on; see ``BayesNet.model``."""
-        changed = [p for p, n in (plates or {}).items() if self._sizes.get(p) != n]
+        changed = [p for p, n in (plates or {}).items() if self._plates.sizes.get(p) != n]
         if changed:
             raise PlateError(
                 f"plates= gives {changed[0]!r}, but the plates of a factor graph have fixed sizes"
             )
         if self._question is not None:
             return self._question[1]
-        read_inputs({}, self._sizes, inputs)
-        model = self._store.model(self._sizes, {})
+        read_inputs({}, self.plates, inputs)
+        model = self._store.model(self.plates, {})
         self._store.validate(model)
         return model
 
@@ -435,8 +417,7 @@ class FactorGraph:
         other = FactorGraph(self.name)
         other._declarations = dict(self._declarations)
         other._potentials = dict(self._potentials)
-        other._sizes = dict(self._sizes)
-        other._labels = dict(self._labels)
+        other._plates = self._plates.copy()
         other._kept_store = self._kept_store
         other._question = self._question
         return other
@@ -451,7 +432,7 @@ class FactorGraph:
     def _store(self) -> ModelStore:
         if self._kept_store is None:
             self._kept_store = ModelStore(
-                self.name, self._declarations, self._potentials, self._labels
+                self.name, self._declarations, self._potentials, self._plates.labels
             )
         return self._kept_store
 
@@ -476,15 +457,3 @@ class FactorGraph:
             raise ModelError(f"a {what}'s name is a non-empty string, not {name!r}")
         if name in self:
             raise DuplicateNodeError(f"{what} {name!r}: the name is declared already")
-
-    def _own_plates(self, what: str, plates: str | Sequence[str]) -> tuple[str, ...]:
-        names = (plates,) if isinstance(plates, str) else tuple(plates)
-        for plate in names:
-            if plate not in self._sizes:
-                raise PlateError(
-                    f"{what} is in plate {plate!r}, which the graph does not have (its plates: "
-                    f"{list(self._sizes) or 'none'}); declare FactorGraph(plates={{{plate!r}: size}})"
-                )
-        if len(set(names)) != len(names):
-            raise PlateError(f"{what}: plates={names} names a plate twice")
-        return names

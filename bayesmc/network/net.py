@@ -19,6 +19,7 @@ from bayesmc.errors import (
     PlateError,
     UnknownNodeError,
 )
+from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.evidence import plate_sizes, read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.intervene import fixed
@@ -31,7 +32,6 @@ from bayesmc.network.node import (
     bind,
     checked_rows,
     plain_states,
-    plate_size,
 )
 from bayesmc.network.store import ModelStore, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -76,23 +76,10 @@ class BayesNet:
         name: str | None = None,
         plates: Mapping[str, int | Sequence[Any] | None] | None = None,
     ) -> None:
-        if name is not None and not isinstance(name, str):
-            raise ModelError(
-                f"BayesNet({name!r}): the name is a string; plates are given as plates="
-            )
-        if plates is not None and not isinstance(plates, Mapping):
-            raise PlateError(
-                f"BayesNet(plates={plates!r}): give a dict from plate name to size, labels or None"
-            )
+        self._plates = DeclaredPlates.read("BayesNet", name, plates)
         self.name = name
         self._declarations: dict[str, Declaration] = {}
         self._potentials: dict[str, Potential] = {}
-        self._sizes: dict[str, int | None] = {}
-        self._labels: dict[str, tuple[Any, ...]] = {}
-        for plate, size in (plates or {}).items():
-            self._sizes[plate] = plate_size(plate, size)
-            if size is not None and not isinstance(size, (int, np.integer)):
-                self._labels[plate] = tuple(size)
         self._kept_store: ModelStore | None = None
 
     # ---- declaring --------------------------------------------------------------------------
@@ -244,7 +231,7 @@ class BayesNet:
                 name,
                 "table",
                 tuple(parents),
-                self._node_plates(name, plates),
+                self._plates.of(f"node {name!r}", plates),
                 states,
                 probs=table,
             ),
@@ -253,7 +240,7 @@ class BayesNet:
 
     def input(self, name: str, plates: str | Sequence[str] = (), event_shape: Any = ()) -> None:
         """Declare a known value, passed as ``inputs=`` to ``infer``, ``sample``, ``log_prob``."""
-        plates = self._node_plates(name, plates)
+        plates = self._plates.of(f"node {name!r}", plates)
         self._declare(
             Declaration(name, "input", (), plates, event_shape=as_shape(event_shape)), False
         )
@@ -273,7 +260,9 @@ class BayesNet:
         names, bound = bind(name, function, parents)
         if name in self._declarations or name in self._potentials:
             raise DuplicateNodeError(f"potential {name!r}: the name is declared already")
-        self._potentials[name] = Potential(name, names, bound, self._node_plates(name, plates))
+        self._potentials[name] = Potential(
+            name, names, bound, self._plates.of(f"node {name!r}", plates)
+        )
         self._changed()
 
     def do(self, mapping: Mapping[str, Any] | None = None, /, **values: Any) -> BayesNet:
@@ -299,7 +288,7 @@ class BayesNet:
         for name in chosen:
             if name not in self._declarations:
                 raise UnknownNodeError(f"do({name}=...): {unknown(self._declarations, name)}")
-        sizes = plate_sizes(self._sizes, self._declarations, chosen)
+        sizes = plate_sizes(self._plates.sizes, self._declarations, chosen)
         model = self._store.probe(sizes)
         other = self.copy()
         for name, value in chosen.items():
@@ -312,8 +301,7 @@ class BayesNet:
         other = BayesNet(self.name)
         other._declarations = dict(self._declarations)
         other._potentials = dict(self._potentials)
-        other._sizes = dict(self._sizes)
-        other._labels = dict(self._labels)
+        other._plates = self._plates.copy()
         return other
 
     def snapshot(self) -> BayesNet:
@@ -327,7 +315,7 @@ class BayesNet:
     def __getitem__(self, name: str) -> Node:
         if name not in self._declarations:
             raise UnknownNodeError(unknown(self._declarations, name))
-        return self._store.probe(self._sizes)[name].record()
+        return self._store.probe(self._plates.sizes)[name].record()
 
     def __contains__(self, name: object) -> bool:
         return name in self._declarations
@@ -349,7 +337,7 @@ class BayesNet:
     @property
     def plates(self) -> dict[str, int | None]:
         """Plate name -> size (None where it is read from the data)."""
-        return dict(self._sizes)
+        return dict(self._plates.sizes)
 
     @property
     def potentials(self) -> dict[str, Potential]:
@@ -384,7 +372,7 @@ class BayesNet:
         if inputs is not None:
             self.model(inputs=inputs)
             return
-        model = self._store.probe(self._sizes)
+        model = self._store.probe(self._plates.sizes)
         self._store.validate(model)
 
     def log_prob(
@@ -452,13 +440,15 @@ class BayesNet:
     ) -> Model:
         """The validated snapshot that engines run on, with plate sizes settled by the data."""
         for plate, size in (plates or {}).items():
-            if plate not in self._sizes:
+            if plate not in self._plates.sizes:
                 raise PlateError(
-                    f"plates= gives {plate!r}; the net's plates are {list(self._sizes)}"
+                    f"plates= gives {plate!r}; the net's plates are {list(self._plates.sizes)}"
                 )
             if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
                 raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
-        sizes = plate_sizes({**self._sizes, **(plates or {})}, self._declarations, evidence, inputs)
+        sizes = plate_sizes(
+            {**self._plates.sizes, **(plates or {})}, self._declarations, evidence, inputs
+        )
         open_plates = [p for p, n in sizes.items() if n is None and self._uses(p)]
         if open_plates:
             raise PlateError(
@@ -515,7 +505,7 @@ class BayesNet:
                 "list parents= for its arguments"
             )
         labels = None if states is None else plain_states(states)
-        own = self._node_plates(name, plates)
+        own = self._plates.of(f"node {name!r}", plates)
         self._declare(Declaration(name, "function", names, own, labels, bound, vectorize), replace_)
 
     def _declare(self, declaration: Declaration, replace_: bool) -> None:
@@ -536,21 +526,9 @@ class BayesNet:
     def _store(self) -> ModelStore:
         if self._kept_store is None:
             self._kept_store = ModelStore(
-                self.name, self._declarations, self._potentials, self._labels
+                self.name, self._declarations, self._potentials, self._plates.labels
             )
         return self._kept_store
-
-    def _node_plates(self, name: str, plates: str | Sequence[str]) -> tuple[str, ...]:
-        names = (plates,) if isinstance(plates, str) else tuple(plates)
-        for plate in names:
-            if plate not in self._sizes:
-                raise PlateError(
-                    f"node {name!r} is in plate {plate!r}, which the net does not have (its plates: "
-                    f"{list(self._sizes) or 'none'}); declare BayesNet(plates={{{plate!r}: size}})"
-                )
-        if len(set(names)) != len(names):
-            raise PlateError(f"node {name!r}: plates={names} names a plate twice")
-        return names
 
     def _uses(self, plate: str) -> bool:
         return any(plate in d.plates for d in self._declarations.values())
@@ -558,9 +536,11 @@ class BayesNet:
     def _unbatched(self, name: str, value: Any) -> Any:
         """A stand-in with the value's plate axes in front, for reading plate sizes off it."""
         declaration = self._declarations[name]
-        if not declaration.plates or all(self._sizes[p] is not None for p in declaration.plates):
+        if not declaration.plates or all(
+            self._plates.sizes[p] is not None for p in declaration.plates
+        ):
             return None
-        event = len(self._store.probe(self._sizes)[name].event_shape)
+        event = len(self._store.probe(self._plates.sizes)[name].event_shape)
         shape = np.shape(value)
         lead = len(shape) - event - len(declaration.plates)
         return np.empty(shape[lead:], dtype=bool) if lead >= 0 else None

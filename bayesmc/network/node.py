@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, ParameterError, PlateError
+from bayesmc.errors import ModelError, ParameterError
 from bayesmc.network.domain import Domain
 from bayesmc.shapes import Shape, first_index
 
@@ -159,28 +159,6 @@ def plain_states(states: Sequence[Any]) -> tuple[Any, ...]:
     if isinstance(states, (str, Set)) or not isinstance(states, (Sequence, np.ndarray)):
         raise ModelError(f"states={states!r}: give a list or tuple, in the order of the support")
     return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
-
-
-def plate_size(plate: str, size: Any) -> int | None:
-    """Size of a plate from an int, a list of labels or None; what is neither raises."""
-    if not isinstance(plate, str):
-        raise PlateError(f"a plate's name is a string, not {plate!r}")
-    if size is None:
-        return None
-    if isinstance(size, str):
-        raise PlateError(
-            f"plate {plate!r}: {size!r} is one string; give a size or a list of labels"
-        )
-    if not isinstance(size, (int, np.integer, Sequence, np.ndarray)) or isinstance(size, bool):
-        raise PlateError(
-            f"plate {plate!r}: {size!r} is no size; give an int, a list of labels or None"
-        )
-    count = int(size) if isinstance(size, (int, np.integer)) else len(size)
-    if not isinstance(size, (int, np.integer)) and len(set(size)) != count:
-        raise PlateError(f"plate {plate!r}: a label stands twice in {list(size)}")
-    if count < 0:
-        raise PlateError(f"plate {plate!r}: size {count} is negative")
-    return count
 
 
 def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:

@@ -137,6 +137,22 @@ class Target:
     def seen(self, name: str) -> Observed | None:
         return self.problem.observed.get(name)
 
+    def is_known(self, name: str) -> bool:
+        """Whether a node's values never change (of a partly seen one in the chain they do)."""
+        return name in self.known and name not in self.chain
+
+    def hidden_above(self, term: Term) -> tuple[str, ...]:
+        """Nodes of the chain that a term's function varies with, through deterministic ones, too."""
+        todo, reached = list(term.parents), set()
+        while todo:
+            name = todo.pop()
+            if name in reached or self.is_known(name):
+                continue
+            reached.add(name)
+            if not self.model[name].is_stochastic:
+                todo += self.model[name].parents
+        return tuple(n for n in self.chain if n in reached)
+
     def free_elements(self, name: str) -> np.ndarray | None:
         """Flat plate elements of a chain node that are hidden; None where all are."""
         seen = self.seen(name)

@@ -61,8 +61,8 @@ def traced_term(target: Target, names: tuple[str, ...], term: Term) -> Traced:
     """As ``trace_term``; raises ``Untraceable`` with the reason."""
     result, keys = _call(target, names, term)
     constant = False
-    if keys and not _has_discrete_ancestor(target, term, names):
-        constant = _same_keys(target, names, term, keys)
+    if keys and not any(target.model[n].is_discrete for n in target.hidden_above(term)):
+        constant = _same_keys(target, term, keys)
     return Traced(result, keys, constant)
 
 
@@ -127,36 +127,9 @@ def _made(links: Any, values: Mapping[str, Any], function: Any, keys: list[Any])
     return result, batch
 
 
-def _has_discrete_ancestor(target: Target, term: Term, names: tuple[str, ...]) -> bool:
-    """Whether a hidden discrete node reaches the term's function."""
-    todo, seen = list(term.parents), set()
-    while todo:
-        name = todo.pop()
-        if name in seen or name in target.known:
-            continue
-        seen.add(name)
-        node = target.model[name]
-        if node.is_stochastic:
-            if node.is_discrete:
-                return True
-        else:
-            todo += node.parents
-    return False
-
-
-def _same_keys(
-    target: Target, names: tuple[str, ...], term: Term, keys: list[tuple[Any, ...]]
-) -> bool:
+def _same_keys(target: Target, term: Term, keys: list[tuple[Any, ...]]) -> bool:
     """Whether the indices stay the same, with all hidden continuous nodes traced."""
-    todo, above = list(term.parents), set()
-    while todo:
-        name = todo.pop()
-        if name in above or name in target.known:
-            continue
-        above.add(name)
-        if not target.model[name].is_stochastic:
-            todo += target.model[name].parents
-    everyone = tuple(n for n in target.chain if n in above and target.model[n].domain is None)
+    everyone = tuple(n for n in target.hidden_above(term) if target.model[n].domain is None)
     try:
         _, again = _call(target, everyone, term)
     except Untraceable:

@@ -258,7 +258,7 @@ FAULTS: list[tuple[str, Callable[[bmc.FactorGraph], Any], type[Exception], str]]
     ("index and plates", lambda g: g.factor(flat, scope="s", index=([0],), plates="site"),
      errors.ModelError, "index= or plates="),
     ("unknown plate", lambda g: g.variable("new", 2, plates="column"),
-     errors.PlateError, "'column', which the graph does not have"),
+     errors.PlateError, "'column', which is not declared"),
     ("no support", lambda g: g.variable("new", "sometimes"), errors.ModelError, "is not known"),
     ("no states", lambda g: g.variable("new", 0), errors.ModelError, "too few"),
     ("states twice", lambda g: g.variable("new", ("a", "a")), errors.ModelError, "twice"),
