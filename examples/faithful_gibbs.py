@@ -29,6 +29,7 @@ TIMES = np.array(ERUPTIONS, dtype=float)  # minutes: it lasted, until the next
 CENTRE = TIMES.mean(axis=0)
 SPREAD = np.diag([2.0, 25.0]) ** 2  # of a cluster's mean about the centre
 DF, SCATTER = 5.0, np.diag([0.2, 60.0])  # a cluster's covariance is SCATTER / (DF - 3) on average
+KAPPA = 0.1  # eruptions that the prior of a mean is worth, where it is in units of the covariance
 CHAINS = 4
 
 #: priors of the waiting times alone: mean and sd of a cluster's mean, InverseGamma of its variance
@@ -57,10 +58,10 @@ def independent() -> bmc.BayesNet:
 
 
 def normal_inverse_wishart() -> bmc.BayesNet:
-    """Both times; a cluster's mean has the covariance of one eruption in it (kappa = 1)."""
+    """Both times; the prior of a cluster's mean is worth ``KAPPA`` eruptions."""
     net = _mixture("Normal-inverse-Wishart prior")
     net.add("cov", bmc.InverseWishart(DF, SCATTER), plates="cluster")
-    net.add("mean", lambda cov: bmc.MvNormal(CENTRE, cov), plates="cluster")
+    net.add("mean", lambda cov: bmc.MvNormal(CENTRE, cov / KAPPA), plates="cluster")
     return _seen(net)
 
 

@@ -42,13 +42,15 @@ class Partner:
     pair : Pair
     power : float
         The power of the node in the parameter (1 for copies and means).
+    is_copy : bool
+        Whether the parameter is the node's value.
     """
 
     def __init__(
-        self, blanket: Blanket, child: Child, kind: Kind, pair: Pair, power: float
+        self, blanket: Blanket, child: Child, kind: Kind, pair: Pair, power: float, is_copy: bool
     ) -> None:
         self.blanket, self.child, self.kind = blanket, child, kind
-        self.pair, self.power = pair, power
+        self.pair, self.power, self.is_copy = pair, power, is_copy
         self.term = child.term
         self.node = blanket.target.model[child.term.name]
         neutral = kind.neutral(blanket.event_shape)
@@ -96,7 +98,9 @@ class Partner:
             return e.sum(found[0]), e.sum(found[1])
         if self.kind.name == "shares":
             return (found if self.pair.child is Categorical else e.sum(found, 1),)
-        return e.sum(found), e.data.scatter(e.get("loc", 1), e)
+        # the node stands at the unit matrix, of which the covariance is a multiple
+        spread = np.ones(()) if self.is_copy else e.get("cov", 2)[..., 0, 0]
+        return e.sum(found), e.data.scatter(e.get("loc", 1), spread, e)
 
     def _mean(self, e: Evaluated | Looked, slope: np.ndarray) -> Naturals:
         """Precision and linear term of a node that enters a mean affinely."""
@@ -198,7 +202,8 @@ class Partner:
         if members is None and self.pair.by_label:
             self._way = by_label(self.blanket, self.child, self.pair)
         if self._way is not None:
-            self._read_directly(above)
+            if self.is_copy or self.pair.form != "multiple":
+                self._read_directly(above)
         elif self.kind.name == "mean":
             self._find_slope(above, members)
 
@@ -279,7 +284,7 @@ def partner_of(
         return f"the {parameter} of child {term.name!r} {reason}"
     power = 1.0 if pair.form != "power" else value.power
     assert power is not None
-    return Partner(blanket, child, kind, pair, power)
+    return Partner(blanket, child, kind, pair, power, value.is_copy)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -299,6 +304,10 @@ def _why_not(blanket: Blanket, child: Child, pair: Pair, value: Tracer) -> str |
         return (
             None if value.power is not None else "is not known to be a power of it times a constant"
         )
+    if pair.form == "multiple":
+        if value.power == 1.0 and value.whole_event:
+            return None
+        return "is not known to be its value times a number"
     if not value.is_copy or (blanket.event_shape and not value.whole_event):
         return "is not known to be its value itself"
     return None

@@ -72,9 +72,9 @@ class Elements:
         z = solve_lower(tril, self.value - loc)
         return np.vecdot(z, z) * self.count
 
-    def scatter(self, loc: np.ndarray, into: Sums) -> np.ndarray:
-        """Scatter matrices about ``loc``, summed for every element of a node."""
-        return into.outer(self.deviations(loc)[..., None, :])
+    def scatter(self, loc: np.ndarray, spread: np.ndarray, into: Sums) -> np.ndarray:
+        """Scatter matrices about ``loc``, each over its ``spread``, summed for every element of a node."""
+        return into.outer((self.deviations(loc) / np.sqrt(spread)[..., None])[..., None, :])
 
     def _counted(self, array: np.ndarray) -> np.ndarray:
         if self.mask is None:
@@ -141,8 +141,8 @@ class Grouped:
         whole = solve_lower(tril[..., None, :, :], np.matrix_transpose(half))
         return np.maximum(np.linalg.trace(whole), 0.0)
 
-    def scatter(self, loc: np.ndarray, into: Sums) -> np.ndarray:
-        return into.sum(self._scatter(loc), 2)
+    def scatter(self, loc: np.ndarray, spread: np.ndarray, into: Sums) -> np.ndarray:
+        return into.sum(self._scatter(loc) / spread[..., None, None], 2)
 
     def _scatter(self, loc: np.ndarray) -> np.ndarray:
         off = loc - self._centre

@@ -66,7 +66,8 @@ class Pair:
     parameter : str
         As the family calls it.
     form : str
-        How the node must enter: ``affine``, ``power`` (``c * x**p``) or ``copy``.
+        How the node must enter: ``affine``, ``power`` (``c * x**p``), ``multiple`` (``c * x``, with one
+        number c for a whole matrix) or ``copy``.
     statistic : callable
         What the child adds, by kind. Mean: a residual divided by the noise. Scale: the power of the
         parameter before the exponential, and the exponential's coefficient. Share: successes and failures.
@@ -192,5 +193,5 @@ PAIRS: tuple[Pair, ...] = (
     Pair("share", NegativeBinomial, "probs", "copy", _of_failures),
     Pair("shares", Categorical, "probs", "copy", _categories, by_label=False),
     Pair("shares", Multinomial, "probs", "copy", _counts, by_label=False),
-    Pair("covariance", MvNormal, "cov", "copy", _one_each, squares=True),
+    Pair("covariance", MvNormal, "cov", "multiple", _one_each, squares=True),
 )

@@ -169,6 +169,26 @@ def test_interrupted_chains_keep_what_they_have(monkeypatch: pytest.MonkeyPatch)
     assert part["mean"].shape == (4, 25, 3)
 
 
+def test_a_name_that_looks_like_an_index_is_a_name() -> None:
+    """A mean adds nodes of a block, x and w, and one outside: it is not frozen whatever that is called."""
+    draws = []
+    for outside in ("x[0]", "c"):
+        net = bmc.BayesNet(plates={"p": 3})
+        net.add("x", bmc.Normal(0.0, 1.0))
+        net.add("w", lambda x: bmc.Normal(x, 1.0))
+        net.add(outside, bmc.StudentT(3.0, 0.0, 2.0))
+        net.add(
+            "y",
+            lambda x, w, c: bmc.Normal(x + w + c, 0.5),
+            parents=["x", "w", outside],
+            plates="p",
+        )
+        assert "block" in kernels(net, {"y": [2.0, 3.0, 2.5]})["x"]
+        posterior = bmc.infer(net, {"y": [2.0, 3.0, 2.5]}, engine=bmc.Gibbs(40, 26, 4), rng=1)
+        draws.append(posterior["x"])
+    assert np.array_equal(*draws)
+
+
 # ---- where chains start -------------------------------------------------------------------------
 
 

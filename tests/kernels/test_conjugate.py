@@ -191,6 +191,10 @@ SIDES = {
         lambda: bmc.InverseWishart(4.5, COV), lambda x: bmc.MvNormal(np.ones(2), x), VECTORS,
         "InverseWishart with MvNormal cov",
     ),
+    "multiple of a covariance": Side(
+        lambda: bmc.InverseWishart(4.5, COV), lambda x: bmc.MvNormal(np.ones(2), x / 2.5), VECTORS,
+        "InverseWishart with MvNormal cov",
+    ),
 }  # fmt: skip
 
 PATTERNS = (
@@ -606,6 +610,24 @@ def test_a_function_that_peeks_at_its_plate_is_not_summed_by_label() -> None:
     assert kernel.partners[0]._way is None
 
 
+def test_a_normal_inverse_wishart_mixture() -> None:
+    """Means share their cluster's covariance, over a number that is hidden itself, and differs."""
+    net, evidence = _mixture(60)
+    net.add("kappa", bmc.Gamma(2.0, 2.0))
+    size = np.array([0.5, 1.0, 4.0])
+    net.add(
+        "mean",
+        lambda covariance, kappa: bmc.MvNormal(
+            np.full(2, 99.0), covariance / (kappa * size)[..., None, None]
+        ),
+        plates="cluster",
+        replace=True,
+    )
+    kernel = _assert_right(net, evidence, "covariance")
+    assert len(kernel.partners) == 2
+    _assert_right(net, evidence, "kappa")
+
+
 # ---- refusals -------------------------------------------------------------------------------------
 
 
@@ -651,6 +673,16 @@ def _words(prior: Any, child: Callable[..., Any], data: Any, plates: Any = "i") 
 )  # fmt: skip
 def test_refusals_say_why(prior: Any, child: Any, data: np.ndarray, words: str) -> None:
     assert words in _words(prior, child, data)
+
+
+def test_a_covariance_times_a_matrix_is_refused() -> None:
+    """Entry by entry that is no inverse Wishart, though it is linear."""
+    weights = np.array([[2.0, 1.0], [1.0, 2.0]])
+    net = bmc.BayesNet()
+    net.add("x", bmc.InverseWishart(4.5, np.eye(2)))
+    net.add("y", lambda x: bmc.MvNormal(np.zeros(2), x * weights))
+    target = target_of(pose(net, {"y": [0.5, 1.0]}))
+    assert "not known to be its value times a number" in conjugate_kernel(Blanket(target, "x"))
 
 
 def test_several_elements_in_one_rate_are_refused() -> None:

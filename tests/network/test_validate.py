@@ -643,6 +643,22 @@ def test_parameters_that_are_not_finite_name_the_node(value):
         net.validate()
 
 
+def test_what_overflows_for_every_draw_tried_is_no_fault():
+    """Vague priors can make a rate infinite in all tries; the arithmetic, or a parent, says that it grew."""
+    net = bmc.BayesNet(plates={"p": 3})
+    net.add("log_rate", bmc.Normal(2000.0, 1.0))
+    net.add("y", lambda log_rate: bmc.Poisson(np.exp(log_rate)), plates="p")
+    net.add("rate", lambda log_rate: np.exp(log_rate))
+    net.add("z", lambda rate: bmc.Poisson(rate), plates="p")
+    net.add("scale", lambda log_rate: np.exp(-log_rate))
+    net.add("x", lambda log_rate: bmc.Normal(0.0, np.exp(-log_rate)))
+    net.validate()
+    assert net.log_prob({"log_rate": 0.0, "y": [0, 0, 0], "z": [0, 0, 0], "x": 0.0}) < 0.0
+    net.add("bad", lambda log_rate: bmc.Normal(log_rate, np.inf))
+    with pytest.raises(ParameterError, match="node 'bad': Normal: scale must be"):
+        net.validate()
+
+
 def test_parameters_out_of_range_name_the_node_and_the_first_index():
     net = bmc.BayesNet(plates={"p": 4})
     net.add("x", lambda: bmc.Normal(0.0, np.array([1.0, 2.0, -1.0, -2.0])), plates="p")
