@@ -25,7 +25,7 @@ demo: .venv/.extras-plot
 	$(PY) -m examples.demo
 
 test: .venv/.extras-plot,arviz,test
-	$(PY) -m pytest -q
+	$(PY) -m pytest -q -n auto --dist worksteal
 
 lint: .venv/.extras-dev
 	$(PY) -m ruff check .

@@ -10,7 +10,7 @@ import pickle
 import signal
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -315,6 +315,15 @@ def test_an_interrupt_in_a_sweep_returns_whole_draws(keep: Any, sweep: int) -> N
     same(quiet(draws=100, **options), quiet(draws=70, resume=cut, **options))
 
 
+@pytest.fixture
+def ctrl_c() -> Iterator[None]:
+    """Python's own handler, which processes started in the background lack."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("ctrl_c")
 def test_ctrl_c_waits_for_the_end_of_a_draw() -> None:
     """A sampler that writes into its own state is interrupted between sweeps, and goes on bit for bit."""
 
@@ -331,6 +340,7 @@ def test_ctrl_c_waits_for_the_end_of_a_draw() -> None:
     same(quiet(draws=100, **options), quiet(draws=79, resume=cut, **options))
 
 
+@pytest.mark.usefixtures("ctrl_c")
 def test_a_second_ctrl_c_does_not_wait() -> None:
     passed = []
 
