@@ -155,7 +155,9 @@ FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("call", "index", "message"), FAULTS, ids=lambda v: str(v)[:50])
+@pytest.mark.parametrize(
+    ("call", "index", "message"), FAULTS, ids=[fault[2][:50] for fault in FAULTS]
+)
 def test_the_first_fault_is_named(call: Callable, index: tuple[int, ...], message: str) -> None:
     with pytest.raises(ParameterError) as caught:
         call()
@@ -163,7 +165,9 @@ def test_the_first_fault_is_named(call: Callable, index: tuple[int, ...], messag
     assert caught.value.index == index
 
 
-@pytest.mark.parametrize(("call", "index", "message"), FAULTS, ids=lambda v: str(v)[:50])
+@pytest.mark.parametrize(
+    ("call", "index", "message"), FAULTS, ids=[fault[2][:50] for fault in FAULTS]
+)
 def test_a_marked_fault_leaves_the_rest_usable(
     call: Callable, index: tuple[int, ...], message: str
 ) -> None:
