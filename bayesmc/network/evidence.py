@@ -55,10 +55,38 @@ def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str,
             )
         if value is None:
             continue
-        found = _observe(node, value)
+        found = observe(node, value)
         if found is not None:
             observed[name] = found
     return observed
+
+
+def observe(node: CompiledNode, value: Any) -> Observed | None:
+    """Check and store what was observed of one node; None where all of it is missing."""
+    try:
+        array, missing = _missing(node, value)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, EvidenceError):
+            raise
+        raise EvidenceError(f"evidence on {node.name!r} is ragged or no array: {error}") from error
+    if array.shape != node.value_shape:
+        raise EvidenceError(_shape_message(node, array.shape))
+    event = tuple(range(len(node.plate_shape), array.ndim))
+    some = missing.any(axis=event) if event else missing
+    every = missing.all(axis=event) if event else missing
+    if (some & ~every).any():
+        raise EvidenceError(
+            f"evidence on {node.name!r}: some components of one vector are missing, which is not "
+            "supported; split the vector into nodes of its parts, or leave the whole vector out"
+        )
+    if every.all() and array.size:
+        return None
+    filler = array[first_index(~missing)] if array.size else 0
+    filled = np.where(missing, filler, array) if missing.any() else array
+    stored = store(node, filled)
+    observed = np.asarray(~every)
+    _check_support(node, stored, observed)
+    return Observed(stored, None if observed.all() else observed)
 
 
 def read_question(
@@ -157,33 +185,6 @@ def store(node: CompiledNode, value: Any) -> np.ndarray:
         raise EvidenceError(_shape_message(node, stored.shape))
     stored.flags.writeable = False
     return stored
-
-
-def _observe(node: CompiledNode, value: Any) -> Observed | None:
-    try:
-        array, missing = _missing(node, value)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, EvidenceError):
-            raise
-        raise EvidenceError(f"evidence on {node.name!r} is ragged or no array: {error}") from error
-    if array.shape != node.value_shape:
-        raise EvidenceError(_shape_message(node, array.shape))
-    event = tuple(range(len(node.plate_shape), array.ndim))
-    some = missing.any(axis=event) if event else missing
-    every = missing.all(axis=event) if event else missing
-    if (some & ~every).any():
-        raise EvidenceError(
-            f"evidence on {node.name!r}: some components of one vector are missing, which is not "
-            "supported; split the vector into nodes of its parts, or leave the whole vector out"
-        )
-    if every.all() and array.size:
-        return None
-    filler = array[first_index(~missing)] if array.size else 0
-    filled = np.where(missing, filler, array) if missing.any() else array
-    stored = store(node, filled)
-    observed = np.asarray(~every)
-    _check_support(node, stored, observed)
-    return Observed(stored, None if observed.all() else observed)
 
 
 def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -340,6 +340,30 @@ class BayesNet:
         return dict(self._plates.sizes)
 
     @property
+    def plate_labels(self) -> dict[str, tuple[Any, ...]]:
+        """Plate name -> labels, of those that were declared with some."""
+        return dict(self._plates.labels)
+
+    @property
+    def declarations(self) -> dict[str, Declaration]:
+        """Name -> what was declared, for code that makes other nets of this one."""
+        return dict(self._declarations)
+
+    @classmethod
+    def of(
+        cls,
+        name: str | None,
+        declarations: Mapping[str, Declaration],
+        sizes: Mapping[str, int | None],
+        labels: Mapping[str, tuple[Any, ...]],
+    ) -> BayesNet:
+        """A net of declarations that were read already."""
+        net = cls(name)
+        net._declarations = dict(declarations)
+        net._plates = DeclaredPlates("BayesNet", dict(sizes), dict(labels))
+        return net
+
+    @property
     def potentials(self) -> dict[str, Potential]:
         """Name -> potential, with its ``parents`` and ``plates``."""
         return dict(self._potentials)

@@ -1,0 +1,294 @@
+"""Observations and inputs over time: read once, checked as a whole, and given out row by row.
+
+Reading treats time as one more plate, so that labels, shapes, supports and missing entries follow the rules
+of evidence; a row that is missing altogether is left out of its slice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
+from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.network import Observed
+from bayesmc.network.evidence import observe
+from bayesmc.network.model import CompiledNode
+from bayesmc.network.node import Declaration
+from bayesmc.network.store import unknown
+from bayesmc.shapes import first_index, owned
+
+if TYPE_CHECKING:
+    from bayesmc.dbn.template import DynamicBayesNet
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """What is known of one slice.
+
+    Attributes
+    ----------
+    t : int
+    seen : dict
+        Node -> ``Observed``, of nodes seen at least in part.
+    inputs : dict
+        ``t``, inputs and, after slice 0, ``t_prev`` and the inputs of the slice before, by their names.
+    """
+
+    t: int
+    seen: dict[str, Observed]
+    inputs: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """Data of several slices.
+
+    Attributes
+    ----------
+    steps : int
+    observed : dict
+        Node -> ``Observed`` with time as the first plate; its mask has shape (steps, *plates).
+    inputs : dict
+        Input -> values, shape (steps, *plates, *event).
+    static : dict
+        Static node -> ``Observed``.
+    """
+
+    steps: int
+    observed: dict[str, Observed]
+    inputs: dict[str, np.ndarray]
+    static: dict[str, Observed] = field(default_factory=dict)
+    #: the slice that row 0 belongs to
+    start: int = 0
+
+    def row(self, k: int) -> Row:
+        """What is known of the k-th slice here."""
+        seen = {}
+        for name, found in self.observed.items():
+            mask = found.mask
+            if mask is None:
+                seen[name] = Observed(found.value[k, ...])
+            elif mask[k].all():
+                seen[name] = Observed(found.value[k, ...])
+            elif mask[k].any():
+                seen[name] = Observed(found.value[k, ...], mask[k])
+        t = self.start + k
+        inputs: dict[str, np.ndarray] = {TIME: np.asarray(t)}
+        if t:
+            inputs[TIME + PREVIOUS] = np.asarray(t - 1)
+        for name, values in self.inputs.items():
+            inputs[name] = values[k, ...]
+            if k:
+                inputs[name + PREVIOUS] = values[k - 1, ...]
+        return Row(t, seen, inputs)
+
+
+def read_series(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None,
+    steps: int | None = None,
+    plates: Mapping[str, int] | None = None,
+) -> tuple[Slices, Series]:
+    """See ``DynamicBayesNet.read``."""
+    template = dbn.template
+    if observations is not None and not isinstance(observations, Mapping):
+        raise EvidenceError(
+            f"observations is a {type(observations).__name__}; give a dict from node name to its rows, time "
+            "first"
+        )
+    given = {n: v for n, v in (observations or {}).items() if v is not None}
+    for name in given:
+        _check_observed(template, name)
+    timed = {n: _rows(n, v) for n, v in given.items() if n not in template.static}
+    count = _count({**timed, **_input_rows(template, inputs)}, steps)
+    sizes = sizes_of(template, {**timed, **(inputs or {})}, plates)
+    rows = read_input_rows(template, sizes, inputs, count)
+    two = {n: v[min(1, count - 1)] for n, v in rows.items()}
+    two |= {n + PREVIOUS: v[0] for n, v in rows.items()}
+    slices = dbn.slices(sizes, two)
+    observed = {n: _observed(slices.later[n], v, count) for n, v in timed.items()}
+    static = {n: observe(slices.first[n], v) for n, v in given.items() if n in template.static}
+    return slices, Series(
+        count,
+        {n: o for n, o in observed.items() if o is not None},
+        rows,
+        {n: o for n, o in static.items() if o is not None},
+    )
+
+
+def read_input_rows(
+    template: Template,
+    sizes: Mapping[str, int],
+    inputs: Mapping[str, Any] | None,
+    steps: int,
+) -> dict[str, np.ndarray]:
+    """Inputs of all slices; every one that is declared must be given, in full.
+
+    Raises
+    ------
+    EvidenceError
+    """
+    given = _input_rows(template, inputs)
+    read = {}
+    for name in template.inputs:
+        if name not in given:
+            raise EvidenceError(
+                f"input {name!r} has no values; pass inputs={{{name!r}: array}}, time first"
+            )
+        value = np.array(given[name])
+        if value.dtype.kind not in "biuf":
+            raise EvidenceError(f"input {name!r} has dtype {value.dtype}; give numbers")
+        declaration = template.later[name]
+        shape = (steps, *(sizes[p] for p in declaration.plates), *declaration.event_shape)
+        if value.shape != shape:
+            raise EvidenceError(
+                f"input {name!r} has shape {value.shape}, but {steps} slices, its plates "
+                f"{declaration.plates} and event_shape {declaration.event_shape} make {shape}"
+            )
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            at = first_index(~np.isfinite(value))
+            raise EvidenceError(
+                f"input {name!r} is {value[at]} at index {at}; inputs must be finite, also where "
+                "observations are missing"
+            )
+        read[name] = owned(value)
+    return read
+
+
+def sizes_of(
+    template: Template,
+    data: Mapping[str, Any],
+    plates: Mapping[str, int] | None = None,
+) -> dict[str, int]:
+    """Sizes of all plates: declared ones, else read off the data behind its axis of time.
+
+    Raises
+    ------
+    PlateError
+    """
+    sizes = {**template.sizes, **(plates or {})}
+    for name, value in data.items():
+        declaration = template.later.get(name)
+        if declaration is None:
+            continue
+        for plate, size in zip(declaration.plates, np.shape(value)[1:], strict=False):
+            if sizes[plate] is None:
+                sizes[plate] = size
+    used = {p for d in template.later.values() for p in d.plates}
+    for plate, size in sizes.items():
+        if size is None and plate in used:
+            raise PlateError(
+                f"the size of plate {plate!r} is not known; observe a node in it, or declare "
+                f"plates={{{plate!r}: size}}"
+            )
+    return {p: n if n is not None else 0 for p, n in sizes.items()}
+
+
+def unrolled(template: Template, observations: Mapping[str, Any]) -> dict[str, Any]:
+    """See ``DynamicBayesNet.unrolled_evidence``."""
+    if not isinstance(observations, Mapping):
+        raise EvidenceError(
+            f"observations is a {type(observations).__name__}; give a dict from node name to its rows"
+        )
+    evidence = {}
+    for name, value in observations.items():
+        _check_observed(template, name)
+        if name in template.static:
+            evidence[name] = value
+            continue
+        if value is None:
+            continue
+        for t, row in enumerate(_rows(name, value)):
+            if not _is_missing(row):
+                evidence[f"{name}[{t}]"] = row
+    return evidence
+
+
+def check_steps(who: str, steps: Any) -> None:
+    """Refuse what is no number of slices."""
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+        raise ValueError(f"{who}(steps={steps!r}): steps is a number of slices, 1 or more")
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _check_observed(template: Template, name: str) -> None:
+    if name in template.inputs:
+        raise EvidenceError(f"observations of {name!r}, which is an input; give it with inputs=")
+    if name not in template.later:
+        raise EvidenceError(f"observations of {name!r}: {unknown(template.later, name)}")
+
+
+def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
+    if inputs is not None and not isinstance(inputs, Mapping):
+        raise EvidenceError(f"inputs is a {type(inputs).__name__}; give a dict from name to rows")
+    for name in inputs or {}:
+        if name not in template.inputs:
+            raise EvidenceError(
+                f"inputs= gives {name!r}, which is not a declared input; the inputs are "
+                f"{list(template.inputs)}"
+            )
+    return dict(inputs or {})
+
+
+def _rows(name: str, value: Any) -> Any:
+    """A series with None rows of vectors filled, so that it is an array."""
+    if isinstance(value, (list, tuple)) and any(v is None for v in value):
+        shapes = {np.shape(v) for v in value if v is not None}
+        if len(shapes) == 1 and (shape := shapes.pop()):
+            return [np.full(shape, np.nan) if v is None else v for v in value]
+    if np.ndim(value) == 0:
+        raise EvidenceError(
+            f"observations of {name!r}: {value!r} has no axis for time; give one row per slice"
+        )
+    return value
+
+
+def _count(data: Mapping[str, Any], steps: int | None) -> int:
+    """The number of slices, which all data agree on."""
+    lengths = {n: len(v) for n, v in data.items()}
+    wanted = {*lengths.values(), *(() if steps is None else (int(steps),))}
+    if len(wanted) > 1:
+        each = ", ".join(f"{n!r} {k}" for n, k in lengths.items())
+        asked = "" if steps is None else f"; asked for {steps} slices"
+        raise EvidenceError(
+            f"the data differ in length ({each}{asked}); row k belongs to slice k, and a missing row is NaN "
+            "or None"
+        )
+    if not wanted:
+        raise EvidenceError("no observations and no inputs: give at least one series, time first")
+    return wanted.pop()
+
+
+def _observed(node: CompiledNode, value: Any, steps: int) -> Observed | None:
+    if not node.is_stochastic:
+        raise EvidenceError(
+            f"observations of {node.name!r}, which is a deterministic node and takes none; observe a "
+            "stochastic node, or give it a narrow distribution"
+        )
+    declaration: Declaration = node.declaration
+    plates = ("time", *declaration.plates)
+    timed = replace(
+        node,
+        declaration=replace(declaration, plates=plates),
+        plate_shape=(steps, *node.plate_shape),
+    )
+    return observe(timed, value)
+
+
+def _is_missing(row: Any) -> bool:
+    """Whether a whole row is missing."""
+    if row is None or row is np.ma.masked:
+        return True
+    if isinstance(row, np.ma.MaskedArray) and np.ma.getmaskarray(row).all():
+        return True
+    if isinstance(row, (list, tuple)):
+        return bool(row) and all(_is_missing(r) for r in row)
+    array = np.asarray(row)
+    return array.dtype.kind == "f" and array.size > 0 and bool(np.isnan(array).all())

@@ -1,0 +1,293 @@
+"""What a template compiles to: slice 0, and two slices in a row.
+
+``Slices.first`` is the model of slice 0. ``Slices.later`` holds a slice, under the nodes' own names, and the
+one before, whose nodes are called ``<node>_prev``; only the first half of it, or what takes its place, needs
+values for the second to be evaluated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bayesmc.errors import ModelError, UnknownNodeError
+from bayesmc.network import Model, Node
+from bayesmc.network.node import Declaration
+from bayesmc.network.ordering import topological_order
+from bayesmc.network.store import ModelStore, unknown
+from bayesmc.shapes import owned
+
+if TYPE_CHECKING:
+    import networkx
+
+#: what the name of a value in the slice before ends in
+PREVIOUS = "_prev"
+#: the index of the slice
+TIME = "t"
+
+_CLOCK = {
+    name: Declaration(name, "input", (), (), event_shape=()) for name in (TIME, TIME + PREVIOUS)
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """Declarations of a template.
+
+    Attributes
+    ----------
+    later : dict
+        Name -> declaration in slices 1, 2, ...; inputs and static nodes among them.
+    first : dict
+        Name -> declaration in slice 0, of nodes that have another one there.
+    inputs, static : tuple of str
+    sizes, labels : dict
+        Of the plates.
+    """
+
+    name: str | None
+    later: dict[str, Declaration]
+    first: dict[str, Declaration]
+    inputs: tuple[str, ...]
+    static: tuple[str, ...]
+    sizes: dict[str, int | None]
+    labels: dict[str, tuple[Any, ...]]
+
+    @cached_property
+    def dynamic(self) -> tuple[str, ...]:
+        """Nodes with one value per slice, inputs apart, parents first."""
+        apart = {*self.inputs, *self.static}
+        own = {n: d for n, d in self.later.items() if n not in apart}
+        order = topological_order({n: [p for p in d.parents if p in own] for n, d in own.items()})
+        return tuple(order)
+
+    @cached_property
+    def interface(self) -> tuple[str, ...]:
+        """Nodes whose value the next slice reads."""
+        read = {p for d in self.later.values() for p in d.parents if p.endswith(PREVIOUS)}
+        return tuple(n for n in self.dynamic if n + PREVIOUS in read)
+
+    def check(self) -> None:
+        """Refuse parents that are not there, and what has no slice before it in slice 0.
+
+        Raises
+        ------
+        UnknownNodeError, ModelError
+        """
+        known = {*self.later, TIME}
+        for name, declaration in self.later.items():
+            fixed = name in self.static
+            for parent in declaration.parents:
+                stem = parent.removesuffix(PREVIOUS)
+                previous = stem != parent
+                if stem not in known or (previous and stem == TIME):
+                    raise UnknownNodeError(
+                        f"node {name!r} has the parent {parent!r}: {unknown(self.later, stem)}. Declare it, "
+                        "give the argument a default if it is no parent, or name the parents with parents="
+                    )
+                if fixed and parent not in self.static:
+                    raise ModelError(
+                        f"static node {name!r} has the parent {parent!r}, which has another value in every "
+                        "slice; static nodes depend on static nodes only"
+                    )
+                if previous and stem in self.static:
+                    raise ModelError(
+                        f"node {name!r} has the parent {parent!r}, but {stem!r} is static; it is the same in "
+                        f"every slice, so name it {stem!r}"
+                    )
+                if previous and name not in self.first:
+                    raise ModelError(
+                        f"node {name!r} reads {parent!r}, which slice 0 does not have; give its density "
+                        "there, initial=a distribution, or a function of nodes of the same slice"
+                    )
+        for name, declaration in self.first.items():
+            for parent in declaration.parents:
+                if parent.endswith(PREVIOUS) and parent.removesuffix(PREVIOUS) in known:
+                    raise ModelError(
+                        f"node {name!r}: initial= reads {parent!r}, but before slice 0 there is no slice; "
+                        "name nodes of the same slice, inputs or 't'"
+                    )
+                if parent not in known:
+                    raise UnknownNodeError(
+                        f"node {name!r}: initial= has the parent {parent!r}: {unknown(self.later, parent)}"
+                    )
+
+    def slice_zero(self) -> dict[str, Declaration]:
+        """Declarations of slice 0."""
+        return {TIME: _CLOCK[TIME], **{n: self.first.get(n, d) for n, d in self.later.items()}}
+
+    def two_slices(self) -> dict[str, Declaration]:
+        """Declarations of a slice and of the one before, as if that were slice 0."""
+        before = {
+            _previous(self, n): replace(
+                d, name=_previous(self, n), parents=tuple(_previous(self, p) for p in d.parents)
+            )
+            for n, d in self.slice_zero().items()
+        }
+        return {**before, TIME: _CLOCK[TIME], **self.later}
+
+    def graph(self) -> networkx.DiGraph:
+        """The two-slice template as a networkx graph."""
+        import networkx
+
+        self.check()
+        graph = networkx.DiGraph(name=self.name or "")
+        read = {p for d in self.later.values() for p in d.parents}
+        for name, declaration in self.later.items():
+            where = "static" if name in self.static else "now"
+            graph.add_node(name, slice=where, source=declaration.source, plates=declaration.plates)
+            if name + PREVIOUS in read:
+                graph.add_node(name + PREVIOUS, slice="prev", source=declaration.source,
+                               plates=declaration.plates)  # fmt: skip
+        for name, declaration in self.later.items():
+            graph.add_edges_from((p, name) for p in declaration.parents if p != TIME)
+        return graph
+
+
+@dataclass(frozen=True, eq=False)
+class Slices:
+    """A compiled template.
+
+    Attributes
+    ----------
+    first : Model
+        Slice 0: nodes under their own names, ``t``, inputs and static nodes.
+    later : Model
+        A slice and the one before it: the same, and ``<node>_prev``, ``t_prev``, ``<input>_prev``.
+    """
+
+    template: Template
+    first: Model
+    later: Model
+
+    def model(self, t: int) -> Model:
+        """The model of slice ``t``."""
+        return self.first if t == 0 else self.later
+
+    @property
+    def dynamic(self) -> tuple[str, ...]:
+        """Nodes of a slice, inputs apart, parents first."""
+        return self.template.dynamic
+
+    @property
+    def interface(self) -> tuple[str, ...]:
+        """Nodes whose value the next slice reads."""
+        return self.template.interface
+
+    @property
+    def stochastic(self) -> tuple[str, ...]:
+        """Nodes of a slice that have a density."""
+        return tuple(n for n in self.dynamic if self.first[n].is_stochastic)
+
+
+class SliceStore:
+    """Compiles a template as it stands, and remembers the last few models of both kinds."""
+
+    def __init__(self, template: Template) -> None:
+        self.template = template
+        self._checked = False
+        self._two: ModelStore | None = None
+        self._one: ModelStore | None = None
+        self._found: dict[tuple[int, int], Slices] = {}
+
+    def slices(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Slices:
+        """Both models for these plate sizes; ``inputs`` hold ``u`` and ``u_prev`` of two slices in a row."""
+        one, two = self._stores()
+        now = {n: inputs[n] for n in inputs if n in self.template.inputs}
+        at_zero = {n: inputs.get(n + PREVIOUS, v) for n, v in now.items()}
+        first = one.model(sizes, {TIME: _number(0), **at_zero})
+        later = two.model(sizes, {TIME: _number(1), TIME + PREVIOUS: _number(0), **inputs})
+        key = (id(first), id(later))
+        found = self._found.get(key)
+        if found is None:
+            _check_alike(self.template, first, later)
+            while len(self._found) >= 8:
+                self._found.pop(next(iter(self._found)))
+            found = self._found[key] = Slices(self.template, first, later)
+        return found
+
+    def probe(self, sizes: Mapping[str, int | None]) -> Slices:
+        """Both models when nobody has given data: open plates and inputs get stand-ins."""
+        self._stores()
+        inputs = self._stand_ins(sizes)
+        settled = {p: n if n is not None else _OPEN + k for k, (p, n) in enumerate(sizes.items())}
+        return self.slices(settled, inputs)
+
+    def validate(self, slices: Slices) -> None:
+        """Refuse functions that break the array rules."""
+        one, two = self._stores()
+        one.validate(slices.first)
+        two.validate(slices.later)
+
+    def record(self, name: str, sizes: Mapping[str, int | None]) -> Node:
+        """The public view of a node."""
+        node = self.probe(sizes).later[name].record()
+        return replace(node, kind="static") if name in self.template.static else node
+
+    def _stores(self) -> tuple[ModelStore, ModelStore]:
+        if self._one is None or self._two is None:
+            template = self.template
+            template.check()
+            self._one = ModelStore(template.name, template.slice_zero(), {}, template.labels)
+            self._two = ModelStore(template.name, template.two_slices(), {}, template.labels)
+        return self._one, self._two
+
+    def _stand_ins(self, sizes: Mapping[str, int | None]) -> dict[str, np.ndarray]:
+        rng = np.random.default_rng(3)
+        found = {}
+        for name in self.template.inputs:
+            declaration = self.template.later[name]
+            order = {p: k for k, p in enumerate(sizes)}
+            plates = tuple(
+                size if (size := sizes[p]) is not None else _OPEN + order[p]
+                for p in declaration.plates
+            )
+            for key in (name, name + PREVIOUS):
+                found[key] = owned(1.0 + rng.random(plates + declaration.event_shape))
+        return found
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+#: size of the first plate that nobody has given a size yet
+_OPEN = 3
+
+
+def _previous(template: Template, name: str) -> str:
+    """What a node of the slice before is called."""
+    return name if name in template.static else name + PREVIOUS
+
+
+def _number(t: int) -> np.ndarray:
+    return owned(np.asarray(t))
+
+
+def _check_alike(template: Template, first: Model, later: Model) -> None:
+    """Refuse a node that is another thing in slice 0 than later."""
+    for name in template.first:
+        a, b = first[name], later[name]
+        what = f"node {name!r}: initial= gives"
+        if a.is_stochastic != b.is_stochastic:
+            kinds = {True: "a distribution", False: "values without chance"}
+            raise ModelError(
+                f"{what} {kinds[a.is_stochastic]}, its function {kinds[b.is_stochastic]}"
+            )
+        if a.event_shape != b.event_shape:
+            raise ModelError(
+                f"{what} values of shape {a.event_shape}, its function values of shape {b.event_shape}"
+            )
+        states = [None if n.domain is None else n.domain.states for n in (a, b)]
+        if a.is_stochastic and states[0] != states[1]:
+            raise ModelError(f"{what} values on {_on(a)}, its function on {_on(b)}")
+        if a.is_discrete != b.is_discrete:
+            raise ModelError(f"{what} values on {_on(a)}, its function on {_on(b)}")
+
+
+def _on(node: Any) -> str:
+    if node.domain is not None:
+        return f"{node.domain.size} states"
+    return node.support.describe() if node.support is not None else "a support that varies"

@@ -1,0 +1,450 @@
+"""``DynamicBayesNet``: one slice of time, declared once, and what a slice takes from the one before.
+
+Every node has a declaration for *later* slices, whose function may name ``<node>_prev`` and ``t``, and with
+``initial=`` another for slice 0. What both compile to is in ``slices``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bayesmc.dbn.series import Series, read_series, unrolled
+from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
+from bayesmc.dbn.unroll import sampled, unroll
+from bayesmc.errors import DuplicateNodeError, ModelError, UnknownNodeError
+from bayesmc.network import BayesNet, Node
+from bayesmc.network.net import Parents
+from bayesmc.network.node import Declaration
+from bayesmc.randomness import Purpose, seed_sequence, stream
+
+if TYPE_CHECKING:
+    import networkx
+
+
+class DynamicBayesNet:
+    """A template for time: the same slice over and over, each given the one before.
+
+    Parameters
+    ----------
+    name : str, optional
+    plates : dict, optional
+        Plate name -> size, list of labels, or None (known from the data), as for a ``BayesNet``.
+
+    Notes
+    -----
+    A function's arguments are nodes of its own slice, ``<node>_prev`` for the value in the slice before,
+    ``t`` for the index of the slice (a whole number from 0, or an array of them that broadcasts, so write
+    ``np.where``, not ``if``), inputs (``u`` and ``u_prev``) and static nodes, which have one value for all
+    time. Whatever reads the slice before needs ``initial=``, its density in slice 0.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet("random walk")
+    >>> @dbn.node(initial=bmc.Normal(0.0, 1.0))
+    ... def x(x_prev):
+    ...     return bmc.Normal(x_prev, 0.5)
+    >>> @dbn.node
+    ... def y(x):
+    ...     return bmc.Normal(x, 1.0)
+    >>> net = dbn.unroll(3)
+    >>> list(net), net["x[2]"].parents
+    (['x[0]', 'y[0]', 'x[1]', 'y[1]', 'x[2]', 'y[2]'], ('x[1]',))
+    >>> evidence = dbn.unrolled_evidence({"y": [0.3, np.nan, 1.2]})
+    >>> posterior = bmc.infer(net, evidence, engine=bmc.Exact())
+    >>> float(posterior.mean("x[2]").round(4))
+    0.6122
+
+    References
+    ----------
+    Dean and Kanazawa (1989), A model for reasoning about persistence and causation; Koller and Friedman
+    (2009), sec. 6.2.2 (2-TBN).
+    """
+
+    def __init__(
+        self,
+        name: str | None = None,
+        plates: Mapping[str, int | Sequence[Any] | None] | None = None,
+    ) -> None:
+        self._reader = BayesNet(name, plates)  # reads declarations; it stays empty
+        self._later: dict[str, Declaration] = {}
+        self._first: dict[str, Declaration] = {}
+        self._inputs: tuple[str, ...] = ()
+        self._static: tuple[str, ...] = ()
+        self._kept_store: SliceStore | None = None
+
+    # ---- declaring --------------------------------------------------------------------------
+
+    def node(
+        self,
+        function: Callable[..., Any] | None = None,
+        *,
+        initial: Any = None,
+        plates: str | Sequence[str] = (),
+        states: Sequence[Any] | None = None,
+        name: str | None = None,
+        parents: Parents = None,
+        vectorize: bool = False,
+        replace: bool = False,
+    ) -> Any:
+        """Declare a node by its conditional density, as a decorator; returns the function unchanged.
+
+        Parameters
+        ----------
+        initial : Distribution or callable, optional
+            Density in slice 0, given nodes of the same slice, inputs and ``t``; needed where the function
+            reads ``<node>_prev``.
+        plates, states, name, parents, vectorize, replace
+            As for ``BayesNet.node``; ``parents=`` may list ``"x_prev"`` and ``"t"``.
+
+        Raises
+        ------
+        DuplicateNodeError, PlateError, ModelError
+        """
+
+        def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+            own = name or getattr(f, "__name__", None)
+            if own is None or own == "<lambda>":
+                raise ModelError("a node needs a name: pass name=, or decorate a named function")
+            options: dict[str, Any] = {"vectorize": vectorize, "replace": replace}
+            self.add(own, f, parents, plates, states, initial=initial, **options)
+            return f
+
+        return declare if function is None else declare(function)
+
+    def add(
+        self,
+        name: str,
+        cpd: Any,
+        parents: Parents = None,
+        plates: str | Sequence[str] = (),
+        states: Sequence[Any] | None = None,
+        *,
+        initial: Any = None,
+        vectorize: bool = False,
+        replace: bool = False,
+    ) -> None:
+        """Declare a node by a distribution, a function or a table of probabilities.
+
+        Parameters
+        ----------
+        cpd, parents, states, plates, vectorize, replace
+            As for ``BayesNet.add``.
+        initial : optional
+            Density in slice 0: a distribution, a function, or probabilities where ``cpd`` is a table.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 2.0))
+        >>> dbn["x"].parents
+        ('x_prev',)
+        """
+        self._check_name(name, replace)
+
+        def add(net: BayesNet) -> None:
+            net.add(name, cpd, parents, plates, states, vectorize=vectorize)
+
+        self._declare(name, initial, states, plates, vectorize, add)
+
+    def table(
+        self,
+        name: str,
+        parents: Sequence[str] = (),
+        probs: Any = None,
+        states: Sequence[Any] | None = None,
+        *,
+        initial: Any = None,
+        plates: str | Sequence[str] = (),
+        replace: bool = False,
+    ) -> None:
+        """Declare a discrete node by its conditional probability table.
+
+        Parameters
+        ----------
+        parents, probs, states, plates, replace
+            As for ``BayesNet.table``; a parent may be ``"<node>_prev"``.
+        initial : array_like, Distribution or callable, optional
+            In slice 0: probabilities of the states, or a density.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet("umbrella world")
+        >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], ("no", "yes"), initial=[0.5, 0.5])
+        >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]], ("no", "yes"))
+        >>> dbn["rain"].states
+        ('no', 'yes')
+        """
+        self._check_name(name, replace)
+
+        def add(net: BayesNet) -> None:
+            net.table(name, parents, probs, states, plates=plates)
+
+        self._declare(name, initial, states, plates, False, add)
+
+    def input(self, name: str, plates: str | Sequence[str] = (), event_shape: Any = ()) -> None:
+        """Declare a value known in every slice, passed as ``inputs={name: array}``, time first.
+
+        Functions read it as ``name`` and, of the slice before, as ``<name>_prev``.
+        """
+        self._check_name(name, False)
+        self._later[name] = self._read(name, lambda net: net.input(name, plates, event_shape))
+        self._inputs += (name,)
+        self._changed()
+
+    def static(
+        self,
+        function: Callable[..., Any] | None = None,
+        *,
+        plates: str | Sequence[str] = (),
+        states: Sequence[Any] | None = None,
+        name: str | None = None,
+        parents: Parents = None,
+        vectorize: bool = False,
+    ) -> Any:
+        """Declare a node without time, as a decorator: a parameter with one value for all slices.
+
+        Its parents are static nodes. Unrolled it keeps its name; filters want it observed.
+        """
+
+        def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+            own = name or getattr(f, "__name__", None)
+            if own is None or own == "<lambda>":
+                raise ModelError("a node needs a name: pass name=, or decorate a named function")
+            self.add_static(own, f, parents, plates, states, vectorize=vectorize)
+            return f
+
+        return declare if function is None else declare(function)
+
+    def add_static(
+        self,
+        name: str,
+        cpd: Any,
+        parents: Parents = None,
+        plates: str | Sequence[str] = (),
+        states: Sequence[Any] | None = None,
+        *,
+        vectorize: bool = False,
+    ) -> None:
+        """Declare a static node by a distribution, a function or a table."""
+        self._check_name(name, False)
+        self._later[name] = self._read(
+            name,
+            lambda net: net.add(name, cpd, parents, plates, states, vectorize=vectorize),
+        )
+        self._static += (name,)
+        self._changed()
+
+    def copy(self) -> DynamicBayesNet:
+        """An independent template with the same declarations."""
+        other = DynamicBayesNet(self.name)
+        other._reader = self._reader
+        other._later, other._first = dict(self._later), dict(self._first)
+        other._inputs, other._static = self._inputs, self._static
+        return other
+
+    # ---- asking -----------------------------------------------------------------------------
+
+    @property
+    def name(self) -> str | None:
+        return self._reader.name
+
+    @property
+    def plates(self) -> dict[str, int | None]:
+        """Plate name -> size; None where the data will tell."""
+        return self._reader.plates
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Names of the inputs."""
+        return self._inputs
+
+    @property
+    def static_nodes(self) -> tuple[str, ...]:
+        """Names of the nodes without time."""
+        return self._static
+
+    @property
+    def template(self) -> Template:
+        """The declarations as they stand, for those who compile or unroll them."""
+        return self._store.template
+
+    @property
+    def graph(self) -> networkx.DiGraph:
+        """A networkx copy of the two-slice template: nodes ``x_prev`` and ``x``; see ``plotting``.
+
+        Every node has ``slice`` (``"prev"``, ``"now"``, or ``"static"``) and ``source``.
+        """
+        return self._store.template.graph()
+
+    def validate(self) -> None:
+        """Check both slices: parents, cycles, shapes, domains, and that functions broadcast.
+
+        Raises
+        ------
+        ModelError and its subclasses, with the node's name
+        """
+        self._store.validate(self._store.probe(self.plates))
+
+    def slices(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Slices:
+        """The compiled slices that engines run on, validated; ``inputs`` are those of two slices in a row."""
+        found = self._store.slices(sizes, inputs)
+        self._store.validate(found)
+        return found
+
+    def read(
+        self,
+        observations: Mapping[str, Any] | None,
+        inputs: Mapping[str, Any] | None = None,
+        steps: int | None = None,
+        plates: Mapping[str, int] | None = None,
+    ) -> tuple[Slices, Series]:
+        """The compiled slices for some data, and the data as stored values.
+
+        Raises
+        ------
+        EvidenceError, PlateError
+        """
+        return read_series(self, observations, inputs, steps, plates)
+
+    def unroll(self, steps: int, inputs: Mapping[str, Any] | None = None) -> BayesNet:
+        """A plain net of so many slices: nodes ``"x[0]"``, ``"x[1]"``, ..., on which every engine runs.
+
+        Parameters
+        ----------
+        steps : int
+        inputs : dict, optional
+            Their values, time first, which become constants; else the net has inputs ``"u[0]"``, ....
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.add("x", lambda x_prev, t: bmc.Normal(x_prev + t, 1.0), initial=bmc.Normal(0.0, 1.0))
+        >>> float(bmc.infer(dbn.unroll(4), engine=bmc.Exact()).mean("x[3]"))
+        6.0
+        """
+        return unroll(self._store.template, steps, inputs)
+
+    def unrolled_evidence(self, observations: Mapping[str, Any]) -> dict[str, Any]:
+        """Evidence for the unrolled net, ``{"y[0]": row 0, ...}``; missing rows are left out."""
+        return unrolled(self._store.template, observations)
+
+    def sample(
+        self,
+        steps: int,
+        draws: int = 1,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+        plates: Mapping[str, int] | None = None,
+        rng: Any = None,
+    ) -> dict[str, np.ndarray]:
+        """Draws of whole trajectories.
+
+        Returns
+        -------
+        dict of ndarray
+            Name -> ``(draws, steps, *plates, *event)``; static nodes have no axis for time.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+        >>> dbn.sample(5, draws=3, rng=0)["x"].shape
+        (3, 5)
+        """
+        chance = stream(seed_sequence(rng), Purpose.SAMPLE)
+        return sampled(self, steps, draws, inputs, plates, chance)
+
+    def __getitem__(self, name: str) -> Node:
+        if name not in self._later:
+            raise UnknownNodeError(f"the template has no node {name!r}; its nodes are {list(self)}")
+        return self._store.record(name, self.plates)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._later
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._later)
+
+    def __len__(self) -> int:
+        return len(self._later)
+
+    def __repr__(self) -> str:
+        return f"DynamicBayesNet({self.name!r}, {len(self)} nodes)"
+
+    # ---- private ----------------------------------------------------------------------------
+
+    def _declare(
+        self,
+        name: str,
+        initial: Any,
+        states: Sequence[Any] | None,
+        plates: str | Sequence[str],
+        vectorize: bool,
+        add: Callable[[BayesNet], None],
+    ) -> None:
+        """Take in a node: for later slices as ``add`` says, for slice 0 by ``initial`` if there is one."""
+        later = self._read(name, add)
+        first = None
+        if isinstance(initial, (list, tuple, np.ndarray)):
+            first = self._read(
+                name, lambda net: net.table(name, (), initial, states, plates=plates)
+            )
+        elif initial is not None:
+            options: dict[str, Any] = {"vectorize": vectorize and callable(initial)}
+            first = self._read(
+                name, lambda net: net.add(name, initial, None, plates, states, **options)
+            )
+        self._later[name] = later
+        self._first.pop(name, None)
+        if first is not None:
+            self._first[name] = first
+        self._changed()
+
+    def _read(self, name: str, add: Callable[[BayesNet], None]) -> Declaration:
+        net = self._reader.copy()
+        add(net)
+        return net.declarations[name]
+
+    def _check_name(self, name: Any, replace: bool) -> None:
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"a node's name is a non-empty string, not {name!r}")
+        if name == TIME:
+            raise ModelError(
+                f"node {TIME!r}: {TIME!r} is the index of the slice; choose another name"
+            )
+        if name.endswith(PREVIOUS):
+            raise ModelError(
+                f"node {name!r}: names that end in {PREVIOUS!r} are those of the slice before; choose another"
+            )
+        if name in self._later and not replace:
+            raise DuplicateNodeError(
+                f"node {name!r} is declared already; choose another name or pass replace=True"
+            )
+
+    def _changed(self) -> None:
+        self._kept_store = None
+
+    @property
+    def _store(self) -> SliceStore:
+        if self._kept_store is None:
+            self._kept_store = SliceStore(
+                Template(
+                    self.name,
+                    dict(self._later),
+                    dict(self._first),
+                    self._inputs,
+                    self._static,
+                    self._reader.plates,
+                    self._reader.plate_labels,
+                )
+            )
+        return self._kept_store
