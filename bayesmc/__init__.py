@@ -8,7 +8,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from bayesmc import errors
-from bayesmc.auto import Explanation, explain, infer
+from bayesmc.auto import Explanation, explain, filter, forecast, infer, most_likely, smooth
+from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import (
     Affine,
     Bernoulli,
@@ -51,11 +52,13 @@ from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.importance import Importance
 from bayesmc.engines.metropolis import MetropolisHastings
 from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
+from bayesmc.engines.particle_belief import ParticleBelief
+from bayesmc.engines.particle_filter import ParticleFilter
 from bayesmc.engines.rejection import Rejection
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
-from bayesmc.results import Marginal, Posterior, Summary
+from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
 
 if TYPE_CHECKING:
     from bayesmc import io, markov, montecarlo
@@ -73,6 +76,7 @@ __all__ = [
     "Density",
     "Dirichlet",
     "DiscreteUniform",
+    "DynamicBayesNet",
     "Distribution",
     "Exact",
     "Explanation",
@@ -100,11 +104,14 @@ __all__ = [
     "MvNormal",
     "NegativeBinomial",
     "Normal",
+    "ParticleBelief",
+    "ParticleFilter",
     "PlateArray",
     "Poisson",
     "Posterior",
     "RandomWalk",
     "Rejection",
+    "SeriesPosterior",
     "StudentT",
     "Summary",
     "Truncated",
@@ -115,10 +122,14 @@ __all__ = [
     "WrappedNormal",
     "errors",
     "explain",
+    "filter",
+    "forecast",
     "infer",
     "io",
     "markov",
     "montecarlo",
+    "most_likely",
+    "smooth",
     "stack",
 ]
 

@@ -128,6 +128,22 @@ class ZeroProbabilityError(EvidenceError):
     """The evidence has probability zero under the net."""
 
 
+class DegeneracyError(BayesmcError, RuntimeError):
+    """All particles have weight zero: nothing that was tried explains what was seen.
+
+    Attributes
+    ----------
+    t : int
+        The slice.
+    node : str or None
+        The first observed node, in the order of the slice, at which no weight was left.
+    """
+
+    def __init__(self, message: str, t: int, node: str | None = None) -> None:
+        super().__init__(message)
+        self.t, self.node = t, node
+
+
 class UnsupportedError(BayesmcError, NotImplementedError):
     """The engine, distribution or posterior cannot answer this; the message names what can."""
 

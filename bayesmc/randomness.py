@@ -41,6 +41,8 @@ class Purpose(IntEnum):
     SAMPLE = 1
     RESAMPLE = 2
     PREDICT = 3
+    FILTER = 4
+    SMOOTH = 5
 
 
 def stream(seed: np.random.SeedSequence, purpose: Purpose, unit: int = 0) -> np.random.Generator:

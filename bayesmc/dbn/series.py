@@ -93,6 +93,7 @@ def read_series(
     inputs: Mapping[str, Any] | None,
     steps: int | None = None,
     plates: Mapping[str, int] | None = None,
+    ahead: int = 0,
 ) -> tuple[Slices, Series]:
     """See ``DynamicBayesNet.read``."""
     template = dbn.template
@@ -105,13 +106,18 @@ def read_series(
     for name in given:
         _check_observed(template, name)
     timed = {n: _rows(n, v) for n, v in given.items() if n not in template.static}
-    count = _count({**timed, **_input_rows(template, inputs)}, steps)
+    if ahead:
+        check_steps("forecast", ahead)
+    count = _count(timed, _input_rows(template, inputs), steps, ahead)
     sizes = sizes_of(template, {**timed, **(inputs or {})}, plates)
     rows = read_input_rows(template, sizes, inputs, count)
     two = {n: v[min(1, count - 1)] for n, v in rows.items()}
     two |= {n + PREVIOUS: v[0] for n, v in rows.items()}
     slices = dbn.slices(sizes, two)
-    observed = {n: _observed(slices.later[n], v, count) for n, v in timed.items()}
+    observed = {
+        n: _padded(_observed(slices.later[n], v, count - ahead), slices.later[n], ahead)
+        for n, v in timed.items()
+    }
     static = {n: observe(slices.first[n], v) for n, v in given.items() if n in template.static}
     return slices, Series(
         count,
@@ -119,6 +125,78 @@ def read_series(
         rows,
         {n: o for n, o in static.items() if o is not None},
     )
+
+
+def read_row(
+    dbn: DynamicBayesNet,
+    slices: Slices | None,
+    t: int,
+    observations: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None,
+    before: Mapping[str, np.ndarray],
+) -> tuple[Slices, Row]:
+    """One row by itself, without an axis for time.
+
+    Parameters
+    ----------
+    slices : Slices or None
+        What the rows before were read for; None for the first.
+    before : dict
+        Inputs of the slice before.
+
+    Raises
+    ------
+    EvidenceError, PlateError
+    """
+    template = dbn.template
+    for what, given in (("observations", observations), ("inputs", inputs)):
+        if given is not None and not isinstance(given, Mapping):
+            raise EvidenceError(
+                f"{what} is a {type(given).__name__}; give a dict from name to the value in this slice"
+            )
+    rows = {n: [v] for n, v in (observations or {}).items() if v is not None}
+    given = {n: [v] for n, v in (inputs or {}).items()}
+    if slices is None:
+        slices, series = read_series(dbn, rows, given, steps=1)
+    else:
+        for name in rows:
+            _check_observed(template, name)
+        sizes = slices.later.sizes
+        values = read_input_rows(template, sizes, given, 1)
+        seen = {n: _observed(slices.later[n], _rows(n, v), 1) for n, v in rows.items()}
+        series = Series(1, {n: o for n, o in seen.items() if o is not None}, values)
+    row = series.row(0)
+    row.inputs[TIME] = np.asarray(t)
+    if t:
+        row.inputs[TIME + PREVIOUS] = np.asarray(t - 1)
+        row.inputs.update({n + PREVIOUS: v for n, v in before.items()})
+    return slices, Row(t, row.seen, row.inputs)
+
+
+def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Stored values of static nodes, all of which must be given.
+
+    Raises
+    ------
+    EvidenceError
+    """
+    found = {}
+    for name in slices.template.static:
+        node = slices.first[name]
+        if not node.is_stochastic:
+            continue
+        seen = observe(node, values[name]) if values.get(name) is not None else None
+        if seen is None or seen.mask is not None:
+            raise EvidenceError(
+                f"static node {name!r} has no value; pass static={{{name!r}: value}}"
+            )
+        found[name] = seen.value
+    for name in values:
+        if name not in found:
+            raise EvidenceError(
+                f"static= gives {name!r}, which is no static node with a density; there are {list(found)}"
+            )
+    return found
 
 
 def read_input_rows(
@@ -250,20 +328,36 @@ def _rows(name: str, value: Any) -> Any:
     return value
 
 
-def _count(data: Mapping[str, Any], steps: int | None) -> int:
-    """The number of slices, which all data agree on."""
-    lengths = {n: len(v) for n, v in data.items()}
+def _count(
+    observed: Mapping[str, Any], inputs: Mapping[str, Any], steps: int | None, ahead: int
+) -> int:
+    """The number of slices, which all data agree on; ``ahead`` of them have inputs alone."""
+    lengths = {n: len(v) + ahead for n, v in observed.items()} | {
+        n: len(v) for n, v in inputs.items()
+    }
     wanted = {*lengths.values(), *(() if steps is None else (int(steps),))}
     if len(wanted) > 1:
-        each = ", ".join(f"{n!r} {k}" for n, k in lengths.items())
-        asked = "" if steps is None else f"; asked for {steps} slices"
+        each = ", ".join(f"{n!r} {len(v)}" for n, v in {**observed, **inputs}.items())
+        more = f"; asked for {steps} slices" if steps is not None else ""
+        more += f"; inputs go on for {ahead} slices after the last row" if ahead else ""
         raise EvidenceError(
-            f"the data differ in length ({each}{asked}); row k belongs to slice k, and a missing row is NaN "
+            f"the data differ in length ({each}{more}); row k belongs to slice k, and a missing row is NaN "
             "or None"
         )
-    if not wanted:
+    if not wanted and not ahead:
         raise EvidenceError("no observations and no inputs: give at least one series, time first")
-    return wanted.pop()
+    return wanted.pop() if wanted else ahead
+
+
+def _padded(found: Observed | None, node: CompiledNode, ahead: int) -> Observed | None:
+    """With so many missing rows behind."""
+    if found is None or not ahead:
+        return found
+    mask = found.mask
+    if mask is None:
+        mask = np.ones((len(found.value), *node.plate_shape), dtype=bool)
+    value = np.concatenate([found.value, np.repeat(found.value[:1], ahead, axis=0)])
+    return Observed(value, np.concatenate([mask, np.zeros((ahead, *mask.shape[1:]), dtype=bool)]))
 
 
 def _observed(node: CompiledNode, value: Any, steps: int) -> Observed | None:

@@ -304,14 +304,17 @@ class DynamicBayesNet:
         inputs: Mapping[str, Any] | None = None,
         steps: int | None = None,
         plates: Mapping[str, int] | None = None,
+        ahead: int = 0,
     ) -> tuple[Slices, Series]:
         """The compiled slices for some data, and the data as stored values.
+
+        ``ahead`` slices follow the last row of the observations; inputs have rows for them, too.
 
         Raises
         ------
         EvidenceError, PlateError
         """
-        return read_series(self, observations, inputs, steps, plates)
+        return read_series(self, observations, inputs, steps, plates, ahead)
 
     def unroll(self, steps: int, inputs: Mapping[str, Any] | None = None) -> BayesNet:
         """A plain net of so many slices: nodes ``"x[0]"``, ``"x[1]"``, ..., on which every engine runs.

@@ -51,6 +51,17 @@ def fast_steps(
     return with_potentials(model, steps)
 
 
+def table_of(model: Model, node: CompiledNode, constants: Mapping[str, np.ndarray]) -> Table | None:
+    """A finite node's table, if it has one of moderate size."""
+    limit = _FUNCTION_ENTRIES if node.declaration.probs is None else _TABLE_ENTRIES
+    try:
+        return tabulate(model, node, constants, limit)
+    except BayesmcError:
+        return (
+            None  # it fails at some configuration, perhaps an impossible one: call it draw by draw
+        )
+
+
 class _Tabulated:
     """What a node's table makes of it: steps that do not depend on the evidence, made once."""
 
@@ -65,11 +76,7 @@ class _Tabulated:
             if distinct and not any(p in constants for p in node.parents):
                 self.hidden = TableCompute(node)
             return
-        limit = _FUNCTION_ENTRIES if node.declaration.probs is None else _TABLE_ENTRIES
-        try:
-            self.table = tabulate(model, node, constants, limit)
-        except BayesmcError:
-            return  # it fails at some configuration, perhaps an impossible one: call it draw by draw
+        self.table = table_of(model, node, constants)
         if self.table is not None:
             self.hidden = TableDraw(node, self.table)
 

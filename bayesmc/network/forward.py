@@ -122,7 +122,7 @@ class Draw:
         self.model, self.node = model, node
 
     def __call__(self, state: Pass) -> None:
-        dist = _distribution(self.model, self.node, state)
+        dist = current_distribution(self.model, self.node, state)
         state.values[self.node.name] = self.model.sample_stored(
             self.node.name, dist, state.rng, state.batch
         )
@@ -160,7 +160,7 @@ class DrawAndWeigh:
         self.plate_axes = tuple(range(-len(node.plates), 0))
 
     def __call__(self, state: Pass) -> None:
-        dist = _distribution(self.model, self.node, state)
+        dist = current_distribution(self.model, self.node, state)
         draws = self.model.sample_stored(self.node.name, dist, state.rng, state.batch)
         values = np.where(self.mask, self.seen.value, draws)
         values.flags.writeable = False
@@ -177,6 +177,20 @@ class Potential:
 
     def __call__(self, state: Pass) -> None:
         state.weigh(self.model.potential(self.name, state.values))
+
+
+def current_distribution(model: Model, node: CompiledNode, state: Pass) -> Distribution:
+    """The node's distribution given its parents; bad parameters raise where the weight is positive."""
+    dist, _ = model.evaluate(node.name, state.values)
+    if dist.invalid is not None:
+        alive: np.ndarray = np.asarray(np.asarray(state.log_weight) > -np.inf)
+        if alive.ndim > len(state.batch):  # elements of plates with weights of their own
+            alive = np.asarray(alive.any(axis=tuple(range(len(state.batch), alive.ndim))))
+        alive = np.broadcast_to(alive, state.batch)
+        error = invalid_error(node, dist, alive, state.batch)
+        if error is not None:
+            raise error
+    return dist
 
 
 def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None:
@@ -203,21 +217,10 @@ def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None
 
 def _weigh_at(model: Model, node: CompiledNode, state: Pass, value: np.ndarray) -> None:
     """Weigh by a node's density at a value, all its plate elements together."""
-    dist = _distribution(model, node, state)
+    dist = current_distribution(model, node, state)
     log_density = model.log_density(node.name, dist, value)
     if node.plates:
         lead = log_density.shape[: max(log_density.ndim - len(node.plates), 0)]
         log_density = np.broadcast_to(log_density, lead + node.plate_shape)
         log_density = log_density.sum(axis=tuple(range(-len(node.plates), 0)))
     state.weigh(log_density)
-
-
-def _distribution(model: Model, node: CompiledNode, state: Pass) -> Distribution:
-    """The node's distribution given its parents; bad parameters raise where the weight is positive."""
-    dist, _ = model.evaluate(node.name, state.values)
-    if dist.invalid is not None:
-        alive = np.broadcast_to(np.asarray(state.log_weight) > -np.inf, state.batch)
-        error = invalid_error(node, dist, alive, state.batch)
-        if error is not None:
-            raise error
-    return dist

@@ -4,6 +4,7 @@ from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint, Runn
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
+from bayesmc.results.series import SeriesPosterior
 from bayesmc.results.sums import Sums, SumsPosterior
 from bayesmc.results.table import Summary
 
@@ -15,6 +16,7 @@ __all__ = [
     "Marginal",
     "Posterior",
     "RunningChains",
+    "SeriesPosterior",
     "Summary",
     "Sums",
     "SumsPosterior",

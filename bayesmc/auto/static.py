@@ -1,12 +1,12 @@
-"""The way in: ``infer`` poses a problem and runs an engine on it; ``explain`` says which and why."""
+"""``infer``: a problem posed, and an engine run on it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
 from typing import Any
 
-from bayesmc.engines.base import Engine, Treatment
+from bayesmc.auto.explanation import Explanation
+from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.exact_plan import too_large_to_search
 from bayesmc.engines.gibbs import Gibbs
@@ -19,54 +19,6 @@ from bayesmc.results import Posterior
 
 #: bytes up to which an exact answer counts as cheap
 _CHEAP = 256 * 2**20
-
-
-@dataclass(frozen=True)
-class Explanation:
-    """Which engine answers a question, and why.
-
-    Attributes
-    ----------
-    engine : object
-        The engine that would run.
-    reasons : tuple of str
-    refused : dict
-        Engine name -> why it was not taken.
-    nodes : dict
-        Node -> what the engine does to it.
-    table : tuple of Treatment
-        The same in columns (node, kernel, why, plates, colour), for engines that move nodes one by one.
-
-    Examples
-    --------
-    >>> import bayesmc as bmc
-    >>> net = bmc.BayesNet()
-    >>> net.add("x", bmc.Normal(0.0, 1.0))
-    >>> explanation = bmc.explain(net, engine=bmc.LikelihoodWeighting(100))
-    engine: LikelihoodWeighting(draws=100)
-      because it was asked for
-      x  sampled given its parents
-    >>> explanation.nodes
-    {'x': 'sampled given its parents'}
-    """
-
-    engine: Any
-    reasons: tuple[str, ...]
-    refused: dict[str, str] = field(default_factory=dict)
-    nodes: dict[str, str] = field(default_factory=dict)
-    table: tuple[Treatment, ...] = ()
-
-    def __str__(self) -> str:
-        lines = [f"engine: {self.engine!r}", *(f"  because {r}" for r in self.reasons)]
-        lines += [f"not {name}: {why}" for name, why in self.refused.items()]
-        if self.table:
-            return "\n".join([*lines, *_columns(self.table)])
-        shown = list(self.nodes.items())
-        width = max((len(n) for n, _ in shown), default=0)
-        lines += [f"  {name.ljust(width)}  {what}" for name, what in shown[:40]]
-        if len(shown) > 40:
-            lines.append(f"  ... and {len(shown) - 40} more nodes")
-        return "\n".join(lines)
 
 
 def infer(
@@ -129,27 +81,13 @@ def infer(
     return chosen.run(problem, seed_sequence(rng), keep, progress, resume)
 
 
-def explain(
+def explained(
     net: BayesNet | FactorGraph,
-    evidence: Mapping[str, Any] | None = None,
-    engine: Any = None,
-    *,
-    inputs: Mapping[str, Any] | None = None,
+    evidence: Mapping[str, Any] | None,
+    engine: Any,
+    inputs: Mapping[str, Any] | None,
 ) -> Explanation:
-    """Which engine would answer, why, what it does to each node, and why anything better was refused.
-
-    It prints the explanation and returns it.
-
-    Examples
-    --------
-    >>> import bayesmc as bmc
-    >>> net = bmc.BayesNet()
-    >>> net.add("a", bmc.Bernoulli(0.2))
-    >>> _ = bmc.explain(net)
-    engine: Exact(max_bytes=2147483648.0)
-      because hidden nodes are finite or linear-Gaussian: induced width 0, ...bytes
-      a  eliminated
-    """
+    """See ``explain``."""
     problem = pose(net, evidence, inputs)
     if engine is None:
         chosen, reasons, refused = _choose(problem)
@@ -161,24 +99,10 @@ def explain(
             reasons = ("it was asked for, but it cannot answer",)
     nodes = {} if type(chosen).__name__ in refused else chosen.describe(problem)
     table = () if type(chosen).__name__ in refused else tuple(chosen.table(problem))
-    explanation = Explanation(chosen, tuple(reasons), refused, nodes, table)
-    print(explanation)
-    return explanation
+    return Explanation(chosen, tuple(reasons), refused, nodes, table)
 
 
-def _columns(table: Sequence[Treatment]) -> list[str]:
-    """A table of nodes in aligned columns; columns that are empty throughout are left out."""
-    names = [f.name for f in fields(Treatment) if f.name != "why"] + ["why"]
-    shown = [n for n in names if any(getattr(row, n) for row in table)]
-    cells = [shown, *([getattr(row, n) for n in shown] for row in table[:60])]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(shown))]
-    lines = [
-        "  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
-        for row in cells
-    ]
-    if len(table) > 60:
-        lines.append(f"  ... and {len(table) - 60} more nodes")
-    return lines
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:

@@ -1,0 +1,8 @@
+"""The way in: questions posed, engines chosen and run, and why."""
+
+from bayesmc.auto.explaining import explain
+from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.series import filter, forecast, most_likely, smooth
+from bayesmc.auto.static import infer
+
+__all__ = ["Explanation", "explain", "filter", "forecast", "infer", "most_likely", "smooth"]

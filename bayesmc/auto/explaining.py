@@ -1,0 +1,41 @@
+"""``explain``: which engine answers a question, of one slice or of many, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.series import explained_series
+from bayesmc.auto.static import explained
+from bayesmc.dbn import DynamicBayesNet
+from bayesmc.network import BayesNet, FactorGraph
+
+
+def explain(
+    net: BayesNet | FactorGraph | DynamicBayesNet,
+    evidence: Mapping[str, Any] | None = None,
+    engine: Any = None,
+    *,
+    inputs: Mapping[str, Any] | None = None,
+) -> Explanation:
+    """Which engine would answer, why, what it does to each node, and why anything better was refused.
+
+    It prints the explanation and returns it.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.2))
+    >>> _ = bmc.explain(net)
+    engine: Exact(max_bytes=2147483648.0)
+      because hidden nodes are finite or linear-Gaussian: induced width 0, ...bytes
+      a  eliminated
+    """
+    if isinstance(net, DynamicBayesNet):
+        explanation = explained_series(net, evidence, engine, inputs)
+    else:
+        explanation = explained(net, evidence, engine, inputs)
+    print(explanation)
+    return explanation

@@ -1,0 +1,201 @@
+"""``filter``, ``smooth``, ``forecast``, ``most_likely``: one template, the same calls for every engine."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.auto.explanation import Explanation
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
+from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.particle_filter import ParticleFilter
+from bayesmc.errors import UnsupportedError
+from bayesmc.randomness import seed_sequence
+from bayesmc.results import SeriesPosterior
+
+#: engines in the order in which they are tried
+_CANDIDATES: tuple[type[FilterEngine], ...] = (ParticleFilter,)
+_WHY = {
+    "DiscreteFilter": "all hidden nodes are finite",
+    "KalmanFilter": "all hidden nodes are linear-Gaussian",
+    "ParticleFilter": "every hidden node can be sampled given its parents",
+}
+
+
+def filter(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any],
+    *,
+    inputs: Mapping[str, Any] | None = None,
+    engine: FilterEngine | None = None,
+    rng: Any = None,
+    progress: bool | None = None,
+    keep: str | None = None,
+    queries: Queries | None = None,
+) -> SeriesPosterior:
+    """Beliefs about every slice given the rows up to it.
+
+    Parameters
+    ----------
+    dbn : DynamicBayesNet
+    observations : dict
+        Node -> its rows, time first, shape ``(time, *plates, *event)``. Row k belongs to slice k; NaN, a
+        masked entry or None is missing. Static nodes are given without time.
+    inputs : dict, optional
+        Input -> its rows, time first.
+    engine : optional
+        ``ParticleFilter(particles)``, ...; None chooses (see ``explain``).
+    rng : seed, SeedSequence, Generator or None
+    keep : "particles", optional
+        Hold the particles of all slices, for queries afterwards; memory grows with time.
+    queries : dict, optional
+        Name -> function of nodes of a slice; its expectation in every slice is in ``.queries``.
+
+    Returns
+    -------
+    SeriesPosterior
+
+    Raises
+    ------
+    ModelError, EvidenceError, UnsupportedError, DegeneracyError
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(np.abs(x), 0.5))
+    >>> engine = bmc.ParticleFilter(2000)
+    >>> filtered = bmc.filter(dbn, {"y": [0.8, 1.4, np.nan]}, engine=engine, rng=0)
+    >>> filtered.std("x").shape
+    (3,)
+    """
+    problem = pose_series(dbn, observations, inputs)
+    chosen = _engine(problem, engine)
+    options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
+    return chosen.filter(problem, seed_sequence(rng), **options)
+
+
+def smooth(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any],
+    *,
+    inputs: Mapping[str, Any] | None = None,
+    engine: FilterEngine | None = None,
+    rng: Any = None,
+    progress: bool | None = None,
+    lag: int | None = None,
+    queries: Queries | None = None,
+) -> SeriesPosterior:
+    """Beliefs about every slice given all rows, or with ``lag`` given those up to so many slices later.
+
+    Parameters and errors are those of ``filter``.
+    """
+    problem = pose_series(dbn, observations, inputs)
+    if lag is not None and (
+        isinstance(lag, bool) or not isinstance(lag, (int, np.integer)) or lag < 0
+    ):
+        raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
+    chosen = _engine(problem, engine)
+    return chosen.smooth(problem, seed_sequence(rng), lag=lag, queries=queries, progress=progress)
+
+
+def forecast(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any],
+    *,
+    steps: int,
+    inputs: Mapping[str, Any] | None = None,
+    engine: FilterEngine | None = None,
+    rng: Any = None,
+    progress: bool | None = None,
+    queries: Queries | None = None,
+) -> SeriesPosterior:
+    """Beliefs about the ``steps`` slices after the last row, observed nodes included.
+
+    ``inputs`` have rows for those slices, too. Other parameters and errors are those of ``filter``.
+    """
+    problem = pose_series(dbn, observations, inputs, ahead=steps)
+    chosen = _engine(problem, engine)
+    options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
+    return chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
+
+
+def most_likely(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any],
+    *,
+    inputs: Mapping[str, Any] | None = None,
+    engine: FilterEngine | None = None,
+    rng: Any = None,
+    progress: bool | None = None,
+) -> dict[str, np.ndarray]:
+    """The most likely trajectory of all hidden nodes together: name -> user values, time first.
+
+    It is one joint mode, as the Viterbi algorithm finds it, and not the sequence of each slice's own mode.
+    """
+    problem = pose_series(dbn, observations, inputs)
+    chosen = _engine(problem, engine)
+    return chosen.most_likely(problem, seed_sequence(rng), progress)
+
+
+def explained_series(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any] | None,
+    engine: FilterEngine | None,
+    inputs: Mapping[str, Any] | None,
+) -> Explanation:
+    """See ``explain``."""
+    problem = pose_series(dbn, observations, inputs)
+    if engine is None:
+        chosen, reasons, refused = _choose(problem)
+        return Explanation(chosen, reasons, refused, chosen.describe(problem))
+    checked = _checked(engine)
+    why = checked.refusal(problem)
+    if why is None:
+        return Explanation(checked, ("it was asked for",), {}, checked.describe(problem))
+    reasons = ("it was asked for, but it cannot answer",)
+    return Explanation(checked, reasons, {type(checked).__name__: why})
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _engine(problem: SeriesProblem, engine: FilterEngine | None) -> FilterEngine:
+    """The engine asked for, or the one chosen; a refusal is raised with an alternative."""
+    if engine is None:
+        return _choose(problem)[0]
+    reason = _checked(engine).refusal(problem)
+    if reason is None:
+        return engine
+    others = [c() for c in _CANDIDATES if not isinstance(engine, c)]
+    able = next((type(o).__name__ for o in others if o.refusal(problem) is None), None)
+    raise UnsupportedError(reason if able is None else f"{reason}. {able}() can answer")
+
+
+def _choose(problem: SeriesProblem) -> tuple[FilterEngine, tuple[str, ...], dict[str, str]]:
+    refused: dict[str, str] = {}
+    for candidate in _CANDIDATES:
+        engine, name = candidate(), candidate.__name__
+        reason = engine.refusal(problem)
+        if reason is None:
+            return engine, (_WHY[name],), refused
+        refused[name] = reason
+    whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
+    raise UnsupportedError(f"filter: no engine can answer. {whys}")
+
+
+def _checked(engine: Any) -> FilterEngine:
+    if isinstance(engine, type):
+        raise TypeError(
+            f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"
+        )
+    if not isinstance(engine, FilterEngine):
+        raise TypeError(
+            f"engine={engine!r} is no engine over time; use ParticleFilter(particles), KalmanFilter(), "
+            "DiscreteFilter(), ..., or unroll the template for a static engine"
+        )
+    return engine

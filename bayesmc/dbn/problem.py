@@ -1,0 +1,78 @@
+"""A question over time posed: a snapshot of the template, its slices, and the data as stored values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from bayesmc.dbn.series import Series
+from bayesmc.dbn.slices import Slices
+from bayesmc.dbn.template import DynamicBayesNet
+from bayesmc.errors import ModelError
+from bayesmc.network import Model
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesProblem:
+    """What an engine is asked over time.
+
+    Attributes
+    ----------
+    dbn : DynamicBayesNet
+        A snapshot: later declarations do not reach it.
+    slices : Slices
+    series : Series
+    cache : dict
+        What engines derived and may use again.
+    """
+
+    dbn: DynamicBayesNet
+    slices: Slices
+    series: Series
+    cache: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    @property
+    def model(self) -> Model:
+        """Slice 0, where every node has its own name: for what nodes are, not for evaluating them."""
+        return self.slices.first
+
+    @property
+    def steps(self) -> int:
+        return self.series.steps
+
+    @cached_property
+    def hidden(self) -> tuple[str, ...]:
+        """Nodes of a slice that are not observed in full throughout, parents first."""
+        seen = {n for n, o in self.series.observed.items() if o.mask is None}
+        return tuple(n for n in self.slices.dynamic if n not in seen)
+
+    @cached_property
+    def unknown_static(self) -> tuple[str, ...]:
+        """Static nodes with a density that nobody observed."""
+        template, model = self.slices.template, self.slices.first
+        return tuple(
+            n
+            for n in template.static
+            if model[n].is_stochastic
+            and (n not in self.series.static or self.series.static[n].mask is not None)
+        )
+
+
+def pose_series(
+    dbn: DynamicBayesNet,
+    observations: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None = None,
+    ahead: int = 0,
+) -> SeriesProblem:
+    """Validate the template, read the data, and take the snapshot; ``ahead`` slices more have no rows.
+
+    Raises
+    ------
+    ModelError, EvidenceError, PlateError
+    """
+    if not isinstance(dbn, DynamicBayesNet):
+        raise ModelError(f"expected a DynamicBayesNet, not {type(dbn).__name__}")
+    slices, series = dbn.read(observations, inputs, ahead=ahead)
+    return SeriesProblem(dbn.copy(), slices, series)

@@ -1,0 +1,123 @@
+"""What engines over time share: refusals, the calls, and the one loop of those that go slice by slice.
+
+A *sequential* engine turns the state of one slice and the row of the next into the state of that slice;
+``FilterEngine.filter`` is the loop, and ``start`` and ``step`` are the same moves taken one by one. Engines
+that know all slices to be alike (finite, linear) work through them at their own speed instead.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from bayesmc.dbn import SeriesProblem, pose_series
+from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.results import SeriesPosterior
+
+#: functions whose expectation is wanted in every slice, by name
+Queries = Mapping[str, Callable[..., Any]]
+
+
+class FilterEngine:
+    """Base of the engines over time; ``filter``, ``smooth``, ``forecast`` and ``most_likely`` are the way in.
+
+    A family supplies ``refusal``, ``describe`` and ``filter``, and of the other questions those that it can
+    answer.
+    """
+
+    #: what stands beside the progress bar
+    label: ClassVar[str] = ""
+
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        """Why this engine cannot answer, or None; a family's own reasons come after the common ones."""
+        return common_refusal(self, problem)
+
+    def describe(self, problem: SeriesProblem) -> dict[str, str]:
+        """What the engine does to each node of a slice."""
+        raise NotImplementedError
+
+    def filter(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        keep: str | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> SeriesPosterior:
+        """Every slice given the rows up to it."""
+        raise NotImplementedError
+
+    def smooth(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> SeriesPosterior:
+        """Every slice given all rows, or given rows up to ``lag`` slices later."""
+        raise self._cannot("smooth")
+
+    def most_likely(
+        self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
+    ) -> dict[str, np.ndarray]:
+        """The most likely trajectory of the hidden nodes, as user values, time first."""
+        raise self._cannot("find the most likely trajectory")
+
+    def unsupported(
+        self,
+        dbn: Any,
+        observations: Mapping[str, Any] | None,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> str | None:
+        """Why this engine cannot answer, or None."""
+        problem = pose_series(dbn, observations, inputs)
+        try:
+            return self.refusal(problem)
+        except BayesmcError as error:  # options that do not fit the template
+            return str(error)
+
+    def _cannot(self, what: str) -> UnsupportedError:
+        return UnsupportedError(
+            f"{type(self).__name__} does not {what}; use engine=None, which finds one that does, or ask a "
+            "static engine on dbn.unroll(steps)"
+        )
+
+
+def common_refusal(engine: FilterEngine, problem: SeriesProblem) -> str | None:
+    """What no engine over time takes: static nodes whose value is not known."""
+    if not problem.unknown_static:
+        return None
+    names = ", ".join(map(repr, problem.unknown_static))
+    return (
+        f"{type(engine).__name__} takes static nodes as known, and {names} is not observed; observe it (its "
+        "value in observations=), infer it by ParticleGibbs or ParticleMetropolis, or ask a static engine on "
+        "dbn.unroll(steps)"
+    )
+
+
+class Answers(NamedTuple):
+    """Tables, means and variances by node, time first."""
+
+    tables: dict[str, np.ndarray]
+    means: dict[str, np.ndarray]
+    variances: dict[str, np.ndarray]
+
+
+def observed_answers(problem: SeriesProblem) -> Answers:
+    """What is known of nodes that are observed in full throughout: their values."""
+    found = Answers({}, {}, {})
+    for name, seen in problem.series.observed.items():
+        node = problem.model[name]
+        if seen.mask is not None:
+            continue
+        if node.domain is not None:
+            found.tables[name] = np.eye(node.domain.size)[seen.value.astype(np.intp)]
+        else:
+            found.means[name] = seen.value.astype(float)
+            found.variances[name] = np.zeros(seen.value.shape)
+    return found

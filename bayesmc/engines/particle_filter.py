@@ -1,0 +1,201 @@
+"""``ParticleFilter``: options, refusals, the run over a series and the same moves one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices, read_row, read_static
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.particle import Mover
+from bayesmc.engines.particle_belief import ParticleBelief
+from bayesmc.engines.particle_record import FilteredParticles, Record
+from bayesmc.network.forward import refuse_unsampled
+from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, seed_sequence, stream
+from bayesmc.resampling import Adaptive, scheme_of
+
+
+@dataclass(frozen=True)
+class ParticleFilter(FilterEngine):
+    """Sequential Monte Carlo on a template: sample what is hidden, weight by what is seen, resample.
+
+    Parameters
+    ----------
+    particles : int
+    resampling : str or callable
+        ``"multinomial"``, ``"stratified"``, ``"systematic"``, ``"residual"``, ``"ssp"``, or a function
+        ``(weights, draws, rng) -> sorted indices``.
+    ess_threshold : float
+        Particles are resampled on the way into a slice where they are worth less than this share of their
+        number: 1 resamples (nearly) always, 0 never (sequential importance sampling).
+
+    Notes
+    -----
+    Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
+    sequences in a plate are 64 filters in one array.
+
+    References
+    ----------
+    Gordon, Salmond and Smith (1993), IEE Proceedings F 140; Koller and Friedman (2009), sec. 15.3.3
+    (LW-2TBN); Doucet and Johansen (2011), A tutorial on particle filtering and smoothing.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 2.0))
+    >>> dbn.add("y", lambda x: bmc.StudentT(4.0, x, 0.5))
+    >>> filtered = bmc.filter(dbn, {"y": [1.2, 0.4, 0.7]}, engine=bmc.ParticleFilter(5000), rng=0)
+    >>> filtered.mean("x").shape, bool(filtered.log_marginal_likelihood < 0)
+    ((3,), True)
+    """
+
+    particles: int = 1000
+    resampling: str | Callable[..., np.ndarray] = "systematic"
+    ess_threshold: float = 0.5
+
+    label: ClassVar[str] = "particle filter"
+
+    def __post_init__(self) -> None:
+        n = self.particles
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ValueError(
+                f"ParticleFilter(particles={n!r}): give a number of particles, 1 or more, such as 10_000"
+            )
+        threshold = self.ess_threshold
+        if (
+            isinstance(threshold, bool)
+            or not isinstance(threshold, (int, float))
+            or not threshold >= 0
+        ):
+            raise ValueError(
+                f"ParticleFilter(ess_threshold={threshold!r}): give a share of the particles, 0 (never "
+                "resample) to 1 (always)"
+            )
+        scheme_of(self.resampling)
+
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        common = super().refusal(problem)
+        if common is not None:
+            return common
+        known = {*problem.slices.template.static, *problem.series.observed}
+        for model in (problem.slices.first, problem.slices.later):
+            inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
+            reason = refuse_unsampled(model, inside, "ParticleFilter")
+            if reason is not None:
+                return reason
+        return None
+
+    def describe(self, problem: SeriesProblem) -> dict[str, str]:
+        found = {}
+        for name in problem.slices.template.later:
+            node = problem.model[name]
+            seen = problem.series.observed.get(name)
+            if name in problem.slices.template.inputs:
+                found[name] = "input"
+            elif name in problem.slices.template.static:
+                found[name] = "static, known"
+            elif not node.is_stochastic:
+                found[name] = "computed"
+            elif seen is None:
+                found[name] = "sampled given its parents"
+            else:
+                found[name] = "observed, weights the particles"
+                if seen.mask is not None:
+                    found[name] += "; sampled where it is missing"
+        return found
+
+    def filter(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        keep: str | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> FilteredParticles:
+        if keep not in (None, "particles"):
+            raise ValueError(
+                f'keep={keep!r}: give "particles", or None for answers of constant size'
+            )
+        static = {n: o.value for n, o in problem.series.static.items()}
+        mover = self._mover(problem.slices, static)
+        record = Record(problem, mover, queries or {}, keep is not None)
+        rng = stream(seed, Purpose.FILTER)
+        rows = problem.series
+        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            cloud = None
+            for k in range(problem.steps):
+                row = rows.row(k)
+                cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
+                record.add(k, cloud)
+                bar.advance()
+        return record.posterior(self)
+
+    def start(
+        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
+    ) -> ParticleBelief:
+        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes."""
+        dbn.validate()
+        return ParticleBelief(dbn.copy(), seed_sequence(rng), static or {})
+
+    def step(
+        self,
+        belief: ParticleBelief,
+        observations: Mapping[str, Any] | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> ParticleBelief:
+        """The belief about the next slice, whose row this is; the old belief stays as it is.
+
+        Parameters
+        ----------
+        observations : dict, optional
+            Node -> its value in this slice, without an axis for time; what is left out is missing.
+        inputs : dict, optional
+            Input -> its value in this slice.
+        """
+        t, mover = belief.t + 1, belief.mover
+        slices, row = read_row(
+            belief.dbn, mover.slices if mover else None, t, observations, inputs, belief.inputs
+        )
+        if mover is None:
+            mover = self._mover(slices, read_static(slices, belief.static))
+        rng = stream(belief.seed, Purpose.FILTER)
+        if belief.chance is not None:
+            rng.bit_generator.state = belief.chance
+        with _quiet():
+            if belief.cloud is None:
+                cloud = mover.first(row, rng)
+            else:
+                cloud = mover.next(belief.cloud, row, rng)
+        total = belief.log_marginal_likelihood + cloud.increment
+        return ParticleBelief(
+            belief.dbn, belief.seed, belief.static, mover, cloud,
+            total if np.ndim(total) else float(total), rng.bit_generator.state,
+            {n: row.inputs[n] for n in slices.template.inputs},
+        )  # fmt: skip
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _mover(self, slices: Slices, static: Mapping[str, np.ndarray]) -> Mover:
+        scheme: Any = scheme_of(self.resampling)
+        threshold = float(self.ess_threshold)
+        if isinstance(scheme, Adaptive):
+            scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
+        return Mover(slices, self.particles, scheme, threshold, slices.dynamic, static)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield

@@ -1,0 +1,175 @@
+"""Posteriors over time: what a filter or smoother says of every slice, time first.
+
+One class for all families: tables of probabilities for finite nodes, means and variances for numbers, worked
+out while the slices passed by. What a family keeps besides (particles, joint covariances) it says itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.network import CompiledNode, Model
+from bayesmc.results.posterior import table_variance
+
+
+class SeriesPosterior:
+    """Beliefs about the nodes of every slice.
+
+    Attributes
+    ----------
+    engine : object
+    kind : str
+        ``"filter"`` (slice t given rows 0 to t), ``"smooth"`` (given all rows), ``"fixed-lag"`` or
+        ``"forecast"``.
+    steps : int
+    start : int
+        The slice that the first entry belongs to.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows; one for each element of the plates that are filtered separately.
+    log_marginal_increments : ndarray, shape (time,) or (time, *plates)
+        Log density of each row given those before; they add up to the above.
+    weight_ess : ndarray or None, shape (time,) or (time, *plates)
+        Equally weighted particles that those of each slice are worth, before they are resampled.
+    resampled : ndarray of bool or None
+        Whether particles were resampled on the way into a slice.
+    unique_ancestors : ndarray of int or None
+        Particles of the slice before that have offspring in this one.
+    queries : dict
+        Name -> expectation of a function in every slice, time first.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], initial=[0.5, 0.5])
+    >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+    >>> filtered = bmc.filter(dbn, {"umbrella": [1, 1]})
+    >>> filtered.probabilities("rain").round(3).tolist()
+    [[0.182, 0.818], [0.117, 0.883]]
+    """
+
+    weight_ess: np.ndarray | None = None
+    resampled: np.ndarray | None = None
+    unique_ancestors: np.ndarray | None = None
+    rejuvenated: np.ndarray | None = None
+
+    def __init__(
+        self,
+        model: Model,
+        engine: Any,
+        kind: str,
+        increments: np.ndarray | None,
+        *,
+        tables: Mapping[str, np.ndarray] | None = None,
+        means: Mapping[str, np.ndarray] | None = None,
+        variances: Mapping[str, np.ndarray] | None = None,
+        queries: Mapping[str, np.ndarray] | None = None,
+        steps: int | None = None,
+        start: int = 0,
+    ) -> None:
+        self.model = model
+        self.engine = engine
+        self.kind = kind
+        self._tables = dict(tables or {})
+        self._means = dict(means or {})
+        self._variances = dict(variances or {})
+        self.queries = dict(queries or {})
+        self.start = start
+        self.log_marginal_increments = increments
+        self.log_marginal_likelihood: Any = None
+        if increments is not None:
+            total = increments.sum(axis=0)
+            self.log_marginal_likelihood = total if increments.ndim > 1 else float(total)
+        answered = next(iter([*self._tables.values(), *self._means.values()]), None)
+        if steps is None:
+            found = increments if increments is not None else answered
+            steps = 0 if found is None else len(found)
+        self.steps = steps
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that are answered for, parents first."""
+        return tuple(n for n in self.model.nodes if n in self._tables or n in self._means)
+
+    def mean(self, name: str) -> np.ndarray:
+        """Means, shape ``(time, *plates, *event)``; circular for angles; labels have none.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError, UnsupportedError
+        """
+        node = self._node(name)
+        if name in self._tables:
+            return self._tables[name] @ self._numbers(node)
+        return self._means[name].copy()
+
+    def var(self, name: str) -> np.ndarray:
+        """Variances, shape ``(time, *plates, *event)``; for angles ``-2 log R``."""
+        node = self._node(name)
+        if name in self._tables:
+            return table_variance(self._tables[name], self._numbers(node))
+        return self._variances[name].copy()
+
+    def std(self, name: str) -> np.ndarray:
+        """Standard deviations, shape ``(time, *plates, *event)``."""
+        return np.sqrt(self.var(name))
+
+    def probabilities(self, name: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(time, *plates, states)``."""
+        self._node(name)
+        if name not in self._tables:
+            raise QueryError(
+                f"probabilities({name!r}): the node has no finite set of states; use mean or var, or give "
+                "queries={name: function} to the call"
+            )
+        return self._tables[name].copy()
+
+    def last(self, steps: int, kind: str) -> SeriesPosterior:
+        """The last so many slices by themselves."""
+
+        def cut(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+            return {n: v[-steps:] for n, v in arrays.items()}
+
+        found = SeriesPosterior(
+            self.model, self.engine, kind, None,
+            tables=cut(self._tables), means=cut(self._means), variances=cut(self._variances),
+            queries=cut(self.queries), steps=steps, start=self.start + self.steps - steps,
+        )  # fmt: skip
+        if self.weight_ess is not None:
+            found.weight_ess = self.weight_ess[-steps:]
+        return found
+
+    def __repr__(self) -> str:
+        engine = type(self.engine).__name__
+        found = f"{self.kind} by {engine}, {self.steps} slices"
+        return f"{type(self).__name__}({found}: {', '.join(self.names)})"
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _node(self, name: str) -> CompiledNode:
+        node = self.model.nodes.get(name)
+        if node is None:
+            raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
+        if name not in self._tables and name not in self._means:
+            raise UnsupportedError(
+                f"{name!r} is not answered for by this result (answered are {list(self.names)}); ask with "
+                "queries={name: function}"
+            )
+        return node
+
+    def _not_kept(self, what: str) -> UnsupportedError:
+        return UnsupportedError(
+            f'{what}: the particles of past slices were not held; give keep="particles" to the call'
+        )
+
+    def _numbers(self, node: CompiledNode) -> np.ndarray:
+        assert node.domain is not None
+        if node.domain.labels is not None:
+            raise QueryError(
+                f"{node.name!r} has labels, which have no mean; use probabilities({node.name!r})"
+            )
+        return np.asarray(node.domain.numbers, dtype=float)
