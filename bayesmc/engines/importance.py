@@ -112,7 +112,8 @@ class Importance(WeightedEngine):
         bare = replace(model, potentials={})  # potentials find their places in the new order
         plain = fast_steps(bare, problem.observed, problem.inputs)
         proposals = _read(problem, self.proposal)
-        return proposal_steps(problem, dict(zip(model.nodes, plain, strict=True)), proposals)
+        by_name = dict(zip(model.nodes, plain, strict=True))
+        return proposal_steps(model, problem.observed, by_name, proposals)
 
     def known(self, problem: Problem) -> dict[str, np.ndarray]:
         """Inputs, and what is wholly observed: proposals may look at it before its turn."""

@@ -6,16 +6,19 @@ Every slice is one forward pass over the two-slice template (``slice_steps``); w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.slice_steps import SlicePlan, plates_apart, size_of
+from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
-from bayesmc.network.forward import Pass, Step
+from bayesmc.network.forward import Pass, Step, WeighDrawn
+
+#: log factors by which particles of the slice before are chosen, from its values and the row
+FirstStage = Callable[[Mapping[str, np.ndarray], Row, np.random.Generator], np.ndarray]
 
 #: numbers of the largest node in a block of particles: its temporaries stay in cache
 BLOCK = 8192
@@ -43,6 +46,8 @@ class Cloud:
     ancestors : ndarray of int or None
         Positions in the cloud before, sorted; None where every particle has itself.
     resampled : ndarray of bool, shape (*apart,)
+    rejuvenated : bool
+        Whether they were drawn anew, since all weights had vanished.
     """
 
     t: int
@@ -54,6 +59,27 @@ class Cloud:
     ess: np.ndarray
     ancestors: np.ndarray | None = None
     resampled: Any = False
+    rejuvenated: bool = False
+
+
+class Selection(NamedTuple):
+    """Who has offspring, and what weight the offspring start with.
+
+    Attributes
+    ----------
+    ancestors : ndarray of int or None
+        Sorted positions; None where everybody has one.
+    resampled : bool or ndarray of bool, shape (*apart,)
+    carried : ndarray or float
+        Log weights that the offspring have already.
+    spent : ndarray or float, shape (*apart,)
+        Log of what their sum stands for: an increment is the log of the new sum, less this.
+    """
+
+    ancestors: np.ndarray | None
+    resampled: Any
+    carried: Any
+    spent: Any
 
 
 class Mover:
@@ -67,10 +93,11 @@ class Mover:
         ``(weights, draws, rng) -> indices``.
     threshold : float
         Share of the particles below which their effective number has them resampled.
-    wanted : tuple of str
-        Nodes whose values are kept, besides those that the next slice reads.
-    static : dict
-        Values of the static nodes.
+    plan : SlicePlan
+    first_stage : callable, optional
+        ``(before, row, rng) -> log factors``, by which particles are chosen for their future.
+    rejuvenate : callable, optional
+        ``row -> steps`` of a slice that does not look at the slice before, for where all weights vanish.
     """
 
     def __init__(
@@ -79,50 +106,90 @@ class Mover:
         particles: int,
         resample: Callable[..., np.ndarray],
         threshold: float,
-        wanted: tuple[str, ...],
-        static: Mapping[str, np.ndarray],
+        plan: SlicePlan,
+        first_stage: FirstStage | None = None,
+        rejuvenate: Callable[[Row], Sequence[Step]] | None = None,
     ) -> None:
         self.slices, self.particles = slices, particles
         self.resample, self.threshold = resample, threshold
-        self.apart = plates_apart(slices)
-        self.plan = SlicePlan(slices, self.apart, static)
-        self.kept = tuple(dict.fromkeys((*slices.interface, *wanted)))
+        self.plan, self.apart = plan, plan.apart
+        self.first_stage, self.rejuvenate = first_stage, rejuvenate
+        self.kept = slices.dynamic
         self.block = max(1, BLOCK // max(size_of(slices), 1))
         self.lead = tuple(slices.first.sizes[p] for p in self.apart)
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""
-        values, log = self._passed(row, {}, None, rng)
-        return self._weighted(row, values, log, None, None, False)
+        start = Selection(None, np.zeros(self.lead, dtype=bool), 0.0, np.log(self.particles))
+        return self._moved(row, {}, start, rng)
 
     def next(self, cloud: Cloud, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of the next slice: resample if need be, move, weight."""
-        ancestors, resampled = self._selected(cloud, rng)
         before = {n + PREVIOUS: cloud.values[n] for n in self.slices.interface}
-        values, log = self._passed(row, before, ancestors, rng)
-        return self._weighted(row, values, log, cloud, ancestors, resampled)
+        return self._moved(row, before, self._selected(cloud, before, row, rng), rng)
 
-    def _selected(self, cloud: Cloud, rng: np.random.Generator) -> tuple[np.ndarray | None, Any]:
-        """Who has offspring, or None where everybody has one."""
-        poor = cloud.ess < self.threshold * self.particles
+    def _moved(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        selection: Selection,
+        rng: np.random.Generator,
+    ) -> Cloud:
+        values, log = self._passed(self.plan.steps(row), row, before, selection.ancestors, rng)
+        cloud = self._weighted(row, values, log, selection)
+        if cloud is not None:
+            return cloud
+        if self.rejuvenate is not None:
+            values, log = self._passed(self.rejuvenate(row), row, before, selection.ancestors, rng)
+            fresh = Selection(None, True, 0.0, np.log(self.particles))
+            cloud = self._weighted(row, values, log, fresh)
+            if cloud is not None:
+                return replace(cloud, rejuvenated=True)
+        raise self._degenerate(row, before, values, selection)
+
+    def _selected(
+        self,
+        cloud: Cloud,
+        before: Mapping[str, np.ndarray],
+        row: Row,
+        rng: np.random.Generator,
+    ) -> Selection:
+        """Resample where weights are uneven; with a first stage, by what the next row makes of them."""
+        n, total = self.particles, np.log(cloud.total)
+        weights, ess, factor, gained = cloud.weights, cloud.ess, None, 0.0
+        if self.first_stage is not None and row.seen:
+            factor = self.first_stage(before, row, rng)
+            weights, level = _exponentials(cloud.log_weights + factor)
+            chosen_from = weights.sum(axis=0)
+            ess = chosen_from**2 / _squares(weights)
+            gained = level + np.log(chosen_from) - total
+        poor = ess < self.threshold * n
         if not np.any(poor):
-            return None, poor
-        if not self.apart:
-            return self.resample(cloud.weights, self.particles, rng), poor
-        chosen = self.resample(cloud.weights, self.particles, rng)
-        own = np.arange(self.particles).reshape((-1,) + (1,) * len(self.apart))
-        return np.where(poor, chosen, own), poor
+            return Selection(None, poor, cloud.log_weights, total)
+        chosen = self.resample(weights, n, rng)
+        carried: Any = 0.0
+        if factor is not None:
+            carried = -(factor[chosen] if not self.apart else np.take_along_axis(factor, chosen, 0))
+        if np.all(poor):
+            return Selection(chosen, poor, carried, np.log(n) - gained)
+        own = np.arange(n).reshape((-1,) + (1,) * len(self.apart))
+        return Selection(
+            np.where(poor, chosen, own),
+            poor,
+            np.where(poor, carried, cloud.log_weights),
+            np.where(poor, np.log(n) - gained, total),
+        )
 
     def _passed(
         self,
+        steps: Sequence[Step],
         row: Row,
         before: Mapping[str, np.ndarray],
         ancestors: np.ndarray | None,
         rng: np.random.Generator,
     ) -> tuple[dict[str, np.ndarray], Any]:
         """One forward pass over a slice, in blocks of particles: kept values and log weights."""
-        steps, known = self.plan.steps(row), self.plan.known(row)
-        n = self.particles
+        n, known = self.particles, self.plan.known(row)
         if n <= self.block:
             taken = {k: self._taken(k, v, ancestors) for k, v in before.items()}
             state = _run(steps, Pass(rng, (n,), {**known, **taken}))
@@ -172,49 +239,66 @@ class Mover:
         return _along_plates(value, ancestors, node.plates, self.apart, len(node.event_shape))
 
     def _weighted(
-        self,
-        row: Row,
-        values: dict[str, np.ndarray],
-        log: Any,
-        cloud: Cloud | None,
-        ancestors: np.ndarray | None,
-        resampled: Any,
-    ) -> Cloud:
-        """The cloud of a slice, its weights those of before unless they were spent on resampling."""
+        self, row: Row, values: dict[str, np.ndarray], log: Any, selection: Selection
+    ) -> Cloud | None:
+        """The cloud of a slice; None where no weight is left somewhere."""
         shape = (self.particles, *self.lead)
-        level_before: Any = np.log(self.particles)
-        if cloud is not None and not np.all(resampled):
-            carried = cloud.log_weights
-            before = np.log(cloud.total)
-            if np.any(resampled):
-                carried = np.where(resampled, 0.0, carried)
-                before = np.where(resampled, np.log(self.particles), before)
-            log, level_before = carried + log, before
-        log = np.asarray(log, dtype=float)
+        log = np.asarray(selection.carried + log, dtype=float)
         if log.shape != shape:
             log = np.broadcast_to(log, shape)
-        level = log.max(axis=0)
-        if not np.all(level > -np.inf):
-            raise self._degenerate(row)
-        log = log - level
-        weights = np.exp(log)
+        weights, level = _exponentials(log)
         total = weights.sum(axis=0)
-        ess = total * total / np.einsum("i...,i...->...", weights, weights)
-        increment = level + np.log(total) - level_before
-        return Cloud(row.t, values, log, weights, total, increment, ess, ancestors, resampled)
+        if not np.all(total > 0):
+            return None
+        increment = level + np.log(total) - selection.spent
+        ess = total * total / _squares(weights)
+        return Cloud(
+            row.t, values, log - level, weights, total, increment, ess,
+            selection.ancestors, selection.resampled,
+        )  # fmt: skip
 
-    def _degenerate(self, row: Row) -> DegeneracyError:
-        seen = ", ".join(map(repr, row.seen))
+    def _degenerate(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        values: Mapping[str, np.ndarray],
+        selection: Selection,
+    ) -> DegeneracyError:
+        """The error, with the first observed node at which no weight was left."""
+        taken = {k: self._taken(k, v, selection.ancestors) for k, v in before.items()}
+        known = {**self.plan.known(row), **taken, **values}
+        state = Pass(np.random.default_rng(0), (self.particles,), known)
+        model, node = self.slices.model(row.t), None
+        for name in (n for n in self.slices.dynamic if n in row.seen):
+            WeighDrawn(model, model[name], self.apart)(state)
+            if not np.all(np.any(np.asarray(state.log_weight) > -np.inf, axis=0)):
+                node = name
+                break
+        what = f"the value of {node!r}" if node else "what was seen"
         return DegeneracyError(
-            f"no particle of {self.particles} explains what was seen in slice {row.t} (of {seen})",
+            f"none of {self.particles} particles explains {what} in slice {row.t}: every weight is zero; use "
+            "more particles, a proposal= that looks at the observations, noise that is less narrow, or "
+            'on_degeneracy="rejuvenate"',
             row.t,
+            node,
         )
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _run(steps: list[Step], state: Pass) -> Pass:
+def _exponentials(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weights relative to the largest, and the log of that (0 where all are zero)."""
+    level = log.max(axis=0)
+    level = np.where(level > -np.inf, level, 0.0) if np.ndim(level) else max(level, -1e308)
+    return np.exp(log - level), level
+
+
+def _squares(weights: np.ndarray) -> Any:
+    return weights @ weights if weights.ndim == 1 else np.einsum("i...,i...->...", weights, weights)
+
+
+def _run(steps: Sequence[Step], state: Pass) -> Pass:
     for step in steps:
         step(state)
     return state

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -15,6 +16,9 @@ from bayesmc.engines.filtering import FilterEngine, Queries
 from bayesmc.engines.particle import Mover
 from bayesmc.engines.particle_belief import ParticleBelief
 from bayesmc.engines.particle_record import FilteredParticles, Record
+from bayesmc.engines.particle_stages import GivenStage, PluggedIn, Rejuvenation
+from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -35,6 +39,28 @@ class ParticleFilter(FilterEngine):
         Particles are resampled on the way into a slice where they are worth less than this share of their
         number: 1 resamples (nearly) always, 0 never (sequential importance sampling).
 
+    proposal : dict, optional
+        Node, or tuple of nodes drawn jointly -> a function whose arguments are the slice before
+        (``x_prev``), observed nodes of the slice, inputs, ``t`` or nodes drawn before, and which returns the
+        distribution to draw from, as for ``Importance``; weights are multiplied by p/q. It does not apply
+        where it names what is missing (an observation, or the slice before slice 0): there the node's own
+        density is drawn from. A detector mixed with the transition is a ``Mixture`` of both.
+    auxiliary : bool or callable
+        Resample with a look at the next row: particles are chosen by their weight times a first-stage
+        factor, by default the density of the row at the conditional means of what is hidden; or a function
+        of the slice before and observed nodes that returns log factors.
+    on_degeneracy : "raise" or "rejuvenate"
+        What to do where all weights vanish.
+    rejuvenation : dict, optional
+        Node -> density to draw it from then, given observed nodes, inputs or ``t``; all nodes that the next
+        slice reads. The slice is weighted as if that density were the model's, so its answers and the
+        evidence are biased; ``rejuvenated`` of the result says which slices.
+
+    Raises
+    ------
+    DegeneracyError
+        From the filter, with the slice and the node at which no weight was left.
+
     Notes
     -----
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
@@ -43,7 +69,8 @@ class ParticleFilter(FilterEngine):
     References
     ----------
     Gordon, Salmond and Smith (1993), IEE Proceedings F 140; Koller and Friedman (2009), sec. 15.3.3
-    (LW-2TBN); Doucet and Johansen (2011), A tutorial on particle filtering and smoothing.
+    (LW-2TBN); Doucet and Johansen (2011), A tutorial on particle filtering and smoothing; Pitt and Shephard
+    (1999), JASA 94; Okuma et al. (2004), A boosted particle filter.
 
     Examples
     --------
@@ -59,6 +86,10 @@ class ParticleFilter(FilterEngine):
     particles: int = 1000
     resampling: str | Callable[..., np.ndarray] = "systematic"
     ess_threshold: float = 0.5
+    proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
+    auxiliary: bool | Callable[..., Any] = False
+    on_degeneracy: str = "raise"
+    rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
 
     label: ClassVar[str] = "particle filter"
 
@@ -79,12 +110,35 @@ class ParticleFilter(FilterEngine):
                 "resample) to 1 (always)"
             )
         scheme_of(self.resampling)
+        accepted = FUNCTION
+        for option in ("proposal", "rejuvenation"):
+            given = getattr(self, option)
+            if given is not None:
+                checked = check_specification("ParticleFilter", given, accepted)
+                for key, spec in checked.items():
+                    as_function("ParticleFilter", key, spec, accepted)
+                object.__setattr__(self, option, MappingProxyType(checked))
+        if self.on_degeneracy not in ("raise", "rejuvenate"):
+            raise ValueError(
+                f'ParticleFilter(on_degeneracy={self.on_degeneracy!r}): give "raise" or "rejuvenate"'
+            )
+        if (self.on_degeneracy == "rejuvenate") != (self.rejuvenation is not None):
+            raise ValueError(
+                'ParticleFilter: on_degeneracy="rejuvenate" and rejuvenation={node: density} go together'
+            )
+        if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
+            raise TypeError(
+                f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
+                "log factors"
+            )
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         common = super().refusal(problem)
         if common is not None:
             return common
         known = {*problem.slices.template.static, *problem.series.observed}
+        proposals = SliceProposals(problem.slices, self.proposal or {}, "ParticleFilter")
+        proposals.check(problem.series.observed.keys())
         for model in (problem.slices.first, problem.slices.later):
             inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
             reason = refuse_unsampled(model, inside, "ParticleFilter")
@@ -189,7 +243,15 @@ class ParticleFilter(FilterEngine):
         threshold = float(self.ess_threshold)
         if isinstance(scheme, Adaptive):
             scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
-        return Mover(slices, self.particles, scheme, threshold, slices.dynamic, static)
+        proposals = (
+            SliceProposals(slices, self.proposal, "ParticleFilter") if self.proposal else None
+        )
+        plan = SlicePlan(slices, plates_apart(slices), static, proposals)
+        stage: Any = None
+        if self.auxiliary is not False:
+            stage = PluggedIn(plan) if self.auxiliary is True else GivenStage(plan, self.auxiliary)
+        anew = Rejuvenation(plan, self.rejuvenation) if self.rejuvenation is not None else None
+        return Mover(slices, self.particles, scheme, threshold, plan, stage, anew)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -43,6 +43,7 @@ class Record:
         self.increments = np.empty((steps, *mover.lead))
         self.ess = np.empty((steps, *mover.lead))
         self.resampled = np.zeros((steps, *mover.lead), dtype=bool)
+        self.rejuvenated = np.zeros(steps, dtype=bool)
         self.unique = np.full((steps, *mover.lead), mover.particles)
         self._nodes = [(n, model[n]) for n in problem.hidden]
 
@@ -52,6 +53,7 @@ class Record:
         self.increments[k] = cloud.increment
         self.ess[k] = cloud.ess
         self.resampled[k] = cloud.resampled
+        self.rejuvenated[k] = cloud.rejuvenated
         if cloud.ancestors is not None:
             changes = cloud.ancestors[1:] != cloud.ancestors[:-1]
             self.unique[k] = np.count_nonzero(changes, axis=0) + 1
@@ -81,7 +83,7 @@ class Record:
             start=self.problem.series.start,
         )
         found.weight_ess, found.resampled = self.ess, self.resampled
-        found.unique_ancestors = self.unique
+        found.unique_ancestors, found.rejuvenated = self.unique, self.rejuvenated
         found.clouds, found.mover = self.clouds, self.mover
         return found
 

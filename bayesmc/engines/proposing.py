@@ -24,13 +24,14 @@ from bayesmc.kernels.proposal import (
     to_stored,
     warn_of_gaps,
 )
-from bayesmc.network import CompiledNode, Problem
+from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.forward import (
     Pass,
     Step,
     WeighDrawn,
     nothing,
     potential_factors,
+    summed,
     with_factors,
 )
 from bayesmc.network.model import fit, invalid_error
@@ -39,25 +40,28 @@ from bayesmc.shapes import Shape
 
 
 def proposal_steps(
-    problem: Problem, steps: Mapping[str, Step], proposals: Sequence[Proposal]
+    model: Model,
+    observed: Mapping[str, Observed],
+    steps: Mapping[str, Step],
+    proposals: Sequence[Proposal],
+    apart: tuple[str, ...] = (),
 ) -> list[Step]:
     """The steps of a pass that draws from proposals where there are some.
 
     ``steps`` are the plain steps of every node. The net's own density of what was proposed comes in as
-    a factor, as soon as its parents have values.
+    a factor, as soon as its parents have values. Elements of the plates ``apart`` have weights of their own.
     """
-    model = problem.model
     by_target = {name: p for p in proposals for name in p.names}
     ordered: dict[str, Step] = {}
-    for name in _order(problem, by_target):
+    for name in _order(model, observed, by_target):
         proposal = by_target.get(name)
         if proposal is None:
             ordered[name] = steps[name]
             continue
         ordered.update(dict.fromkeys(proposal.names, nothing))
-        ordered[name] = Propose(problem, proposal)
+        ordered[name] = Propose(model, observed, proposal, apart)
     factors: list[tuple[Sequence[str], Step]] = [
-        ((name, *model[name].parents), WeighDrawn(model, model[name]))
+        ((name, *model[name].parents), WeighDrawn(model, model[name], apart))
         for name in model.nodes  # parents first: a parent of probability zero excuses its children
         if name in by_target
     ]
@@ -67,11 +71,16 @@ def proposal_steps(
 class Propose:
     """Draw the targets of one proposal and divide the weight by its density at the draw."""
 
-    def __init__(self, problem: Problem, proposal: Proposal) -> None:
+    def __init__(
+        self,
+        model: Model,
+        observed: Mapping[str, Observed],
+        proposal: Proposal,
+        apart: tuple[str, ...] = (),
+    ) -> None:
         self.proposal = proposal
-        self.model = problem.model
-        self.nodes = [problem.model[name] for name in proposal.names]
-        self.observed = problem.observed
+        self.model, self.observed, self.apart = model, observed, apart
+        self.nodes = [model[name] for name in proposal.names]
         self._compared: set[str] = set()
 
     def __call__(self, state: Pass) -> None:
@@ -92,7 +101,7 @@ class Propose:
         if node.name not in self._compared:
             self._compared.add(node.name)
             warn_of_gaps(self.proposal, node, dist)
-        alive = _alive(state)
+        alive = state.alive
         error = invalid_error(node, dist, alive, state.batch)
         if error is not None:
             raise error
@@ -108,10 +117,9 @@ class Propose:
             outside = outside & ~seen.mask
             mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
             values = np.where(mask, seen.value, values)
-        plate_axes = tuple(range(-len(node.plates), 0))
-        if plate_axes:
-            log_q = log_q.sum(axis=plate_axes)
-            outside = np.asarray(outside.any(axis=plate_axes))
+        if node.plates:
+            log_q = summed(log_q, node, self.apart)
+            outside = summed(outside.astype(np.intp), node, self.apart) > 0
         self._divide(log_q, outside, alive, state)
         values.flags.writeable = False
         state.values[node.name] = values
@@ -120,7 +128,7 @@ class Propose:
         """Draw a block as one vector and split it in order."""
         check_vector(self.nodes, dist, self.observed.keys())
         fit(self.proposal.declaration, dist, batch, ())
-        alive = _alive(state)
+        alive = state.alive
         if dist.invalid is not None:
             bad = np.broadcast_to(dist.invalid, state.batch) & alive
             if bad.any() and dist.problem is not None:
@@ -140,7 +148,8 @@ class Propose:
         self, log_q: np.ndarray, outside: np.ndarray, alive: np.ndarray, state: Pass
     ) -> None:
         """Divide the weight by q; draws outside the target's values have p = 0."""
-        refuse_infinite(np.where(alive, log_q, 0.0))
+        spare = alive.reshape(alive.shape + (1,) * (log_q.ndim - alive.ndim))
+        refuse_infinite(np.where(spare, log_q, 0.0))
         state.weigh(-np.where(np.isfinite(log_q), log_q, 0.0))
         if outside.any():
             state.weigh(np.where(outside, -np.inf, 0.0))
@@ -149,12 +158,9 @@ class Propose:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _alive(state: Pass) -> np.ndarray:
-    """Draws whose weight is not zero yet, shape ``batch``."""
-    return np.broadcast_to(np.asarray(state.log_weight) > -np.inf, state.batch)
-
-
-def _order(problem: Problem, by_target: Mapping[str, Proposal]) -> list[str]:
+def _order(
+    model: Model, observed: Mapping[str, Observed], by_target: Mapping[str, Proposal]
+) -> list[str]:
     """Names in an order of drawing, a block by its first name.
 
     Targets come after their parents in the net where that is possible, so that draws of probability zero
@@ -163,10 +169,10 @@ def _order(problem: Problem, by_target: Mapping[str, Proposal]) -> list[str]:
     cycle = CycleError("")
     for after_parents in (True, False):
         try:
-            return topological_order(_needs(problem, by_target, after_parents))
+            return topological_order(_needs(model, observed, by_target, after_parents))
         except CycleError as error:
             cycle = error
-    partly = [n for n in cycle.path if n in problem.observed]
+    partly = [n for n in cycle.path if n in observed]
     hint = f" ({partly[0]!r} is observed only in part, so it is drawn)" if partly else ""
     raise CycleError(
         f"Importance: the proposals need each other in a cycle: {' -> '.join(cycle.path)}{hint}; a "
@@ -176,11 +182,13 @@ def _order(problem: Problem, by_target: Mapping[str, Proposal]) -> list[str]:
 
 
 def _needs(
-    problem: Problem, by_target: Mapping[str, Proposal], after_parents: bool
+    model: Model,
+    observed: Mapping[str, Observed],
+    by_target: Mapping[str, Proposal],
+    after_parents: bool,
 ) -> dict[str, list[str]]:
     """What must have values before each node is drawn."""
-    model = problem.model
-    known = {n for n, seen in problem.observed.items() if seen.mask is None}
+    known = {n for n, seen in observed.items() if seen.mask is None}
     needs: dict[str, list[str]] = {}
     for name, node in model.nodes.items():
         proposal = by_target.get(name)

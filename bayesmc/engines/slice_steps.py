@@ -8,15 +8,29 @@ their functions do not read the time.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, Row, Slices
 from bayesmc.engines.forward import RowIndex, TableDraw, table_of
-from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.forward import Compute, Draw, Pass, Step, current_distribution
+from bayesmc.engines.proposal import FUNCTION, as_function, bound
+from bayesmc.engines.proposing import proposal_steps
+from bayesmc.errors import ModelError, UnknownNodeError
+from bayesmc.kernels.proposal import Key, Proposal, names_of
+from bayesmc.network import CompiledNode
+from bayesmc.network.forward import (
+    Compute,
+    Draw,
+    DrawAndWeigh,
+    Pass,
+    Step,
+    WeighDrawn,
+    nothing,
+    summed,
+)
+from bayesmc.network.store import unknown
 from bayesmc.structure import Table
 
 
@@ -33,19 +47,24 @@ class SlicePlan:
     """
 
     def __init__(
-        self, slices: Slices, apart: tuple[str, ...], static: Mapping[str, np.ndarray]
+        self,
+        slices: Slices,
+        apart: tuple[str, ...],
+        static: Mapping[str, np.ndarray],
+        proposals: SliceProposals | None = None,
     ) -> None:
         self.slices, self.apart, self.static = slices, apart, dict(static)
+        self.proposals = proposals
         self._kept: dict[Any, list[Step]] = {}
         self._tables: dict[tuple[bool, str], Table | None] = {}
 
-    def steps(self, row: Row, skip: frozenset[str] = frozenset()) -> list[Step]:
-        """The steps of a row's slice, without those of the nodes to ``skip``."""
+    def steps(self, row: Row) -> list[Step]:
+        """The steps of a row's slice."""
         partly = any(seen.mask is not None for seen in row.seen.values())
-        key = (row.t == 0, frozenset(row.seen), skip)
+        key = (row.t == 0, frozenset(row.seen))
         found = None if partly else self._kept.get(key)
         if found is None:
-            found = self._build(row, skip)
+            found = self._build(row)
             if not partly:
                 self._kept[key] = found
         return found
@@ -70,13 +89,19 @@ class SlicePlan:
         if seen is None:
             return Draw(model, node) if table is None else TableDraw(node, table)
         if seen.mask is not None:
-            return DrawAndWeighApart(model, node, seen, self.apart)
+            return DrawAndWeigh(model, node, seen, self.apart)
         if table is None:
-            return WeighApart(model, node, self.apart)
+            return WeighDrawn(model, node, self.apart)
         return TableWeighApart(node, table, self.apart)
 
-    def _build(self, row: Row, skip: frozenset[str]) -> list[Step]:
-        return [self.step(row, name) for name in self.slices.dynamic if name not in skip]
+    def _build(self, row: Row) -> list[Step]:
+        plain = {name: self.step(row, name) for name in self.slices.dynamic}
+        asked = [] if self.proposals is None else self.proposals.of(row)
+        if not asked:
+            return list(plain.values())
+        model = self.slices.model(row.t)
+        steps = {name: plain.get(name, nothing) for name in model.nodes}
+        return proposal_steps(model, row.seen, steps, asked, self.apart)
 
     def _table(self, first: bool, name: str) -> Table | None:
         """A finite node's table over what varies, if it is the same in every slice."""
@@ -88,6 +113,65 @@ class SlicePlan:
             timeless = not inputs & set(model[name].parents)
             self._tables[key] = table_of(model, model[name], self.static) if timeless else None
         return self._tables[key]
+
+
+class SliceProposals:
+    """Proposals of a filter, read against both models of a template.
+
+    A proposal that names the slice before does not apply in slice 0, nor does one that names a node below its
+    targets where that is missing: the nodes' own densities are drawn from there.
+
+    Parameters
+    ----------
+    slices : Slices
+    given : dict
+        As ``check_specification`` leaves it.
+    engine : str
+        For messages.
+    """
+
+    def __init__(self, slices: Slices, given: Mapping[Key, Any], engine: str) -> None:
+        self.engine = engine
+        self.first: list[Proposal] = []
+        self.later: list[Proposal] = []
+        #: for each proposal what it reads and can only know by having seen it
+        self._looks: dict[Key, frozenset[str]] = {}
+        for key, spec in given.items():
+            for name in names_of(key):
+                _check_target(slices, name, f"{engine}: proposal for {key!r}")
+            function = as_function(engine, key, spec, FUNCTION)
+            later = bound(engine, slices.later, key, function)
+            if not later.is_independent:
+                own = next(p for p in later.parents if p in later.names)
+                raise ModelError(
+                    f"{later.what}: it names {own!r}, which it is to draw; name observed nodes, inputs, the "
+                    f"slice before ({own + PREVIOUS!r}) or nodes drawn before"
+                )
+            self.later.append(later)
+            self._looks[key] = frozenset(later.parents) & _below(slices, later.names)
+            if not any(p.endswith(PREVIOUS) for p in later.parents):
+                self.first.append(bound(engine, slices.first, key, function))
+
+    def check(self, observed: Set[str]) -> None:
+        """Refuse proposals that look at nodes which a series never observes.
+
+        Raises
+        ------
+        ModelError
+        """
+        for proposal in self.later:
+            never = sorted(self._looks[proposal.key] - observed)
+            if never:
+                raise ModelError(
+                    f"{proposal.what}: it names {never[0]!r}, which depends on what is to be drawn and is "
+                    "not observed; name observed nodes, inputs, or the slice before"
+                )
+
+    def of(self, row: Row) -> list[Proposal]:
+        """Those that apply in a row's slice."""
+        seen = {n for n, o in row.seen.items() if o.mask is None}
+        asked = self.first if row.t == 0 else self.later
+        return [p for p in asked if self._looks[p.key] <= seen and not seen & set(p.names)]
 
 
 def plates_apart(slices: Slices) -> tuple[str, ...]:
@@ -107,57 +191,6 @@ def plates_apart(slices: Slices) -> tuple[str, ...]:
                 if parent in varies:
                     found = [p for p in found if p not in link.foreign]
     return tuple(found)
-
-
-def summed(log: np.ndarray, node: CompiledNode, apart: tuple[str, ...]) -> np.ndarray:
-    """A node's log densities, ``(*lead, *plates)``, summed over all plates but those ``apart``."""
-    if not node.plates:
-        return log
-    lead = log.shape[: max(log.ndim - len(node.plates), 0)]
-    full = np.broadcast_to(log, lead + node.plate_shape)
-    count = len(lead)
-    others = tuple(count + k for k, p in enumerate(node.plates) if p not in apart)
-    total = full.sum(axis=others) if others else full
-    kept = [p for p in node.plates if p in apart]
-    order = [kept.index(p) for p in apart if p in kept]
-    if order != sorted(order):
-        total = total.transpose(*range(count), *(count + k for k in order))
-    return total
-
-
-class WeighApart:
-    """A node whose value is in place: its density is a factor of the weight."""
-
-    def __init__(self, model: Model, node: CompiledNode, apart: tuple[str, ...]) -> None:
-        self.model, self.node, self.apart = model, node, apart
-
-    def __call__(self, state: Pass) -> None:
-        node = self.node
-        dist = current_distribution(self.model, node, state)
-        log = self.model.log_density(node.name, dist, state.values[node.name])
-        state.weigh(summed(log, node, self.apart) if node.plates else log)
-
-
-class DrawAndWeighApart:
-    """A partly observed node: sample the missing elements, weight by the others."""
-
-    def __init__(
-        self, model: Model, node: CompiledNode, seen: Observed, apart: tuple[str, ...]
-    ) -> None:
-        assert seen.mask is not None
-        self.model, self.node, self.seen, self.apart = model, node, seen, apart
-        self.elements = seen.mask
-        self.mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
-
-    def __call__(self, state: Pass) -> None:
-        node = self.node
-        dist = current_distribution(self.model, node, state)
-        draws = self.model.sample_stored(node.name, dist, state.rng, state.batch)
-        values = np.where(self.mask, self.seen.value, draws)
-        values.flags.writeable = False
-        log = self.model.log_density(node.name, dist, values)
-        state.weigh(summed(np.where(self.elements, log, 0.0), node, self.apart))
-        state.values[node.name] = values
 
 
 class TableWeighApart:
@@ -180,3 +213,27 @@ class TableWeighApart:
 def size_of(slices: Slices) -> int:
     """Numbers that the largest node of a slice holds."""
     return max((math.prod(slices.first[n].value_shape) for n in slices.dynamic), default=1)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _check_target(slices: Slices, name: str, what: str) -> None:
+    template = slices.template
+    if name not in template.later:
+        raise UnknownNodeError(f"{what}: {unknown(template.later, name)}")
+    node = slices.later[name]
+    if name in template.static or not node.is_stochastic:
+        kind = "static" if name in template.static else node.kind
+        raise ModelError(
+            f"{what}: {name!r} is {kind} and not drawn in a slice; propose a stochastic node"
+        )
+
+
+def _below(slices: Slices, names: tuple[str, ...]) -> frozenset[str]:
+    """Nodes of a slice that depend on some of its nodes."""
+    reached = set(names)
+    for name in slices.dynamic:
+        if reached & set(slices.later[name].parents):
+            reached.add(name)
+    return frozenset(reached - set(names))

@@ -29,13 +29,22 @@ class Pass:
     values : dict
         Name -> stored values drawn, known or computed so far.
     log_weight : float or ndarray
-        Sum of the log densities of the evidence so far; broadcasts to ``batch``.
+        Sum of the log densities of the evidence so far; broadcasts to ``batch``, or to ``batch`` and those
+        plates whose elements have weights of their own.
     """
 
     rng: np.random.Generator
     batch: Shape
     values: dict[str, np.ndarray]
     log_weight: Any = 0.0
+
+    @property
+    def alive(self) -> np.ndarray:
+        """Draws whose weight is not zero yet (in any plate element that has its own), shape ``batch``."""
+        alive: np.ndarray = np.asarray(np.asarray(self.log_weight) > -np.inf)
+        if alive.ndim > len(self.batch):
+            alive = np.asarray(alive.any(axis=tuple(range(len(self.batch), alive.ndim))))
+        return np.broadcast_to(alive, self.batch)
 
     def weigh(self, log_density: np.ndarray) -> None:
         """Multiply the weights by a density given in logs."""
@@ -132,32 +141,39 @@ class Weigh:
     """An observed node: its density at what was seen is a factor of the weight."""
 
     def __init__(self, model: Model, node: CompiledNode, seen: Observed) -> None:
-        self.model, self.node, self.seen = model, node, seen
+        self.node, self.seen = node, seen
+        self.weigh = WeighDrawn(model, node)
 
     def __call__(self, state: Pass) -> None:
-        _weigh_at(self.model, self.node, state, self.seen.value)
         state.values[self.node.name] = self.seen.value
+        self.weigh(state)
 
 
 class WeighDrawn:
-    """A node drawn from elsewhere: its density given its parents is a factor of the weight."""
+    """A node whose value comes from elsewhere: its density given its parents is a factor of the weight.
 
-    def __init__(self, model: Model, node: CompiledNode) -> None:
-        self.model, self.node = model, node
+    Elements of the plates ``apart`` have weights of their own, shape ``(*batch, *apart)``.
+    """
+
+    def __init__(self, model: Model, node: CompiledNode, apart: tuple[str, ...] = ()) -> None:
+        self.model, self.node, self.apart = model, node, apart
 
     def __call__(self, state: Pass) -> None:
-        _weigh_at(self.model, self.node, state, state.values[self.node.name])
+        dist = current_distribution(self.model, self.node, state)
+        log = self.model.log_density(self.node.name, dist, state.values[self.node.name])
+        state.weigh(summed(log, self.node, self.apart) if self.node.plates else log)
 
 
 class DrawAndWeigh:
     """A partly observed node: sample the missing plate elements, weight by the others."""
 
-    def __init__(self, model: Model, node: CompiledNode, seen: Observed) -> None:
-        self.model, self.node, self.seen = model, node, seen
+    def __init__(
+        self, model: Model, node: CompiledNode, seen: Observed, apart: tuple[str, ...] = ()
+    ) -> None:
+        self.model, self.node, self.seen, self.apart = model, node, seen, apart
         assert seen.mask is not None
         self.elements = seen.mask
         self.mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
-        self.plate_axes = tuple(range(-len(node.plates), 0))
 
     def __call__(self, state: Pass) -> None:
         dist = current_distribution(self.model, self.node, state)
@@ -165,7 +181,7 @@ class DrawAndWeigh:
         values = np.where(self.mask, self.seen.value, draws)
         values.flags.writeable = False
         density = self.model.log_density(self.node.name, dist, values)
-        state.weigh(np.where(self.elements, density, 0.0).sum(axis=self.plate_axes))
+        state.weigh(summed(np.where(self.elements, density, 0.0), self.node, self.apart))
         state.values[self.node.name] = values
 
 
@@ -183,14 +199,26 @@ def current_distribution(model: Model, node: CompiledNode, state: Pass) -> Distr
     """The node's distribution given its parents; bad parameters raise where the weight is positive."""
     dist, _ = model.evaluate(node.name, state.values)
     if dist.invalid is not None:
-        alive: np.ndarray = np.asarray(np.asarray(state.log_weight) > -np.inf)
-        if alive.ndim > len(state.batch):  # elements of plates with weights of their own
-            alive = np.asarray(alive.any(axis=tuple(range(len(state.batch), alive.ndim))))
-        alive = np.broadcast_to(alive, state.batch)
-        error = invalid_error(node, dist, alive, state.batch)
+        error = invalid_error(node, dist, state.alive, state.batch)
         if error is not None:
             raise error
     return dist
+
+
+def summed(log: np.ndarray, node: CompiledNode, apart: tuple[str, ...]) -> np.ndarray:
+    """A node's log densities, ``(*lead, *plates)``, summed over all plates but those ``apart``."""
+    if not node.plates:
+        return log
+    lead = log.shape[: max(log.ndim - len(node.plates), 0)]
+    full = np.broadcast_to(log, lead + node.plate_shape)
+    count = len(lead)
+    others = tuple(count + k for k, p in enumerate(node.plates) if p not in apart)
+    total = full.sum(axis=others) if others else full
+    kept = [p for p in node.plates if p in apart]
+    order = [kept.index(p) for p in apart if p in kept]
+    if order != sorted(order):
+        total = total.transpose(*range(count), *(count + k for k in order))
+    return total
 
 
 def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None:
@@ -213,14 +241,3 @@ def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None
         f"{who} samples every hidden node from its conditional density, but {from_density[0]!r} is a "
         "Density without sample=; give one, or observe the node"
     )
-
-
-def _weigh_at(model: Model, node: CompiledNode, state: Pass, value: np.ndarray) -> None:
-    """Weigh by a node's density at a value, all its plate elements together."""
-    dist = current_distribution(model, node, state)
-    log_density = model.log_density(node.name, dist, value)
-    if node.plates:
-        lead = log_density.shape[: max(log_density.ndim - len(node.plates), 0)]
-        log_density = np.broadcast_to(log_density, lead + node.plate_shape)
-        log_density = log_density.sum(axis=tuple(range(-len(node.plates), 0)))
-    state.weigh(log_density)
