@@ -37,8 +37,8 @@ class Adaptive:
     scheme : str or callable
         A name of ``SCHEMES``, or a function with the signature of one.
     threshold : float
-        Resample if ``ess < threshold * n``: 0 never does, anything above 1 always does. With 1, only exactly
-        even weights are left alone.
+        Resample if ``ess < threshold * n``: 0 never does, anything above 1 always does. With 1, only even
+        weights are left alone (as far as rounding lets them be even).
 
     Raises
     ------
@@ -72,8 +72,7 @@ class Adaptive:
     threshold: float = 0.5
 
     def __post_init__(self) -> None:
-        if isinstance(scheme_of(self.scheme), Adaptive):
-            raise ValueError("Adaptive(scheme=Adaptive(...)): give the scheme inside it")
+        self._plain_scheme()
         if not self.threshold >= 0:
             raise ValueError(
                 f"Adaptive(threshold={self.threshold!r}): give a share of the particles, "
@@ -102,7 +101,7 @@ class Adaptive:
             ``ess(weights)``, where the caller has it.
         """
         weights = np.asarray(weights, dtype=float)
-        scheme = scheme_of(self.scheme)
+        scheme = self._plain_scheme()
         batch = weights.shape[1:]
         if self.threshold > 1:
             return Resampled(scheme(weights, draws, rng), np.ones(batch, bool) if batch else True)
@@ -124,6 +123,12 @@ class Adaptive:
         indices[:, due] = scheme(weights[:, due], draws, rng)
         return Resampled(indices, due)
 
+    def _plain_scheme(self) -> Scheme:
+        scheme = scheme_of(self.scheme)
+        if isinstance(scheme, Adaptive):
+            raise ValueError("Adaptive(scheme=Adaptive(...)): give the scheme inside it")
+        return scheme
+
 
 def scheme_of(resampling: str | Scheme | Adaptive) -> Scheme | Adaptive:
     """The scheme that a name stands for; functions and :class:`Adaptive` as they are.
@@ -141,7 +146,7 @@ def scheme_of(resampling: str | Scheme | Adaptive) -> Scheme | Adaptive:
     >>> scheme_of("sistematic")
     Traceback (most recent call last):
         ...
-    ValueError: resampling='sistematic' is no scheme (did you mean 'systematic'?); there are 'multinomial', ...
+    ValueError: resampling='sistematic' is no scheme (did you mean 'systematic'?); there are ...
     """
     if isinstance(resampling, str) and resampling in SCHEMES:
         return SCHEMES[resampling]

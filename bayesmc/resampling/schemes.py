@@ -5,10 +5,10 @@ shape ``(draws, *batch)``. On average index ``i`` comes ``draws * weights[i] / s
 differ in how far a single number of offspring may stray from that. An index of weight zero never comes.
 
 All of them work on *edges*: entry ``i`` of the edges says how many draws fall on indices up to ``i``. With
-``x`` the running sum of the expected offspring, and one point of each unit interval ``(k, k + 1]`` or
-``draws`` points anywhere below ``draws``, it is the number of points up to ``x[i]``. Equal neighbours in
-``x`` have equal edges, which keeps weights of zero out, and the edge at the end of ``x`` is set to
-``draws``, which keeps indices within bounds whatever the rounding.
+``x`` the running sum of the expected offspring, and ``draws`` random points on ``[0, draws)`` (one in each
+``[k, k + 1)``, or anywhere), it is the number of points below ``x[i]``. Equal neighbours in ``x`` have equal
+edges, and none lies below a leading zero, which keeps weights of zero out; the edge at the end of ``x`` is
+set to ``draws``, which keeps indices within bounds whatever the rounding.
 """
 
 from __future__ import annotations
@@ -62,15 +62,16 @@ def multinomial(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np
 
     References
     ----------
-    Gordon, Salmond and Smith (1993); Devroye (1986), Non-Uniform Random Variate Generation, sec. V.3.1.
+    Gordon, Salmond and Smith (1993), IEE Proc. F 140(2); Devroye (1986), Non-Uniform Random Variate
+    Generation, ch. V (sorted uniforms).
 
     Examples
     --------
     >>> import numpy as np
     >>> from bayesmc.resampling import multinomial
-    >>> picked = multinomial(np.array([0.5, 0.0, 0.5]), 1000, np.random.default_rng(0))
+    >>> picked = multinomial(np.array([0.5, 0.0, 0.5]), 1000, np.random.default_rng(1))
     >>> np.bincount(picked).tolist()
-    [484, 0, 516]
+    [517, 0, 483]
     """
     draws = count_of(draws)
     positions = cumulative_offspring(weights, draws)
@@ -87,7 +88,7 @@ def stratified(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.
 
     References
     ----------
-    Kitagawa (1996), JCGS 5(1); Douc, Cappe and Moulines (2005), sec. 2.3 and 3.2.
+    Kitagawa (1996), JCGS 5(1); Douc, Cappe and Moulines (2005).
 
     Examples
     --------
@@ -100,14 +101,15 @@ def stratified(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.
     draws = count_of(draws)
     positions = cumulative_offspring(weights, draws)
     points = _one_per_stratum(draws, positions.shape[1:], rng)
-    return _unfolded(_closed(_reached(positions, points), positions, draws), draws)
+    return _unfolded(_closed(_below(positions, points), positions, draws), draws)
 
 
 def systematic(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
     """Sorted indices from one comb of ``draws`` equally spaced points, shifted by one uniform.
 
-    Offspring number ``floor`` or ``ceil`` of ``draws * weight``. The fastest scheme, and usually the one of
-    least variance; but the order of the particles matters, and no order is proved to make it converge.
+    Offspring number ``floor`` or ``ceil`` of ``draws * weight``. The fastest scheme, and no unbiased one has
+    numbers of less variance. The variance of a mean hangs on the order of the particles, though, and in
+    unlucky orders it need not vanish with their number; :func:`ssp` has no such order.
 
     Parameters and errors are those of :func:`multinomial`.
 
@@ -124,8 +126,8 @@ def systematic(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.
     """
     draws = count_of(draws)
     positions = cumulative_offspring(weights, draws)
-    # the points are k + 1 - u: floor(x + u) of them lie up to x
-    positions += rng.random(positions.shape[1:] or None)
+    # ceil(x - u) of the points k + u lie below x: the whole part of x + (1 - u), but for u = 0
+    positions += (1.0 - rng.random(positions.shape[1:] or None)) % 1.0
     return _unfolded(_closed(positions.astype(np.intp), positions, draws), draws)
 
 
@@ -139,7 +141,7 @@ def residual(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.nd
 
     References
     ----------
-    Liu and Chen (1998), JASA 93(443); Douc, Cappe and Moulines (2005), sec. 2.2 and 3.1.
+    Liu and Chen (1998), JASA 93(443); Douc, Cappe and Moulines (2005).
 
     Examples
     --------
@@ -155,11 +157,11 @@ def residual(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.nd
 
 
 def ssp(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
-    """Sorted indices by the Srinivasan sampling process: offspring ``floor`` or ``ceil``, negatively associated.
+    """Sorted indices by the Srinivasan sampling process, whose offspring are negatively associated.
 
-    As close to their expectation as those of :func:`systematic`, but the numbers of offspring are negatively
-    associated, so that averages converge whatever the order of the particles, with never more variance
-    than :func:`multinomial`.
+    Offspring number ``floor`` or ``ceil`` of ``draws * weight``, as with :func:`systematic`, but means
+    converge whatever the order of the particles. Never more variance than :func:`residual`, whatever
+    is averaged.
 
     Parameters and errors are those of :func:`multinomial`.
 
@@ -167,14 +169,14 @@ def ssp(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray
     -----
     The process lets the residuals fight in order, two at a time, until each is 0 or 1: ordered pivotal
     sampling (Deville and Tille 1998). That has the same law as Deville's systematic sampling (Chauvet
-    2012, theorem 1): one point in each unit stratum of the running sum of the residuals, with the unit
+    2012): one point in each unit stratum of the running sum of the residuals, with the unit
     across a border taken at most once. Only "was it taken in the stratum before" passes from one stratum
     to the next, and it is resolved for all strata at once, without a loop over particles.
 
     References
     ----------
-    Gerber, Chopin and Whiteley (2019), Annals of Statistics 47(4), sec. 3.3; Srinivasan (2001), FOCS;
-    Chauvet (2012), Bernoulli 18(4).
+    Gerber, Chopin and Whiteley (2019), Annals of Statistics 47(4); Srinivasan (2001), FOCS; Chauvet
+    (2012), Bernoulli 18(4); Chauvet and Ruiz-Gazen (2017), Statistics and Probability Letters 121.
 
     Examples
     --------
@@ -187,7 +189,7 @@ def ssp(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray
     draws = count_of(draws)
     kept, positions, left = _kept_and_left(weights, draws)
     points = _pivotal_points(positions, left, rng)
-    return _unfolded(kept + _closed(_reached(positions, points), positions, left), draws)
+    return _unfolded(kept + _closed(_below(positions, points), positions, left), draws)
 
 
 #: every scheme by its name
@@ -234,14 +236,14 @@ def _scattered(positions: np.ndarray, draws: Any, rng: np.random.Generator) -> n
     # those of a batch element beyond its own number come to lie beyond its last position
     points *= positions[-1] / _taken(points, np.broadcast_to(draws, (1, *batch)))[0]
     # Both are sorted, and a stable sort merges two runs in linear time; searchsorted is three times
-    # slower at 10**6. Positions come first among equals, so a point on a position lies beyond it.
+    # slower at 10**6. Positions come first among equals, so a point on a position is not below it.
     order = np.argsort(np.concatenate([positions, points[:-1]]), axis=0, kind="stable")
     ranks = np.nonzero((order < n).T)[-1].reshape(*batch[::-1], n).T
     return _closed(ranks - _column(n, batch), positions, draws)
 
 
-def _reached(positions: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """How many points lie up to each position; the one of ``(k, k + 1]`` is ``k + points[k]``.
+def _below(positions: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """How many points lie below each position; the one of ``[k, k + 1)`` is ``k + points[k]``.
 
     Whole and fraction are compared apart, since their sum may round into the next stratum.
     """
@@ -250,15 +252,14 @@ def _reached(positions: np.ndarray, points: np.ndarray) -> np.ndarray:
     for start in range(0, len(edges), rows):
         whole = edges[start : start + rows]
         fraction = positions[start : start + rows] - whole
-        whole += fraction >= _taken(points, whole)
+        whole += fraction > _taken(points, whole)
     return edges
 
 
 def _one_per_stratum(strata: int, batch: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
-    """Uniform on (0, 1], shape (strata + 1, *batch); the last row lies beyond reach."""
+    """Uniform on [0, 1), shape (strata + 1, *batch); the last row lies beyond reach."""
     points = np.empty((strata + 1, *batch))
     rng.random(out=points[:strata])
-    np.subtract(1.0, points[:strata], out=points[:strata])
     points[strata] = 2.0
     return points
 
@@ -277,7 +278,7 @@ def _pivotal_points(positions: np.ndarray, left: Any, rng: np.random.Generator) 
 
     With ``before`` the mass of the first stratum outside the unit across the border and ``after`` that
     unit's mass in the second: if the first did not take it, the second does with probability
-    ``after / before`` (so ``after`` in all); otherwise its point is uniform beyond it.
+    ``after / before``, hence with ``after`` in all; otherwise its point is uniform beyond that unit.
     """
     batch, strata = positions.shape[1:], _most(left)
     points = _one_per_stratum(strata, batch, rng)
@@ -294,12 +295,12 @@ def _pivotal_points(positions: np.ndarray, left: Any, rng: np.random.Generator) 
     may_enter = rng.random(before.shape) * before < after
     # Was the unit across its upper border taken in stratum j? If its point lies there, and the stratum was
     # not entered from below; the latter hangs on stratum j - 1 only where it may be entered.
-    lies_there = points[: strata - 1] > before
+    lies_there = points[: strata - 1] >= before
     hangs = np.zeros_like(lies_there)
     hangs[1:] = lies_there[1:] & may_enter[:-1]
     decided = np.maximum.accumulate(np.where(hangs, 0, border - 1), axis=0)
     was_taken = _taken(lies_there & ~hangs, decided)
-    np.copyto(beyond, after, where=may_enter & ~was_taken)
+    np.copyto(beyond, 0.0, where=may_enter & ~was_taken)
     return points
 
 

@@ -35,7 +35,7 @@ def ess(weights: np.ndarray) -> Any:
 
     References
     ----------
-    Kong, Liu and Wong (1994), JASA 89(425), sec. 4.1.
+    Kong, Liu and Wong (1994), JASA 89(425).
 
     Examples
     --------

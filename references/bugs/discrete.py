@@ -82,6 +82,11 @@ CASES = (
     jags_case("asia", "test1", asia),
     jags_case("asia", "test2", asia_learnt),
     jags_case(
-        "eyes", "test1", eyes, monitors={"lambda[1]": ("lambda1", ()), "lambda[2]": ("lambda2", ())}
+        "eyes",
+        "test1",
+        eyes,
+        monitors={"lambda[1]": ("lambda1", ()), "lambda[2]": ("lambda2", ())},
+        settings={"chains": 16, "draws": 2000},
+        remark="that both groups exist ties all eyes, so that they move one after the other",
     ),
 )
