@@ -62,6 +62,32 @@ class Cloud:
     rejuvenated: bool = False
 
 
+@dataclass(frozen=True)
+class Layout:
+    """How the arrays of a cloud are laid out.
+
+    Attributes
+    ----------
+    particles : int
+    apart : tuple of str
+        Plates whose elements have weights of their own: axes of the weights after that of the particles.
+    lead : tuple of int
+        Their sizes.
+    """
+
+    particles: int
+    apart: tuple[str, ...]
+    lead: tuple[int, ...]
+
+
+def even_cloud(t: int, values: dict[str, np.ndarray], layout: Layout) -> Cloud:
+    """Draws of equal weight as a cloud."""
+    shape = (layout.particles, *layout.lead)
+    ones, none = np.ones(shape), np.zeros(layout.lead)
+    count = np.full(layout.lead, float(layout.particles))
+    return Cloud(t, values, np.zeros(shape), ones, count, none, count)
+
+
 class Selection(NamedTuple):
     """Who has offspring, and what weight the offspring start with.
 
@@ -117,6 +143,7 @@ class Mover:
         self.kept = slices.dynamic
         self.block = max(1, BLOCK // max(size_of(slices), 1))
         self.lead = tuple(slices.first.sizes[p] for p in self.apart)
+        self.layout = Layout(particles, self.apart, self.lead)
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""
@@ -236,7 +263,7 @@ class Mover:
             return value
         if not self.apart:
             return value.take(ancestors, axis=0)
-        return _along_plates(value, ancestors, node.plates, self.apart, len(node.event_shape))
+        return along_plates(value, ancestors, node.plates, self.apart)
 
     def _weighted(
         self, row: Row, values: dict[str, np.ndarray], log: Any, selection: Selection
@@ -284,6 +311,24 @@ class Mover:
         )
 
 
+def along_plates(
+    value: np.ndarray,
+    index: np.ndarray,
+    plates: tuple[str, ...],
+    apart: tuple[str, ...],
+) -> np.ndarray:
+    """``value[index]`` on the first axis, where every element of the plates ``apart`` has an index of its own."""
+    ndim = 1 + len(plates)
+    order = [apart.index(p) if p in apart else None for p in plates]
+    shape = [len(index), *(index.shape[1 + k] if k is not None else 1 for k in order)]
+    first = index.transpose(0, *(1 + k for k in order if k is not None)).reshape(shape)
+    rest = [
+        np.arange(value.shape[axis]).reshape([-1 if a == axis else 1 for a in range(ndim)])
+        for axis in range(1, ndim)
+    ]
+    return value[(first, *rest)]
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -306,24 +351,3 @@ def _run(steps: Sequence[Step], state: Pass) -> Pass:
 
 def _cut(value: np.ndarray, low: int, high: int, n: int) -> np.ndarray:
     return value[low:high] if value.ndim and len(value) == n else value
-
-
-def _along_plates(
-    value: np.ndarray,
-    ancestors: np.ndarray,
-    plates: tuple[str, ...],
-    apart: tuple[str, ...],
-    event_ndim: int,
-) -> np.ndarray:
-    """``value[ancestors]`` where every element of some plates has ancestors of its own."""
-    index: list[Any] = []
-    ndim = 1 + len(plates)
-    order = [apart.index(p) if p in apart else None for p in plates]
-    shape = [len(ancestors)] + [ancestors.shape[1 + k] if k is not None else 1 for k in order]
-    moved = ancestors.transpose(0, *(1 + k for k in order if k is not None)).reshape(shape)
-    index.append(moved)
-    for axis in range(1, ndim):
-        size = value.shape[axis]
-        index.append(np.arange(size).reshape([size if a == axis else 1 for a in range(ndim)]))
-    del event_ndim
-    return value[tuple(index)]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet
-from bayesmc.engines.particle import Cloud, Mover
+from bayesmc.engines.particle import Cloud, Layout, Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import circular_variance, table_variance
@@ -96,12 +96,12 @@ class ParticleBelief:
     def mean(self, name: str) -> np.ndarray:
         """Mean, shape ``(*plates, *event)``; circular for angles."""
         node, value = self._found(name)
-        return _mean(self._mover, self._cloud, node, value)
+        return _mean(self._mover.layout, self._cloud, node, value)
 
     def var(self, name: str) -> np.ndarray:
         """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
         node, value = self._found(name)
-        return _variance(self._mover, self._cloud, node, value)
+        return _variance(self._mover.layout, self._cloud, node, value)
 
     def std(self, name: str) -> np.ndarray:
         """Standard deviation, shape ``(*plates, *event)``."""
@@ -114,11 +114,11 @@ class ParticleBelief:
             raise QueryError(
                 f"probabilities({name!r}): the node has no finite set of states; use mean, var or expectation"
             )
-        return table_of_states(self._mover, self._cloud, node, value)
+        return table_of_states(self._mover.layout, self._cloud, node, value)
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Mean of a function of nodes of the slice, whose arguments have a leading axis of particles."""
-        return expectation(self._mover, self._cloud, self._mover.slices.first, function)
+        return expectation(self._mover.layout, self._cloud, self._mover.slices.first, function)
 
     def __repr__(self) -> str:
         if self.cloud is None:
@@ -151,7 +151,7 @@ class ParticleBelief:
 
 
 def expectation(
-    mover: Mover, cloud: Cloud, model: Model, function: Callable[..., Any]
+    layout: Layout, cloud: Cloud, model: Model, function: Callable[..., Any]
 ) -> np.ndarray:
     """Weighted mean of a function's values, shape what one value has."""
     arguments = []
@@ -162,17 +162,17 @@ def expectation(
                 f"{list(cloud.values)}"
             )
         node = model[name]
-        shape = (mover.particles, *node.value_shape)
+        shape = (layout.particles, *node.value_shape)
         arguments.append(node.decode(np.broadcast_to(cloud.values[name], shape)))
     values = np.asarray(function(*arguments))
-    if not values.ndim or len(values) != mover.particles:
+    if not values.ndim or len(values) != layout.particles:
         raise QueryError(
             f"a query returns shape {values.shape}; it must return one value per particle, the axis of "
-            f"{mover.particles} particles first"
+            f"{layout.particles} particles first"
         )
-    if mover.apart and values.shape[1 : 1 + len(mover.apart)] != mover.lead:
+    if layout.apart and values.shape[1 : 1 + len(layout.apart)] != layout.lead:
         raise QueryError(
-            f"a query returns shape {values.shape}; plates {mover.apart} are filtered separately, so their "
+            f"a query returns shape {values.shape}; plates {layout.apart} are filtered separately, so their "
             "axes follow that of the particles"
         )
     lead = cloud.weights.reshape(cloud.weights.shape + (1,) * (values.ndim - cloud.weights.ndim))
@@ -181,67 +181,67 @@ def expectation(
 
 
 def table_of_states(
-    mover: Mover, cloud: Cloud, node: CompiledNode, value: np.ndarray
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray
 ) -> np.ndarray:
     """Probabilities of a finite node's states, shape ``(*plates, states)``."""
     assert node.domain is not None
     states = np.arange(node.domain.size)
     if value.ndim == len(node.value_shape):
         return (value[..., None] == states).astype(float)
-    if not mover.apart and not node.plates:
+    if not layout.apart and not node.plates:
         counts = np.bincount(value, cloud.weights, minlength=len(states))
         return counts / cloud.total
     hits = value[..., None] == states
-    return _average(mover, cloud, node, hits.astype(float), 1)
+    return _average(layout, cloud, node, hits.astype(float), 1)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _mean(mover: Mover, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
+def _mean(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
     if node.domain is not None:
-        return table_of_states(mover, cloud, node, value) @ _numbers(node)
+        return table_of_states(layout, cloud, node, value) @ _numbers(node)
     if value.ndim == len(node.value_shape):
         return value
     if _is_angle(node):
-        return np.arctan2(*_turn(mover, cloud, node, value))
-    return _average(mover, cloud, node, value)
+        return np.arctan2(*_turn(layout, cloud, node, value))
+    return _average(layout, cloud, node, value)
 
 
-def _variance(mover: Mover, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
+def _variance(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
     if node.domain is not None:
-        return table_variance(table_of_states(mover, cloud, node, value), _numbers(node))
+        return table_variance(table_of_states(layout, cloud, node, value), _numbers(node))
     if value.ndim == len(node.value_shape):
         return np.zeros(node.value_shape)
     if _is_angle(node):
-        return circular_variance(*_turn(mover, cloud, node, value))
-    off = value - _average(mover, cloud, node, value)
-    return _average(mover, cloud, node, off * off)
+        return circular_variance(*_turn(layout, cloud, node, value))
+    off = value - _average(layout, cloud, node, value)
+    return _average(layout, cloud, node, off * off)
 
 
-def moments(mover: Mover, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
+def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
     """Mean and variance of a node that is not finite."""
     if value.ndim == len(node.value_shape) or _is_angle(node):
-        return _mean(mover, cloud, node, value), _variance(mover, cloud, node, value)
-    mean = _average(mover, cloud, node, value)
+        return _mean(layout, cloud, node, value), _variance(layout, cloud, node, value)
+    mean = _average(layout, cloud, node, value)
     off = value - mean
     off *= off
-    return mean, _average(mover, cloud, node, off)
+    return mean, _average(layout, cloud, node, off)
 
 
 def _average(
-    mover: Mover, cloud: Cloud, node: CompiledNode, value: np.ndarray, more: int = 0
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray, more: int = 0
 ) -> Any:
     """Weighted mean over particles; ``more`` axes follow the event's."""
-    if not mover.apart:
+    if not layout.apart:
         flat = cloud.weights @ value.reshape(len(value), -1) if value.ndim > 1 else None
         if flat is None:
             return cloud.weights @ value / cloud.total
         return (flat / cloud.total).reshape(value.shape[1:])
-    order = [p for p in node.plates if p in mover.apart]
-    axes = [mover.apart.index(p) for p in order]
+    order = [p for p in node.plates if p in layout.apart]
+    axes = [layout.apart.index(p) for p in order]
     shape = [
-        n if p in mover.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
+        n if p in layout.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
     ]
     tail = [1] * (len(node.event_shape) + more)
     weights = cloud.weights.transpose(0, *(1 + a for a in axes)).reshape(len(value), *shape, *tail)
@@ -250,10 +250,10 @@ def _average(
 
 
 def _turn(
-    mover: Mover, cloud: Cloud, node: CompiledNode, value: np.ndarray
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    sine = _average(mover, cloud, node, np.sin(value))
-    return sine, _average(mover, cloud, node, np.cos(value))
+    sine = _average(layout, cloud, node, np.sin(value))
+    return sine, _average(layout, cloud, node, np.cos(value))
 
 
 def _is_angle(node: CompiledNode) -> bool:

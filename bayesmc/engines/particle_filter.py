@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -13,9 +14,10 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices, read_row, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import FilterEngine, Queries
-from bayesmc.engines.particle import Mover
+from bayesmc.engines.particle import Cloud, Layout, Mover
 from bayesmc.engines.particle_belief import ParticleBelief
 from bayesmc.engines.particle_record import FilteredParticles, Record
+from bayesmc.engines.particle_smoothing import Backward, ancestors_of
 from bayesmc.engines.particle_stages import GivenStage, PluggedIn, Rejuvenation
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
@@ -56,6 +58,12 @@ class ParticleFilter(FilterEngine):
         slice reads. The slice is weighted as if that density were the model's, so its answers and the
         evidence are biased; ``rejuvenated`` of the result says which slices.
 
+    trajectories : int, optional
+        Trajectories that ``smooth`` draws; by default as many as there are particles.
+    backward : "rejection" or "exact"
+        How ``smooth`` draws them: by rejection where the transition's height is known (time linear in the
+        particles, and the same law), else with all particles tried for each.
+
     Raises
     ------
     DegeneracyError
@@ -90,6 +98,8 @@ class ParticleFilter(FilterEngine):
     auxiliary: bool | Callable[..., Any] = False
     on_degeneracy: str = "raise"
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
+    trajectories: int | None = None
+    backward: str = "rejection"
 
     label: ClassVar[str] = "particle filter"
 
@@ -118,6 +128,15 @@ class ParticleFilter(FilterEngine):
                 for key, spec in checked.items():
                     as_function("ParticleFilter", key, spec, accepted)
                 object.__setattr__(self, option, MappingProxyType(checked))
+        if self.backward not in ("rejection", "exact"):
+            raise ValueError(
+                f'ParticleFilter(backward={self.backward!r}): give "rejection" or "exact"'
+            )
+        m = self.trajectories
+        if m is not None and (isinstance(m, bool) or not isinstance(m, (int, np.integer)) or m < 1):
+            raise ValueError(
+                f"ParticleFilter(trajectories={m!r}): give a number of them, 1 or more"
+            )
         if self.on_degeneracy not in ("raise", "rejuvenate"):
             raise ValueError(
                 f'ParticleFilter(on_degeneracy={self.on_degeneracy!r}): give "raise" or "rejuvenate"'
@@ -180,7 +199,7 @@ class ParticleFilter(FilterEngine):
             )
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
-        record = Record(problem, mover, queries or {}, keep is not None)
+        record = Record(problem, mover.layout, queries or {}, keep is not None)
         rng = stream(seed, Purpose.FILTER)
         rows = problem.series
         with Progress(problem.steps, self.label, progress) as bar, _quiet():
@@ -191,6 +210,73 @@ class ParticleFilter(FilterEngine):
                 record.add(k, cloud)
                 bar.advance()
         return record.posterior(self)
+
+    def smooth(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> FilteredParticles:
+        if lag is not None:
+            return self._lagged(problem, seed, lag, queries or {}, progress)
+        filtered = self.filter(problem, seed, keep="particles", progress=progress)
+        assert filtered.clouds is not None
+        static = {n: o.value for n, o in problem.series.static.items()}
+        mover = self._mover(problem.slices, static)
+        count = self.particles if self.trajectories is None else self.trajectories
+        backward = Backward(mover.plan, mover.layout, self.backward == "rejection")
+        with _quiet():
+            rng = stream(seed, Purpose.SMOOTH)
+            found = backward.trajectories(filtered.clouds, problem.series, count, rng)
+            layout = Layout(count, mover.apart, mover.lead)
+            record = Record(problem, layout, queries or {}, True)
+            for k, cloud in enumerate(found):
+                record.add(k, cloud)
+        return self._given_filtered(record.posterior(self, "smooth"), filtered)
+
+    def _lagged(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        lag: int,
+        queries: Queries,
+        progress: bool | None,
+    ) -> FilteredParticles:
+        """Slices by the particles of ``lag`` slices later, through their ancestors."""
+        static = {n: o.value for n, o in problem.series.static.items()}
+        mover = self._mover(problem.slices, static)
+        record = Record(problem, mover.layout, queries, False)
+        filtered = Record(problem, mover.layout, {}, False)
+        window: deque[Cloud] = deque(maxlen=lag + 1)
+        rng, last = stream(seed, Purpose.FILTER), problem.steps - 1
+        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            cloud = None
+            for k in range(problem.steps):
+                row = problem.series.row(k)
+                cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
+                filtered.add(k, cloud)
+                window.append(cloud)
+                while window and (len(window) > lag or k == last):
+                    values = ancestors_of(list(window), mover.layout, mover.slices)
+                    at = k - len(window) + 1
+                    record.add(at, replace(cloud, t=window[0].t, values=values))
+                    window.popleft()
+                bar.advance()
+        return self._given_filtered(record.posterior(self, "fixed-lag"), filtered.posterior(self))
+
+    def _given_filtered(
+        self, found: FilteredParticles, filtered: FilteredParticles
+    ) -> FilteredParticles:
+        """Smoothed answers with the filter's figures."""
+        found.log_marginal_increments = filtered.log_marginal_increments
+        found.log_marginal_likelihood = filtered.log_marginal_likelihood
+        found.weight_ess, found.resampled = filtered.weight_ess, filtered.resampled
+        found.unique_ancestors = filtered.unique_ancestors
+        found.rejuvenated = filtered.rejuvenated
+        return found
 
     def start(
         self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries, observed_answers
-from bayesmc.engines.particle import Cloud, Mover
+from bayesmc.engines.particle import Cloud, Layout
 from bayesmc.engines.particle_belief import expectation, moments, table_of_states
 from bayesmc.results import SeriesPosterior
 
@@ -19,14 +19,16 @@ class Record:
     Parameters
     ----------
     problem : SeriesProblem
-    mover : Mover
+    layout : Layout
     queries : dict
     keep : bool
         Hold the clouds, too.
     """
 
-    def __init__(self, problem: SeriesProblem, mover: Mover, queries: Queries, keep: bool) -> None:
-        self.problem, self.mover, self.asked = problem, mover, queries
+    def __init__(
+        self, problem: SeriesProblem, layout: Layout, queries: Queries, keep: bool
+    ) -> None:
+        self.problem, self.layout, self.asked = problem, layout, queries
         steps, model = problem.steps, problem.model
         self.clouds: list[Cloud] | None = [] if keep else None
         self.tables: dict[str, np.ndarray] = {}
@@ -40,16 +42,16 @@ class Record:
                 self.means[name] = np.empty((steps, *node.value_shape))
                 self.variances[name] = np.empty((steps, *node.value_shape))
         self.queries: dict[str, list[np.ndarray]] = {n: [] for n in queries}
-        self.increments = np.empty((steps, *mover.lead))
-        self.ess = np.empty((steps, *mover.lead))
-        self.resampled = np.zeros((steps, *mover.lead), dtype=bool)
+        self.increments = np.empty((steps, *layout.lead))
+        self.ess = np.empty((steps, *layout.lead))
+        self.resampled = np.zeros((steps, *layout.lead), dtype=bool)
         self.rejuvenated = np.zeros(steps, dtype=bool)
-        self.unique = np.full((steps, *mover.lead), mover.particles)
+        self.unique = np.full((steps, *layout.lead), layout.particles)
         self._nodes = [(n, model[n]) for n in problem.hidden]
 
     def add(self, k: int, cloud: Cloud) -> None:
         """Take in the cloud of the k-th slice."""
-        mover = self.mover
+        layout = self.layout
         self.increments[k] = cloud.increment
         self.ess[k] = cloud.ess
         self.resampled[k] = cloud.resampled
@@ -60,21 +62,21 @@ class Record:
         for name, node in self._nodes:
             value = cloud.values[name]
             if node.domain is not None:
-                self.tables[name][k] = table_of_states(mover, cloud, node, value)
+                self.tables[name][k] = table_of_states(layout, cloud, node, value)
             else:
-                self.means[name][k], self.variances[name][k] = moments(mover, cloud, node, value)
+                self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
         for name, function in self.asked.items():
-            self.queries[name].append(expectation(mover, cloud, self.problem.model, function))
+            self.queries[name].append(expectation(layout, cloud, self.problem.model, function))
         if self.clouds is not None:
             self.clouds.append(cloud)
 
-    def posterior(self, engine: Any) -> FilteredParticles:
+    def posterior(self, engine: Any, kind: str = "filter") -> FilteredParticles:
         """The answers of all slices."""
         seen = observed_answers(self.problem)
         found = FilteredParticles(
             self.problem.model,
             engine,
-            "filter",
+            kind,
             self.increments,
             tables={**seen.tables, **self.tables},
             means={**seen.means, **self.means},
@@ -84,7 +86,7 @@ class Record:
         )
         found.weight_ess, found.resampled = self.ess, self.resampled
         found.unique_ancestors, found.rejuvenated = self.unique, self.rejuvenated
-        found.clouds, found.mover = self.clouds, self.mover
+        found.clouds, found.layout = self.clouds, self.layout
         return found
 
 
@@ -98,13 +100,13 @@ class FilteredParticles(SeriesPosterior):
     """
 
     clouds: list[Cloud] | None = None
-    mover: Mover | None = None
+    layout: Layout | None = None
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
-        clouds, mover = self._kept("particles")
+        clouds, layout = self._kept("particles")
         node = self._node(name)
-        shape = (mover.particles, *node.value_shape)
+        shape = (layout.particles, *node.value_shape)
         rows = [np.broadcast_to(c.values[name], shape) for c in clouds]
         return np.array(node.decode(np.stack(rows)), subok=True)
 
@@ -117,14 +119,14 @@ class FilteredParticles(SeriesPosterior):
     @property
     def ancestors(self) -> np.ndarray:
         """Positions of the ancestors in the slice before, shape ``(time, particles, *plates)``."""
-        clouds, mover = self._kept("ancestors")
-        own = np.arange(mover.particles).reshape((-1,) + (1,) * len(mover.apart))
-        shape = (mover.particles, *mover.lead)
+        clouds, layout = self._kept("ancestors")
+        own = np.arange(layout.particles).reshape((-1,) + (1,) * len(layout.apart))
+        shape = (layout.particles, *layout.lead)
         return np.stack(
             [np.broadcast_to(own if c.ancestors is None else c.ancestors, shape) for c in clouds]
         )
 
-    def _kept(self, what: str) -> tuple[list[Cloud], Mover]:
-        if self.clouds is None or self.mover is None:
+    def _kept(self, what: str) -> tuple[list[Cloud], Layout]:
+        if self.clouds is None or self.layout is None:
             raise self._not_kept(what)
-        return self.clouds, self.mover
+        return self.clouds, self.layout
