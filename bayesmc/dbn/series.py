@@ -249,7 +249,7 @@ def sizes_of(
     ------
     PlateError
     """
-    sizes = {**template.sizes, **(plates or {})}
+    sizes = {**template.plates.sizes, **(plates or {})}
     for name, value in data.items():
         declaration = template.later.get(name)
         if declaration is None:

@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.network import Model, Node
+from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.node import Declaration
 from bayesmc.network.ordering import topological_order
 from bayesmc.network.store import ModelStore, unknown
@@ -45,8 +46,7 @@ class Template:
     first : dict
         Name -> declaration in slice 0, of nodes that have another one there.
     inputs, static : tuple of str
-    sizes, labels : dict
-        Of the plates.
+    plates : DeclaredPlates
     """
 
     name: str | None
@@ -54,8 +54,7 @@ class Template:
     first: dict[str, Declaration]
     inputs: tuple[str, ...]
     static: tuple[str, ...]
-    sizes: dict[str, int | None]
-    labels: dict[str, tuple[Any, ...]]
+    plates: DeclaredPlates
 
     @cached_property
     def dynamic(self) -> tuple[str, ...]:
@@ -232,8 +231,8 @@ class SliceStore:
         if self._one is None or self._two is None:
             template = self.template
             template.check()
-            self._one = ModelStore(template.name, template.slice_zero(), {}, template.labels)
-            self._two = ModelStore(template.name, template.two_slices(), {}, template.labels)
+            self._one = ModelStore(template.name, template.slice_zero(), {}, template.plates.labels)
+            self._two = ModelStore(template.name, template.two_slices(), {}, template.plates.labels)
         return self._one, self._two
 
     def _stand_ins(self, sizes: Mapping[str, int | None]) -> dict[str, np.ndarray]:

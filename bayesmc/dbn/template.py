@@ -16,6 +16,7 @@ from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
 from bayesmc.dbn.unroll import sampled, unroll
 from bayesmc.errors import DuplicateNodeError, ModelError, UnknownNodeError
 from bayesmc.network import BayesNet, Node
+from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import Parents
 from bayesmc.network.node import Declaration
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -70,7 +71,8 @@ class DynamicBayesNet:
         name: str | None = None,
         plates: Mapping[str, int | Sequence[Any] | None] | None = None,
     ) -> None:
-        self._reader = BayesNet(name, plates)  # reads declarations; it stays empty
+        self._plates = DeclaredPlates.read("DynamicBayesNet", name, plates)
+        self.name = name
         self._later: dict[str, Declaration] = {}
         self._first: dict[str, Declaration] = {}
         self._inputs: tuple[str, ...] = ()
@@ -244,7 +246,7 @@ class DynamicBayesNet:
     def copy(self) -> DynamicBayesNet:
         """An independent template with the same declarations."""
         other = DynamicBayesNet(self.name)
-        other._reader = self._reader
+        other._plates = self._plates.copy()
         other._later, other._first = dict(self._later), dict(self._first)
         other._inputs, other._static = self._inputs, self._static
         return other
@@ -252,13 +254,9 @@ class DynamicBayesNet:
     # ---- asking -----------------------------------------------------------------------------
 
     @property
-    def name(self) -> str | None:
-        return self._reader.name
-
-    @property
     def plates(self) -> dict[str, int | None]:
         """Plate name -> size; None where the data will tell."""
-        return self._reader.plates
+        return dict(self._plates.sizes)
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -413,7 +411,7 @@ class DynamicBayesNet:
         self._changed()
 
     def _read(self, name: str, add: Callable[[BayesNet], None]) -> Declaration:
-        net = self._reader.copy()
+        net = BayesNet.of(None, {}, self._plates)
         add(net)
         return net.declarations[name]
 
@@ -446,8 +444,7 @@ class DynamicBayesNet:
                     dict(self._first),
                     self._inputs,
                     self._static,
-                    self._reader.plates,
-                    self._reader.plate_labels,
+                    self._plates,
                 )
             )
         return self._kept_store

@@ -42,7 +42,7 @@ def unroll(template: Template, steps: int, inputs: Mapping[str, Any] | None) -> 
                 )
             else:
                 declarations[own] = _at(template, source[name], t)
-    return BayesNet.of(template.name, declarations, template.sizes, template.labels)
+    return BayesNet.of(template.name, declarations, template.plates)
 
 
 def sampled(

@@ -16,6 +16,7 @@ from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn
+from bayesmc.shapes import first_index
 
 #: log factors by which particles of the slice before are chosen, from its values and the row
 FirstStage = Callable[[Mapping[str, np.ndarray], Row, np.random.Generator], np.ndarray]
@@ -295,13 +296,15 @@ class Mover:
         taken = {k: self._taken(k, v, selection.ancestors) for k, v in before.items()}
         known = {**self.plan.known(row), **taken, **values}
         state = Pass(np.random.default_rng(0), (self.particles,), known)
-        model, node = self.slices.model(row.t), None
+        model, node, which = self.slices.model(row.t), None, ""
         for name in (n for n in self.slices.dynamic if n in row.seen):
             WeighDrawn(model, model[name], self.apart)(state)
-            if not np.all(np.any(np.asarray(state.log_weight) > -np.inf, axis=0)):
-                node = name
+            alive = np.asarray(np.any(np.asarray(state.log_weight) > -np.inf, axis=0))
+            if not alive.all():
+                node, at = name, first_index(~alive)
+                which = f" (plate element {at if len(at) > 1 else at[0]})" if at else ""
                 break
-        what = f"the value of {node!r}" if node else "what was seen"
+        what = f"the value of {node!r}{which}" if node else "what was seen"
         return DegeneracyError(
             f"none of {self.particles} particles explains {what} in slice {row.t}: every weight is zero; use "
             "more particles, a proposal= that looks at the observations, noise that is less narrow, or "
@@ -317,7 +320,7 @@ def along_plates(
     plates: tuple[str, ...],
     apart: tuple[str, ...],
 ) -> np.ndarray:
-    """``value[index]`` on the first axis, where every element of the plates ``apart`` has an index of its own."""
+    """``value[index]`` on the first axis; elements of the plates ``apart`` have indices of their own."""
     ndim = 1 + len(plates)
     order = [apart.index(p) if p in apart else None for p in plates]
     shape = [len(index), *(index.shape[1 + k] if k is not None else 1 for k in order)]

@@ -340,11 +340,6 @@ class BayesNet:
         return dict(self._plates.sizes)
 
     @property
-    def plate_labels(self) -> dict[str, tuple[Any, ...]]:
-        """Plate name -> labels, of those that were declared with some."""
-        return dict(self._plates.labels)
-
-    @property
     def declarations(self) -> dict[str, Declaration]:
         """Name -> what was declared, for code that makes other nets of this one."""
         return dict(self._declarations)
@@ -354,13 +349,12 @@ class BayesNet:
         cls,
         name: str | None,
         declarations: Mapping[str, Declaration],
-        sizes: Mapping[str, int | None],
-        labels: Mapping[str, tuple[Any, ...]],
+        plates: DeclaredPlates,
     ) -> BayesNet:
         """A net of declarations that were read already."""
         net = cls(name)
         net._declarations = dict(declarations)
-        net._plates = DeclaredPlates("BayesNet", dict(sizes), dict(labels))
+        net._plates = plates.copy()
         return net
 
     @property
