@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -65,17 +66,25 @@ class Series:
     #: the slice that row 0 belongs to
     start: int = 0
 
+    @cached_property
+    def _looked_at(self) -> dict[str, tuple[Any, Any, Any, Any]]:
+        """Node -> values, mask, and for each row whether all and whether some of it was seen."""
+        found: dict[str, tuple[Any, Any, Any, Any]] = {}
+        for name, seen in self.observed.items():
+            flat = None if seen.mask is None else seen.mask.reshape(self.steps, -1)
+            full = None if flat is None else flat.all(axis=1).tolist()
+            some = None if flat is None else flat.any(axis=1).tolist()
+            found[name] = (seen.value, seen.mask, full, some)
+        return found
+
     def row(self, k: int) -> Row:
         """What is known of the k-th slice here."""
         seen = {}
-        for name, found in self.observed.items():
-            mask = found.mask
-            if mask is None:
-                seen[name] = Observed(found.value[k, ...])
-            elif mask[k].all():
-                seen[name] = Observed(found.value[k, ...])
-            elif mask[k].any():
-                seen[name] = Observed(found.value[k, ...], mask[k])
+        for name, (value, mask, full, some) in self._looked_at.items():
+            if full is None or full[k]:
+                seen[name] = Observed(value[k, ...])
+            elif some[k]:
+                seen[name] = Observed(value[k, ...], mask[k])
         t = self.start + k
         inputs: dict[str, np.ndarray] = {TIME: np.asarray(t)}
         if t:

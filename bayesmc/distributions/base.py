@@ -342,6 +342,8 @@ class Distribution:
             value
         ):  # a constant, at the cost of no array operation
             return value
+        if math.isfinite(np.add.reduce(value, axis=None)):  # cheaper than looking at every element
+            return value
         return self._check(name, value, np.isfinite(value), 0.0, "finite")
 
     def _positive(self, name: str, value: np.ndarray) -> np.ndarray:

@@ -6,8 +6,9 @@ Every slice is one forward pass over the two-slice template (``slice_steps``); w
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +26,7 @@ FirstStage = Callable[[Mapping[str, np.ndarray], Row, np.random.Generator], np.n
 BLOCK = 8192
 
 
-@dataclass(frozen=True, eq=False)
-class Cloud:
+class Cloud(NamedTuple):
     """Particles of one slice.
 
     Attributes
@@ -41,6 +41,8 @@ class Cloud:
         Their exponentials relative to the largest.
     total : ndarray, shape (*apart,)
         Sums of ``weights``.
+    log_total : ndarray, shape (*apart,)
+        Log of the sums of the exponentials of ``log_weights``.
     increment : ndarray, shape (*apart,)
         Log density of the row given the rows before.
     ess : ndarray, shape (*apart,)
@@ -55,9 +57,10 @@ class Cloud:
     values: dict[str, np.ndarray]
     log_weights: np.ndarray
     weights: np.ndarray
-    total: np.ndarray
-    increment: np.ndarray
-    ess: np.ndarray
+    total: Any
+    log_total: Any
+    increment: Any
+    ess: Any
     ancestors: np.ndarray | None = None
     resampled: Any = False
     rejuvenated: bool = False
@@ -74,11 +77,14 @@ class Layout:
         Plates whose elements have weights of their own: axes of the weights after that of the particles.
     lead : tuple of int
         Their sizes.
+    block : int
+        Particles that are worked on at a time.
     """
 
     particles: int
     apart: tuple[str, ...]
     lead: tuple[int, ...]
+    block: int = BLOCK
 
 
 def even_cloud(t: int, values: dict[str, np.ndarray], layout: Layout) -> Cloud:
@@ -86,7 +92,7 @@ def even_cloud(t: int, values: dict[str, np.ndarray], layout: Layout) -> Cloud:
     shape = (layout.particles, *layout.lead)
     ones, none = np.ones(shape), np.zeros(layout.lead)
     count = np.full(layout.lead, float(layout.particles))
-    return Cloud(t, values, np.zeros(shape), ones, count, none, count)
+    return Cloud(t, values, np.zeros(shape), ones, count, np.log(count), none, count)
 
 
 class Selection(NamedTuple):
@@ -125,6 +131,8 @@ class Mover:
         ``(before, row, rng) -> log factors``, by which particles are chosen for their future.
     rejuvenate : callable, optional
         ``row -> steps`` of a slice that does not look at the slice before, for where all weights vanish.
+    kept : sequence of str, optional
+        Nodes whose values clouds hold besides those that the next slice reads; all by default.
     """
 
     def __init__(
@@ -136,20 +144,31 @@ class Mover:
         plan: SlicePlan,
         first_stage: FirstStage | None = None,
         rejuvenate: Callable[[Row], Sequence[Step]] | None = None,
+        kept: Sequence[str] | None = None,
     ) -> None:
         self.slices, self.particles = slices, particles
         self.resample, self.threshold = resample, threshold
         self.plan, self.apart = plan, plan.apart
         self.first_stage, self.rejuvenate = first_stage, rejuvenate
-        self.kept = slices.dynamic
+        wanted = slices.dynamic if kept is None else (*slices.interface, *kept)
+        self.kept = tuple(dict.fromkeys(wanted))
         self.block = max(1, BLOCK // max(size_of(slices), 1))
         self.lead = tuple(slices.first.sizes[p] for p in self.apart)
-        self.layout = Layout(particles, self.apart, self.lead)
+        self.layout = Layout(particles, self.apart, self.lead, self.block)
+        self._log_particles = math.log(particles)
+        self._even = np.ones((particles, *self.lead))
+        self._even.flags.writeable = False
+        self._spare = _Spare()
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""
-        start = Selection(None, np.zeros(self.lead, dtype=bool), 0.0, np.log(self.particles))
+        start = Selection(None, np.zeros(self.lead, dtype=bool), 0.0, self._log_particles)
         return self._moved(row, {}, start, rng)
+
+    def recycle(self, cloud: Cloud) -> None:
+        """Take back the large arrays of a cloud that nobody will look at again."""
+        if self.particles > self.block:
+            self._spare.put(cloud.weights, cloud.log_weights, *cloud.values.values())
 
     def next(self, cloud: Cloud, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of the next slice: resample if need be, move, weight."""
@@ -169,10 +188,10 @@ class Mover:
             return cloud
         if self.rejuvenate is not None:
             values, log = self._passed(self.rejuvenate(row), row, before, selection.ancestors, rng)
-            fresh = Selection(None, True, 0.0, np.log(self.particles))
+            fresh = Selection(None, True, 0.0, self._log_particles)
             cloud = self._weighted(row, values, log, fresh)
             if cloud is not None:
-                return replace(cloud, rejuvenated=True)
+                return cloud._replace(rejuvenated=True)
         raise self._degenerate(row, before, values, selection)
 
     def _selected(
@@ -183,29 +202,32 @@ class Mover:
         rng: np.random.Generator,
     ) -> Selection:
         """Resample where weights are uneven; with a first stage, by what the next row makes of them."""
-        n, total = self.particles, np.log(cloud.total)
+        n, total = self.particles, cloud.log_total
         weights, ess, factor, gained = cloud.weights, cloud.ess, None, 0.0
         if self.first_stage is not None and row.seen:
             factor = self.first_stage(before, row, rng)
-            weights, level = _exponentials(cloud.log_weights + factor)
+            log = cloud.log_weights + factor
+            level = _top(log)
+            weights = np.exp(log - level)
             chosen_from = weights.sum(axis=0)
             ess = chosen_from**2 / _squares(weights)
             gained = level + np.log(chosen_from) - total
         poor = ess < self.threshold * n
-        if not np.any(poor):
+        some, every = (poor, poor) if not self.apart else (poor.any(), poor.all())
+        if not some:
             return Selection(None, poor, cloud.log_weights, total)
         chosen = self.resample(weights, n, rng)
         carried: Any = 0.0
         if factor is not None:
             carried = -(factor[chosen] if not self.apart else np.take_along_axis(factor, chosen, 0))
-        if np.all(poor):
-            return Selection(chosen, poor, carried, np.log(n) - gained)
+        if every:
+            return Selection(chosen, poor, carried, self._log_particles - gained)
         own = np.arange(n).reshape((-1,) + (1,) * len(self.apart))
         return Selection(
             np.where(poor, chosen, own),
             poor,
             np.where(poor, carried, cloud.log_weights),
-            np.where(poor, np.log(n) - gained, total),
+            np.where(poor, self._log_particles - gained, total),
         )
 
     def _passed(
@@ -228,18 +250,22 @@ class Mover:
             high = min(low + self.block, n)
             part = None if ancestors is None else ancestors[low:high]
             taken = {
-                k: self._taken(k, v if part is not None else _cut(v, low, high, n), part)
+                k: self._taken(
+                    k,
+                    v if part is not None else self._cut(k, v, low, high),
+                    part,
+                )
                 for k, v in before.items()
             }
             state = _run(steps, Pass(rng, (high - low,), {**known, **taken}))
             self._store(values, state.values, low, high)
             weight = np.asarray(state.log_weight)
+            if weight.ndim <= len(self.lead):
+                log = weight  # nothing was seen, or nothing that depends on the particles
+                continue
             if low == 0:
-                log = np.empty((n, *self.lead)) if weight.ndim > len(self.lead) else weight
-            if log.ndim > len(self.lead):
-                log[low:high] = weight
-        for value in values.values():
-            value.flags.writeable = False
+                log = self._spare.get((n, *self.lead), np.dtype(float))
+            log[low:high] = weight
         return values, log
 
     def _store(
@@ -252,8 +278,16 @@ class Mover:
                 values[name] = value  # the same for all particles
                 continue
             if low == 0:
-                values[name] = np.empty((self.particles, *shape), dtype=value.dtype)
+                values[name] = self._spare.get((self.particles, *shape), value.dtype)
             values[name][low:high] = value
+
+    def _cut(self, name: str, value: np.ndarray, low: int, high: int) -> np.ndarray:
+        """A block of a node's values, read-only."""
+        if value.ndim == len(self.slices.later[name].value_shape):
+            return value
+        part = value[low:high]
+        part.flags.writeable = False
+        return part
 
     def _taken(self, name: str, value: np.ndarray, ancestors: np.ndarray | None) -> np.ndarray:
         """A node's values of the slice before, of the ancestors of a block."""
@@ -263,26 +297,42 @@ class Mover:
         if value.ndim == len(node.value_shape):
             return value
         if not self.apart:
-            return value.take(ancestors, axis=0)
-        return along_plates(value, ancestors, node.plates, self.apart)
+            found = value.take(ancestors, axis=0, mode="clip")  # they lie within
+        else:
+            found = along_plates(value, ancestors, node.plates, self.apart)
+        found.flags.writeable = False
+        return found
 
     def _weighted(
         self, row: Row, values: dict[str, np.ndarray], log: Any, selection: Selection
     ) -> Cloud | None:
         """The cloud of a slice; None where no weight is left somewhere."""
-        shape = (self.particles, *self.lead)
-        log = np.asarray(selection.carried + log, dtype=float)
+        n, shape = self.particles, (self.particles, *self.lead)
+        log = selection.carried + log if np.ndim(selection.carried) else np.asarray(log)
+        if np.ndim(log) <= len(self.lead) and np.all(log == 0.0):
+            even = np.full(self.lead, float(n)) if self.lead else float(n)
+            return Cloud(
+                row.t, values, np.broadcast_to(0.0, shape), self._even, even, np.log(even),
+                np.log(even) - selection.spent, even, selection.ancestors, selection.resampled,
+            )  # fmt: skip
         if log.shape != shape:
             log = np.broadcast_to(log, shape)
-        weights, level = _exponentials(log)
-        total = weights.sum(axis=0)
-        if not np.all(total > 0):
+        level = _top(log)
+        weights = self._spare.get(shape, np.dtype(float))
+        total: Any = 0.0
+        squares: Any = 0.0
+        for low in range(0, n, self.block):
+            part = weights[low : low + self.block]
+            np.subtract(log[low : low + self.block], level, out=part)
+            np.exp(part, out=part)
+            total = total + np.add.reduce(part)
+            squares = squares + _squares(part)
+        if not (total > 0 if not self.lead else (total > 0).all()):
             return None
-        increment = level + np.log(total) - selection.spent
-        ess = total * total / _squares(weights)
+        log_total = level + (math.log(total) if not self.lead else np.log(total))
         return Cloud(
-            row.t, values, log - level, weights, total, increment, ess,
-            selection.ancestors, selection.resampled,
+            row.t, values, log, weights, total, log_total, log_total - selection.spent,
+            total * total / squares, selection.ancestors, selection.resampled,
         )  # fmt: skip
 
     def _degenerate(
@@ -335,11 +385,28 @@ def along_plates(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _exponentials(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weights relative to the largest, and the log of that (0 where all are zero)."""
-    level = log.max(axis=0)
-    level = np.where(level > -np.inf, level, 0.0) if np.ndim(level) else max(level, -1e308)
-    return np.exp(log - level), level
+class _Spare:
+    """Large arrays that are used again: fresh ones cost the machine a page at a time."""
+
+    def __init__(self) -> None:
+        self._free: dict[tuple[Any, ...], list[np.ndarray]] = {}
+
+    def get(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        free = self._free.get((shape, dtype))
+        return free.pop() if free else np.empty(shape, dtype)
+
+    def put(self, *arrays: np.ndarray) -> None:
+        for array in arrays:
+            if array.flags.owndata and array.flags.writeable:
+                self._free.setdefault((array.shape, array.dtype), []).append(array)
+
+
+def _top(log: np.ndarray) -> Any:
+    """The largest log weight; 0 where all are minus infinity."""
+    level = np.maximum.reduce(log)
+    if log.ndim == 1:
+        return level if level > -np.inf else 0.0
+    return np.where(level > -np.inf, level, 0.0)
 
 
 def _squares(weights: np.ndarray) -> Any:
@@ -350,7 +417,3 @@ def _run(steps: Sequence[Step], state: Pass) -> Pass:
     for step in steps:
         step(state)
     return state
-
-
-def _cut(value: np.ndarray, low: int, high: int, n: int) -> np.ndarray:
-    return value[low:high] if value.ndim and len(value) == n else value

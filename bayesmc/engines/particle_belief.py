@@ -176,7 +176,8 @@ def expectation(
             "axes follow that of the particles"
         )
     lead = cloud.weights.reshape(cloud.weights.shape + (1,) * (values.ndim - cloud.weights.ndim))
-    total = cloud.total.reshape(cloud.total.shape + (1,) * (values.ndim - 1 - cloud.total.ndim))
+    share = np.asarray(cloud.total)
+    total = share.reshape(share.shape + (1,) * (values.ndim - 1 - share.ndim))
     return (lead * values).sum(axis=0) / total
 
 
@@ -220,13 +221,32 @@ def _variance(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarra
 
 
 def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
-    """Mean and variance of a node that is not finite."""
-    if value.ndim == len(node.value_shape) or _is_angle(node):
+    """Mean and variance of a node that is not finite, in blocks of particles."""
+    if layout.apart or value.ndim == len(node.value_shape) or _is_angle(node):
         return _mean(layout, cloud, node, value), _variance(layout, cloud, node, value)
-    mean = _average(layout, cloud, node, value)
-    off = value - mean
-    off *= off
-    return mean, _average(layout, cloud, node, off)
+    centre: Any = None
+    alone = True
+    first: Any = 0.0
+    second: Any = 0.0
+    for low in range(0, len(value), layout.block):
+        part, weights = value[low : low + layout.block], cloud.weights[low : low + layout.block]
+        if part.ndim > 1:
+            part = part.reshape(len(part), -1)
+        if centre is None:  # near the mean, so that the squares do not cancel
+            alone = len(value) <= layout.block
+            share = cloud.total if alone else weights.sum()
+            centre = weights @ part / share if share > 0 else part[0]
+        off = part - centre
+        if not alone:
+            first = first + weights @ off
+        off *= off
+        second = second + weights @ off
+    mean, variance = first / cloud.total, second / cloud.total
+    if not alone:
+        variance = np.maximum(variance - mean * mean, 0.0)
+    if value.ndim == 1:
+        return mean + centre, variance
+    return (mean + centre).reshape(value.shape[1:]), variance.reshape(value.shape[1:])
 
 
 def _average(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -198,16 +199,20 @@ class ParticleFilter(FilterEngine):
                 f'keep={keep!r}: give "particles", or None for answers of constant size'
             )
         static = {n: o.value for n, o in problem.series.static.items()}
-        mover = self._mover(problem.slices, static)
+        asked = [p for q in (queries or {}).values() for p in inspect.signature(q).parameters]
+        wanted = None if keep else [*problem.hidden, *asked]
+        mover = self._mover(problem.slices, static, wanted)
         record = Record(problem, mover.layout, queries or {}, keep is not None)
         rng = stream(seed, Purpose.FILTER)
         rows = problem.series
         with Progress(problem.steps, self.label, progress) as bar, _quiet():
             cloud = None
             for k in range(problem.steps):
-                row = rows.row(k)
-                cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
+                row, old = rows.row(k), cloud
+                cloud = mover.first(row, rng) if old is None else mover.next(old, row, rng)
                 record.add(k, cloud)
+                if old is not None and keep is None:
+                    mover.recycle(old)
                 bar.advance()
         return record.posterior(self)
 
@@ -262,7 +267,7 @@ class ParticleFilter(FilterEngine):
                 while window and (len(window) > lag or k == last):
                     values = ancestors_of(list(window), mover.layout, mover.slices)
                     at = k - len(window) + 1
-                    record.add(at, replace(cloud, t=window[0].t, values=values))
+                    record.add(at, cloud._replace(t=window[0].t, values=values))
                     window.popleft()
                 bar.advance()
         return self._given_filtered(record.posterior(self, "fixed-lag"), filtered.posterior(self))
@@ -324,7 +329,12 @@ class ParticleFilter(FilterEngine):
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _mover(self, slices: Slices, static: Mapping[str, np.ndarray]) -> Mover:
+    def _mover(
+        self,
+        slices: Slices,
+        static: Mapping[str, np.ndarray],
+        kept: Sequence[str] | None = None,
+    ) -> Mover:
         scheme: Any = scheme_of(self.resampling)
         threshold = float(self.ess_threshold)
         if isinstance(scheme, Adaptive):
@@ -337,7 +347,7 @@ class ParticleFilter(FilterEngine):
         if self.auxiliary is not False:
             stage = PluggedIn(plan) if self.auxiliary is True else GivenStage(plan, self.auxiliary)
         anew = Rejuvenation(plan, self.rejuvenation) if self.rejuvenation is not None else None
-        return Mover(slices, self.particles, scheme, threshold, plan, stage, anew)
+        return Mover(slices, self.particles, scheme, threshold, plan, stage, anew, kept)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -63,6 +63,8 @@ class Record:
             value = cloud.values[name]
             if node.domain is not None:
                 self.tables[name][k] = table_of_states(layout, cloud, node, value)
+            elif value.ndim == len(node.value_shape):  # seen here, or the same for all particles
+                self.means[name][k], self.variances[name][k] = value, 0.0
             else:
                 self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
         for name, function in self.asked.items():

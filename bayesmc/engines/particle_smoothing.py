@@ -2,8 +2,8 @@
 
 Backward simulation draws a particle of the last slice, then one of each slice before with its weight times
 the density of what was drawn after it. Exactly that costs trajectories x particles per slice; where the
-density is known to be bounded, particles are drawn by weight and accepted with its share of the bound instead,
-and only what is still open after some rounds is drawn exactly.
+density is known to be bounded, particles are drawn by weight and accepted with its share of the bound
+instead, and only what is still open after some rounds is drawn exactly.
 
 References
 ----------

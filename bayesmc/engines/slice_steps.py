@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, Row, Slices
+from bayesmc.distributions import Distribution
 from bayesmc.engines.forward import RowIndex, TableDraw, table_of
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import proposal_steps
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.kernels.proposal import Key, Proposal, names_of
-from bayesmc.network import CompiledNode
+from bayesmc.network import CompiledNode, Model
 from bayesmc.network.forward import (
     Compute,
     Draw,
@@ -87,12 +88,22 @@ class SlicePlan:
         if table is not None and table.invalid is not None:
             table = None  # its function says at which particle
         if seen is None:
-            return Draw(model, node) if table is None else TableDraw(node, table)
+            if table is not None:
+                return TableDraw(node, table)
+            return quickly(model, node, QuickDraw, Draw(model, node))
         if seen.mask is not None:
             return DrawAndWeigh(model, node, seen, self.apart)
-        if table is None:
-            return WeighDrawn(model, node, self.apart)
-        return TableWeighApart(node, table, self.apart)
+        return self.factor(row, name)
+
+    def factor(self, row: Row, name: str) -> Step:
+        """The density of one node, whose value is in place in full, as a factor of the weight."""
+        model = self.slices.model(row.t)
+        table = self._table(row.t == 0, name)
+        if table is None or table.invalid is not None:
+            return quickly(
+                model, model[name], QuickWeigh, WeighDrawn(model, model[name], self.apart)
+            )
+        return TableWeighApart(model[name], table, self.apart)
 
     def _build(self, row: Row) -> list[Step]:
         plain = {name: self.step(row, name) for name in self.slices.dynamic}
@@ -191,6 +202,66 @@ def plates_apart(slices: Slices) -> tuple[str, ...]:
                 if parent in varies:
                     found = [p for p in found if p not in link.foreign]
     return tuple(found)
+
+
+class Quick:
+    """A node without plates whose parents arrive as they are: its function called without ceremony.
+
+    What is out of the ordinary (an error, parameters out of range, another shape) goes the plain way, which
+    says what is wrong.
+    """
+
+    def __init__(self, node: CompiledNode, plain: Step) -> None:
+        assert node.declaration.function is not None
+        self.name, self.function, self.plain = node.name, node.declaration.function, plain
+        self.parents, self.event_shape = node.parents, node.event_shape
+
+    def distribution(self, state: Pass) -> Distribution | None:
+        """The node's distribution, if there is nothing to say about it."""
+        values = state.values
+        try:
+            dist = self.function(*[values[p] for p in self.parents])
+        except Exception:  # whatever it is, the plain step explains it
+            return None
+        if not isinstance(dist, Distribution) or dist.invalid is not None:
+            return None
+        fits = dist.batch_shape in ((), state.batch) and dist.event_shape == self.event_shape
+        return dist if fits else None
+
+
+class QuickDraw(Quick):
+    """A hidden number or vector: drawn."""
+
+    def __call__(self, state: Pass) -> None:
+        dist = self.distribution(state)
+        if dist is None:
+            self.plain(state)
+            return
+        draws = dist.sample_to(state.rng, state.batch)
+        draws.flags.writeable = False
+        state.values[self.name] = draws
+
+
+class QuickWeigh(Quick):
+    """A number or vector in place: its density is a factor of the weight."""
+
+    def __call__(self, state: Pass) -> None:
+        dist = self.distribution(state)
+        if dist is not None:
+            log = dist.log_prob_unchecked(state.values[self.name])
+            if not log.size or np.maximum.reduce(log, axis=None) < np.inf:  # false for NaN, too
+                state.weigh(log)
+                return
+        self.plain(state)
+
+
+def quickly(model: Model, node: CompiledNode, kind: type[Quick], plain: Step) -> Step:
+    """The quick step where a node has one, else the plain one."""
+    nodes = [node, *(model[p] for p in node.parents)]
+    simple = not any(n.plates or n.domain is not None for n in nodes)
+    simple = simple and node.declaration.source == "function" and not node.declaration.vectorize
+    quick: Any = kind(node, plain)
+    return quick if simple and not node.unsampled else plain
 
 
 class TableWeighApart:

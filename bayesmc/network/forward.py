@@ -17,6 +17,9 @@ from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
 from bayesmc.shapes import Shape
 
+#: the log weight of draws that nothing was asked of yet
+_NOTHING = 0.0
+
 
 @dataclass(eq=False)
 class Pass:
@@ -36,7 +39,7 @@ class Pass:
     rng: np.random.Generator
     batch: Shape
     values: dict[str, np.ndarray]
-    log_weight: Any = 0.0
+    log_weight: Any = _NOTHING
 
     @property
     def alive(self) -> np.ndarray:
@@ -48,7 +51,10 @@ class Pass:
 
     def weigh(self, log_density: np.ndarray) -> None:
         """Multiply the weights by a density given in logs."""
-        self.log_weight = self.log_weight + log_density
+        if self.log_weight is _NOTHING:
+            self.log_weight = log_density
+        else:
+            self.log_weight = self.log_weight + log_density
 
 
 Step = Callable[[Pass], None]

@@ -160,7 +160,7 @@ class Model:
         node = self.nodes[name]
         value = node.domain.to_support(stored) if node.domain is not None else stored
         with np.errstate(all="ignore"):
-            result = distribution.log_prob(value)
+            result = distribution.log_prob_unchecked(np.asarray(value))
         if not result.size or result.max() < np.inf:  # false for NaN, too
             return result
         bad = ~(result < np.inf)
