@@ -49,6 +49,7 @@ from bayesmc.distributions import (
 )
 from bayesmc.engines.exact import Exact
 from bayesmc.engines.gibbs import Gibbs
+from bayesmc.engines.grid_filter import GridFilter
 from bayesmc.engines.importance import Importance
 from bayesmc.engines.metropolis import MetropolisHastings
 from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
@@ -84,6 +85,7 @@ __all__ = [
     "FactorGraph",
     "Gamma",
     "Geometric",
+    "GridFilter",
     "Gibbs",
     "HalfCauchy",
     "HalfNormal",

@@ -194,6 +194,10 @@ class SupportWarning(BayesmcWarning):
     """A proposal that cannot reach values that have mass."""
 
 
+class GridWarning(BayesmcWarning):
+    """A grid that is too small or too coarse for the densities on it."""
+
+
 def missing_extra(package: str, extra: str) -> MissingExtraError:
     """The error for an absent optional ``package`` that ``bayesmc[extra]`` installs."""
     return MissingExtraError(

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bayesmc.errors import ModelError, UnknownNodeError
-from bayesmc.network import Model, Node
+from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.declared_plates import DeclaredPlates
+from bayesmc.network.domain import Domain
 from bayesmc.network.node import Declaration
 from bayesmc.network.ordering import topological_order
 from bayesmc.network.store import ModelStore, unknown
@@ -188,25 +189,34 @@ class SliceStore:
 
     def __init__(self, template: Template) -> None:
         self.template = template
-        self._checked = False
+        #: values that computed nodes shall have
+        self._domains: dict[str, Domain] = {}
         self._two: ModelStore | None = None
         self._one: ModelStore | None = None
         self._found: dict[tuple[int, int], Slices] = {}
 
     def slices(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Slices:
         """Both models for these plate sizes; ``inputs`` hold ``u`` and ``u_prev`` of two slices in a row."""
-        one, two = self._stores()
         now = {n: inputs[n] for n in inputs if n in self.template.inputs}
         at_zero = {n: inputs.get(n + PREVIOUS, v) for n, v in now.items()}
-        first = one.model(sizes, {TIME: _number(0), **at_zero})
-        later = two.model(sizes, {TIME: _number(1), TIME + PREVIOUS: _number(0), **inputs})
-        key = (id(first), id(later))
-        found = self._found.get(key)
-        if found is None:
-            _check_alike(self.template, first, later)
-            while len(self._found) >= 8:
-                self._found.pop(next(iter(self._found)))
-            found = self._found[key] = Slices(self.template, first, later)
+        for _ in range(_ROUNDS):
+            one, two = self._stores()
+            first = one.model(sizes, {TIME: _number(0), **at_zero})
+            later = two.model(sizes, {TIME: _number(1), TIME + PREVIOUS: _number(0), **inputs})
+            key = (id(first), id(later))
+            if key in self._found:
+                return self._found[key]
+            domains = _computed_domains(self.template, first, later)
+            if not domains:
+                break
+            self._settle(domains)
+        else:  # values without end, such as a count of slices
+            self._settle(dict.fromkeys(domains, _UNCOUNTED))
+            return self.slices(sizes, inputs)
+        _check_alike(self.template, first, later)
+        while len(self._found) >= 8:
+            self._found.pop(next(iter(self._found)))
+        found = self._found[key] = Slices(self.template, first, later)
         return found
 
     def probe(self, sizes: Mapping[str, int | None]) -> Slices:
@@ -227,10 +237,23 @@ class SliceStore:
         node = self.probe(sizes).later[name].record()
         return replace(node, kind="static") if name in self.template.static else node
 
+    def _settle(self, domains: Mapping[str, Domain]) -> None:
+        """Compile again, with the values that computed nodes have in any slice."""
+        self._domains.update(domains)
+        self._one = self._two = None
+
     def _stores(self) -> tuple[ModelStore, ModelStore]:
         if self._one is None or self._two is None:
             template = self.template
             template.check()
+            if self._domains:
+
+                def settled(given: Mapping[str, Declaration]) -> dict[str, Declaration]:
+                    return {n: replace(d, domain=self._domains.get(n)) for n, d in given.items()}
+
+                template = replace(
+                    template, later=settled(template.later), first=settled(template.first)
+                )
             self._one = ModelStore(template.name, template.slice_zero(), {}, template.plates.labels)
             self._two = ModelStore(template.name, template.two_slices(), {}, template.plates.labels)
         return self._one, self._two
@@ -254,6 +277,45 @@ class SliceStore:
 
 #: size of the first plate that nobody has given a size yet
 _OPEN = 3
+#: times that models are compiled to find all values of computed nodes
+_ROUNDS = 6
+#: of a computed node whose values are not counted
+_UNCOUNTED = Domain(0)
+
+
+def _computed_domains(template: Template, first: Model, later: Model) -> dict[str, Domain]:
+    """For computed nodes that have other finite values in slice 0 than later, the values of both."""
+    found = {}
+    for name in template.dynamic:
+        nodes = [(first, first[name]), (later, later[name])]
+        if any(n.is_stochastic or n.declaration.states is not None for _, n in nodes):
+            continue
+        values = [_values(model, node) for model, node in nodes]
+        if all(node.domain is None for _, node in nodes):
+            continue
+        if any(v is None for v in values):
+            found[name] = _UNCOUNTED
+            continue
+        union: np.ndarray = np.unique(np.concatenate([v for v in values if v is not None]))
+        if not all(_has_values(node, union) for _, node in nodes):
+            union.flags.writeable = False
+            found[name] = Domain(len(union), values=union)
+    return found
+
+
+def _has_values(node: CompiledNode, wanted: np.ndarray) -> bool:
+    numbers = None if node.domain is None else node.domain.numbers
+    return numbers is not None and np.array_equal(numbers, wanted)
+
+
+def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
+    """Values of a computed node: of its domain, or of a constant."""
+    if node.domain is not None:
+        return node.domain.numbers
+    if node.parents or node.event_shape:
+        return None
+    value = np.asarray(model.probe[node.name])
+    return np.unique(value) if value.dtype.kind in "biu" else None
 
 
 def _previous(template: Template, name: str) -> str:

@@ -54,7 +54,8 @@ class SlicePlan:
         static: Mapping[str, np.ndarray],
         proposals: SliceProposals | None = None,
     ) -> None:
-        self.slices, self.apart, self.static = slices, apart, dict(static)
+        self.slices, self.apart = slices, apart
+        self.static = static_values(slices, static)
         self.proposals = proposals
         self._kept: dict[Any, list[Step]] = {}
         self._tables: dict[tuple[bool, str], Table | None] = {}
@@ -183,6 +184,16 @@ class SliceProposals:
         seen = {n for n, o in row.seen.items() if o.mask is None}
         asked = self.first if row.t == 0 else self.later
         return [p for p in asked if self._looks[p.key] <= seen and not seen & set(p.names)]
+
+
+def static_values(slices: Slices, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Static nodes that are known, and what is computed from these alone."""
+    values = dict(given)
+    for name, node in slices.first.nodes.items():
+        if name in slices.template.static and name not in values and not node.is_stochastic:
+            if all(p in values for p in node.parents):
+                values[name], _ = slices.first.evaluate(name, values)
+    return values
 
 
 def plates_apart(slices: Slices) -> tuple[str, ...]:

@@ -315,7 +315,12 @@ def _discover_deterministic(
         labels = one.states  # labels that a function passes on stay labels
     node = CompiledNode(declaration, links, plates, event, integral, False)
     if labels is None:
-        tabulated = _tabulate_deterministic(node, None)
+        wanted = declaration.domain  # where other functions compute the same node, too
+        if wanted is not None and not wanted.size:
+            return node, value
+        if wanted is not None and not links and not event and integral:
+            return _constant_of(node, wanted, value)
+        tabulated = _tabulate_deterministic(node, None, wanted)
         return (node, value) if tabulated is None else (tabulated, lookup(tabulated, probe))
     if event or not integral or (value.size and not 0 <= value.min() <= value.max() < len(labels)):
         raise ModelError(
@@ -329,6 +334,19 @@ def _discover_deterministic(
     return replace(node, domain=domain, is_discrete=True), value
 
 
+def _constant_of(
+    node: CompiledNode, domain: Domain, value: np.ndarray
+) -> tuple[CompiledNode, np.ndarray]:
+    """A computed node without parents, as positions in a domain."""
+    numbers = domain.numbers
+    assert numbers is not None
+    if not np.isin(value, numbers).all():
+        return node, value
+    table = np.searchsorted(numbers, np.broadcast_to(value, node.plate_shape))
+    table = table.astype(domain.dtype)
+    return replace(node, domain=domain, table=table), read_only(table)
+
+
 def _states_of(name: str, states: tuple[Any, ...]) -> Domain:
     try:
         return states_domain(states)
@@ -336,8 +354,13 @@ def _states_of(name: str, states: tuple[Any, ...]) -> Domain:
         raise ModelError(f"node {name!r}: {error}") from None
 
 
-def _tabulate_deterministic(node: CompiledNode, domain: Domain | None) -> CompiledNode | None:
-    """``node`` with the table of its positions over all configurations of its parents, if small."""
+def _tabulate_deterministic(
+    node: CompiledNode, domain: Domain | None, wanted: Domain | None = None
+) -> CompiledNode | None:
+    """``node`` with the table of its positions over all configurations of its parents, if small.
+
+    ``domain`` says what positions its function returns; ``wanted`` which values it shall have.
+    """
     domains = [link.domain for _, link in node.links]
     if node.event_shape or not node.links or node.has_foreign_parents or None in domains:
         return None
@@ -355,8 +378,15 @@ def _tabulate_deterministic(node: CompiledNode, domain: Domain | None) -> Compil
         return None
     if domain is None:
         unique, positions = np.unique(full, return_inverse=True)
-        unique.flags.writeable = False
-        domain = Domain(len(unique), values=unique)
+        if (
+            wanted is not None
+            and wanted.numbers is not None
+            and np.isin(unique, wanted.numbers).all()
+        ):
+            domain, positions = wanted, np.searchsorted(wanted.numbers, unique)[positions]
+        else:
+            unique.flags.writeable = False
+            domain = Domain(len(unique), values=unique)
         positions = positions.reshape(full.shape)
     elif full.size and not 0 <= full.min() <= full.max() < domain.size:
         raise ModelError(

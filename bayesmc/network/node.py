@@ -47,7 +47,8 @@ class Declaration:
     """What was declared under one name.
 
     ``source`` is "function", "table", "input", "fixed", or "variable" (of a factor graph: its function
-    returns a flat density, log 1 on all of its support); ``function`` takes the parents in order.
+    returns a flat density, log 1 on all of its support); ``function`` takes the parents in order. ``domain``
+    is that of a fixed node; of a computed one the values that it shall have (of size 0: none are counted).
     """
 
     name: str

@@ -166,6 +166,42 @@ def test_the_picture_of_two_slices() -> None:
     assert "t" not in graph
 
 
+def changing() -> bmc.DynamicBayesNet:
+    """Whether a state changed: never in slice 0; and how often so far, which has no end."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("z", ["z_prev"], [[0.8, 0.2], [0.3, 0.7]], initial=[0.5, 0.5])
+    dbn.add("change", lambda z, z_prev: (z != z_prev) * 1, initial=lambda z: 0 * z)
+    dbn.add("count", lambda count_prev, z: count_prev + z, initial=lambda z: z)
+    dbn.add("y", lambda z, change, count: bmc.Normal(z + 2.0 * change + 0.1 * count, 1.0))
+    return dbn
+
+
+def test_computed_nodes_with_other_values_in_slice_zero() -> None:
+    """Their values are counted together, or not at all; 100,000 particles against exact answers, to 0.01."""
+    dbn, rows = changing(), [0.3, 1.5, 2.0, 2.8]
+    filtered = bmc.filter(dbn, {"y": rows}, engine=bmc.ParticleFilter(100_000), rng=0)
+    for t in range(4):
+        evidence = dbn.unrolled_evidence({"y": rows[: t + 1]})
+        exact = bmc.infer(dbn.unroll(t + 1), evidence, engine=bmc.Exact())
+        for name in ("z", "change", "count"):
+            assert abs(filtered.mean(name)[t] - exact.mean(f"{name}[{t}]")) < 0.01, (name, t)
+    draws = dbn.sample(5, 100, rng=1)
+    assert (draws["change"][:, 0] == 0).all() and (draws["count"] == draws["z"].cumsum(1)).all()
+    assert (draws["change"][:, 1:] == (np.diff(draws["z"]) != 0)).all()
+
+
+def test_computed_static_nodes() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("a", bmc.Normal(0.0, 1.0))
+    dbn.add_static("double", lambda a: 2 * a)
+    dbn.add(
+        "x", lambda x_prev, double: bmc.Normal(x_prev + double, 1e-3), initial=bmc.Normal(0.0, 1e-3)
+    )
+    rows = {"a": 1.5, "x": [0.0, None, None]}
+    filtered = bmc.filter(dbn, rows, engine=bmc.ParticleFilter(50), rng=0)
+    np.testing.assert_allclose(filtered.mean("x"), [0.0, 3.0, 6.0], atol=0.01)
+
+
 # ---- what is refused ----------------------------------------------------------------------------
 
 NORMAL = bmc.Normal(0.0, 1.0)

@@ -1,0 +1,222 @@
+"""Axes of a grid: the points at which densities are evaluated, and how much of the line each stands for.
+
+Reads what users give as ``grid=``; finite nodes are their states, and bounded ones are cut evenly without
+being asked. Nothing here knows slices of time or beliefs.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import Slices
+from bayesmc.network import CompiledNode
+from bayesmc.shapes import owned
+
+#: rules that turn an interval into points and widths
+RULES = ("midpoint", "trapezoid", "simpson", "gauss-legendre")
+#: supports on which a product of intervals has a volume
+_FLAT = ("real", "interval", "circle", "real vector", "product", "integers")
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """Points on a line.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n,)
+        Stored values: positions for finite nodes.
+    widths : ndarray, shape (n,)
+        Quadrature weights: the length that a point stands for, 1 for isolated values.
+    """
+
+    points: np.ndarray
+    widths: np.ndarray
+
+    @property
+    def size(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, eq=False)
+class Axes:
+    """The axes of all nodes of a slice that can have some.
+
+    Attributes
+    ----------
+    of : dict
+        Node -> one axis per component of its event, in C order; all plate elements have the same.
+    asked : frozenset of str
+        Nodes named in ``grid=``.
+    missing : dict
+        Other nodes with a density -> why they have none, and how to give them some.
+    """
+
+    of: dict[str, tuple[Axis, ...]]
+    asked: frozenset[str]
+    missing: dict[str, str]
+
+
+def read_axes(slices: Slices, grid: Mapping[str, Any], cells: int, rule: str) -> Axes:
+    """The axes of all nodes of a slice, from ``grid=`` and from supports.
+
+    Raises
+    ------
+    ValueError
+        A grid that is none, or for a node that takes none.
+    """
+    found: dict[str, tuple[Axis, ...]] = {}
+    missing = {}
+    for name in grid:
+        if name not in slices.stochastic:
+            raise ValueError(
+                f"GridFilter(grid=...): {name!r} is no node with a density in the template; there are "
+                f"{list(slices.stochastic)}"
+            )
+    for name in slices.dynamic:
+        node = slices.first[name]
+        if node.domain is not None:
+            if name in grid:
+                raise ValueError(
+                    f"GridFilter(grid=...): {name!r} is finite; its states are its cells, so leave it out"
+                )
+            size = node.domain.size
+            found[name] = (Axis(owned(np.arange(size)), owned(np.ones(size))),)
+        elif not node.is_stochastic:
+            continue
+        elif (kind := _unfit(slices, name)) is not None:
+            missing[name] = (
+                f"{name!r} has values on {kind}, which a product of intervals does not fill"
+            )
+        elif name in grid:
+            found[name] = _axes(node, grid[name], rule)
+        else:
+            bounds = _bounds(slices, name)
+            if bounds is None:
+                missing[name] = (
+                    f"{name!r} is hidden and unbounded; give it a grid, grid={{{name!r}: (low, high, "
+                    "cells)} or an array of points"
+                )
+            else:
+                axis = _interval(name, *bounds, cells, rule)
+                found[name] = (axis,) * math.prod(node.event_shape)
+    return Axes(found, frozenset(grid), missing)
+
+
+def check_rule(rule: str) -> None:
+    """Refuse a ``quadrature=`` that is none."""
+    if rule not in RULES:
+        raise ValueError(f"GridFilter(quadrature={rule!r}): give one of {', '.join(RULES)}")
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _unfit(slices: Slices, name: str) -> str | None:
+    for model in (slices.first, slices.later):
+        support = model[name].support
+        if support is None:
+            continue
+        kinds = {support.kind, *(part.kind for part, _ in support.parts)}
+        if not kinds <= set(_FLAT):
+            return support.describe()
+    return None
+
+
+def _bounds(slices: Slices, name: str) -> tuple[float, float] | None:
+    """The interval that holds a node in every slice; None where it is infinite or varies."""
+    lows, highs = [], []
+    for model in (slices.first, slices.later):
+        support = model[name].support
+        if support is None or support.kind not in ("interval", "circle") or not support.is_constant:
+            return None
+        if support.kind == "circle":
+            lows.append(-np.pi)
+            highs.append(np.pi)
+        else:
+            lows.append(float(np.min(support.low)))
+            highs.append(float(np.max(support.high)))
+    low, high = min(lows), max(highs)
+    return (low, high) if math.isfinite(low) and math.isfinite(high) else None
+
+
+def _axes(node: CompiledNode, given: Any, rule: str) -> tuple[Axis, ...]:
+    """One axis per component; one grid for all of them, or a list of one each."""
+    count = math.prod(node.event_shape)
+    several = isinstance(given, (list, tuple)) and any(np.ndim(part) > 0 for part in given)
+    if not several:
+        return (_axis(node, given, rule),) * count
+    if len(given) != count:
+        raise ValueError(
+            f"GridFilter(grid=...): {node.name!r} has {count} components, but {len(given)} grids; give one "
+            "for all, or a list of one each"
+        )
+    return tuple(_axis(node, part, rule) for part in given)
+
+
+def _axis(node: CompiledNode, given: Any, rule: str) -> Axis:
+    what = f"GridFilter(grid={{{node.name!r}: ...}})"
+    if isinstance(given, tuple) and len(given) == 3 and isinstance(given[2], (int, np.integer)):
+        low, high, cells = float(given[0]), float(given[1]), int(given[2])
+        if not (math.isfinite(low) and math.isfinite(high) and low < high and cells > 1):
+            raise ValueError(
+                f"{what}: {given!r} is no (low, high, cells) with low < high, cells > 1"
+            )
+        if node.is_discrete:
+            raise ValueError(f"{what}: the node counts; give the values, such as np.arange(100)")
+        return _interval(node.name, low, high, cells, rule)
+    try:
+        points = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        raise ValueError(f"{what}: give an array of points or (low, high, cells)") from None
+    if points.ndim != 1 or len(points) < 2 or not np.isfinite(points).all():
+        raise ValueError(
+            f"{what}: points of shape {points.shape}; give two finite ones or more, on one axis, or "
+            "(low, high, cells)"
+        )
+    if (np.diff(points) <= 0).any():
+        raise ValueError(f"{what}: points must increase")
+    if node.is_discrete:
+        if (points != np.floor(points)).any():
+            raise ValueError(f"{what}: the node counts; give whole numbers")
+        return Axis(owned(points, np.int64), owned(np.ones(len(points))))
+    return Axis(owned(points), owned(_widths(what, points, rule)))
+
+
+def _interval(name: str, low: float, high: float, cells: int, rule: str) -> Axis:
+    """An interval by a rule; only the midpoint rule has cells, the others so many points."""
+    if rule == "midpoint":
+        width = (high - low) / cells
+        return Axis(owned(low + width * (np.arange(cells) + 0.5)), owned(np.full(cells, width)))
+    if rule == "gauss-legendre":
+        points, weights = np.polynomial.legendre.leggauss(cells)
+        half = (high - low) / 2
+        return Axis(owned(low + half * (points + 1)), owned(weights * half))
+    points = np.linspace(low, high, cells)
+    return Axis(owned(points), owned(_widths(f"GridFilter(grid={{{name!r}: ...}})", points, rule)))
+
+
+def _widths(what: str, points: np.ndarray, rule: str) -> np.ndarray:
+    """What every given point stands for."""
+    gaps = np.diff(points)
+    ends: Sequence[float] = (gaps[0], gaps[-1])
+    inner = (gaps[1:] + gaps[:-1]) / 2
+    if rule == "midpoint":  # the outer cells are as wide on both sides of their points
+        return np.concatenate([ends[:1], inner, ends[1:]])
+    if rule == "trapezoid":
+        return np.concatenate([[ends[0] / 2], inner, [ends[1] / 2]])
+    if rule == "simpson":
+        if len(points) % 2 == 0 or np.ptp(gaps) > 1e-9 * gaps.max():
+            raise ValueError(f"{what}: Simpson's rule wants an odd number of evenly spaced points")
+        weights = np.full(len(points), 2.0)
+        weights[1::2] = 4.0
+        weights[[0, -1]] = 1.0
+        return weights * gaps.mean() / 3
+    raise ValueError(
+        f'{what}: quadrature="gauss-legendre" places the points itself; give (low, high, cells)'
+    )
