@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import sys
 
-from benchmarks import bench_exact, bench_gaussian, bench_gibbs, bench_scale, bench_weighting
+from benchmarks import (
+    bench_exact,
+    bench_gaussian,
+    bench_gibbs,
+    bench_scale,
+    bench_time,
+    bench_weighting,
+)
 from benchmarks.harness import data_folder, peer_python
 
 if __name__ == "__main__":
@@ -20,3 +27,5 @@ if __name__ == "__main__":
         print(f"no networks at {data_folder()}: set BAYESMC_DATA to time them")
     print()
     bench_gibbs.main(sys.argv[1:])
+    print()
+    bench_time.main(sys.argv[1:])

@@ -282,5 +282,6 @@ def volatility_series(steps: int, seed: int = 0) -> np.ndarray:
 
 def pounds(data: Path) -> np.ndarray:
     """Daily log returns of GBP against USD in 1997-98, in per cent, from the reference data, (750,)."""
-    rates = np.loadtxt(data / "statespace" / "GBP_vs_USD_9798.txt", skiprows=2, usecols=3)
+    path = data / "statespace" / "GBP_vs_USD_9798.txt"
+    rates = np.loadtxt(path, skiprows=2, usecols=3, max_rows=751)  # a notice of rights follows
     return 100.0 * np.diff(np.log(rates))

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.models_time import GROWTH, LORENZ, TREND
 
-BLOCK = 8192
+BLOCK = 8192  # particles
 SHARE = 0.5  # of the particles, below which their effective number has them resampled
 
 
@@ -72,7 +72,8 @@ def bootstrap(model: Model, y: np.ndarray, particles: int, seed: int) -> Filtere
     model.start(x)
     mean, increments = np.empty((steps, d)), np.zeros(steps)
     ess, level = float(n), math.log(n)
-    for t in range(steps):
+    largest, add, minus, exp = np.maximum.reduce, np.add.reduce, np.subtract, np.exp
+    for t, seen in enumerate(y.tolist()):
         again = t > 0 and ess < SHARE * n
         source, ancestors = x, None
         if again:
@@ -80,36 +81,34 @@ def bootstrap(model: Model, y: np.ndarray, particles: int, seed: int) -> Filtere
             current = 1 if x is cloud.values[0] else 0
             x, blocks = cloud.values[current], cloud.blocks[current]
             level = math.log(n)
-        fresh, seen, top = again or t == 0, y[t] == y[t], -math.inf
+        fresh, missing, top = again or t == 0, math.isnan(seen), -math.inf
         for part, log, _, noise, spare, low, high in blocks:
             if ancestors is not None:
-                source.take(ancestors[low:high], axis=1, out=part, mode="clip")
+                for old, new in zip(source, part, strict=True):
+                    old.take(ancestors[low:high], out=new, mode="clip")
             if t:
                 rng.standard_normal(out=noise)
                 model.move(part, noise, spare, t)
-            if not seen:
+            if missing:
                 if fresh:
                     log.fill(0.0)
             elif fresh:
-                model.weigh(part, y[t], log, spare)
+                model.weigh(part, seen, log, spare)
             else:
-                model.weigh(part, y[t], noise[0], spare)
+                model.weigh(part, seen, noise[0], spare)
                 log += noise[0]
-            top = max(top, log.max())
-        total = squares = 0.0
-        moments = 0.0
+            top = max(top, float(largest(log)))
+        total, squares, moments = 0.0, 0.0, np.zeros(d)
         for part, log, weights, _, _, _, _ in blocks:
-            np.subtract(log, top, out=weights)
-            np.exp(weights, out=weights)
-            total += np.add.reduce(weights)
-            squares += weights @ weights
-            moments = moments + part @ weights
+            minus(log, top, out=weights)
+            exp(weights, out=weights)
+            total += float(add(weights))
+            squares += float(weights.dot(weights))
+            moments += part.dot(weights)
         mean[t] = moments / total
         ess = total * total / squares
         before, level = level, top + math.log(total)
-        increments[t] = level - before + (model.constant if seen else 0.0)
-        if seen:
-            level += 0.0  # the constant is in no weight, so nothing carries it on
+        increments[t] = level - before + (0.0 if missing else model.constant)
     return Filtered(mean, increments)
 
 
@@ -121,8 +120,8 @@ class _Cloud:
         self.values = [np.empty((dimension, n)), np.empty((dimension, n))]
         self.log, self.weights = np.empty(n), np.empty(n)
         self.running, self.edges = np.empty(n), np.empty(n, np.intp)
-        width = min(n, BLOCK // dimension)
-        noise, spare = np.empty((dimension, width)), np.empty((dimension, width))
+        width = min(n, BLOCK)
+        noise, spare = np.empty(dimension * width), np.empty(dimension * width)
         spans = [(low, min(low + width, n)) for low in range(0, n, width)]
         self.blocks = [
             [
@@ -130,8 +129,8 @@ class _Cloud:
                     values[:, low:high],
                     self.log[low:high],
                     self.weights[low:high],
-                    noise[:, : high - low],
-                    spare[:, : high - low],
+                    noise[: dimension * (high - low)].reshape(dimension, -1),
+                    spare[: dimension * (high - low)].reshape(dimension, -1),
                     low,
                     high,
                 )
@@ -146,9 +145,8 @@ class _Cloud:
         np.add.accumulate(self.weights, out=running)
         running *= n / running[-1]
         running += u
-        np.copyto(edges, running, casting="unsafe")
-        edges[-1] = n
-        np.minimum(edges, n, out=edges)
+        edges[:] = running
+        edges[-1] = n  # the sum may round below n
         counts = np.bincount(edges, minlength=n)[:n]
         return np.add.accumulate(counts, out=counts)
 
