@@ -6,14 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayesmc.auto.explanation import Explanation
+from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.exact_plan import too_large_to_search
 from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError
-from bayesmc.network import BayesNet, FactorGraph, Problem, pose
+from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
 
@@ -22,7 +24,7 @@ _CHEAP = 256 * 2**20
 
 
 def infer(
-    net: BayesNet | FactorGraph,
+    net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Mapping[str, Any] | None = None,
     *,
     inputs: Mapping[str, Any] | None = None,
@@ -32,16 +34,18 @@ def infer(
     keep: str | Sequence[str] = "draws",
     resume: Posterior | None = None,
 ) -> Posterior:
-    """The posterior of a net, or of a factor graph, given evidence.
+    """The posterior of a net, of a factor graph, or of a template over all its slices, given evidence.
 
     Parameters
     ----------
-    net : BayesNet or FactorGraph
+    net : BayesNet, FactorGraph or DynamicBayesNet
+        A template is unrolled over its data: the answer is about nodes ``"x[0]"``, ``"x[1]"``, ... and its
+        static nodes.
     evidence : dict, optional
         Node name -> value, an array over the node's plates, or a state label. A masked entry, NaN in a
-        plated node, or None is unobserved.
+        plated node, or None is unobserved. Of a template: observations, time first.
     inputs : dict, optional
-        Values of the net's input nodes.
+        Values of the net's input nodes; of a template time first.
     engine : optional
         ``Exact()``, ``LikelihoodWeighting(draws)``, ...; None chooses (see ``explain``).
     rng : seed, SeedSequence, Generator or None
@@ -72,7 +76,7 @@ def infer(
     >>> bmc.infer(net, {"wet": "yes"}).probabilities("rain").round(4).tolist()
     [0.3077, 0.6923]
     """
-    problem = pose(net, evidence, inputs)
+    problem = pose_any(net, evidence, inputs, resume)
     _check_keep(keep, problem)
     chosen = _choose(problem)[0] if engine is None else _checked(engine)
     reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
@@ -82,13 +86,13 @@ def infer(
 
 
 def explained(
-    net: BayesNet | FactorGraph,
+    net: BayesNet | FactorGraph | DynamicBayesNet,
     evidence: Mapping[str, Any] | None,
     engine: Any,
     inputs: Mapping[str, Any] | None,
 ) -> Explanation:
     """See ``explain``."""
-    problem = pose(net, evidence, inputs)
+    problem = pose_any(net, evidence, inputs)
     if engine is None:
         chosen, reasons, refused = _choose(problem)
     else:

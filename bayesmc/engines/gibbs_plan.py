@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -125,26 +125,47 @@ class Plan:
         return found
 
 
-def plan_of(problem: Problem, debug: bool = False) -> Plan:
-    """The plan for a posed problem, made once."""
+def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None = None) -> Plan:
+    """The plan for a posed problem, made once.
+
+    Parameters
+    ----------
+    only : collection of str, optional
+        Nodes that the plan is to move; the rest of the chain is moved by others. By default all of it.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.gibbs_plan import plan_of
+    >>> from bayesmc.network import pose
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.Gamma(1.0, 1.0))
+    >>> net.add("n", lambda rate: bmc.Poisson(rate))
+    >>> net.add("seen", lambda n: bmc.Binomial(n, 0.5))
+    >>> [kernel.names for kernel in plan_of(pose(net, {"seen": 3}), only=("rate",)).kernels]
+    [('rate',)]
+    """
     key = f"gibbs plan, debug={debug}"
+    if only is not None:
+        key += f", only {sorted(only)}"
     if key not in problem.cache:
-        problem.cache[key] = _planned(problem, debug)
+        problem.cache[key] = _planned(problem, debug, only)
     return problem.cache[key]
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _planned(problem: Problem, debug: bool) -> Plan:
+def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Plan:
     target = target_of(problem)
-    blankets = {name: Blanket(target, name) for name in target.chain}
+    names = tuple(n for n in target.chain if only is None or n in only)
+    blankets = {name: Blanket(target, name) for name in names}
     blocks = gaussian_blocks(target, blankets, debug)
     joined = {n for b in blocks for n in b.names}
     kernels, constraints = _finite(target, blankets, debug)
     refusals: dict[str, str] = {}
     numbers = []
-    for name in target.chain:
+    for name in names:
         if name in joined or target.model[name].domain is not None:
             continue
         kernel = conjugate_kernel(blankets[name], debug)
@@ -167,8 +188,8 @@ def _planned(problem: Problem, debug: bool) -> Plan:
 def _finite(
     target: Target, blankets: Mapping[str, Blanket], debug: bool
 ) -> tuple[list[Kernel], tuple[str, ...]]:
-    """Kernels of finite nodes, and those that these may leave stuck."""
-    names = [n for n in target.chain if target.model[n].domain is not None]
+    """Kernels of the finite nodes that have a blanket, and those that these may leave stuck."""
+    names = [n for n in blankets if target.model[n].domain is not None]
     if not names:
         return [], ()
     kernels: list[Kernel] = []
@@ -178,7 +199,7 @@ def _finite(
     if len(lattices) == len(names):
         return kernels, tight
     terms = FiniteTerms(target)
-    blocks = coupled_blocks(target, terms)
+    blocks = [b for b in coupled_blocks(target, terms) if blankets.keys() >= set(b)]
     wanted = [(n,) for n in names if n not in lattices] + blocks
     tabulated, left = table_kernels(target, wanted, terms)
     kernels += tabulated
@@ -195,7 +216,8 @@ def _finite(
     groups, alone = stacks(target, blankets, alone)
     kernels += [Stacked(group, Enumerate) for group in groups]
     kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
-    return kernels, (*tight, *deterministic_constraints(target, blocks, terms))
+    tied = deterministic_constraints(target, blocks, terms)
+    return kernels, (*tight, *(n for n in tied if n in blankets))
 
 
 def _numbers(target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]) -> list[Kernel]:

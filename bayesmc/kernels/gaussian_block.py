@@ -31,6 +31,8 @@ from bayesmc.tracing import TracedCall, Tracer
 
 #: components that one dense matrix may have
 MAX_DENSE = 400
+#: nodes of a block, whose precision matrix is dense
+_MOST_NODES = 64
 _FAMILIES = (Normal, MvNormal, LogNormal)
 
 
@@ -136,6 +138,8 @@ def gaussian_blocks(
         shared = [g for g in groups if _meets(target, name, g)]
         merged = [name]
         for group in shared:
+            if len(group) + len(merged) > _MOST_NODES:
+                continue  # a long chain is cut: each piece is drawn given its neighbours
             if _jointly_affine(target, [*group, *merged], blankets):
                 merged = [*group, *merged]
                 groups.remove(group)

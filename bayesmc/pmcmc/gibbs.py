@@ -1,0 +1,131 @@
+"""``ParticleGibbs``: static nodes by the kernels of Gibbs, whole trajectories by a conditional filter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+from bayesmc.engines.base import Treatment
+from bayesmc.engines.gibbs_plan import Plan, plan_of
+from bayesmc.errors import UnsupportedError
+from bayesmc.kernels.base import Kernel
+from bayesmc.network import Problem
+from bayesmc.pmcmc.base import ParticleEngine
+from bayesmc.pmcmc.filters import Filter
+from bayesmc.pmcmc.sampler import ParticleSampler
+from bayesmc.pmcmc.trajectory import Trajectory
+
+
+@dataclass(frozen=True)
+class ParticleGibbs(ParticleEngine):
+    """Markov chains that draw the whole trajectory of a template at once, then its static nodes, and so on.
+
+    The trajectory comes from a particle filter that keeps the current one among its particles (with ancestor
+    sampling), static nodes from their full conditionals given it, as with ``Gibbs``: in closed form where
+    there is one. Any number of particles from two on is exact in the long run; more of them mix faster. It is
+    called with the template, ``infer(dbn, observations, engine=ParticleGibbs())``, and answers about the
+    unrolled net: ``posterior.mean("x[3]")``, ``posterior["theta"]``.
+
+    Parameters
+    ----------
+    draws : int
+        Draws kept of every chain.
+    warmup : int
+        Sweeps before that.
+    chains : int
+        Chains, all in one array.
+    particles : int
+        Two or more, of each chain; the trajectory that is kept is one of them.
+    thinning : int
+        Sweeps per kept draw.
+
+    Raises
+    ------
+    UnsupportedError
+        From ``infer``: a plain net, a hidden node that cannot be sampled, or nothing hidden.
+
+    Notes
+    -----
+    Where a deterministic node carries something on from slice to slice (a running sum), ancestors are not
+    drawn anew: that is valid, too, but early slices then change seldom unless particles are many. Plates
+    whose elements never meet have particles of their own.
+
+    References
+    ----------
+    Andrieu, Doucet and Holenstein (2010), JRSS B 72; Lindsten, Jordan and Schön (2014), JMLR 15.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.pmcmc import ParticleGibbs
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add_static("precision", bmc.Gamma(2.0, 1.0))
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(0.5 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x, precision: bmc.Normal(x, precision**-0.5))
+    >>> engine = ParticleGibbs(draws=400, warmup=50, chains=4, particles=20)
+    >>> posterior = bmc.infer(dbn, {"y": [1.2, 0.7, -0.4]}, engine=engine, rng=0)
+    >>> posterior["x[2]"].shape, bool(1.5 < posterior.mean("precision") < 3.0)
+    ((4, 400), True)
+    """
+
+    draws: int = 1000
+    warmup: int = 500
+    chains: int = 2
+    particles: int = 100
+    thinning: int = 1
+
+    label: ClassVar[str] = "particle Gibbs"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.particles < 2:
+            raise ValueError(
+                f"ParticleGibbs(particles={self.particles!r}): one particle is the trajectory that is kept; "
+                "give 2 or more, such as 100"
+            )
+
+    def refusal(self, problem: Problem) -> str | None:
+        reason = super().refusal(problem)
+        if reason is not None:
+            return reason
+        try:
+            self._plan(problem)
+        except UnsupportedError as error:
+            return f"ParticleGibbs has no kernel for the static nodes: {error}"
+        return None
+
+    def describe(self, problem: Problem) -> dict[str, str]:
+        return {row.node: str(row) for row in self.table(problem)}
+
+    def table(self, problem: Problem) -> list[Treatment]:
+        trajectory = self._trajectory(problem)
+        drawn = {} if trajectory is None else dict.fromkeys(trajectory.names, trajectory)
+        return [
+            Treatment(row.node, *drawn[row.node].words(row.node), row.plates)
+            if row.node in drawn
+            else row
+            for row in self._plan(problem).table()
+        ]
+
+    def tied(self, problem: Problem) -> Sequence[str]:
+        return self._plan(problem).constraints
+
+    def sampler(self, problem: Problem) -> ParticleSampler:
+        question = self._question(problem)
+        kernels: list[Kernel] = list(self._plan(problem).kernels)
+        trajectory = self._trajectory(problem)
+        if trajectory is not None:
+            kernels.insert(0, trajectory)
+        filter = Filter(question.trellis, self.particles)
+        return ParticleSampler(question.target, kernels, filter)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _plan(self, problem: Problem) -> Plan:
+        """What moves the static nodes."""
+        return plan_of(problem, only=self._question(problem).statics)
+
+    def _trajectory(self, problem: Problem) -> Trajectory | None:
+        trellis = self._question(problem).trellis
+        return Trajectory(trellis, self.particles) if trellis.names else None

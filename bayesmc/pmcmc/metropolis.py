@@ -1,0 +1,120 @@
+"""``ParticleMetropolis``: static nodes by a random walk, their likelihood estimated by a particle filter."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from bayesmc.engines.weighted import treatment
+from bayesmc.errors import ConvergenceWarning
+from bayesmc.network import Problem
+from bayesmc.pmcmc.base import ParticleEngine
+from bayesmc.pmcmc.filters import Filter
+from bayesmc.pmcmc.sampler import ParticleSampler
+from bayesmc.pmcmc.walk import ParameterWalk
+from bayesmc.results import Checkpoint
+
+#: errors of the log likelihood beyond which a chain hardly moves, and the best to have
+_NOISY, _BEST = 2.0, 1.2
+
+
+@dataclass(frozen=True)
+class ParticleMetropolis(ParticleEngine):
+    """Markov chains over static nodes, each step of which runs a particle filter over all rows.
+
+    Static nodes move together by an adaptive random walk on the unconstrained scale; a step is accepted by
+    the filter's estimate of the likelihood, and the trajectory drawn from that filter comes with it. The
+    estimate is kept with its chain, which makes the answers exact in the long run for any number of
+    particles. It suits static nodes that hold the trajectory fast, where ``ParticleGibbs`` mixes slowly. It
+    is called with the template, ``infer(dbn, observations, engine=ParticleMetropolis())``.
+
+    Parameters
+    ----------
+    draws, warmup, chains, thinning : int
+        As for ``Gibbs``.
+    particles : int
+        Of each filter. Best is an error of the log likelihood near 1.2 (its variance falls with the number of
+        particles, and rises with that of rows); the warmup measures it, and over 2 there is a warning.
+
+    Raises
+    ------
+    UnsupportedError
+        From ``infer``: a plain net, no continuous static node to learn, a discrete one, or a hidden node that
+        cannot be sampled.
+
+    References
+    ----------
+    Andrieu, Doucet and Holenstein (2010), JRSS B 72, sec. 2.4.2; Pitt, Silva, Giordani and Kohn (2012),
+    J. Econometrics 171 (how many particles).
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.pmcmc import ParticleMetropolis
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add_static("scale", bmc.LogNormal(0.0, 0.5))
+    >>> dbn.add("x", lambda x_prev, scale: bmc.Normal(x_prev, scale), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    >>> engine = ParticleMetropolis(draws=500, warmup=150, chains=20, particles=50)
+    >>> posterior = bmc.infer(dbn, {"y": [0.2, 2.9, 0.4]}, engine=engine, rng=0)
+    >>> posterior["scale"].shape, list(posterior.acceptance)
+    ((20, 500), ['scale'])
+    """
+
+    draws: int = 1000
+    warmup: int = 1000
+    chains: int = 2
+    particles: int = 200
+    thinning: int = 1
+
+    label: ClassVar[str] = "particle Metropolis"
+
+    def refusal(self, problem: Problem) -> str | None:
+        reason = super().refusal(problem)
+        if reason is not None:
+            return reason
+        question = self._question(problem)
+        if not question.statics:
+            return (
+                "ParticleMetropolis walks over static nodes, and none is hidden; ParticleGibbs() draws "
+                "trajectories alone, and so does smooth(dbn, observations)"
+            )
+        discrete = [n for n in question.statics if problem.model[n].is_discrete]
+        if discrete:
+            return (
+                f"ParticleMetropolis walks over continuous static nodes, and {discrete[0]!r} is discrete; "
+                "ParticleGibbs() takes those, too"
+            )
+        return None
+
+    def describe(self, problem: Problem) -> dict[str, str]:
+        found = {n: treatment(problem, n) for n in problem.model.nodes}
+        walk = self._walk(problem)
+        for name in walk.names:
+            found[name] = ": ".join(walk.words(name))
+        return found
+
+    def sampler(self, problem: Problem) -> ParticleSampler:
+        walk = self._walk(problem)
+        return ParticleSampler(self._question(problem).target, [walk], walk.filter)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _walk(self, problem: Problem) -> ParameterWalk:
+        question = self._question(problem)
+        filter = Filter(question.trellis, self.particles)
+        return ParameterWalk(question.target, question.statics, filter)
+
+    def _posterior(self, problem: Problem, sampler: Any, held: Any, checkpoint: Checkpoint) -> Any:
+        (memory,) = checkpoint.state["memory"]
+        error = memory["error"]
+        if len(memory["looks"]) and error > _NOISY:
+            wanted = self.particles * (error / _BEST) ** 2
+            warnings.warn(
+                f"ParticleMetropolis: the log likelihood is estimated with an error of {error:.1f} (standard "
+                f"deviation), so that chains hardly move; give about particles={wanted:.0f}",
+                ConvergenceWarning,
+                stacklevel=4,
+            )
+        return super()._posterior(problem, sampler, held, checkpoint)

@@ -1,0 +1,87 @@
+"""Where the chains of this room start: static nodes as elsewhere, trajectories by a filter."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.starting import start_states
+from bayesmc.engines.sweep import SweepSampler
+from bayesmc.errors import ZeroProbabilityError
+from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.densities import instead
+from bayesmc.pmcmc.filters import Filter
+from bayesmc.pmcmc.walk import ParameterWalk, prior_of
+from bayesmc.structure.target import Target, Values
+
+#: draws of the static nodes from their prior before giving up
+_ATTEMPTS = 50
+
+
+class ParticleSampler(SweepSampler):
+    """Sweeps whose first trajectories are drawn by a filter, which sees what forward draws do not.
+
+    Parameters
+    ----------
+    target : Target
+    kernels : sequence of Kernel
+    filter : Filter
+    """
+
+    def __init__(self, target: Target, kernels: Sequence[Kernel], filter: Filter) -> None:
+        super().__init__(target, kernels)
+        self.filter = filter
+        walks = [k for k in self.kernels if isinstance(k, ParameterWalk)]
+        #: rates are low where estimates are noisy, which is warned of by itself
+        self.acceptance_band = {", ".join(walk.statics): (0.02, 0.9) for walk in walks}
+
+    def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        found = {}
+        for kernel, memory in zip(self.kernels, state["memory"], strict=True):
+            rate = kernel.acceptance(memory)
+            if rate is not None:
+                names = kernel.statics if isinstance(kernel, ParameterWalk) else kernel.names
+                found[", ".join(names)] = rate
+        return found
+
+    def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:
+        values = self._begun(rng, rows)
+        self.target.refresh(values, self.target.chain)
+        inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
+        memory = [kernel.start(values, rows) for kernel in self.kernels]
+        return {"values": inside, "memory": memory, "chains": chains}
+
+    def _begun(self, rng: np.random.Generator, rows: int) -> Values:
+        """Static nodes and trajectories of positive density."""
+        try:
+            values = start_states(self.target, rows, rng)
+        except ZeroProbabilityError as error:
+            return self._searched(rng, rows, error)
+        if not self.filter.trellis.names:
+            return values
+        history = self.filter.run(values, rows, rng)
+        failed = ~np.isfinite(history.log_likelihood)
+        for name, value in self.filter.drawn(history, rng).items():
+            values[name] = instead(failed, value, values[name])
+        return values
+
+    def _searched(self, rng: np.random.Generator, rows: int, error: ZeroProbabilityError) -> Values:
+        """Static nodes from their prior, until a filter finds a trajectory for some chain."""
+        inside = {*self.filter.trellis.names}
+        statics = tuple(n for n in self.target.chain if n not in inside)
+        prior = prior_of(self.target, statics)
+        for _ in range(_ATTEMPTS):
+            values = start_states(prior, rows, rng) if statics else dict(self.target.known)
+            history = self.filter.run(values, rows, rng)
+            good = np.flatnonzero(np.isfinite(history.log_likelihood))
+            if not len(good):
+                continue
+            values.update(self.filter.drawn(history, rng))
+            chosen = np.arange(rows)
+            failed = ~np.isfinite(history.log_likelihood)
+            chosen[failed] = rng.choice(good, int(failed.sum()))
+            moved = {n: values[n][chosen] for n in (*self.target.chain, *prior.links)}
+            return {**self.target.known, **moved}
+        raise error

@@ -1,0 +1,162 @@
+"""Particle Metropolis: posteriors of static nodes against quadrature with the exact likelihood."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy.special
+
+import bayesmc as bmc
+from bayesmc.engines.unrolled import pose_any
+from bayesmc.errors import ConvergenceWarning, UnsupportedError
+from bayesmc.pmcmc import ParticleMetropolis
+from bayesmc.pmcmc.filters import Filter
+from bayesmc.pmcmc.walk import ParameterWalk
+from bayesmc.structure.target import target_of
+from bayesmc.testing.matching import holm
+
+ALPHA = 1e-4
+YS = {"y": [0.5, 1.9, -0.4, 0.9]}
+
+pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+
+
+def walk() -> bmc.DynamicBayesNet:
+    """A random walk whose steps have an unknown scale."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("scale", bmc.HalfNormal(1.0))
+    start = bmc.Normal(0.0, 1.0)
+    dbn.add("x", lambda x_prev, scale: bmc.Normal(x_prev, scale), initial=start)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.4))
+    return dbn
+
+
+def moments() -> dict[tuple[str, int], float]:
+    """First and second moments of the scale and of the states, by quadrature over the scale."""
+    grid = np.linspace(0.0, 6.0, 241)[1:]
+    net, evidence = walk().unroll(4), walk().unrolled_evidence(YS)
+    names = [f"x[{t}]" for t in range(4)]
+    logs, means, squares = [], [], []
+    for scale in grid:
+        exact = bmc.infer(net, {**evidence, "scale": scale}, engine=bmc.Exact())
+        logs.append(exact.log_marginal_likelihood)  # the prior of the scale is in it
+        means.append([exact.mean(n) for n in names])
+        squares.append([exact.var(n) + exact.mean(n) ** 2 for n in names])
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    found = {("scale", 1): weights @ grid, ("scale", 2): weights @ grid**2}
+    for k, name in enumerate(names):
+        found[name, 1] = weights @ np.array(means)[:, k]
+        found[name, 2] = weights @ np.array(squares)[:, k]
+    return found
+
+
+def rejections(posterior: Any, exact: dict[tuple[str, int], float]) -> int:
+    """How many moments do not match: chains are independent, so their means have a plain standard error."""
+    values = []
+    for (name, power), value in exact.items():
+        means = np.mean(posterior[name] ** power, axis=1)
+        error = means.std(ddof=1) / np.sqrt(len(means))
+        values.append(scipy.special.erfc(abs(means.mean() - value) / error / np.sqrt(2.0)))
+    return holm(sorted(values), ALPHA)
+
+
+def test_posterior_is_that_of_quadrature(monkeypatch: pytest.MonkeyPatch) -> None:
+    exact = moments()
+    engine = ParticleMetropolis(draws=400, warmup=150, chains=300, particles=8)
+    found = bmc.infer(walk(), YS, engine=engine, rng=0)
+    # false-alarm rate ALPHA, a little more with 300 chains
+    assert rejections(found, exact) == 0
+    assert list(found.acceptance) == ["scale"]
+    assert 0.1 < found.acceptance["scale"].mean() < 0.6
+
+    step = ParameterWalk.step
+
+    def made_anew(self: Any, values: Any, memory: Any, rng: Any, warmup: bool) -> Any:
+        return step(self, values, {**memory, "log_likelihood": None}, rng, warmup)
+
+    monkeypatch.setattr(ParameterWalk, "step", made_anew)
+    assert rejections(bmc.infer(walk(), YS, engine=engine, rng=0), exact)
+
+
+def test_likelihood_has_no_bias() -> None:
+    """The mean of the estimate is the exact likelihood, for every chain's own parameters."""
+    dbn, rng, chains = walk(), np.random.default_rng(0), 40_000
+    problem = pose_any(dbn, YS)
+    engine = ParticleMetropolis(particles=6)
+    filter = Filter(engine._question(problem).trellis, 6)
+    values = {**target_of(problem).known, "scale": np.tile([0.3, 1.5], chains // 2)}
+    found = filter.run(values, chains, rng).log_likelihood.reshape(-1, 2)
+    for k, scale in enumerate((0.3, 1.5)):
+        evidence = {**dbn.unrolled_evidence(YS), "scale": scale}
+        exact = bmc.infer(dbn.unroll(4), evidence, engine=bmc.Exact())
+        prior = float(bmc.HalfNormal(1.0).log_prob(scale))
+        ratio = np.exp(found[:, k] - (exact.log_marginal_likelihood - prior))
+        # 4.4 standard errors: false-alarm rate 1e-5
+        assert abs(ratio.mean() - 1.0) < 4.4 * ratio.std() / np.sqrt(len(ratio))
+        assert abs(found[:, k].mean() - (exact.log_marginal_likelihood - prior)) > 0.02
+
+
+def test_many_kinds_of_static_nodes() -> None:
+    """A simplex, a partly seen plate and a computed node; the draws keep to their supports."""
+    dbn = bmc.DynamicBayesNet(plates={"i": 3})
+    dbn.add_static("shares", bmc.Dirichlet([2.0, 2.0, 2.0]))
+    dbn.add_static("slope", bmc.Normal(0.0, 1.0), plates="i")
+    dbn.add_static("double", lambda slope: 2.0 * slope, plates="i")
+    dbn.add("z", lambda shares: bmc.Categorical(shares), plates="i")
+    start = bmc.Normal(0.0, 1.0)
+    dbn.add("x", lambda x_prev, double: bmc.Normal(x_prev + double, 1.0), initial=start, plates="i")
+    dbn.add("y", lambda x, z: bmc.Normal(x + z, 0.5), plates="i")
+    rows = {"y": np.arange(12.0).reshape(4, 3), "slope": [np.nan, 0.5, np.nan]}
+    engine = ParticleMetropolis(draws=20, warmup=30, chains=3, particles=20)
+    found = bmc.infer(dbn, rows, engine=engine, rng=0)
+    assert np.allclose(found["shares"].sum(axis=-1), 1.0)
+    assert (found["slope"][..., 1] == 0.5).all()
+    assert np.allclose(found["double"], 2.0 * found["slope"])
+    assert set(np.unique(found["z[2]"])) <= {0, 1, 2}
+
+
+def test_same_seed_and_resuming() -> None:
+    options = {"warmup": 45, "chains": 3, "particles": 6}
+    long = _run(ParticleMetropolis(draws=30, **options))
+    first = _run(ParticleMetropolis(draws=12, **options))
+    dbn = walk()
+    one = bmc.infer(dbn, YS, engine=ParticleMetropolis(draws=12, **options), rng=5)
+    rest = bmc.infer(dbn, YS, engine=ParticleMetropolis(draws=18, **options), rng=5, resume=one)
+    for name in ("scale", "x[2]"):
+        assert np.array_equal(first[name], one[name])
+        assert np.array_equal(long[name], rest[name])
+
+
+def test_noisy_estimates_are_warned_of() -> None:
+    dbn = walk()
+    ys = {"y": np.r_[np.zeros(20), 6.0, -6.0, 6.0, -6.0]}
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        bmc.infer(dbn, ys, engine=ParticleMetropolis(draws=5, warmup=60, particles=5), rng=0)
+    noisy = [w for w in caught if "estimated with an error" in str(w.message)]
+    assert len(noisy) == 1
+    assert issubclass(noisy[0].category, ConvergenceWarning)
+    assert noisy[0].filename == __file__
+
+
+def test_refusals() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("b", lambda a: bmc.Normal(a, 1.0))
+    with pytest.raises(UnsupportedError, match="give the template: infer"):
+        bmc.infer(net, {"b": 1.0}, engine=ParticleMetropolis())
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    assert "none is hidden" in str(ParticleMetropolis().unsupported(dbn, {"y": [1.0, 2.0]}))
+    dbn.add_static("k", bmc.Bernoulli(0.5))
+    dbn.add("w", lambda x, k: bmc.Normal(x + k, 1.0))
+    assert "'k' is discrete" in str(ParticleMetropolis().unsupported(dbn, {"w": [1.0, 2.0]}))
+
+
+def _run(engine: Any) -> Any:
+    return bmc.infer(walk(), YS, engine=engine, rng=5)
