@@ -47,6 +47,7 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
+from bayesmc.engines.discrete_filter import DiscreteFilter
 from bayesmc.engines.exact import Exact
 from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.grid_filter import GridFilter
@@ -59,6 +60,7 @@ from bayesmc.engines.rejection import Rejection
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
+from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
 
 if TYPE_CHECKING:
@@ -76,6 +78,7 @@ __all__ = [
     "Cauchy",
     "Density",
     "Dirichlet",
+    "DiscreteFilter",
     "DiscreteUniform",
     "DynamicBayesNet",
     "Distribution",
@@ -108,6 +111,8 @@ __all__ = [
     "Normal",
     "ParticleBelief",
     "ParticleFilter",
+    "ParticleGibbs",
+    "ParticleMetropolis",
     "PlateArray",
     "Poisson",
     "Posterior",

@@ -9,6 +9,7 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.series import explained_series
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.engines.base import Engine
 from bayesmc.network import BayesNet, FactorGraph
 
 
@@ -33,7 +34,7 @@ def explain(
       because hidden nodes are finite or linear-Gaussian: induced width 0, ...bytes
       a  eliminated
     """
-    if isinstance(net, DynamicBayesNet):
+    if isinstance(net, DynamicBayesNet) and not isinstance(engine, Engine):
         explanation = explained_series(net, evidence, engine, inputs)
     else:
         explanation = explained(net, evidence, engine, inputs)

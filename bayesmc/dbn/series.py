@@ -163,7 +163,7 @@ def read_row(
             raise EvidenceError(
                 f"{what} is a {type(given).__name__}; give a dict from name to the value in this slice"
             )
-    rows = {n: [v] for n, v in (observations or {}).items() if v is not None}
+    rows = {n: _in_time(v) for n, v in (observations or {}).items() if v is not None}
     given = {n: [v] for n, v in (inputs or {}).items()}
     if slices is None:
         slices, series = read_series(dbn, rows, given, steps=1)
@@ -303,6 +303,11 @@ def check_steps(who: str, steps: Any) -> None:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _in_time(value: Any) -> Any:
+    """One row as a series of one."""
+    return value[None] if isinstance(value, (np.ndarray, np.ma.MaskedArray)) else [value]
 
 
 def _check_observed(template: Template, name: str) -> None:

@@ -18,10 +18,11 @@ from bayesmc.engines.filtering import FilterEngine, Queries
 from bayesmc.engines.particle import Cloud, Layout, Mover
 from bayesmc.engines.particle_belief import ParticleBelief
 from bayesmc.engines.particle_record import FilteredParticles, Record
-from bayesmc.engines.particle_smoothing import Backward, ancestors_of
+from bayesmc.engines.particle_smoothing import Backward, ancestors_of, carried
 from bayesmc.engines.particle_stages import GivenStage, PluggedIn, Rejuvenation
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
+from bayesmc.errors import UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -227,6 +228,12 @@ class ParticleFilter(FilterEngine):
     ) -> FilteredParticles:
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
+        sums = carried(problem.slices)
+        if sums:
+            raise UnsupportedError(
+                f"ParticleFilter: {sums[0]!r} is computed from its own past, so trajectories cannot be drawn "
+                "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
+            )
         filtered = self.filter(problem, seed, keep="particles", progress=progress)
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}

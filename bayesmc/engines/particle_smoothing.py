@@ -160,8 +160,7 @@ class Backward:
         batch: tuple[int, ...],
     ) -> np.ndarray:
         """Log density of the slice after the k-th: factors that the slice before enters."""
-        known = self.plan.known(series.row(k + 1))
-        known |= {n: v for n, v in now.items() if n not in known}
+        known = {**self.plan.known(series.row(k + 1)), **now}  # fillers stand for what is missing
         known |= {n + PREVIOUS: v for n, v in before.items()}
         state = Pass(np.random.default_rng(0), batch, known)
         for step in self.steps:
@@ -188,6 +187,22 @@ class Backward:
 
     def _trailing(self, name: str) -> int:
         return len(self.slices.later[name].value_shape)
+
+
+def carried(slices: Slices) -> tuple[str, ...]:
+    """Deterministic nodes that carry something of the slice before on to the next, such as running sums.
+
+    Trajectories cannot be put together backwards through them: what they were is settled by the past.
+    """
+    reached = {n + PREVIOUS for n in slices.interface}
+    found = []
+    for name in slices.dynamic:
+        node = slices.later[name]
+        if not node.is_stochastic and reached & set(node.parents):
+            reached.add(name)
+            if name in slices.interface:
+                found.append(name)
+    return tuple(found)
 
 
 def ancestors_of(clouds: Sequence[Cloud], layout: Layout, slices: Slices) -> dict[str, np.ndarray]:

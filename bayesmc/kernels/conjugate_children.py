@@ -239,12 +239,8 @@ class Partner:
         if not (isinstance(loc, Tracer) and loc.is_affine):
             return
         # values that can be: the noise may depend on some of these nodes, too
-        state = {**target.known}
-        for n in above:
-            shape = target.model[n].value_shape
-            state[n] = np.asarray(target.model.probe[n], dtype=float).reshape(-1, *shape)[:1]
+        state = target.example(above)
         try:
-            target.refresh(state, above)
             dist, _, _ = self._distribution(state, members, True)
         except BayesmcError:
             return

@@ -178,7 +178,7 @@ def read_directly(way: ByLabel, neutral: np.ndarray, above: tuple[str, ...]) -> 
     hidden = [n for n in target.chain if n in above and n != way.groups.label]
     if any(target.model[n].is_discrete for n in hidden):
         return None
-    state = _example(way, above)
+    state = way.blanket.target.example(above)
     dist, keys = way.at_labels(state, state[name])
     wanted = _FAMILIES.get(type(dist))
     if wanted is None or dist.invalid is not None:
@@ -215,7 +215,7 @@ def read_directly(way: ByLabel, neutral: np.ndarray, above: tuple[str, ...]) -> 
 def _suffices(way: ByLabel) -> bool:
     """Whether parameters at every label are those of the elements with that label."""
     target, term = way.blanket.target, way.child.term
-    state = _example(way, target.hidden_above(term))
+    state = target.example(target.hidden_above(term))
     states = way.groups.states
     label = np.random.default_rng(0).permutation(np.arange(math.prod(term.shape)) % states)
     label = label.reshape(term.shape)
@@ -246,17 +246,6 @@ def _agrees(full: np.ndarray, short: np.ndarray, label: np.ndarray, event_ndim: 
         table = short.reshape((*lead, plates[-1], *short.shape[end:]))
         short = np.take(table, label, axis=len(lead))
     return bool(((full == short) | (np.isnan(full) & np.isnan(short))).all())
-
-
-def _example(way: ByLabel, above: tuple[str, ...]) -> Values:
-    """One reachable value of every hidden node, and what follows from them."""
-    target = way.blanket.target
-    state: Values = dict(target.known)
-    for name in above:
-        rows = np.asarray(target.model.probe[name])
-        state[name] = rows.reshape((-1, *target.model[name].value_shape))[:1]
-    target.refresh(state, above)
-    return state
 
 
 def _is_in_order(way: ByLabel, keys: tuple[Any, ...]) -> bool:

@@ -52,6 +52,8 @@ class GaussianBlock(Kernel):
         self.layout = Layout(target, self.names, blankets, self.terms)
         self.parts = [BlockTerm(target, blankets, self.layout, term) for term in self.terms]
         self.match = "jointly Normal with " + ", ".join(self.names)
+        self._standing: tuple[Any, list[BlockTerm]] = (None, [])
+        self._moving: list[BlockTerm] = []
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
@@ -81,9 +83,25 @@ class GaussianBlock(Kernel):
     def _summed(self, base: Values, chains: int) -> BlockSums:
         """What all terms say, given the state with the block at zero."""
         sums = BlockSums(chains, self.layout)
+        together, standing = self._standing
+        if together is not None and all(part.stands(base) for part in standing):
+            sums.add(*together)
+            for part in self._moving:
+                part.add(base, sums)
+            return sums
         for part in self.parts:
             part.add(base, sums)
+        if together is None:
+            self._part_ways(base)
         return sums
+
+    def _part_ways(self, base: Values) -> None:
+        """Terms that say the same in every sweep are summed once, the others each time."""
+        standing = [p for p in self.parts if p.stands(base)]
+        self._moving = [p for p in self.parts if not p.stands(base)]
+        if standing:
+            columns = zip(*(p.summed for p in standing), strict=True)
+            self._standing = tuple(sum(c) for c in columns), standing
 
     def _why_bad(self, sums: BlockSums) -> str:
         if sums.problem is not None:
@@ -134,8 +152,9 @@ def gaussian_blocks(
     """Blocks of two or more coupled Normal nodes whose terms are jointly affine in them."""
     able = [n for n, b in blankets.items() if _is_able(target, b)]
     groups: list[list[str]] = []
+    entered = {n: {t.name for t in target.terms_of((n,))} for n in able}
     for name in able:
-        shared = [g for g in groups if _meets(target, name, g)]
+        shared = [g for g in groups if any(entered[name] & entered[n] for n in g)]
         merged = [name]
         for group in shared:
             if len(group) + len(merged) > _MOST_NODES:
@@ -195,20 +214,15 @@ def _is_affine(
     )
 
 
-def _meets(target: Target, name: str, group: Sequence[str]) -> bool:
-    mine = {id(t) for t in target.terms_of((name,))}
-    return any(id(t) in mine for other in group for t in target.terms_of((other,)))
-
-
 def _jointly_affine(target: Target, names: Sequence[str], blankets: Mapping[str, Blanket]) -> bool:
+    children: dict[str, list[tuple[str, str]]] = {}
+    for name in names:
+        for child in blankets[name].children:
+            children.setdefault(child.term.name, []).append((name, child.relation.kind))
     for term in target.terms_of(tuple(names)):
-        entering = tuple(n for n in names if any(c.term is term for c in blankets[n].children))
-        lookups = [
-            n
-            for n in entering
-            for c in blankets[n].children
-            if c.term is term and c.relation.kind == "lookup"
-        ]
+        found = children.get(term.name, [])
+        entering = tuple(dict.fromkeys(n for n, _ in found))
+        lookups = [n for n, kind in found if kind == "lookup"]
         if len(lookups) > 1 or (lookups and len(entering) > 1):
             return False
         if len(entering) > 1 and not _is_affine(target, entering, term):

@@ -58,12 +58,10 @@ class BlockTerm:
 
     def add(self, base: Values, sums: BlockSums) -> None:
         """Add what the term says, given the state with the block at zero."""
-        fixed = self.fixed and (
-            self.own or base[self.term.name] is self.target.known[self.term.name]
-        )
-        if fixed and self.frozen and self.summed is not None:
+        if self.stands(base):
             sums.add(*self.summed)
             return
+        fixed = self._is_fixed(base)
         dist, _, keys = self._distribution(base)
         if dist.invalid is not None:
             lead = dist.invalid.shape[: max(dist.invalid.ndim - len(self.term.shape), 0)]
@@ -91,7 +89,16 @@ class BlockTerm:
             self.summed = _first(summed)
         sums.add(*summed)
 
+    def stands(self, base: Values) -> bool:
+        """Whether it says what it said before, which is known."""
+        return self.frozen and self.summed is not None and self._is_fixed(base)
+
     # ---- private -------------------------------------------------------------------------------
+
+    def _is_fixed(self, base: Values) -> bool:
+        return self.fixed and (
+            self.own or base[self.term.name] is self.target.known[self.term.name]
+        )
 
     def _distribution(self, state: Values) -> tuple[Any, Any, Any]:
         if self.dynamic is not None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -158,18 +159,42 @@ class Target:
         seen = self.seen(name)
         return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
 
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        """Name of a term -> its place among all."""
+        return {name: k for k, name in enumerate(self.terms)}
+
+    @cached_property
+    def _entered(self) -> dict[str, list[str]]:
+        """Node -> names of the terms that it enters directly, in their order."""
+        found: dict[str, list[str]] = {}
+        for key, term in self.terms.items():
+            for name in dict.fromkeys(term.scope):
+                found.setdefault(name, []).append(key)
+        return found
+
+    @cached_property
+    def _link_children(self) -> dict[str, list[str]]:
+        """Node -> deterministic nodes between the chain and the terms that read it."""
+        found: dict[str, list[str]] = {}
+        for link in self.links:
+            for parent in dict.fromkeys(self.model[link].parents):
+                found.setdefault(parent, []).append(link)
+        return found
+
     def below(self, names: Iterable[str]) -> tuple[str, ...]:
         """Deterministic nodes that follow from some nodes on the way to terms, parents first."""
         key = "\0".join(names)
         found = self._below.get(key)
         if found is None:
-            reached = set(key.split("\0"))
-            order = []
-            for link in self.links:
-                if reached & set(self.model[link].parents):
-                    reached.add(link)
-                    order.append(link)
-            found = self._below[key] = tuple(order)
+            reached: set[str] = set()
+            todo = key.split("\0")
+            while todo:
+                for link in self._link_children.get(todo.pop(), ()):
+                    if link not in reached:
+                        reached.add(link)
+                        todo.append(link)
+            found = self._below[key] = tuple(n for n in self.links if n in reached)
         return found
 
     def refresh(self, values: Values, moved: Iterable[str]) -> None:
@@ -177,10 +202,40 @@ class Target:
         for link in self.below(moved):
             values[link], _ = self.model.evaluate(link, values)
 
+    def example(self, names: Iterable[str]) -> Values:
+        """One reachable value of some chain nodes, and of what else is needed for what follows from them."""
+        wanted = list(names)
+        for link in self.below(wanted):
+            wanted += [p for p in self._ancestors(link) if p not in wanted]
+        state: Values = dict(self.known)
+        for name in wanted:
+            rows = np.asarray(self.model.probe[name])
+            state[name] = rows.reshape((-1, *self.model[name].value_shape))[:1]
+        for link in self.links:
+            if all(p in state for p in self.model[link].parents):
+                state[link], _ = self.model.evaluate(link, state)
+        return state
+
+    def _ancestors(self, link: str) -> Iterable[str]:
+        """Chain nodes that a deterministic node is computed from."""
+        todo, seen = [link], {link}
+        while todo:
+            for parent in self.model[todo.pop()].parents:
+                if parent in seen or self.is_known(parent):
+                    continue
+                seen.add(parent)
+                if self.model[parent].is_stochastic:
+                    yield parent
+                else:
+                    todo.append(parent)
+
     def terms_of(self, names: Iterable[str]) -> tuple[Term, ...]:
         """The terms that some chain nodes enter, directly or through deterministic nodes."""
-        reached = {*names, *self.below(names)}
-        return tuple(t for t in self.terms.values() if reached & set(t.scope))
+        reached = (*names, *self.below(names))
+        if len(reached) == 1:
+            return tuple(self.terms[t] for t in self._entered.get(reached[0], ()))
+        entered = {t for n in reached for t in self._entered.get(n, ())}
+        return tuple(self.terms[t] for t in sorted(entered, key=self._place.__getitem__))
 
     def log_density(
         self, values: Mapping[str, np.ndarray], terms: Iterable[Term] | None = None
