@@ -49,14 +49,17 @@ from bayesmc.distributions import (
 )
 from bayesmc.engines.discrete_filter import DiscreteFilter
 from bayesmc.engines.exact import Exact
+from bayesmc.engines.extended_kalman import ExtendedKalmanFilter
 from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.grid_filter import GridFilter
 from bayesmc.engines.importance import Importance
+from bayesmc.engines.kalman import KalmanFilter
 from bayesmc.engines.metropolis import MetropolisHastings
 from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
 from bayesmc.engines.particle_belief import ParticleBelief
 from bayesmc.engines.particle_filter import ParticleFilter
 from bayesmc.engines.rejection import Rejection
+from bayesmc.engines.unscented_kalman import UnscentedKalmanFilter
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
@@ -85,6 +88,7 @@ __all__ = [
     "Exact",
     "Explanation",
     "Exponential",
+    "ExtendedKalmanFilter",
     "FactorGraph",
     "Gamma",
     "Geometric",
@@ -98,6 +102,7 @@ __all__ = [
     "InverseGamma",
     "InverseWishart",
     "Joint",
+    "KalmanFilter",
     "KernelDensity",
     "Laplace",
     "LikelihoodWeighting",
@@ -123,6 +128,7 @@ __all__ = [
     "Summary",
     "Truncated",
     "Uniform",
+    "UnscentedKalmanFilter",
     "VonMises",
     "Weibull",
     "Wishart",

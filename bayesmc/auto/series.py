@@ -11,13 +11,18 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.engines.discrete_filter import DiscreteFilter
 from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.kalman import KalmanFilter
 from bayesmc.engines.particle_filter import ParticleFilter
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior
 
 #: engines in the order in which they are tried
-_CANDIDATES: tuple[type[FilterEngine], ...] = (DiscreteFilter, ParticleFilter)
+_CANDIDATES: tuple[type[FilterEngine], ...] = (
+    DiscreteFilter,
+    KalmanFilter,
+    ParticleFilter,
+)
 _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",

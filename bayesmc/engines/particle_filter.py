@@ -17,6 +17,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import FilterEngine, Queries
 from bayesmc.engines.particle import Cloud, Layout, Mover
 from bayesmc.engines.particle_belief import ParticleBelief
+from bayesmc.engines.particle_optimal import OptimalPlan, why_not_optimal
 from bayesmc.engines.particle_record import FilteredParticles, Record
 from bayesmc.engines.particle_smoothing import Backward, ancestors_of, carried
 from bayesmc.engines.particle_stages import GivenStage, PluggedIn, Rejuvenation
@@ -48,7 +49,9 @@ class ParticleFilter(FilterEngine):
         (``x_prev``), observed nodes of the slice, inputs, ``t`` or nodes drawn before, and which returns the
         distribution to draw from, as for ``Importance``; weights are multiplied by p/q. It does not apply
         where it names what is missing (an observation, or the slice before slice 0): there the node's own
-        density is drawn from. A detector mixed with the transition is a ``Mixture`` of both.
+        density is drawn from. A detector mixed with the transition is a ``Mixture`` of both. ``"optimal"``
+        derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
+        is seen is affine in them, else its linearisation at each particle.
     auxiliary : bool or callable
         Resample with a look at the next row: particles are chosen by their weight times a first-stage
         factor, by default the density of the row at the conditional means of what is hidden; or a function
@@ -96,7 +99,7 @@ class ParticleFilter(FilterEngine):
     particles: int = 1000
     resampling: str | Callable[..., np.ndarray] = "systematic"
     ess_threshold: float = 0.5
-    proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
+    proposal: Mapping[Any, Any] | str | None = field(default=None, hash=False)
     auxiliary: bool | Callable[..., Any] = False
     on_degeneracy: str = "raise"
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
@@ -125,7 +128,13 @@ class ParticleFilter(FilterEngine):
         accepted = FUNCTION
         for option in ("proposal", "rejuvenation"):
             given = getattr(self, option)
-            if given is not None:
+            if option == "proposal" and isinstance(given, str):
+                if given != "optimal":
+                    raise ValueError(
+                        f'ParticleFilter(proposal={given!r}): give "optimal", or a dict from node name to '
+                        f"{accepted}"
+                    )
+            elif given is not None:
                 checked = check_specification("ParticleFilter", given, accepted)
                 for key, spec in checked.items():
                     as_function("ParticleFilter", key, spec, accepted)
@@ -158,8 +167,13 @@ class ParticleFilter(FilterEngine):
         if common is not None:
             return common
         known = {*problem.slices.template.static, *problem.series.observed}
-        proposals = SliceProposals(problem.slices, self.proposal or {}, "ParticleFilter")
-        proposals.check(problem.series.observed.keys())
+        if isinstance(self.proposal, str):
+            why = why_not_optimal(problem.slices, tuple(problem.series.observed))
+            if why is not None:
+                return why
+        else:
+            proposals = SliceProposals(problem.slices, self.proposal or {}, "ParticleFilter")
+            proposals.check(problem.series.observed.keys())
         for model in (problem.slices.first, problem.slices.later):
             inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
             reason = refuse_unsampled(model, inside, "ParticleFilter")
@@ -346,10 +360,13 @@ class ParticleFilter(FilterEngine):
         threshold = float(self.ess_threshold)
         if isinstance(scheme, Adaptive):
             scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
-        proposals = (
-            SliceProposals(slices, self.proposal, "ParticleFilter") if self.proposal else None
-        )
-        plan = SlicePlan(slices, plates_apart(slices), static, proposals)
+        apart = plates_apart(slices)
+        if isinstance(self.proposal, str):
+            plan: SlicePlan = OptimalPlan(slices, apart, static)
+        else:
+            asked = self.proposal or {}
+            proposals = SliceProposals(slices, asked, "ParticleFilter") if asked else None
+            plan = SlicePlan(slices, apart, static, proposals)
         stage: Any = None
         if self.auxiliary is not False:
             stage = PluggedIn(plan) if self.auxiliary is True else GivenStage(plan, self.auxiliary)

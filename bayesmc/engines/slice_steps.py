@@ -107,11 +107,12 @@ class SlicePlan:
         return TableWeighApart(model[name], table, self.apart)
 
     def _build(self, row: Row) -> list[Step]:
-        plain = {name: self.step(row, name) for name in self.slices.dynamic}
+        model = self.slices.model(row.t)
+        order = [n for n in model.nodes if n in self.slices.dynamic]  # slice 0 may have its own
+        plain = {name: self.step(row, name) for name in order}
         asked = [] if self.proposals is None else self.proposals.of(row)
         if not asked:
             return list(plain.values())
-        model = self.slices.model(row.t)
         steps = {name: plain.get(name, nothing) for name in model.nodes}
         return proposal_steps(model, row.seen, steps, asked, self.apart)
 
