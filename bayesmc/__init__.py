@@ -47,19 +47,19 @@ from bayesmc.distributions import (
     Wishart,
     WrappedNormal,
 )
-from bayesmc.engines.discrete_filter import DiscreteFilter
+from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact import Exact
-from bayesmc.engines.extended_kalman import ExtendedKalmanFilter
 from bayesmc.engines.gibbs import Gibbs
-from bayesmc.engines.grid_filter import GridFilter
+from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.importance import Importance
-from bayesmc.engines.kalman import KalmanFilter
+from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
+from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
 from bayesmc.engines.metropolis import MetropolisHastings
 from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
-from bayesmc.engines.particle_belief import ParticleBelief
-from bayesmc.engines.particle_filter import ParticleFilter
+from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.rejection import Rejection
-from bayesmc.engines.unscented_kalman import UnscentedKalmanFilter
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack

@@ -9,10 +9,10 @@ import numpy as np
 
 from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
-from bayesmc.engines.discrete_filter import DiscreteFilter
+from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.filtering import FilterEngine, Queries
-from bayesmc.engines.kalman import KalmanFilter
-from bayesmc.engines.particle_filter import ParticleFilter
+from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior

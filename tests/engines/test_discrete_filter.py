@@ -10,8 +10,9 @@ import pytest
 import scipy.special
 
 import bayesmc as bmc
-from bayesmc.engines import discrete_chain, discrete_run
-from bayesmc.engines.discrete_filter import DiscreteFilter
+from bayesmc.engines.discrete import chain as discrete_chain
+from bayesmc.engines.discrete import run as discrete_run
+from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.errors import (
     ParameterError,
     QueryError,

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines import grid_moves
-from bayesmc.engines.grid_filter import GridFilter
-from bayesmc.engines.grid_terms import Term, contract, largest, maximise
+from bayesmc.engines.grid import moves as grid_moves
+from bayesmc.engines.grid.filter import GridFilter
+from bayesmc.engines.grid.terms import Term, contract, largest, maximise
 from bayesmc.errors import (
     BudgetError,
     GridWarning,

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines import kalman_base, kalman_passes
-from bayesmc.engines.kalman import KalmanFilter
+from bayesmc.engines.kalman import base as kalman_base
+from bayesmc.engines.kalman import passes as kalman_passes
+from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.kernels.kalman import Conditioned, condition
 from bayesmc.testing.linear_dbns import LinearSeries, random_linear_dbn
 

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines import kalman_levels, kalman_passes, kalman_rows
-from bayesmc.engines.extended_kalman import ExtendedKalmanFilter
-from bayesmc.engines.kalman import KalmanFilter
-from bayesmc.engines.unscented_kalman import UnscentedKalmanFilter
+from bayesmc.engines.kalman import levels as kalman_levels
+from bayesmc.engines.kalman import passes as kalman_passes
+from bayesmc.engines.kalman import rows as kalman_rows
+from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
+from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
 from bayesmc.testing.linear_dbns import random_linear_dbn
 
 ENGINES = [

@@ -14,8 +14,8 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines import particle
-from bayesmc.engines.particle import Mover, Selection
+from bayesmc.engines.particles import cloud as particle
+from bayesmc.engines.particles.cloud import Mover, Selection
 from bayesmc.errors import (
     DegeneracyError,
     EvidenceError,
@@ -442,7 +442,7 @@ def worst(runs: list[Any], exact: Any) -> float:
 def test_backward_simulation_without_the_transition_is_caught(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from bayesmc.engines.particle_smoothing import Backward
+    from bayesmc.engines.particles.smoothing import Backward
 
     monkeypatch.setattr(
         Backward,
@@ -455,7 +455,7 @@ def test_backward_simulation_without_the_transition_is_caught(
 
 
 def test_rejection_accepts_and_draws_the_rest_exactly() -> None:
-    from bayesmc.engines.particle_smoothing import Backward
+    from bayesmc.engines.particles.smoothing import Backward
     from bayesmc.randomness import Purpose, seed_sequence, stream
 
     engine = bmc.ParticleFilter(2000)

@@ -1,0 +1,1 @@
+"""Exact filters for templates whose hidden nodes are finite."""

@@ -1,0 +1,373 @@
+"""What beliefs about finite variables say of the nodes of every slice: tables, means, queries, paths."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.discrete.chain import most_likely
+from bayesmc.engines.discrete.limits import first_gap
+from bayesmc.engines.discrete.rows import Rows, Term
+from bayesmc.engines.discrete.run import Run
+from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
+from bayesmc.engines.discrete.sums import Variable, groups, log_max, product
+from bayesmc.engines.filtering import Answers, Queries
+from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.network import CompiledNode
+from bayesmc.results.posterior import circular_variance
+
+
+class SliceAnswers:
+    """Reads answers off a run.
+
+    Parameters
+    ----------
+    run : Run
+        Passed forward, and backward where answers given later rows are wanted.
+    """
+
+    def __init__(self, run: Run) -> None:
+        self.run, self.plan = run, run.plan
+        self.reader = run.plan.reader
+        self.model = run.plan.slices.first
+
+    def of(self, names: Sequence[str]) -> Answers:
+        """Tables of finite nodes, means and variances of others; what cannot be told is left out."""
+        found = Answers({}, {}, {})
+        for name in names:
+            node = self.model[name]
+            if name in self.reader.variables:
+                found.tables[name] = self._table(name, node)
+            elif self._can_tell(name, node):
+                self._tell(name, node, found)
+        return found
+
+    def hands_on(self, name: str) -> bool:
+        """Whether a node is part of the state of a chain."""
+        return any(v[1] == name for c in self.plan.chains for v in c.state)
+
+    def pairs(self, name: str) -> np.ndarray:
+        """Joint tables of a node and itself in the slice before, (steps - 1, *plates, states, states)."""
+        node, size = self.model[name], self.reader.card(name)
+        out = np.empty((self.run.steps, *node.plate_shape, size, size))
+        for element in range(self.reader.elements(name)):
+            scope = ((1, name, element), (0, name, element))
+            for start, stop in self._stretches(scope):
+                if start > 0:
+                    self._place(out, start, stop, node, element, self.run.joint(scope, start, stop))
+        return out[1:]
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Mean of a function of nodes of a slice, whose arguments have one leading axis, in every slice.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError, UnsupportedError, BudgetError
+        """
+        names = arguments_of(function)
+        for name in names:
+            if name not in self.model.nodes:
+                raise UnknownNodeError(
+                    f"a query reads {name!r}, which is no node of a slice; there are {list(self.model.nodes)}"
+                )
+        parts = []
+        kinds = {k: self.reader.question(names, k) for k in (0, 1, 2)}
+        for term in kinds.values():
+            self._check_question(term)
+        entries = max(math.prod(map(float, self.reader.cards(t))) for t in kinds.values())
+        for start, stop in self._cut(kinds[2], entries):
+            rows = self.plan.rows(self.run.series, start, stop)
+            parts.append(self._expectation(function, names, kinds[rows.kind], rows))
+        return np.concatenate(parts)
+
+    # ---- private ----------------------------------------------------------------------------
+
+    def _table(self, name: str, node: CompiledNode) -> np.ndarray:
+        alone = (0, name, 0)
+        number = self.plan.chain_of(alone)
+        if self.plan.chains[number].state == (alone,) and node.plates == self.reader.apart:
+            belief = self.run.beliefs[number].belief  # as it stands: long series are not copied
+            return belief.reshape(self.run.steps, *node.plate_shape, -1)
+        out = np.empty((self.run.steps, *node.plate_shape, self.reader.card(name)))
+        for element in range(self.reader.elements(name)):
+            scope = ((0, name, element),)
+            for start, stop in self._stretches(scope):
+                self._place(out, start, stop, node, element, self.run.joint(scope, start, stop))
+        return out
+
+    def _can_tell(self, name: str, node: CompiledNode) -> bool:
+        """Whether all that a node reads is known wherever it is missing itself."""
+        series = self.run.series
+        needed = np.ones((series.steps, *node.plate_shape), dtype=bool)
+        seen = series.observed.get(name)
+        if node.is_stochastic and seen is not None:
+            needed = np.zeros_like(needed) if seen.mask is None else ~seen.mask
+        needed[: series.steps - self.run.steps] = False
+        return all(
+            first_gap(self.plan, series, self.plan.terms[name, k], needed) is None
+            for k in (0, 1, 2)
+        )
+
+    def _tell(self, name: str, node: CompiledNode, found: Answers) -> None:
+        """Answers of a node that is no variable: averages over what it reads."""
+        circle = node.support is not None and node.support.kind == "circle"
+        size = (self.reader.card(name),) if self._is_tabular(name) else ()
+        rest = len(node.event_shape) + len(size)
+        first = np.empty((self.run.steps, *node.value_shape, *size))
+        second = np.empty(first.shape)
+        for start, stop in self._cut(self.plan.terms[name, 2], 1.0):
+            rows = self.plan.rows(self.run.series, start, stop)
+            term = self.plan.terms[name, rows.kind]
+            try:
+                parts = self.reader.over_rows(term, rows, self._moments)
+            except UnsupportedError:  # a family without closed moments
+                return
+            for element in range(self.reader.elements(name)):
+                scope = self.reader.scope(term, element)
+                weights = self.run.joint(scope, start, stop)
+                cards = len(self.reader.cards(term))
+                own = self.reader.at_element(parts[0], node, cards, element, rest)
+                one = _averaged(weights, own, rest)
+                self._place(first, start, stop, node, element, one)
+                if parts[1] is None:
+                    continue
+                other = self.reader.at_element(parts[1], node, cards, element, rest)
+                if not circle:
+                    centre = one.reshape(*one.shape[:2], *(1,) * cards, *one.shape[2:])
+                    other = other + (own - centre) ** 2
+                self._place(second, start, stop, node, element, _averaged(weights, other, rest))
+        self._put_seen(name, node, circle, first, second)
+        if size:
+            found.tables[name] = first
+        elif circle:
+            found.means[name] = np.arctan2(second, first)
+            found.variances[name] = circular_variance(first, second)
+        else:
+            found.means[name] = first
+            found.variances[name] = second
+
+    def _moments(self, term: Term, rows: Rows) -> tuple[Any, ...]:
+        """What is averaged of a node: probabilities, or mean and variance, or mean cosine and sine."""
+        node = self.model[term.name]
+        with marking_invalid(), np.errstate(all="ignore"):
+            result, _ = self.reader.evaluate(term, rows)
+            lead = 1 + len(self.reader.cards(term)) + len(node.plates)
+            if not isinstance(result, Distribution):
+                own = self.reader.model(term.kind, 0)[term.name]
+                value = np.asarray(result)
+                if self._is_tabular(term.name):
+                    one_hot = value[..., None] == np.arange(self.reader.card(term.name))
+                    return _padded(one_hot * 1.0, lead + 1), None
+                value = np.asarray(own.decode(value), dtype=float)
+                value = _padded(value, lead + len(node.event_shape))
+                return value, np.zeros((1,) * value.ndim)
+            if node.domain is not None:
+                return _padded(np.asarray(result.probs_table), lead + 1), None
+            ndim = lead + len(node.event_shape)
+            mean, var = _padded(result.mean, ndim), _padded(result.var, ndim)
+            if node.support is not None and node.support.kind == "circle":
+                length = np.exp(-0.5 * var)
+                return length * np.cos(mean), length * np.sin(mean)
+            return mean, var
+
+    def _is_tabular(self, name: str) -> bool:
+        """Whether a node has the same states in all slices; computed nodes may not, and are numbers then."""
+        now, later = self.model[name].domain, self.plan.slices.later[name].domain
+        return now is not None and later is not None and now.states == later.states
+
+    def _put_seen(
+        self, name: str, node: CompiledNode, circle: bool, first: np.ndarray, second: np.ndarray
+    ) -> None:
+        """Elements that were seen have the value that was seen."""
+        seen = self.run.series.observed.get(name)
+        if seen is None or not node.is_stochastic:
+            return
+        value = seen.value[-self.run.steps :]
+        mask = np.ones(value.shape[: 1 + len(node.plates)], dtype=bool)
+        if seen.mask is not None:
+            mask = seen.mask[-self.run.steps :]
+        if node.domain is not None:
+            first[mask] = np.eye(node.domain.size)[value[mask].astype(np.intp)]
+        elif circle:
+            first[mask], second[mask] = np.cos(value[mask]), np.sin(value[mask])
+        else:
+            first[mask], second[mask] = value[mask], 0.0
+
+    def _place(
+        self,
+        out: np.ndarray,
+        start: int,
+        stop: int,
+        node: CompiledNode,
+        element: int,
+        array: np.ndarray,
+    ) -> None:
+        """Write an element's answers ``(rows, sequences, *rest)`` where they belong."""
+        reader = self.reader
+        shape = (array.shape[0], *(reader.lead if array.shape[1] > 1 else (1,) * len(reader.lead)))
+        full = array.reshape(*shape, *array.shape[2:])
+        outer = [p for p in node.plates if p in reader.apart]
+        index: list[Any] = [slice(None)]
+        index += [slice(None) if p in outer else 0 for p in reader.apart]
+        kept = [p for p in reader.apart if p in outer]
+        full = full[tuple(index)]
+        order = [1 + kept.index(p) for p in outer]
+        full = full.transpose(0, *order, *range(1 + len(order), full.ndim))
+        inner = [p for p in node.plates if p not in reader.apart]
+        sizes = tuple(self.model.sizes[p] for p in inner)
+        at = iter(np.unravel_index(element, sizes) if inner else ())
+        where = [int(next(at)) if p in inner else slice(None) for p in node.plates]
+        rows = slice(start - self.run.first, stop - self.run.first)
+        out[(rows, *where)] = full
+
+    def _stretches(self, scope: Sequence[Variable]) -> list[tuple[int, int]]:
+        """Slices cut so that the joint of some variables stays within bounds."""
+        entries = 1.0
+        for number in {self.plan.chain_of(v) for v in scope}:
+            chain = self.plan.chains[number]
+            plain = set(scope) <= set(chain.state)
+            entries = max(entries, float(chain.size) if plain else self.plan.widest(chain))
+        return self.run.stretches(entries * self.run.sequences)
+
+    def _cut(self, term: Term, more: float) -> list[tuple[int, int]]:
+        """Slices cut so that a term's tables and the joints of what it reads stay within bounds."""
+        entries = max(more, math.prod(map(float, self.reader.cards(term))))
+        for _, name in (*term.alone, *term.whole):
+            for element in range(self.reader.elements(name)):
+                chain = self.plan.chains[self.plan.chain_of((0, name, element))]
+                entries = max(entries, self.plan.widest(chain))
+        return self.run.stretches(entries * self.run.sequences)
+
+    def _check_question(self, term: Term) -> None:
+        entries = math.prod(map(float, self.reader.cards(term)))
+        if entries > BLOCK_ENTRIES:
+            raise BudgetError(
+                f"a query reads nodes with {entries:.3g} joint states in a slice; ask about fewer nodes at "
+                "once, or use ParticleFilter(particles)",
+                int(min(8 * entries, 2**62)),
+            )
+        gap = first_gap(self.plan, self.run.series, term)
+        if gap is not None:
+            raise UnsupportedError(
+                f"a query reads {gap[0]!r}, which is missing in slice {gap[1]} and has no finite set of "
+                "states; use ParticleFilter(particles)"
+            )
+
+    def _expectation(
+        self, function: Callable[..., Any], names: Sequence[str], term: Term, rows: Rows
+    ) -> np.ndarray:
+        reader = self.reader
+        placed = rows.on_axes(reader, term)
+        cards = reader.cards(term)
+        lead = (rows.count, *cards)
+        count = math.prod(lead)
+        arguments = []
+        with marking_invalid(), np.errstate(all="ignore"):
+            for name in names:
+                node = reader.model(term.kind, 0)[name]
+                value = np.broadcast_to(placed.value(name, 0), (*lead, *node.value_shape))
+                arguments.append(node.decode(value.reshape(count, *node.value_shape)))
+            values = np.asarray(function(*arguments))
+        if (
+            not values.ndim
+            or len(values) != count
+            or (values.shape[1 : 1 + len(reader.lead)] != reader.lead)
+        ):
+            apart = f", then those of plates {reader.apart}" if reader.apart else ""
+            raise QueryError(
+                f"a query returns shape {values.shape}; it must return one value per configuration, the axis "
+                f"of {count} configurations first{apart}"
+            )
+        values = values.reshape(rows.count, math.prod(cards), *values.shape[1:])
+        scope = reader.scope_of_keys(term)
+        weights = self.run.joint(scope, rows.start, rows.stop)
+        weights = weights.reshape(rows.count, *reader.lead, -1)
+        weights = np.moveaxis(weights, -1, 1)
+        weights = weights.reshape(weights.shape + (1,) * (values.ndim - weights.ndim))
+        return np.where(weights > 0, weights * values, 0.0).sum(axis=1)
+
+
+def arguments_of(function: Callable[..., Any]) -> list[str]:
+    """Nodes that a query reads; arguments with a default are none, as for the functions of nodes."""
+    parameters = inspect.signature(function).parameters.values()
+    return [p.name for p in parameters if p.default is inspect.Parameter.empty]
+
+
+def answer_queries(answers: SliceAnswers, queries: Queries | None) -> dict[str, np.ndarray]:
+    """Expectations of functions in every slice, by name."""
+    return {n: answers.expectation(f) for n, f in (queries or {}).items()}
+
+
+def best_path(run: Run) -> dict[Variable, np.ndarray] | None:
+    """States of all variables on the most likely path, shape (steps, sequences); None where there is none."""
+    plan = run.plan
+    found: dict[Variable, np.ndarray] = {}
+    for number, chain in enumerate(plan.chains):
+        path = most_likely(run.blocks(number, log_max), run.steps, run.sequences, chain.size)
+        if path is None:
+            return None
+        shape = tuple(plan.cards[v] for v in chain.state)
+        states = np.unravel_index(path, shape) if shape else ()
+        own = dict(zip(chain.state, states, strict=True))
+        for variable in chain.inside:
+            own[variable] = np.empty((run.steps, run.sequences), dtype=np.intp)
+        if chain.inside:
+            _fill_inside(run, number, own)
+        found |= own
+    return found
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -> None:
+    """The best states of the variables of a slice that no other slice reads, given those that some do."""
+    plan = run.plan
+    chain = plan.chains[number]
+    for start, stop in run.stretches(plan.widest(chain) * run.sequences):
+        rows = plan.rows(run.series, start, stop)
+        pieces = run.pieces(number, rows)
+        for group in groups(chain.inside, [p.scope for p in pieces]):
+            members = [p for p in pieces if set(group) & set(p.scope)]
+            border = tuple(dict.fromkeys(v for p in members for v in p.scope if v not in group))
+            sizes = tuple(plan.cards[v] for v in group)
+            entries = math.prod(map(float, (*sizes, *(plan.cards[v] for v in border))))
+            if entries > BLOCK_ENTRIES:
+                raise BudgetError(
+                    f"most_likely: {len(group)} hidden nodes of a slice have {entries:.3g} joint states that "
+                    "meet in one density; observe more of them",
+                    int(min(8 * entries, 2**62)),
+                )
+            table = product(members, (*border, *group), plan.cards)
+            table = table.reshape(*table.shape[: 2 + len(border)], -1)
+            here = np.arange(rows.count)[:, None] if len(table) > 1 else 0
+            there = np.arange(run.sequences) if table.shape[1] > 1 else 0
+            at = [_on_path(states, v, start - run.first, stop - run.first) for v in border]
+            best = table[(here, there, *at)].argmax(axis=-1)
+            best = np.broadcast_to(best, (rows.count, run.sequences))
+            for variable, state in zip(group, np.unravel_index(best, sizes), strict=True):
+                states[variable][start - run.first : stop - run.first] = state
+
+
+def _on_path(
+    states: Mapping[Variable, np.ndarray], variable: Variable, first: int, last: int
+) -> np.ndarray:
+    lag, name, element = variable
+    return states[0, name, element][first - lag : last - lag]
+
+
+def _averaged(weights: np.ndarray, values: np.ndarray, rest: int) -> np.ndarray:
+    """Mean over configurations: weights ``(rows, sequences, *cards)``, values with ``rest`` more axes."""
+    full = weights.reshape(weights.shape + (1,) * rest)
+    axes = tuple(range(2, weights.ndim))
+    return np.where(full > 0, full * values, 0.0).sum(axis=axes)
+
+
+def _padded(array: np.ndarray, ndim: int) -> np.ndarray:
+    return array.reshape((1,) * (ndim - array.ndim) + array.shape)

@@ -1,0 +1,120 @@
+"""An exact belief about one slice, as ``DiscreteFilter.start`` and ``step`` give it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet, Row, Series, Slices
+from bayesmc.engines.discrete.answers import SliceAnswers
+from bayesmc.engines.discrete.run import Run
+from bayesmc.errors import QueryError
+from bayesmc.network import Observed
+from bayesmc.results import SeriesPosterior
+
+#: rows that a slice may read: its own and two before
+_ROWS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class DiscreteBelief:
+    """Probabilities of the nodes of one slice.
+
+    Attributes
+    ----------
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import DiscreteFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], initial=[0.5, 0.5])
+    >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+    >>> engine = DiscreteFilter()
+    >>> belief = engine.step(engine.start(dbn), {"umbrella": 1})
+    >>> belief.t, belief.probabilities("rain").round(3).tolist()
+    (0, [0.182, 0.818])
+    """
+
+    dbn: DynamicBayesNet = field(repr=False)
+    static: Mapping[str, Any] = field(repr=False)
+    t: int = -1
+    log_marginal_likelihood: Any = 0.0
+    run: Run | None = field(default=None, repr=False)
+
+    @property
+    def inputs(self) -> dict[str, np.ndarray]:
+        """Inputs of the slice."""
+        if self.run is None:
+            return {}
+        return {n: v[-1] for n, v in self.run.series.inputs.items()}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that are answered for, parents first."""
+        return self._posterior.names
+
+    def mean(self, name: str) -> np.ndarray:
+        """Mean, shape ``(*plates, *event)``; circular for angles; labels have none."""
+        return self._posterior.mean(name)[0]
+
+    def var(self, name: str) -> np.ndarray:
+        """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
+        return self._posterior.var(name)[0]
+
+    def std(self, name: str) -> np.ndarray:
+        """Standard deviation, shape ``(*plates, *event)``."""
+        return np.sqrt(self.var(name))
+
+    def probabilities(self, name: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
+        return self._posterior.probabilities(name)[0]
+
+    @cached_property
+    def _posterior(self) -> SeriesPosterior:
+        if self.run is None:
+            raise QueryError(
+                "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
+            )
+        slices = self.run.plan.slices
+        found = SliceAnswers(self.run).of(slices.dynamic)
+        return SeriesPosterior(
+            slices.first, None, "filter", None, tables=found.tables, means=found.means,
+            variances=found.variances, steps=1, start=self.t,
+        )  # fmt: skip
+
+
+def window(slices: Slices, before: Series | None, row: Row) -> Series:
+    """The last few rows as a series that ends with ``row``."""
+    names = {*row.seen, *(before.observed if before is not None else ())}
+    kept = 0 if before is None else min(before.steps, _ROWS - 1)
+    observed = {}
+    for name in names:
+        node = slices.first[name]
+        old = None if before is None else before.observed.get(name)
+        new = row.seen.get(name)
+        sample = new.value if new is not None else old.value[-1]  # type: ignore[union-attr]
+        value = np.empty((kept + 1, *node.value_shape), dtype=sample.dtype)
+        mask = np.zeros((kept + 1, *node.plate_shape), dtype=bool)
+        value[:] = sample
+        if old is not None and kept:
+            value[:kept] = old.value[-kept:]
+            mask[:kept] = True if old.mask is None else old.mask[-kept:]
+        if new is not None:
+            mask[kept] = True if new.mask is None else new.mask
+        if mask.any():
+            observed[name] = Observed(value, mask)
+    inputs = {}
+    for name in slices.template.inputs:
+        now = row.inputs[name][None]
+        past = [] if before is None or not kept else [before.inputs[name][-kept:]]
+        inputs[name] = np.concatenate([*past, now])
+    return Series(kept + 1, observed, inputs, {}, row.t - kept)

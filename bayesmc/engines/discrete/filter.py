@@ -1,0 +1,349 @@
+"""``DiscreteFilter``: exact answers over time where everything hidden is finite.
+
+Options, refusals and the calls; tables of slices are made in ``slices``, passed along in
+``chain`` and read in ``answers``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem, read_row, read_static
+from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, arguments_of, best_path
+from bayesmc.engines.discrete.belief import DiscreteBelief, window
+from bayesmc.engines.discrete.limits import size_refusal, why_unreadable
+from bayesmc.engines.discrete.path import path_values
+from bayesmc.engines.discrete.run import Run
+from bayesmc.engines.discrete.slices import DiscreteSlices
+from bayesmc.engines.filtering import FilterEngine, Queries, observed_answers
+from bayesmc.engines.slice_steps import plates_apart
+from bayesmc.errors import BayesmcError, BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.progress import Progress
+from bayesmc.results import SeriesPosterior
+
+
+@dataclass(frozen=True)
+class DiscreteFilter(FilterEngine):
+    """Exact filtering, smoothing and decoding where all hidden nodes have finitely many values.
+
+    The nodes that the next slice reads form one joint state; whatever else is hidden is summed out within
+    its slice. Variables that never meet are passed separately, and elements of plates that never meet are
+    one more array axis, so 64 sequences cost little more than one. Observed nodes may have any density,
+    and be read by the next slice; where one is missing, it is averaged over if nothing depends on it.
+
+    Parameters
+    ----------
+    max_states : int
+        Joint states of one chain above which it refuses.
+    max_bytes : float
+        Memory above which it refuses, with the figure, before allocating.
+
+    Notes
+    -----
+    A slice costs the square of the number of joint states. ``most_likely`` maximises over all hidden finite
+    nodes together, missing observations included; a missing continuous observation is averaged over.
+
+    References
+    ----------
+    Rabiner (1989), A tutorial on hidden Markov models; Murphy (2002), Dynamic Bayesian networks, sec. 3.4
+    (the interface algorithm); Koller and Friedman (2009), sec. 15.2.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import DiscreteFilter
+    >>> dbn = bmc.DynamicBayesNet("umbrella world")
+    >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], ("no", "yes"), initial=[0.5, 0.5])
+    >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]], ("no", "yes"))
+    >>> seen = {"umbrella": ["yes", "yes", "no"]}
+    >>> smoothed = bmc.smooth(dbn, seen, engine=DiscreteFilter())
+    >>> smoothed.probabilities("rain")[:, 1].round(3).tolist()
+    [0.862, 0.799, 0.191]
+    >>> bmc.most_likely(dbn, seen, engine=DiscreteFilter())["rain"].tolist()
+    ['yes', 'yes', 'no']
+    """
+
+    max_states: int = 1 << 16
+    max_bytes: float = 2.0 * 2**30
+
+    label: ClassVar[str] = "discrete filter"
+
+    def __post_init__(self) -> None:
+        n = self.max_states
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ValueError(
+                f"DiscreteFilter(max_states={n!r}): give a number of states, 1 or more"
+            )
+        if not (isinstance(self.max_bytes, (int, float)) and self.max_bytes > 0):
+            raise ValueError(
+                f"DiscreteFilter(max_bytes={self.max_bytes!r}): give a positive number of bytes"
+            )
+
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        common = super().refusal(problem)
+        if common is not None:
+            return common
+        error = self._why_not(problem)
+        return None if error is None else str(error)
+
+    def describe(self, problem: SeriesProblem) -> dict[str, str]:
+        plan = self._plan(problem)
+        sizes = {v[1]: c.size for c in plan.chains for v in c.state}
+        found = {}
+        for name in problem.slices.template.later:
+            if name in problem.slices.template.inputs:
+                found[name] = "input"
+            elif name in problem.slices.template.static:
+                found[name] = "static, known"
+            elif name in sizes:
+                found[name] = f"part of a state with {sizes[name]} values"
+            elif name in plan.reader.variables:
+                found[name] = "summed out in its slice"
+            elif not problem.model[name].is_stochastic:
+                found[name] = "computed"
+            elif name in problem.series.observed:
+                found[name] = "observed, a likelihood of the state"
+                if problem.series.observed[name].mask is not None:
+                    found[name] += "; averaged over where it is missing"
+            else:
+                found[name] = "averaged over"
+        return found
+
+    def filter(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        keep: str | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> DiscretePosterior:
+        if keep is not None:
+            raise ValueError(
+                f"keep={keep!r}: an exact filter has no particles to keep; leave it out"
+            )
+        return self._answer(problem, "filter", None, queries, progress)
+
+    def smooth(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> DiscretePosterior:
+        kind = "smooth" if lag is None else "fixed-lag"
+        return self._answer(problem, kind, lag, queries, progress)
+
+    def most_likely(
+        self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
+    ) -> dict[str, np.ndarray]:
+        self._check(problem, leaves=False)
+        run = Run(self._plan(problem, leaves=False), problem.series)
+        path = best_path(run)
+        if path is None or run.is_suspect:
+            run.forward()  # says what is impossible, or wrong
+        assert path is not None
+        return path_values(run, path, problem.hidden)
+
+    def start(
+        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
+    ) -> DiscreteBelief:
+        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes.
+
+        ``rng`` is taken as other filters take it; nothing is random here.
+        """
+        dbn.validate()
+        return DiscreteBelief(dbn.copy(), dict(static or {}))
+
+    def step(
+        self,
+        belief: DiscreteBelief,
+        observations: Mapping[str, Any] | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> DiscreteBelief:
+        """The belief about the next slice, whose row this is; the old belief stays as it is.
+
+        Parameters
+        ----------
+        observations : dict, optional
+            Node -> its value in this slice, without an axis for time; what is left out is missing.
+        inputs : dict, optional
+            Input -> its value in this slice.
+
+        Raises
+        ------
+        EvidenceError, ZeroProbabilityError, UnsupportedError
+        """
+        t, run = belief.t + 1, belief.run
+        slices, row = read_row(
+            belief.dbn, run.plan.slices if run else None, t, observations, inputs, belief.inputs
+        )
+        if run is None:
+            static = read_static(slices, belief.static)
+            plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)
+            error = self._too_large(plan, 1)
+            if error is not None:
+                raise error
+        else:
+            plan = run.plan
+        series = window(slices, None if run is None else run.series, row)
+        reason = why_unreadable(plan, series, last=True)
+        if reason is not None:
+            raise UnsupportedError(_words(reason))
+        before = None if run is None else [p.log_belief[-1] for p in run.passed]
+        after = Run(plan, series, t, before)
+        increment = after.forward()[0].reshape(plan.reader.lead)
+        total = belief.log_marginal_likelihood + increment
+        return DiscreteBelief(
+            belief.dbn, belief.static, t, total if np.ndim(total) else float(total), after
+        )
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _answer(
+        self,
+        problem: SeriesProblem,
+        kind: str,
+        lag: int | None,
+        queries: Queries | None,
+        progress: bool | None,
+    ) -> DiscretePosterior:
+        leaves = not self._asks_for_leaves(problem, queries)
+        self._check(problem, leaves)
+        run = Run(self._plan(problem, leaves), problem.series)
+        with Progress(3, self.label, progress) as bar:
+            increments = run.forward().reshape(problem.steps, *run.plan.reader.lead)
+            bar.advance()
+            if kind != "filter":
+                run.backward(lag)
+            bar.advance()
+            answers = SliceAnswers(run)
+            seen, hidden = observed_answers(problem), answers.of(problem.hidden)
+            found = DiscretePosterior(
+                problem.model, self, kind, increments,
+                tables={**seen.tables, **hidden.tables},
+                means={**seen.means, **hidden.means},
+                variances={**seen.variances, **hidden.variances},
+                queries=answer_queries(answers, queries),
+                start=problem.series.start,
+            )  # fmt: skip
+            run.forget()
+            bar.advance()
+        return found.read_from(answers)
+
+    def _asks_for_leaves(self, problem: SeriesProblem, queries: Queries | None) -> bool:
+        """Whether a query reads finite nodes that would be left to be answered for one by one."""
+        names = {p for f in (queries or {}).values() for p in arguments_of(f)}
+        own = self._plan(problem).reader.variables
+        return any(
+            n in names and problem.model[n].domain is not None and n not in own
+            and problem.model[n].is_stochastic
+            for n in problem.hidden
+        )  # fmt: skip
+
+    def _check(self, problem: SeriesProblem, leaves: bool) -> None:
+        error = self._why_not(problem, leaves)
+        if error is not None:
+            raise error
+
+    def _why_not(self, problem: SeriesProblem, leaves: bool = True) -> UnsupportedError | None:
+        """What speaks against this engine, found before any large table exists."""
+        try:
+            plan = self._plan(problem, leaves)
+            reason = why_unreadable(plan, problem.series)
+        except BudgetError as error:
+            return error
+        except BayesmcError as error:
+            return UnsupportedError(_words(str(error)))
+        if reason is not None:
+            return UnsupportedError(_words(reason))
+        too_large = self._too_large(plan, problem.steps)
+        if too_large is not None:
+            return too_large
+        try:
+            plan.try_out(problem.series)
+        except BayesmcError as error:
+            return UnsupportedError(
+                "DiscreteFilter evaluates functions on all states of their parents, also impossible ones, "
+                f"and one of them fails there: {error}; use ParticleFilter(particles)"
+            )
+        return None
+
+    def _too_large(self, plan: DiscreteSlices, steps: int) -> BudgetError | None:
+        found = size_refusal(plan, steps, int(self.max_states), float(self.max_bytes))
+        if found is None:
+            return None
+        return BudgetError(
+            f"DiscreteFilter: {found[0]}; use ParticleFilter(particles)", int(min(found[1], 2**62))
+        )
+
+    def _plan(self, problem: SeriesProblem, leaves: bool = True) -> DiscreteSlices:
+        key = f"discrete slices {leaves}"
+        if key not in problem.cache:
+            seen = frozenset(n for n, o in problem.series.observed.items() if o.mask is None)
+            absent = frozenset(
+                n for n in problem.slices.dynamic if n not in problem.series.observed
+            )
+            static = {n: o.value for n, o in problem.series.static.items()}
+            apart = plates_apart(problem.slices)
+            problem.cache[key] = DiscreteSlices(problem.slices, apart, seen, static, leaves, absent)
+        return problem.cache[key]
+
+
+class DiscretePosterior(SeriesPosterior):
+    """What a ``DiscreteFilter`` says of every slice: tables, means, and joint tables of two slices in a row.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import DiscreteFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.table("x", ["x_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
+    >>> dbn.table("y", ["x"], [[0.7, 0.3], [0.1, 0.9]])
+    >>> smoothed = bmc.smooth(dbn, {"y": [0, 1, 1]}, engine=DiscreteFilter())
+    >>> smoothed.pairs("x").shape, smoothed.pairs("x").sum(axis=(1, 2)).round(6).tolist()
+    ((2, 2, 2), [1.0, 1.0])
+    """
+
+    _answers: SliceAnswers | None = None
+
+    def read_from(self, answers: SliceAnswers) -> DiscretePosterior:
+        """With the beliefs that joint tables are worked out from."""
+        self._answers = answers
+        return self
+
+    def pairs(self, name: str) -> np.ndarray:
+        """Joint tables of a node in two slices in a row, ``(time - 1, *plates, states before, states)``.
+
+        Entry ``t - 1`` is of slices ``t - 1`` and ``t``, given the rows that the answer of slice ``t`` rests
+        on.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError
+        """
+        if name not in self.model.nodes:
+            raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
+        answers = self._answers
+        if answers is None or (1, name, 0) not in answers.plan.cards or not answers.hands_on(name):
+            raise QueryError(
+                f"pairs({name!r}): the node is no hidden finite node that the next slice reads"
+            )
+        return answers.pairs(name)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _words(reason: str) -> str:
+    return (
+        f"DiscreteFilter needs every hidden node to have finitely many values, but {reason}; use "
+        "ParticleFilter(particles)"
+    )

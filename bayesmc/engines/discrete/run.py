@@ -1,0 +1,270 @@
+"""A series passed through the chains of a template, and what that says of any variables of a slice.
+
+The one loop over stretches of time: tables are made for a stretch, used, and made anew on the way back, so
+that memory holds beliefs and a few stretches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import Series
+from bayesmc.engines.discrete.chain import Passed, filtered, lagged, smoothed
+from bayesmc.engines.discrete.rows import Rows
+from bayesmc.engines.discrete.slices import STRETCH_ENTRIES, Block, DiscreteSlices
+from bayesmc.engines.discrete.sums import Piece, Variable, eliminate, log_sum, spread
+from bayesmc.errors import ParameterError, ZeroProbabilityError
+
+#: bytes of factors that are kept for the next pass
+_KEPT = 1 << 28
+
+
+class Run:
+    """Beliefs about every chain of a template.
+
+    Parameters
+    ----------
+    plan : DiscreteSlices
+    series : Series
+    first : int, optional
+        The slice to begin with; rows before it are there to be read.
+    before : list of ndarray, optional
+        Logs of the beliefs in the slice before, by chain, shape (sequences, states).
+    """
+
+    def __init__(
+        self,
+        plan: DiscreteSlices,
+        series: Series,
+        first: int = 0,
+        before: Sequence[np.ndarray] | None = None,
+    ) -> None:
+        self.plan, self.series, self.first = plan, series, first
+        self.stop = series.start + series.steps
+        self.before = before
+        self.sequences = plan.reader.sequences
+        self._kept: dict[Any, list[Piece]] = {}
+        self._suspect: set[int] = set()  # chains with bad parameters somewhere
+        self.passed: list[Passed] = []
+        self.beliefs: list[Passed] = []
+
+    @property
+    def steps(self) -> int:
+        return self.stop - self.first
+
+    @property
+    def is_suspect(self) -> bool:
+        """Whether some configuration, perhaps an impossible one, has bad parameters."""
+        return bool(self._suspect)
+
+    # ---- passing ----------------------------------------------------------------------------
+
+    def forward(self) -> np.ndarray:
+        """Filter all chains; log densities of the rows, shape (steps, sequences).
+
+        Raises
+        ------
+        ZeroProbabilityError, ParameterError
+        """
+        increments = np.zeros((self.steps, self.sequences))
+        for start, stop in self._stretches(None):
+            rows = self.plan.rows(self.series, start, stop)
+            for piece in self.pieces(None, rows):
+                increments[start - self.first : stop - self.first] += piece.log
+                if piece.invalid is not None and piece.invalid.any():
+                    row = int(np.argmax(piece.invalid.reshape(len(piece.invalid), -1).any(axis=1)))
+                    raise _bad_parameters(piece.node, start + row)
+        for number, chain in enumerate(self.plan.chains):
+            last = None if self.before is None else self.before[number]
+            found = filtered(self.blocks(number), self.steps, self.sequences, chain.size, last)
+            increments += found.increments
+            self.passed.append(found)
+        self.beliefs = self.passed
+        if not (increments > -np.inf).all():
+            self._refuse_impossible(increments)
+        self._refuse_invalid()
+        return increments
+
+    def backward(self, lag: int | None) -> None:
+        """Beliefs given all rows, or those up to ``lag`` slices later."""
+        self.beliefs = [
+            smoothed(self.blocks(k), found) if lag is None else lagged(self.blocks(k), found, lag)
+            for k, found in enumerate(self.passed)
+        ]
+
+    def forget(self) -> None:
+        """Let go of factors that were kept for the next pass."""
+        self._kept.clear()
+
+    def blocks(
+        self, number: int, reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum
+    ) -> Callable[[bool], Iterator[Block]]:
+        """Makes the blocks of one chain, in either direction."""
+
+        def make(backwards: bool) -> Iterator[Block]:
+            cuts = self._stretches(number)
+            for start, stop in reversed(cuts) if backwards else cuts:
+                rows = self.plan.rows(self.series, start, stop)
+                yield self.plan.block(number, self.pieces(number, rows), rows, reduce)
+
+        return make
+
+    def pieces(self, number: int | None, rows: Rows) -> list[Piece]:
+        """The factors of a chain in some slices; the last few are kept."""
+        key = (number, rows.start, rows.stop)
+        found = self._kept.get(key)
+        if found is None:
+            found = [
+                p
+                for p in self.plan.pieces(rows, number)
+                if (not p.scope if number is None else p.scope and self._is_of(p, number))
+            ]
+            while self._kept and sum(map(_bytes, self._kept.values())) > _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = found
+            if number is not None and any(p.invalid is not None for p in found):
+                self._suspect.add(number)
+        return found
+
+    def stretches(self, entries: float) -> list[tuple[int, int]]:
+        """All slices cut so that tables of so many entries a row stay within bounds."""
+        length = max(1, int(STRETCH_ENTRIES / max(entries, 1.0)))
+        return list(self.plan.stretches(self.first, self.stop, length))
+
+    # ---- reading ----------------------------------------------------------------------------
+
+    def joint(self, scope: Sequence[Variable], start: int, stop: int) -> np.ndarray:
+        """Probabilities of variables in slices of one kind, shape (rows, sequences, *cards)."""
+        scope = tuple(scope)
+        cards = self.plan.cards
+        owners = list(dict.fromkeys(self.plan.chain_of(v) for v in scope))
+        if len(owners) == 1:
+            found = self._marginal(owners[0], scope, start, stop)
+        else:
+            found = np.ones((1, 1, *(cards[v] for v in scope)))
+        for number in owners if len(owners) > 1 else ():
+            own = tuple(v for v in scope if self.plan.chain_of(v) == number)
+            found = found * spread(self._marginal(number, own, start, stop), own, scope)
+        return np.broadcast_to(found, (stop - start, self.sequences, *found.shape[2:]))
+
+    # ---- private ----------------------------------------------------------------------------
+
+    def _stretches(self, number: int | None) -> list[tuple[int, int]]:
+        entries = self.sequences if number is None else self.plan.row_entries(number)
+        return self.stretches(float(entries))
+
+    def _is_of(self, piece: Piece, number: int) -> bool:
+        return self.plan.chain_of(piece.scope[0]) == number
+
+    def _marginal(
+        self, number: int, scope: tuple[Variable, ...], start: int, stop: int
+    ) -> np.ndarray:
+        """The joint of some variables of one chain."""
+        chain, cards = self.plan.chains[number], self.plan.cards
+        now = slice(start - self.first, stop - self.first)
+        if set(scope) <= set(chain.state):
+            belief = self.beliefs[number].belief[now]
+            shaped = belief.reshape(*belief.shape[:2], *(cards[v] for v in chain.state))
+            out = tuple(2 + k for k, v in enumerate(chain.state) if v not in scope)
+            left = [v for v in chain.state if v in scope]
+            return spread(shaped.sum(axis=out) if out else shaped, left, scope)
+        rows = self.plan.rows(self.series, start, stop)
+        pieces = [*self.pieces(number, rows), *self._around(number, start, stop)]
+        table = eliminate(pieces, scope, cards, log_sum).log
+        over = tuple(range(2, table.ndim))
+        top = table.max(axis=over, keepdims=True)
+        found = np.exp(table - np.where(np.isfinite(top), top, 0.0))
+        return found / found.sum(axis=over, keepdims=True)
+
+    def _around(self, number: int, start: int, stop: int) -> list[Piece]:
+        """What the slices before, and the rows after, say of the states of some slices."""
+        chain, cards = self.plan.chains[number], self.plan.cards
+        shape = tuple(cards[v] for v in chain.state)
+        first, last = start - self.first, stop - self.first
+        passed, now = self.passed[number], self.beliefs[number]
+        found = []
+        if start > 0:
+            logs = np.empty((stop - start, self.sequences, chain.size))
+            skip = 1 if first == 0 else 0
+            if skip:
+                assert self.before is not None
+                logs[0] = self.before[number]
+            with np.errstate(divide="ignore"):
+                source = passed.log if passed.log is not None else None
+                part = slice(first - 1 + skip, last - 1)
+                logs[skip:] = np.log(passed.belief[part]) if source is None else source[part]
+            found.append(Piece("", chain.before, logs.reshape(*logs.shape[:2], *shape)))
+        if now is not passed:
+            with np.errstate(divide="ignore", invalid="ignore"):
+                after = _logs(now, first, last) - _logs(passed, first, last)
+            after = np.where(np.isnan(after), -np.inf, after)
+            found.append(Piece("", chain.state, after.reshape(*after.shape[:2], *shape)))
+        return found
+
+    def _refuse_invalid(self) -> None:
+        """Bad parameters at configurations that turn out to be possible are the user's to hear of."""
+        for number in tuple(self._suspect):
+            for start, stop in self._stretches(number):
+                rows = self.plan.rows(self.series, start, stop)
+                for piece in self.pieces(number, rows):
+                    if piece.invalid is None:
+                        continue
+                    bad = piece.invalid & (self.joint(piece.scope, start, stop) > 0)
+                    if bad.any():
+                        row = int(np.argmax(bad.reshape(len(bad), -1).any(axis=1)))
+                        raise _bad_parameters(piece.node, start + row)
+
+    def _refuse_impossible(self, increments: np.ndarray) -> None:
+        """Say in which slice, and at which node, nothing is left."""
+        impossible = np.isnan(increments) | (increments == -np.inf)
+        row, sequence = (int(k) for k in np.argwhere(impossible)[0])
+        t = self.first + row
+        where = f" of sequence {sequence}" if self.sequences > 1 else ""
+        node = self._culprit(t, sequence)
+        raise ZeroProbabilityError(
+            f"the observations have probability zero: in slice {t}{where}, what was seen of {node!r} is "
+            "impossible given what was seen before; check that row, or give the tables a small positive entry"
+        )
+
+    def _culprit(self, t: int, sequence: int) -> str:
+        """The first observed node of a slice at which no probability is left."""
+        rows = self.plan.rows(self.series, t, t + 1)
+        for piece in self.pieces(None, rows):
+            if not (piece.log > -np.inf).all():
+                return piece.node
+        order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
+        for number in range(len(self.plan.chains)):
+            if self.passed[number].increments[t - self.first, sequence] > -np.inf:
+                continue
+            pieces = sorted(self.pieces(number, rows), key=lambda p: order[p.node])
+            taken = [p for p in pieces if not p.is_evidence]
+            now = [p for p in self._around(number, t, t + 1) if p.scope and p.scope[0][0] == 1]
+            for piece in (p for p in pieces if p.is_evidence):
+                taken.append(piece)
+                total = eliminate([*taken, *now], (), self.plan.cards, log_sum).log
+                if np.broadcast_to(total, (1, self.sequences))[0, sequence] == -np.inf:
+                    return piece.node
+        return self.plan.slices.dynamic[-1]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _logs(passed: Passed, first: int, last: int) -> np.ndarray:
+    if passed.log is not None:
+        return passed.log[first:last]
+    return np.log(passed.belief[first:last])
+
+
+def _bytes(pieces: Sequence[Piece]) -> int:
+    return sum(p.log.nbytes for p in pieces)
+
+
+def _bad_parameters(node: str, t: int) -> ParameterError:
+    return ParameterError(
+        f"node {node!r}: the function gives bad parameters in slice {t} at a configuration that is possible",
+        (t,),
+    )

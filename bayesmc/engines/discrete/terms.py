@@ -1,0 +1,367 @@
+"""What a slice says of its finite variables, read off the declared functions with time as an array axis.
+
+``SliceReader`` finds the variables that a node's density reads, through the deterministic nodes between, and
+evaluates it on all their states and on all rows of a series in one call. How the tables are summed is no
+affair of this module.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, TIME, Slices
+from bayesmc.distributions import Distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.discrete.rows import Key, Rows, Term
+from bayesmc.engines.discrete.sums import Piece, Variable
+from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.network import CompiledNode, Model
+
+#: reads arrays off a term in some slices
+Read = Callable[["Term", "Rows"], tuple[Any, ...]]
+
+
+class SliceReader:
+    """Reads terms off a template.
+
+    Parameters
+    ----------
+    slices : Slices
+    apart : tuple of str
+        Plates whose elements are filtered separately: they are array axes.
+    variables : frozenset of str
+        Finite nodes to sum over; all their elements but for the plates ``apart`` are variables.
+    static : dict
+        Stored values of static nodes.
+    """
+
+    def __init__(
+        self,
+        slices: Slices,
+        apart: tuple[str, ...],
+        variables: frozenset[str],
+        static: Mapping[str, np.ndarray],
+    ) -> None:
+        self.slices, self.apart, self.variables = slices, apart, variables
+        self.static = _all_static(slices, static)
+        self.lead = tuple(slices.first.sizes[p] for p in apart)
+        self.sequences = math.prod(self.lead)
+        self._slow: set[tuple[str, int]] = set()
+
+    def term(self, name: str, kind: int) -> Term:
+        """What a node reads.
+
+        Raises
+        ------
+        UnsupportedError
+            A deterministic node hands on what is two slices back.
+        """
+        node = self.model(kind, 0)[name]
+        found: dict[Key, bool] = {}
+        reads: dict[Key, None] = {}
+        clock = False
+
+        def visit(parents: Sequence[str], lag: int, own: tuple[str, ...], whole: bool) -> None:
+            nonlocal clock
+            for parent in parents:
+                stem, back = self.origin(parent, lag)
+                if stem == TIME or stem in self.slices.template.inputs:
+                    clock = True
+                    continue
+                if stem in self.static:
+                    continue
+                above = self.slices.first[stem]
+                foreign = whole or any(p not in own for p in above.plates)
+                if stem in self.variables:
+                    self._check_back(name, stem, back)
+                    found[back, stem] = found.get((back, stem), False) or foreign
+                elif above.is_stochastic:
+                    reads[back, stem] = None
+                else:
+                    self._check_back(name, stem, back)
+                    visit(self.model(kind, back)[stem].parents, back, above.plates, foreign)
+
+        visit(node.parents, 0, node.plates, False)
+        alone = tuple(k for k, is_whole in found.items() if not is_whole)
+        whole_keys = tuple(k for k, is_whole in found.items() if is_whole)
+        return Term(name, kind, alone, whole_keys, tuple(reads), clock)
+
+    def origin(self, parent: str, lag: int) -> tuple[str, int]:
+        """The node that a parent of the slice ``lag`` back is, and how far back it stands."""
+        if parent.endswith(PREVIOUS):
+            return parent.removesuffix(PREVIOUS), lag + 1
+        return parent, lag
+
+    def model(self, kind: int, lag: int) -> Model:
+        """The model of the slice ``lag`` slices before one of a kind."""
+        return self.slices.first if kind - lag <= 0 and kind < 2 else self.slices.later
+
+    def card(self, name: str) -> int:
+        """States of a finite node."""
+        domain = self.slices.first[name].domain
+        assert domain is not None
+        return domain.size
+
+    def elements(self, name: str) -> int:
+        """Elements of a node in the plates that are not apart."""
+        node = self.slices.first[name]
+        return math.prod(self._inner(node))
+
+    def scope(self, term: Term, element: int) -> tuple[Variable, ...]:
+        """The variables that one element of a term's node reads."""
+        node = self.slices.first[term.name]
+        plates = [p for p in node.plates if p not in self.apart]
+        at = np.unravel_index(element, self._inner(node)) if plates else ()
+        scope: list[Variable] = []
+        for lag, name in term.alone:
+            other = self.slices.first[name]
+            own = tuple(int(at[plates.index(p)]) for p in other.plates if p not in self.apart)
+            flat = int(np.ravel_multi_index(own, self._inner(other))) if own else 0
+            scope.append((lag, name, flat))
+        for lag, name in term.whole:
+            scope += [(lag, name, e) for e in range(self.elements(name))]
+        return tuple(scope)
+
+    def question(self, names: Sequence[str], kind: int) -> Term:
+        """A term that reads several nodes of a slice, all elements of each."""
+        whole: dict[Key, None] = {}
+        reads: dict[Key, None] = {}
+        clock = False
+        for name in names:
+            node = self.slices.first[name]
+            if name in self.variables:
+                whole[0, name] = None
+            elif name in self.slices.template.inputs or name == TIME:
+                clock = True
+            elif name not in self.static and node.is_stochastic:
+                reads[0, name] = None
+            elif name not in self.static:
+                above = self.term(name, kind)
+                whole.update(dict.fromkeys((*above.alone, *above.whole)))
+                reads.update(dict.fromkeys(above.reads))
+                clock |= above.clock
+        return Term("", kind, (), tuple(whole), tuple(reads), clock)
+
+    def scope_of_keys(self, term: Term) -> tuple[Variable, ...]:
+        """The variables of a question."""
+        return tuple((lag, n, e) for lag, n in term.whole for e in range(self.elements(n)))
+
+    def shares_scope(self, term: Term) -> bool:
+        """Whether all elements of a term's node read the same variables."""
+        return all(self.elements(name) == 1 for _, name in term.alone)
+
+    def cards(self, term: Term) -> tuple[int, ...]:
+        """Sizes of the axes of a term's configurations."""
+        sizes = [self.card(name) for _, name in term.alone]
+        for _, name in term.whole:
+            sizes += [self.card(name)] * self.elements(name)
+        return tuple(sizes)
+
+    # ---- evaluating -------------------------------------------------------------------------
+
+    def evaluate(self, term: Term, rows: Rows) -> tuple[Any, Rows]:
+        """A term's node on all configurations: a distribution or stored values, and where they stand.
+
+        Its batch axes are rows (1 where nothing varies) and one for each entry of ``cards``.
+        """
+        placed = rows.on_axes(self, term)
+        model = self.model(term.kind, 0)
+        result, _ = model.evaluate(term.name, placed.arguments(model, term.name, 0))
+        return result, placed
+
+    def over_rows(self, term: Term, rows: Rows, read: Read) -> tuple[Any, ...]:
+        """Arrays read off a term, all rows in one call where its functions broadcast over time.
+
+        ``read(term, rows)`` returns arrays with time as the first axis (size 1 where nothing varies), or None
+        in place of one. What a call for all rows says is held against calls for single ones.
+        """
+        if not term.clock or rows.count == 1:
+            return read(term, rows)
+        if (term.name, term.kind) not in self._slow:
+            found = self._at_once(term, rows, read)
+            if found is not None:
+                return found
+            self._slow.add((term.name, term.kind))
+        singles = [read(term, rows.one(k)) for k in range(rows.count)]
+        return tuple(_stacked(parts) for parts in zip(*singles, strict=True))
+
+    def pieces(self, term: Term, rows: Rows) -> list[Piece]:
+        """The factors of a term, element by element."""
+        node = self.slices.first[term.name]
+        own = term.name in self.variables
+        log, invalid = self.over_rows(term, rows, self._log_tables)
+        cards = len(self.cards(term))
+        if not own and self.shares_scope(term):
+            log = self._sum_inner(log, node, cards)
+            if invalid is not None:
+                invalid = self._sum_inner(invalid.astype(float), node, cards) > 0
+            count = 1
+        else:
+            count = self.elements(term.name)
+        found = []
+        for element in range(count):
+            scope = self.scope(term, element)
+            if own:
+                scope += ((0, term.name, element),)
+            part = self.at_element(log, node, cards, element, int(own))
+            bad = None
+            if invalid is not None:
+                bad = self.at_element(invalid, node, cards, element, int(own))
+            found.append(Piece(term.name, scope, part, not own, bad))
+        return found
+
+    def indicators(self, name: str, rows: Rows) -> list[Piece]:
+        """What was seen of a variable that is not always seen."""
+        node, size = self.slices.first[name], self.card(name)
+        seen = rows.observed(name, 0)
+        if seen is None:
+            return []
+        value, mask = seen
+        with np.errstate(divide="ignore"):
+            log = np.log((value[..., None] == np.arange(size)) | ~mask[..., None])
+        return [
+            Piece(name, ((0, name, e),), self.at_element(log, node, 0, e, 1), True)
+            for e in range(self.elements(name))
+        ]
+
+    def at_element(
+        self, array: np.ndarray, node: CompiledNode, cards: int, element: int, rest: int
+    ) -> np.ndarray:
+        """One element of an array ``(rows, *cards, *plates, *rest)``: ``(rows, sequences, *cards, *rest)``.
+
+        Sequences are one where nothing differs between them.
+        """
+        plates = len(node.plates)
+        array = _padded(array, 1 + cards + plates + rest)
+        inner = [k for k, p in enumerate(node.plates) if p not in self.apart]
+        index: list[Any] = [slice(None)] * array.ndim
+        if inner:
+            at = np.unravel_index(element, self._inner(node))
+            for k, place in zip(inner, at, strict=True):
+                axis = 1 + cards + k
+                index[axis] = int(place) if array.shape[axis] > 1 else 0
+        array = array[tuple(index)]
+        outer = [p for p in node.plates if p in self.apart]
+        axes = [1 + cards + outer.index(p) for p in self.apart if p in outer]
+        others = [k for k in range(1, array.ndim) if k not in axes]
+        array = array.transpose(0, *axes, *others)
+        sizes = iter(array.shape[1 : 1 + len(axes)])
+        lead = tuple(next(sizes) if p in outer else 1 for p in self.apart)
+        array = array.reshape(array.shape[0], *lead, *array.shape[1 + len(axes) :])
+        if math.prod(lead) == 1:
+            return array.reshape(array.shape[0], 1, *array.shape[1 + len(lead) :])
+        full = np.broadcast_to(array, (array.shape[0], *self.lead, *array.shape[1 + len(lead) :]))
+        flat = full.reshape(array.shape[0], self.sequences, *array.shape[1 + len(lead) :])
+        if len(flat) == 1 and (flat == flat[:, :1]).all():  # one matrix for all is much cheaper
+            return flat[:, :1]
+        return flat
+
+    # ---- private ----------------------------------------------------------------------------
+
+    def _inner(self, node: CompiledNode) -> tuple[int, ...]:
+        return tuple(
+            n for p, n in zip(node.plates, node.plate_shape, strict=True) if p not in self.apart
+        )
+
+    def _check_back(self, name: str, stem: str, back: int) -> None:
+        if back > 1:
+            raise UnsupportedError(
+                f"node {name!r} depends on {stem!r} of two slices before, through a deterministic node that "
+                "is handed on to the next slice; give that node states=, so that it becomes part of the state"
+            )
+
+    def _at_once(self, term: Term, rows: Rows, read: Read) -> tuple[Any, ...] | None:
+        """All rows in one call; None where that fails or calls for single rows say otherwise."""
+        try:
+            found = read(term, rows)
+            for k in {0, rows.count // 2, rows.count - 1}:
+                for many, one in zip(found, read(term, rows.one(k)), strict=True):
+                    if not _agree(many, one, k):
+                        return None
+        except BayesmcError:
+            return None
+        return found
+
+    def _log_tables(self, term: Term, rows: Rows) -> tuple[np.ndarray, np.ndarray | None]:
+        node = self.slices.first[term.name]
+        with marking_invalid(), np.errstate(all="ignore"):
+            result, placed = self.evaluate(term, rows)
+            lead = 1 + len(self.cards(term)) + len(node.plates)
+            if not isinstance(result, Distribution):
+                size = self.card(term.name)
+                return np.log(_padded(np.asarray(result), lead)[..., None] == np.arange(size)), None
+            bad = result.invalid if result.invalid is not None and result.invalid.any() else None
+            if term.name in self.variables:
+                table = result.probs_table
+                assert table is not None
+                log = _padded(np.log(table), lead + 1)
+                bad = None if bad is None else _padded(bad, lead)[..., None]
+            else:
+                seen = placed.observed(term.name, 0)
+                assert seen is not None
+                value, mask = seen
+                log = self.model(term.kind, 0).log_density(term.name, result, value)
+                log = _padded(log, lead)
+                bad = None if bad is None else _padded(bad, lead)
+                if not mask.all():
+                    log = np.where(mask, log, 0.0)
+                    bad = None if bad is None else bad & mask
+        if bad is None or not bad.any():
+            return log, None
+        return np.where(bad, 0.0, log), np.broadcast_to(
+            bad, np.broadcast_shapes(bad.shape, log.shape)
+        )
+
+    def _sum_inner(self, array: np.ndarray, node: CompiledNode, cards: int) -> np.ndarray:
+        """Summed over the plates that are not apart, whose axes stay with size one."""
+        axes = tuple(1 + cards + k for k, p in enumerate(node.plates) if p not in self.apart)
+        if not axes:
+            return array
+        shape = list(array.shape)
+        for axis in axes:
+            shape[axis] = node.plate_shape[axis - 1 - cards]
+        return np.broadcast_to(array, shape).sum(axis=axes, keepdims=True)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _agree(many: Any, one: Any, k: int) -> bool:
+    """Whether row k of an array for many rows is the one worked out alone."""
+    if many is None or one is None:
+        return many is None and one is None
+    row = many[k : k + 1] if len(many) > 1 else many
+    if row.ndim != one.ndim:
+        return False
+    return bool(np.allclose(row, one, rtol=1e-9, atol=1e-9, equal_nan=True))
+
+
+def _stacked(parts: Sequence[Any]) -> Any:
+    """Arrays of single rows one after the other."""
+    known = [p for p in parts if p is not None]
+    if not known:
+        return None
+    shape = np.broadcast_shapes(*(p.shape[1:] for p in known))
+    blank = np.zeros((1, *shape), dtype=known[0].dtype)
+    return np.concatenate([blank if p is None else np.broadcast_to(p, blank.shape) for p in parts])
+
+
+def _padded(array: np.ndarray, ndim: int) -> np.ndarray:
+    """With ones in front."""
+    return array.reshape((1,) * (ndim - array.ndim) + array.shape)
+
+
+def _all_static(slices: Slices, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Static nodes, the deterministic ones computed."""
+    values = dict(known)
+    with marking_invalid(), np.errstate(all="ignore"):
+        for name, node in slices.first.nodes.items():
+            if name in slices.template.static and name not in values and not node.is_stochastic:
+                above = node.parents
+                if all(p in values for p in above):
+                    values[name] = np.asarray(slices.first.evaluate(name, values)[0])
+    return values

@@ -1,0 +1,1 @@
+"""The histogram filter: beliefs as probabilities of cells."""

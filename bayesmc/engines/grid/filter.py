@@ -1,0 +1,401 @@
+"""``GridFilter``: options, refusals, and the runs over a series."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices, read_row, read_static
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.grid.answers import Answers
+from bayesmc.engines.grid.axes import check_rule, read_axes
+from bayesmc.engines.grid.belief import GridBelief
+from bayesmc.engines.grid.moves import Cells, GridMover
+from bayesmc.engines.grid.record import GridPosterior, GridRecord
+from bayesmc.engines.grid.sources import is_previous, previous
+from bayesmc.engines.grid.tables import GridModel
+from bayesmc.engines.grid.terms import Label, largest
+from bayesmc.errors import BayesmcError, BudgetError
+from bayesmc.progress import Progress
+
+
+@dataclass(frozen=True)
+class GridFilter(FilterEngine):
+    """Histogram filter (Markov localisation): beliefs as probabilities of the cells of a grid.
+
+    Exact but for the grid: sums over points stand for integrals. With points closer than the narrowest
+    density is wide and a grid that holds all mass, the error of the midpoint rule falls faster than any power
+    of the distance.
+
+    Parameters
+    ----------
+    grid : dict
+        Node -> ``(low, high, cells)``, or an increasing array of points; for a vector one for all
+        components, or a list of one each; for counts the values. Finite nodes need none (their states are
+        their cells), nor do nodes on a bounded interval or circle.
+    cells : int
+        Cells of bounded nodes without a grid.
+    quadrature : str
+        ``"midpoint"``; or ``"trapezoid"``, ``"simpson"``, ``"gauss-legendre"``, for which ``(low, high, n)``
+        are n points. Points given as an array stand for what is nearest to them.
+    max_bytes : float
+        What one table may take, and the beliefs of all slices in ``smooth``. A density of a node is a
+        table over its own cells and those of the nodes that it reads, in this slice and the one before;
+        one that does not fit is refused ahead.
+    tolerance : float
+        Mass lost or gained in one slice from which on a ``GridWarning`` says that the grid is too small or
+        too coarse; ``inf`` for never.
+
+    Notes
+    -----
+    Every component of a hidden node is an axis, so three or four are what a grid can hold; nodes that move
+    independently cost the sum of their tables, not the product. Plates whose elements never meet are filtered
+    separately on the same grid. Noise narrower than a cell falls between the points: widen it, refine the
+    grid, or take another engine; a state without noise has no density at all and is refused. Hidden nodes
+    that nothing reads (missing observations) go without axes unless ``grid`` names them.
+
+    References
+    ----------
+    Thrun, Burgard and Fox (2005), Probabilistic Robotics, sec. 4.1 (histogram filter) and ch. 8; Kitagawa
+    (1987), Non-Gaussian state-space modeling of nonstationary time series, JASA 82.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc import GridFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 2.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(0.0, np.exp(x / 2)))
+    >>> engine = GridFilter(grid={"x": (-12.0, 12.0, 300)})
+    >>> filtered = bmc.filter(dbn, {"y": [0.3, -2.1, 4.0]}, engine=engine)
+    >>> filtered.mean("x").round(3).tolist(), round(filtered.log_marginal_likelihood, 4)
+    ([-0.907, 1.044, 2.179], -8.3043)
+    """
+
+    grid: Mapping[str, Any] = field(default_factory=dict)
+    cells: int = 200
+    quadrature: str = "midpoint"
+    max_bytes: float = float(2**30)
+    tolerance: float = 0.01
+
+    label: ClassVar[str] = "grid filter"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, Mapping):
+            raise ValueError(
+                f"GridFilter(grid={type(self.grid).__name__}): give a dict from node to (low, high, cells) "
+                "or an array of points"
+            )
+        cells = self.cells
+        if isinstance(cells, bool) or not isinstance(cells, (int, np.integer)) or cells < 2:
+            raise ValueError(f"GridFilter(cells={cells!r}): give a number of cells, 2 or more")
+        check_rule(self.quadrature)
+        for what in ("max_bytes", "tolerance"):
+            if not getattr(self, what) > 0:
+                raise ValueError(
+                    f"GridFilter({what}={getattr(self, what)!r}): give a number above 0"
+                )
+
+    # ---- what it can do ---------------------------------------------------------------------
+
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        common = super().refusal(problem)
+        if common is not None:
+            return common
+        try:
+            with _quiet():
+                model = self._model(problem.slices, _static(problem))
+        except BayesmcError as error:
+            return str(error)
+        for name in problem.hidden:
+            if name in model.own and name not in model.leaves and name not in model.axes.of:
+                return f"GridFilter: {model.axes.missing[name]}"
+        return self._too_large(model, problem) or _without_density(problem)
+
+    def describe(self, problem: SeriesProblem) -> dict[str, str]:
+        model = self._model(problem.slices, _static(problem))
+        found = {}
+        for name in problem.slices.template.later:
+            seen = problem.series.observed.get(name)
+            if name in problem.slices.template.inputs:
+                found[name] = "input"
+            elif name in problem.slices.template.static:
+                found[name] = "static, known"
+            elif name not in model.own:
+                found[name] = "computed"
+            elif seen is not None and seen.mask is None:
+                found[name] = "observed, weights the cells"
+            elif name in model.leaves:
+                found[name] = "integrated out in closed form where it is hidden"
+            else:
+                sizes = " x ".join(str(a.size) for a in model.axes.of[name])
+                each = f" for each of {n} elements" if (n := model.elements(name)) > 1 else ""
+                cells = "states" if problem.model[name].domain is not None else "cells"
+                found[name] = f"on a grid of {sizes} {cells}" + (
+                    each if not problem.model[name].event_shape else ""
+                )
+        return found
+
+    # ---- runs over a series -----------------------------------------------------------------
+
+    def filter(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        keep: str | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> GridPosterior:
+        if keep not in (None, "summaries"):
+            raise ValueError(
+                f'keep={keep!r}: a grid has no particles; give "summaries" for answers of constant size, or '
+                "None, which keeps densities, too"
+            )
+        mover = self._mover(problem)
+        record = GridRecord(problem, mover.model, queries or {}, keep is None)
+        increments = np.empty((problem.steps, *mover.model.lead))
+        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            before: Cells | None = None
+            for k in range(problem.steps):
+                cells = mover.move(before, problem.series.row(k))
+                increments[k] = cells.increment
+                record.add(k, _answers(mover, before, cells, cells.probs))
+                before = cells
+                bar.advance()
+        return record.posterior(self, "filter", increments)
+
+    def smooth(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> GridPosterior:
+        """Every slice given all rows by one pass forwards and one back, or ``lag`` back from every slice."""
+        mover = self._mover(problem)
+        record = GridRecord(problem, mover.model, queries or {}, True)
+        steps = problem.steps
+        increments = np.empty((steps, *mover.model.lead))
+        reach = steps if lag is None else int(lag)
+        held: deque[Cells] = deque(maxlen=reach + 2)
+        with Progress(steps, self.label, progress) as bar, _quiet():
+            for k in range(steps):
+                cells = mover.move(held[-1] if held else None, problem.series.row(k))
+                increments[k] = cells.increment
+                held.append(cells)
+                if k == 0:
+                    self._check_held(cells.probs.nbytes, min(steps, reach + 2), lag)
+                bar.advance()
+                if k >= reach and k < steps - 1:
+                    self._smoothed(mover, record, held, k, k - reach, k - reach)
+            self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
+        return record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
+
+    def most_likely(
+        self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
+    ) -> dict[str, np.ndarray]:
+        """The most likely trajectory over the points of the grid (Viterbi), by density.
+
+        Hidden nodes that nothing reads and that have no grid are integrated out and left out.
+        """
+        static = _static(problem)
+        with _quiet(), Progress(problem.steps, self.label, progress) as bar:
+            model = self._model(problem.slices, static, logs=True)
+            mover = GridMover(model, self.tolerance)
+            rows = [problem.series.row(k) for k in range(problem.steps)]
+            path = mover.best(rows, bar.advance)
+        found = {}
+        for name in problem.hidden:
+            node = problem.model[name]
+            if name not in model.own or name in model.leaves:
+                continue
+            values = [_chosen(model, name, row, at) for row, at in zip(rows, path, strict=True)]
+            found[name] = np.array(node.decode(np.stack(values)), subok=True)
+        return found
+
+    # ---- one slice at a time ----------------------------------------------------------------
+
+    def start(
+        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
+    ) -> GridBelief:
+        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes."""
+        dbn.validate()
+        return GridBelief(dbn.copy(), static or {}, _quiet)
+
+    def step(
+        self,
+        belief: GridBelief,
+        observations: Mapping[str, Any] | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> GridBelief:
+        """The belief about the next slice, whose row this is; the old belief stays as it is.
+
+        Parameters
+        ----------
+        observations : dict, optional
+            Node -> its value in this slice, without an axis for time; what is left out is missing.
+        inputs : dict, optional
+            Input -> its value in this slice.
+        """
+        mover = belief.mover
+        slices = mover.model.slices if mover else None
+        slices, row = read_row(
+            belief.dbn, slices, belief.t + 1, observations, inputs, belief.inputs
+        )
+        with _quiet():
+            if mover is None:
+                model = self._model(slices, read_static(slices, belief.static))
+                mover = GridMover(model, self.tolerance)
+            cells = mover.move(belief.cells, row)
+        total = belief.log_marginal_likelihood + cells.increment
+        return GridBelief(
+            belief.dbn, belief.static, _quiet, mover, cells, belief.cells,
+            total if np.ndim(total) else float(total),
+            {n: row.inputs[n] for n in slices.template.inputs},
+        )  # fmt: skip
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _model(
+        self, slices: Slices, static: Mapping[str, np.ndarray], logs: bool = False
+    ) -> GridModel:
+        axes = read_axes(slices, self.grid, self.cells, self.quadrature)
+        return GridModel(slices, axes, static, self.max_bytes, logs)
+
+    def _mover(self, problem: SeriesProblem) -> GridMover:
+        with _quiet():
+            return GridMover(self._model(problem.slices, _static(problem)), self.tolerance)
+
+    def _smoothed(
+        self,
+        mover: GridMover,
+        record: GridRecord,
+        held: deque[Cells],
+        k: int,
+        low: int,
+        high: int,
+    ) -> None:
+        """Back from slice k, whose belief stands last in ``held``, recording slices low to high."""
+        probs = held[-1].probs
+        for t in range(k, low - 1, -1):
+            at = len(held) - 1 - (k - t)
+            if t < k:
+                probs = mover.back(held[at], held[at + 1], probs)
+            if t <= high:
+                before = held[at - 1] if t else None
+                record.add(t, _answers(mover, before, held[at], probs))
+
+    def _check_held(self, each: int, slices: int, lag: int | None) -> None:
+        """Refuse a pass back over more beliefs than fit."""
+        count = 2 * each * slices  # of every slice what was predicted, too
+        if count > self.max_bytes:
+            advice = "give lag= to smooth, " if lag is None else "a smaller lag, "
+            raise BudgetError(
+                f"GridFilter: the beliefs of {slices} slices take {readable_bytes(count)}, and max_bytes is "
+                f"{readable_bytes(self.max_bytes)}; {advice}fewer cells, or raise max_bytes=",
+                count,
+            )
+
+    def _too_large(self, model: GridModel, problem: SeriesProblem) -> str | None:
+        """Why the tables do not fit, found from their sizes alone."""
+        hidden = frozenset(n for n in problem.hidden if n in model.own and n not in model.leaves)
+        sizes: dict[Label, int] = dict(zip(model.apart, model.lead, strict=True))
+        labels: list[Label] = []
+        for name in sorted(hidden):
+            axes = model.axes.of[name]
+            for e in range(model.elements(name)):
+                label = (name, e)
+                labels.append(label)
+                sizes[label] = sizes[previous(label)] = axes[e % len(axes)].size
+        scopes = []
+        for first in (True, False) if problem.steps > 1 else (True,):
+            for name in hidden | set(problem.series.observed):
+                if name not in model.own or (
+                    name in model.leaves and name not in problem.series.observed
+                ):
+                    continue
+                scope = model.scope(first, name, hidden)
+                cells = [sizes[x] for x in scope]
+                if 8 * math.prod(map(float, cells)) > self.max_bytes:
+                    return model.too_large(name, cells, 8 * math.prod(map(float, cells)))
+                if any(map(is_previous, scope)):
+                    scopes.append(scope)
+        belief = {previous(x) for x in labels} | set(model.apart)
+        entries = largest([belief, *scopes], (*labels, *model.apart), sizes)
+        if 8 * entries > self.max_bytes:
+            names = ", ".join(sorted(hidden))
+            return model.too_large(names, [sizes[x] for x in labels], 8 * entries)
+        return None
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield
+
+
+def _static(problem: SeriesProblem) -> dict[str, np.ndarray]:
+    return {n: o.value for n, o in problem.series.static.items()}
+
+
+def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.ndarray) -> Answers:
+    def pair() -> Any:
+        assert before is not None
+        return mover.pair(before, cells, probs)
+
+    placed = None if before is None else before.placed
+    return Answers(mover.model, placed, cells.placed, probs, pair)
+
+
+def _without_density(problem: SeriesProblem) -> str | None:
+    """A node whose density cannot be evaluated, tried where its parents can be."""
+    for model in (problem.slices.first, problem.slices.later):
+        for name in problem.slices.stochastic:
+            try:
+                with _quiet():
+                    dist, _ = model.evaluate(name, model.probe)
+                    model.log_density(name, dist, model.probe[name])
+            except (BayesmcError, NotImplementedError) as error:
+                why = str(error) or "it is not implemented"
+                return f"GridFilter evaluates every density, and that of {name!r} cannot be: {why}"
+    return None
+
+
+def _chosen(
+    model: GridModel, name: str, row: Any, positions: Mapping[Label, np.ndarray]
+) -> np.ndarray:
+    """Stored values of a node at chosen positions, or as seen."""
+    placed = model.place(row)
+    node = model.slices.first[name]
+    value = placed.values[name]
+    batch = value.ndim - len(node.value_shape)
+    if not batch:
+        return value
+    apart = model.apart
+    full = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
+    out = np.empty(node.value_shape, dtype=value.dtype)
+    for element in np.ndindex(*model.lead):
+        at = tuple(
+            int(positions[s.label][element]) if value.shape[k] > 1 else 0
+            for k, s in enumerate(placed.scalars)
+        )
+        where = dict(zip(apart, element, strict=True))
+        plates = tuple(where.get(p, slice(None)) for p in node.plates)
+        out[plates] = full[at][plates]
+    return out

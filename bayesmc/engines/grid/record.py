@@ -1,0 +1,178 @@
+"""What a run on a grid keeps: answers about every slice, with densities unless told otherwise."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.filtering import Queries, observed_answers
+from bayesmc.engines.grid.answers import Answers
+from bayesmc.engines.grid.tables import GridModel
+from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.network import Model
+from bayesmc.results import SeriesPosterior
+
+
+class GridRecord:
+    """Answers written slice by slice, in any order.
+
+    Parameters
+    ----------
+    problem : SeriesProblem
+    model : GridModel
+    queries : dict
+    densities : bool
+        Keep the densities of all nodes with a grid, too.
+    """
+
+    def __init__(
+        self, problem: SeriesProblem, model: GridModel, queries: Queries, densities: bool
+    ) -> None:
+        self.problem, self.model, self.asked = problem, model, queries
+        steps = problem.steps
+        self.tables: dict[str, np.ndarray] = {}
+        self.means: dict[str, np.ndarray] = {}
+        self.variances: dict[str, np.ndarray] = {}
+        self.densities: dict[str, np.ndarray] = {}
+        self.unanswered: set[str] = set()
+        self.queries: dict[str, list[Any]] = {n: [None] * steps for n in queries}
+        for name in problem.hidden:
+            node = problem.model[name]
+            if _one_domain(problem, name):
+                assert node.domain is not None
+                self.tables[name] = np.empty((steps, *node.plate_shape, node.domain.size))
+                continue
+            self.means[name] = np.empty((steps, *node.value_shape))
+            self.variances[name] = np.empty((steps, *node.value_shape))
+            if densities and node.is_stochastic and name not in model.leaves:
+                cells = tuple(a.size for a in model.axes.of[name])
+                shape = (steps, *node.plate_shape, *cells)
+                _check_kept(name, shape, model.max_bytes)
+                self.densities[name] = np.empty(shape)
+
+    def add(self, k: int, answers: Answers) -> None:
+        """Take in the k-th slice."""
+        for name, table in self.tables.items():
+            table[k] = answers.table(name)
+        for name in list(self.means):
+            found = answers.moments(name)
+            if found is None:
+                self.unanswered.add(name)
+                del self.means[name], self.variances[name]
+                continue
+            self.means[name][k], self.variances[name][k] = found
+        for name, kept in self.densities.items():
+            kept[k] = answers.density(name)
+        for name, function in self.asked.items():
+            self.queries[name][k] = answers.expectation(function)
+
+    def posterior(self, engine: Any, kind: str, increments: np.ndarray) -> GridPosterior:
+        """The answers of all slices."""
+        seen = observed_answers(self.problem)
+        axes = self.model.axes.of
+        grids = {n: tuple(a.points for a in axes[n]) for n in self.densities}
+        return GridPosterior(
+            self.problem.model,
+            engine,
+            kind,
+            increments,
+            grids,
+            self.densities,
+            tables={**seen.tables, **self.tables},
+            means={**seen.means, **self.means},
+            variances={**seen.variances, **self.variances},
+            queries={n: np.stack(rows) for n, rows in self.queries.items()},
+            start=self.problem.series.start,
+        )
+
+
+class GridPosterior(SeriesPosterior):
+    """Beliefs on a grid about the nodes of every slice: a ``SeriesPosterior`` with densities.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc import GridFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(np.abs(x), 0.5))
+    >>> filtered = bmc.filter(dbn, {"y": [2.0, 2.5]}, engine=GridFilter({"x": (-10.0, 10.0, 400)}))
+    >>> x, density = filtered.grid("x"), filtered.density("x")
+    >>> density.shape, float(abs(x[density[1].argmax()]).round(2))
+    ((2, 400), 2.32)
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        engine: Any,
+        kind: str,
+        increments: np.ndarray | None,
+        grids: dict[str, tuple[np.ndarray, ...]],
+        densities: dict[str, np.ndarray],
+        **answers: Any,
+    ) -> None:
+        super().__init__(model, engine, kind, increments, **answers)
+        self._grids, self._densities = grids, densities
+
+    def density(self, name: str) -> np.ndarray:
+        """Densities at the points of the grid, shape ``(time, *plates, *cells)``.
+
+        A vector has one axis of cells per component; counts have probabilities; where the node is seen
+        stands NaN.
+
+        Raises
+        ------
+        UnknownNodeError, UnsupportedError
+        """
+        self._node(name)
+        return self._kept(name, "density", self._densities).copy()
+
+    def grid(self, name: str) -> Any:
+        """The points of a node's grid, shape ``(cells,)``; of a vector a tuple, one per component."""
+        self._node(name)
+        axes = self._kept(name, "grid", self._grids)
+        return tuple(axes) if self.model[name].event_shape else axes[0]
+
+    def last(self, steps: int, kind: str) -> GridPosterior:
+        """The last so many slices by themselves."""
+        cut = super().last(steps, kind)
+        return GridPosterior(
+            self.model, self.engine, kind, None, self._grids,
+            {n: v[-steps:] for n, v in self._densities.items()},
+            tables=cut._tables, means=cut._means, variances=cut._variances, queries=cut.queries,
+            steps=steps, start=cut.start,
+        )  # fmt: skip
+
+    def _kept(self, name: str, what: str, kept: dict[str, Any]) -> Any:
+        if name not in kept:
+            raise UnsupportedError(
+                f"{what}({name!r}): no density was kept of it; hidden nodes with a grid have one unless keep="
+                '"summaries" is given, finite ones have probabilities(name)'
+            )
+        return kept[name]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _one_domain(problem: SeriesProblem, name: str) -> bool:
+    """Whether a node has the same finite set of states in all slices; a computed one may not."""
+    domains = [m[name].domain for m in (problem.slices.first, problem.slices.later)]
+    states = [None if d is None else d.states for d in domains]
+    return states[0] is not None and states[0] == states[1]
+
+
+def _check_kept(name: str, shape: tuple[int, ...], max_bytes: float) -> None:
+    count = 8 * float(np.prod(shape, dtype=float))
+    if count > max_bytes:
+        raise BudgetError(
+            f"GridFilter: the densities of {name!r} in all slices take {readable_bytes(count)}, and "
+            f'max_bytes is {readable_bytes(max_bytes)}; give keep="summaries" to filter, fewer cells, or '
+            "raise max_bytes=",
+            int(count),
+        )

@@ -1,0 +1,1 @@
+"""Kalman filters: linear-Gaussian templates exactly, others made linear or through sigma points."""

@@ -1,0 +1,84 @@
+"""From vectors of unknown numbers to answers about nodes, for filters and smoothers alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.filtering import observed_answers
+from bayesmc.engines.kalman.data import SeriesData
+from bayesmc.engines.kalman.passes import Filtered, Smoothed
+from bayesmc.engines.kalman.posterior import GaussianSeries, Spreads, on_circle
+
+
+def filter_answers(
+    engine: Any, problem: SeriesProblem, data: SeriesData, found: Filtered
+) -> GaussianSeries:
+    """Every slice given the rows up to it."""
+    spreads = Spreads(_stack(found.factors), found.which)
+    return _answers(engine, problem, data, "filter", found, found.means, spreads)
+
+
+def smooth_answers(
+    engine: Any,
+    problem: SeriesProblem,
+    data: SeriesData,
+    found: Filtered,
+    smoothed: Smoothed,
+    kind: str,
+) -> GaussianSeries:
+    """Every slice given later rows, too."""
+    layout, roots = data.layouts[0], _stack(found.factors)
+    left = roots[..., : layout.carried][found.which]
+    if left.ndim == 3:  # the same in all elements of the plates apart
+        left = left.reshape(len(left), *(1,) * len(layout.lead), *left.shape[1:])
+    means = found.means + np.matvec(left, smoothed.noise)
+    spreads = Spreads(roots, found.which, smoothed.spread)
+    return _answers(engine, problem, data, kind, found, means, spreads)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _stack(factors: list[np.ndarray]) -> np.ndarray:
+    """Roots of all slices that differ, with the plates' axes where any has them."""
+    shape = np.broadcast_shapes(*(f.shape[:-2] for f in factors))
+    return np.stack([np.broadcast_to(f, shape + f.shape[-2:]) for f in factors])
+
+
+def _answers(
+    engine: Any,
+    problem: SeriesProblem,
+    data: SeriesData,
+    kind: str,
+    filtered: Filtered,
+    means: np.ndarray,
+    spreads: Spreads,
+) -> GaussianSeries:
+    variances = spreads.variances()
+    layout = data.layouts[0]
+    answers = observed_answers(problem)
+    wide = variances.reshape(
+        len(variances), *(1,) * (means.ndim - variances.ndim), *variances.shape[1:]
+    )
+    full = np.broadcast_to(wide, means.shape)
+    for name, place in layout.rows.items():
+        node = layout.slices.first[name]
+        answers.means[name] = layout.unpacked(node, on_circle(layout, name, means[..., place]))
+        answers.variances[name] = layout.unpacked(node, full[..., place])
+    for name, value in data.computed().items():
+        node = layout.slices.first[name]
+        value = np.broadcast_to(value, (data.steps, *node.value_shape))
+        if node.domain is not None:
+            answers.tables[name] = np.eye(node.domain.size)[value.astype(np.intp)]
+        else:
+            answers.means[name] = value.astype(float)
+            answers.variances[name] = np.zeros(value.shape)
+    found = GaussianSeries(
+        problem.model, engine, kind, filtered.increments, tables=answers.tables, means=answers.means,
+        variances=answers.variances, start=problem.series.start,
+    )  # fmt: skip
+    found.layout, found.spreads = layout, spreads
+    return found

@@ -1,0 +1,271 @@
+"""What Gaussian filters answer: means, variances, and joint covariances of the nodes of a slice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet
+from bayesmc.engines.kalman.rows import RowTaker, Taken
+from bayesmc.engines.kalman.slices import Layout
+from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.results import SeriesPosterior
+
+
+@dataclass(frozen=True, eq=False)
+class Spreads:
+    """Covariances of the unknown numbers of every slice, kept as roots.
+
+    Attributes
+    ----------
+    roots : ndarray, shape (kinds, [*lead], n, n)
+    which : ndarray of int, shape (time,)
+        Which root is a slice's.
+    noise : ndarray, shape (time, [*lead], c, c), or None
+        Covariance of the first c numbers that a root multiplies, where it is not the identity.
+    """
+
+    roots: np.ndarray
+    which: np.ndarray
+    noise: np.ndarray | None = None
+
+    def covariances(self) -> np.ndarray:
+        """Of all slices, shape (time, [*lead], n, n)."""
+        if self.noise is None:
+            return (self.roots @ np.matrix_transpose(self.roots))[self.which]
+        left, alone, noise = self._parts(self.noise)
+        return left @ noise @ np.matrix_transpose(left) + alone[self.which]
+
+    def variances(self) -> np.ndarray:
+        """Their diagonals, shape (time, [*lead], n)."""
+        if self.noise is None:
+            return np.vecdot(self.roots, self.roots)[self.which]
+        left, alone, noise = self._parts(self.noise)
+        return np.vecdot(left @ noise, left) + alone.diagonal(0, -2, -1)[self.which]
+
+    def last(self, steps: int) -> Spreads:
+        """Of the last so many slices."""
+        noise = None if self.noise is None else self.noise[-steps:]
+        return Spreads(self.roots, self.which[-steps:], noise)
+
+    def _parts(self, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Roots on that noise by slice, covariances by the rest by kind, and the noise, of one dimension."""
+        c = noise.shape[-1]
+        left, rest = self.roots[..., :c], self.roots[..., c:]
+        ndim = max(left.ndim, noise.ndim)
+        left, alone, noise = (
+            a.reshape(len(a), *(1,) * (ndim - a.ndim), *a.shape[1:])
+            for a in (left, rest @ np.matrix_transpose(rest), noise)
+        )
+        return left[self.which], alone, noise
+
+
+class GaussianSeries(SeriesPosterior):
+    """Gaussian beliefs about every slice.
+
+    Answers what ``SeriesPosterior`` does, and ``cov``.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import KalmanFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 0.1), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("x", lambda x_prev, v: bmc.Normal(x_prev + v, 0.1), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    >>> filtered = bmc.filter(dbn, {"y": [0.1, 1.2, 1.9]}, engine=KalmanFilter())
+    >>> filtered.cov("x", "v").shape
+    (3, 2, 2)
+    """
+
+    layout: Layout
+    spreads: Spreads
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Joint covariances of nodes in every slice.
+
+        Parameters
+        ----------
+        names : str
+            Nodes, whose numbers follow each other in this order; those of plates that are not filtered
+            separately are stacked before the event's.
+
+        Returns
+        -------
+        ndarray, shape (time, *plates, d, d)
+            The plates are those that are filtered separately.
+
+        Raises
+        ------
+        UnknownNodeError, UnsupportedError, QueryError
+        """
+        places = [self._place(n) for n in names]
+        return joined(self.layout, places, self.spreads.covariances(), self.steps)
+
+    def last(self, steps: int, kind: str) -> SeriesPosterior:
+        """The last so many slices by themselves."""
+        cut = super().last(steps, kind)
+        found = GaussianSeries(
+            self.model, self.engine, kind, None, tables=cut._tables, means=cut._means,
+            variances=cut._variances, steps=steps, start=cut.start,
+        )  # fmt: skip
+        found.layout, found.spreads = self.layout, self.spreads.last(steps)
+        return found
+
+    def _place(self, name: str) -> np.ndarray | int:
+        """Places of a node's numbers among the unknown ones, or how many known ones it has."""
+        self._node(name)
+        return place_of(self.layout, name, name in self._tables)
+
+
+class GaussianBelief:
+    """A Gaussian belief about one slice, as ``start`` and ``step`` of the Kalman filters give it.
+
+    Attributes
+    ----------
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import KalmanFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    >>> engine = KalmanFilter()
+    >>> belief = engine.step(engine.start(dbn), {"y": 0.8})
+    >>> belief.t, round(float(belief.mean("x")), 6), round(float(belief.var("x")), 6)
+    (0, 0.64, 0.2)
+    """
+
+    def __init__(
+        self,
+        dbn: DynamicBayesNet,
+        static: Mapping[str, Any],
+        t: int = -1,
+        taker: RowTaker | None = None,
+        taken: Taken | None = None,
+        log_marginal_likelihood: Any = 0.0,
+        inputs: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        self.dbn, self.static, self.t = dbn, dict(static), t
+        self.taker, self.taken = taker, taken
+        self.log_marginal_likelihood = log_marginal_likelihood
+        self.inputs = dict(inputs or {})
+
+    @property
+    def layout(self) -> Layout:
+        """Where the numbers stand."""
+        return self._slice.layout
+
+    @property
+    def vector(self) -> np.ndarray:
+        """Means of the unknown numbers, shape (*plates, n)."""
+        return self._slice.mean
+
+    @property
+    def factor(self) -> np.ndarray:
+        """Lower root of their covariance, shape ([*plates], n, n)."""
+        return self._slice.factor
+
+    @property
+    def known(self) -> dict[str, np.ndarray]:
+        """Values of nodes that are known."""
+        return self._slice.known
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that are answered for."""
+        return (*self.layout.rows, *self.known)
+
+    def mean(self, name: str) -> np.ndarray:
+        """Mean, shape ``(*plates, *event)``; an angle's lies in [-pi, pi)."""
+        place = self._place(name)
+        if isinstance(place, int):
+            return np.asarray(self.known[name], dtype=float)
+        node = self.layout.model[name]
+        return self.layout.unpacked(node, on_circle(self.layout, name, self.vector[..., place]))
+
+    def var(self, name: str) -> np.ndarray:
+        """Variance, shape ``(*plates, *event)``."""
+        place = self._place(name)
+        if isinstance(place, int):
+            return np.zeros(np.shape(self.known[name]))
+        rows = self.factor[..., place, :]
+        shape = (*self.layout.lead, len(place))
+        return self.layout.unpacked(
+            self.layout.model[name], np.broadcast_to(np.vecdot(rows, rows), shape)
+        )
+
+    def std(self, name: str) -> np.ndarray:
+        """Standard deviation, shape ``(*plates, *event)``."""
+        return np.sqrt(self.var(name))
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Joint covariance, shape ``(*plates, d, d)``, of nodes one after the other."""
+        places = [self._place(n) for n in names]
+        whole = self.factor @ np.matrix_transpose(self.factor)
+        return joined(self.layout, places, whole[None], 1)[0]
+
+    def __repr__(self) -> str:
+        if self.taken is None:
+            return "GaussianBelief(nothing absorbed yet)"
+        return f"GaussianBelief(t={self.t}, {', '.join(self.names)})"
+
+    # ---- private -------------------------------------------------------------------------------
+
+    @property
+    def _slice(self) -> Taken:
+        if self.taken is None:
+            raise QueryError(
+                "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
+            )
+        return self.taken
+
+    def _place(self, name: str) -> np.ndarray | int:
+        layout = self.layout
+        if name not in layout.rows and name not in self.known:
+            raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
+        return place_of(layout, name, layout.model[name].domain is not None)
+
+
+def on_circle(layout: Layout, name: str, value: np.ndarray) -> np.ndarray:
+    """Angles in [-pi, pi); other numbers as they are."""
+    if not layout.is_angle(name):
+        return value
+    return np.remainder(value + np.pi, 2 * np.pi) - np.pi
+
+
+def place_of(layout: Layout, name: str, is_table: bool) -> np.ndarray | int:
+    """Places of a node's numbers among the unknown ones, or how many known ones it has."""
+    if is_table:
+        raise QueryError(f"cov({name!r}): the node has states, not numbers")
+    place = layout.rows.get(name)
+    return layout.size(name) if place is None else np.arange(place.start, place.stop)
+
+
+def joined(
+    layout: Layout, places: list[np.ndarray | int], whole: np.ndarray, steps: int
+) -> np.ndarray:
+    """Covariance of some numbers, known ones with zeros, shape (steps, *lead, d, d)."""
+    sizes = [p if isinstance(p, int) else len(p) for p in places]
+    total, at = sum(sizes), 0
+    here: list[int] = []
+    there: list[int] = []
+    for place, size in zip(places, sizes, strict=True):
+        if not isinstance(place, int):
+            here += range(at, at + size)
+            there += place.tolist()
+        at += size
+    found = np.zeros((steps, *layout.lead, total, total))
+    part = whole[..., there, :][..., there]
+    wide = part.reshape(len(part), *(1,) * (found.ndim - part.ndim), *part.shape[1:])
+    index = np.asarray(here, dtype=np.intp)
+    found[..., index[:, None], index] = wide
+    return found

@@ -1,0 +1,287 @@
+"""What a cloud of particles says: expectations of nodes and functions, with the weights of its slice."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet
+from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
+from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.network import CompiledNode, Model
+from bayesmc.results.posterior import circular_variance, table_variance
+
+
+class ParticleBelief:
+    """Particles of one slice, as ``ParticleFilter.start`` and ``step`` give them.
+
+    Attributes
+    ----------
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far.
+    weight_ess : float or ndarray
+        Equally weighted particles that these are worth.
+    resampled : bool or ndarray of bool
+        Whether they were resampled on the way into this slice.
+    weights : ndarray, shape (particles, *plates)
+        Normalised weights; the plates are those that are filtered separately.
+    ancestors : ndarray of int or None
+        Positions among the particles of the slice before; None where everybody has itself.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    >>> engine = bmc.ParticleFilter(1000)
+    >>> belief = engine.start(dbn, rng=0)
+    >>> belief = engine.step(belief, {"y": 0.8})
+    >>> belief.t, bool(abs(belief.mean("x") - 0.64) < 0.05)
+    (0, True)
+    """
+
+    def __init__(
+        self,
+        dbn: DynamicBayesNet,
+        seed: np.random.SeedSequence,
+        static: Mapping[str, Any],
+        mover: Mover | None = None,
+        cloud: Cloud | None = None,
+        log_marginal_likelihood: Any = 0.0,
+        chance: Mapping[str, Any] | None = None,
+        inputs: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        self.dbn, self.seed, self.static = dbn, seed, dict(static)
+        self.mover, self.cloud, self.chance = mover, cloud, chance
+        self.inputs = dict(inputs or {})
+        self.log_marginal_likelihood = log_marginal_likelihood
+        self.t = -1 if cloud is None else cloud.t
+
+    @property
+    def weights(self) -> np.ndarray:
+        cloud = self._cloud
+        return cloud.weights / cloud.total
+
+    @property
+    def weight_ess(self) -> Any:
+        ess = self._cloud.ess
+        return ess if np.ndim(ess) else float(ess)
+
+    @property
+    def resampled(self) -> Any:
+        found = self._cloud.resampled
+        return found if np.ndim(found) else bool(found)
+
+    @property
+    def ancestors(self) -> np.ndarray | None:
+        return self._cloud.ancestors
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes whose particles are kept."""
+        return tuple(self._cloud.values)
+
+    def particles(self, name: str) -> np.ndarray:
+        """Values of all particles, ``(particles, *plates, *event)``, not weighted."""
+        node, value = self._found(name)
+        full = np.broadcast_to(value, (self._mover.particles, *node.value_shape))
+        return np.array(node.decode(full), subok=True)
+
+    def mean(self, name: str) -> np.ndarray:
+        """Mean, shape ``(*plates, *event)``; circular for angles."""
+        node, value = self._found(name)
+        return _mean(self._mover.layout, self._cloud, node, value)
+
+    def var(self, name: str) -> np.ndarray:
+        """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
+        node, value = self._found(name)
+        return _variance(self._mover.layout, self._cloud, node, value)
+
+    def std(self, name: str) -> np.ndarray:
+        """Standard deviation, shape ``(*plates, *event)``."""
+        return np.sqrt(self.var(name))
+
+    def probabilities(self, name: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
+        node, value = self._found(name)
+        if node.domain is None:
+            raise QueryError(
+                f"probabilities({name!r}): the node has no finite set of states; use mean, var or expectation"
+            )
+        return table_of_states(self._mover.layout, self._cloud, node, value)
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Mean of a function of nodes of the slice, whose arguments have a leading axis of particles."""
+        return expectation(self._mover.layout, self._cloud, self._mover.slices.first, function)
+
+    def __repr__(self) -> str:
+        if self.cloud is None:
+            return "ParticleBelief(nothing absorbed yet)"
+        ess = np.round(self.weight_ess, 1)
+        return f"ParticleBelief(t={self.t}, {self._mover.particles} particles, ess={ess})"
+
+    # ---- private -------------------------------------------------------------------------------
+
+    @property
+    def _cloud(self) -> Cloud:
+        if self.cloud is None:
+            raise QueryError(
+                "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
+            )
+        return self.cloud
+
+    @property
+    def _mover(self) -> Mover:
+        assert self.mover is not None
+        return self.mover
+
+    def _found(self, name: str) -> tuple[CompiledNode, np.ndarray]:
+        cloud = self._cloud
+        if name not in cloud.values:
+            raise UnknownNodeError(
+                f"particles of {name!r} are not kept; there are those of {list(cloud.values)}"
+            )
+        return self._mover.slices.first[name], cloud.values[name]
+
+
+def expectation(
+    layout: Layout, cloud: Cloud, model: Model, function: Callable[..., Any]
+) -> np.ndarray:
+    """Weighted mean of a function's values, shape what one value has."""
+    arguments = []
+    for name in inspect.signature(function).parameters:
+        if name not in cloud.values:
+            raise UnknownNodeError(
+                f"a query reads {name!r}, of which there are no particles; there are those of "
+                f"{list(cloud.values)}"
+            )
+        node = model[name]
+        shape = (layout.particles, *node.value_shape)
+        arguments.append(node.decode(np.broadcast_to(cloud.values[name], shape)))
+    values = np.asarray(function(*arguments))
+    if not values.ndim or len(values) != layout.particles:
+        raise QueryError(
+            f"a query returns shape {values.shape}; it must return one value per particle, the axis of "
+            f"{layout.particles} particles first"
+        )
+    if layout.apart and values.shape[1 : 1 + len(layout.apart)] != layout.lead:
+        raise QueryError(
+            f"a query returns shape {values.shape}; plates {layout.apart} are filtered separately, so their "
+            "axes follow that of the particles"
+        )
+    lead = cloud.weights.reshape(cloud.weights.shape + (1,) * (values.ndim - cloud.weights.ndim))
+    share = np.asarray(cloud.total)
+    total = share.reshape(share.shape + (1,) * (values.ndim - 1 - share.ndim))
+    return (lead * values).sum(axis=0) / total
+
+
+def table_of_states(
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray
+) -> np.ndarray:
+    """Probabilities of a finite node's states, shape ``(*plates, states)``."""
+    assert node.domain is not None
+    states = np.arange(node.domain.size)
+    if value.ndim == len(node.value_shape):
+        return (value[..., None] == states).astype(float)
+    if not layout.apart and not node.plates:
+        counts = np.bincount(value, cloud.weights, minlength=len(states))
+        return counts / cloud.total
+    hits = value[..., None] == states
+    return _average(layout, cloud, node, hits.astype(float), 1)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _mean(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
+    if node.domain is not None:
+        return table_of_states(layout, cloud, node, value) @ _numbers(node)
+    if value.ndim == len(node.value_shape):
+        return value
+    if _is_angle(node):
+        return np.arctan2(*_turn(layout, cloud, node, value))
+    return _average(layout, cloud, node, value)
+
+
+def _variance(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
+    if node.domain is not None:
+        return table_variance(table_of_states(layout, cloud, node, value), _numbers(node))
+    if value.ndim == len(node.value_shape):
+        return np.zeros(node.value_shape)
+    if _is_angle(node):
+        return circular_variance(*_turn(layout, cloud, node, value))
+    off = value - _average(layout, cloud, node, value)
+    return _average(layout, cloud, node, off * off)
+
+
+def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
+    """Mean and variance of a node that is not finite, in blocks of particles."""
+    if layout.apart or value.ndim == len(node.value_shape) or _is_angle(node):
+        return _mean(layout, cloud, node, value), _variance(layout, cloud, node, value)
+    centre: Any = None
+    alone = True
+    first: Any = 0.0
+    second: Any = 0.0
+    for low in range(0, len(value), layout.block):
+        part, weights = value[low : low + layout.block], cloud.weights[low : low + layout.block]
+        if part.ndim > 1:
+            part = part.reshape(len(part), -1)
+        if centre is None:  # near the mean, so that the squares do not cancel
+            alone = len(value) <= layout.block
+            share = cloud.total if alone else weights.sum()
+            centre = weights @ part / share if share > 0 else part[0]
+        off = part - centre
+        if not alone:
+            first = first + weights @ off
+        off *= off
+        second = second + weights @ off
+    mean, variance = first / cloud.total, second / cloud.total
+    if not alone:
+        variance = np.maximum(variance - mean * mean, 0.0)
+    if value.ndim == 1:
+        return mean + centre, variance
+    return (mean + centre).reshape(value.shape[1:]), variance.reshape(value.shape[1:])
+
+
+def _average(
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray, more: int = 0
+) -> Any:
+    """Weighted mean over particles; ``more`` axes follow the event's."""
+    if not layout.apart:
+        flat = cloud.weights @ value.reshape(len(value), -1) if value.ndim > 1 else None
+        if flat is None:
+            return cloud.weights @ value / cloud.total
+        return (flat / cloud.total).reshape(value.shape[1:])
+    order = [p for p in node.plates if p in layout.apart]
+    axes = [layout.apart.index(p) for p in order]
+    shape = [
+        n if p in layout.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
+    ]
+    tail = [1] * (len(node.event_shape) + more)
+    weights = cloud.weights.transpose(0, *(1 + a for a in axes)).reshape(len(value), *shape, *tail)
+    total = cloud.total.transpose(axes).reshape(*shape, *tail)
+    return (weights * value).sum(axis=0) / total
+
+
+def _turn(
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    sine = _average(layout, cloud, node, np.sin(value))
+    return sine, _average(layout, cloud, node, np.cos(value))
+
+
+def _is_angle(node: CompiledNode) -> bool:
+    return node.support is not None and node.support.kind == "circle"
+
+
+def _numbers(node: CompiledNode) -> np.ndarray:
+    assert node.domain is not None
+    if node.domain.labels is not None:
+        raise QueryError(f"{node.name!r} has labels, which have no mean; use probabilities")
+    return np.asarray(node.domain.numbers, dtype=float)

@@ -1,0 +1,419 @@
+"""Particle filters: weighted draws of a slice, carried to the next, resampled where weights are uneven.
+
+Every slice is one forward pass over the two-slice template (``slice_steps``); what a filter keeps of it is a
+``Cloud``. ``belief`` answers questions about a cloud, ``record`` collects the answers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, Row, Slices
+from bayesmc.engines.slice_steps import SlicePlan, size_of
+from bayesmc.errors import DegeneracyError
+from bayesmc.network.forward import Pass, Step, WeighDrawn
+from bayesmc.shapes import first_index
+
+#: log factors by which particles of the slice before are chosen, from its values and the row
+FirstStage = Callable[[Mapping[str, np.ndarray], Row, np.random.Generator], np.ndarray]
+
+#: numbers of the largest node in a block of particles: its temporaries stay in cache
+BLOCK = 8192
+
+
+class Cloud(NamedTuple):
+    """Particles of one slice.
+
+    Attributes
+    ----------
+    t : int
+    values : dict
+        Node -> stored values, shape ``(particles, *plates, *event)``; without the first axis where all
+        particles agree.
+    log_weights : ndarray, shape (particles, *apart)
+        Up to a constant.
+    weights : ndarray, shape (particles, *apart)
+        Their exponentials relative to the largest.
+    total : ndarray, shape (*apart,)
+        Sums of ``weights``.
+    log_total : ndarray, shape (*apart,)
+        Log of the sums of the exponentials of ``log_weights``.
+    increment : ndarray, shape (*apart,)
+        Log density of the row given the rows before.
+    ess : ndarray, shape (*apart,)
+    ancestors : ndarray of int or None
+        Positions in the cloud before, sorted; None where every particle has itself.
+    resampled : ndarray of bool, shape (*apart,)
+    rejuvenated : bool
+        Whether they were drawn anew, since all weights had vanished.
+    """
+
+    t: int
+    values: dict[str, np.ndarray]
+    log_weights: np.ndarray
+    weights: np.ndarray
+    total: Any
+    log_total: Any
+    increment: Any
+    ess: Any
+    ancestors: np.ndarray | None = None
+    resampled: Any = False
+    rejuvenated: bool = False
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the arrays of a cloud are laid out.
+
+    Attributes
+    ----------
+    particles : int
+    apart : tuple of str
+        Plates whose elements have weights of their own: axes of the weights after that of the particles.
+    lead : tuple of int
+        Their sizes.
+    block : int
+        Particles that are worked on at a time.
+    """
+
+    particles: int
+    apart: tuple[str, ...]
+    lead: tuple[int, ...]
+    block: int = BLOCK
+
+
+def even_cloud(t: int, values: dict[str, np.ndarray], layout: Layout) -> Cloud:
+    """Draws of equal weight as a cloud."""
+    shape = (layout.particles, *layout.lead)
+    ones, none = np.ones(shape), np.zeros(layout.lead)
+    count = np.full(layout.lead, float(layout.particles))
+    return Cloud(t, values, np.zeros(shape), ones, count, np.log(count), none, count)
+
+
+class Selection(NamedTuple):
+    """Who has offspring, and what weight the offspring start with.
+
+    Attributes
+    ----------
+    ancestors : ndarray of int or None
+        Sorted positions; None where everybody has one.
+    resampled : bool or ndarray of bool, shape (*apart,)
+    carried : ndarray or float
+        Log weights that the offspring have already.
+    spent : ndarray or float, shape (*apart,)
+        Log of what their sum stands for: an increment is the log of the new sum, less this.
+    """
+
+    ancestors: np.ndarray | None
+    resampled: Any
+    carried: Any
+    spent: Any
+
+
+class Mover:
+    """Moves clouds from slice to slice: the plan of a particle filter on a template.
+
+    Parameters
+    ----------
+    slices : Slices
+    particles : int
+    resample : callable
+        ``(weights, draws, rng) -> indices``.
+    threshold : float
+        Share of the particles below which their effective number has them resampled.
+    plan : SlicePlan
+    first_stage : callable, optional
+        ``(before, row, rng) -> log factors``, by which particles are chosen for their future.
+    rejuvenate : callable, optional
+        ``row -> steps`` of a slice that does not look at the slice before, for where all weights vanish.
+    kept : sequence of str, optional
+        Nodes whose values clouds hold besides those that the next slice reads; all by default.
+    """
+
+    def __init__(
+        self,
+        slices: Slices,
+        particles: int,
+        resample: Callable[..., np.ndarray],
+        threshold: float,
+        plan: SlicePlan,
+        first_stage: FirstStage | None = None,
+        rejuvenate: Callable[[Row], Sequence[Step]] | None = None,
+        kept: Sequence[str] | None = None,
+    ) -> None:
+        self.slices, self.particles = slices, particles
+        self.resample, self.threshold = resample, threshold
+        self.plan, self.apart = plan, plan.apart
+        self.first_stage, self.rejuvenate = first_stage, rejuvenate
+        wanted = slices.dynamic if kept is None else (*slices.interface, *kept)
+        self.kept = tuple(dict.fromkeys(wanted))
+        self.block = max(1, BLOCK // max(size_of(slices), 1))
+        self.lead = tuple(slices.first.sizes[p] for p in self.apart)
+        self.layout = Layout(particles, self.apart, self.lead, self.block)
+        self._log_particles = math.log(particles)
+        self._even = np.ones((particles, *self.lead))
+        self._even.flags.writeable = False
+        self._spare = _Spare()
+
+    def first(self, row: Row, rng: np.random.Generator) -> Cloud:
+        """The cloud of slice 0."""
+        start = Selection(None, np.zeros(self.lead, dtype=bool), 0.0, self._log_particles)
+        return self._moved(row, {}, start, rng)
+
+    def recycle(self, cloud: Cloud) -> None:
+        """Take back the large arrays of a cloud that nobody will look at again."""
+        if self.particles > self.block:
+            self._spare.put(cloud.weights, cloud.log_weights, *cloud.values.values())
+
+    def next(self, cloud: Cloud, row: Row, rng: np.random.Generator) -> Cloud:
+        """The cloud of the next slice: resample if need be, move, weight."""
+        before = {n + PREVIOUS: cloud.values[n] for n in self.slices.interface}
+        return self._moved(row, before, self._selected(cloud, before, row, rng), rng)
+
+    def _moved(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        selection: Selection,
+        rng: np.random.Generator,
+    ) -> Cloud:
+        values, log = self._passed(self.plan.steps(row), row, before, selection.ancestors, rng)
+        cloud = self._weighted(row, values, log, selection)
+        if cloud is not None:
+            return cloud
+        if self.rejuvenate is not None:
+            values, log = self._passed(self.rejuvenate(row), row, before, selection.ancestors, rng)
+            fresh = Selection(None, True, 0.0, self._log_particles)
+            cloud = self._weighted(row, values, log, fresh)
+            if cloud is not None:
+                return cloud._replace(rejuvenated=True)
+        raise self._degenerate(row, before, values, selection)
+
+    def _selected(
+        self,
+        cloud: Cloud,
+        before: Mapping[str, np.ndarray],
+        row: Row,
+        rng: np.random.Generator,
+    ) -> Selection:
+        """Resample where weights are uneven; with a first stage, by what the next row makes of them."""
+        n, total = self.particles, cloud.log_total
+        weights, ess, factor, gained = cloud.weights, cloud.ess, None, 0.0
+        if self.first_stage is not None and row.seen:
+            factor = self.first_stage(before, row, rng)
+            log = cloud.log_weights + factor
+            level = _top(log)
+            weights = np.exp(log - level)
+            chosen_from = weights.sum(axis=0)
+            ess = chosen_from**2 / _squares(weights)
+            gained = level + np.log(chosen_from) - total
+        poor = ess < self.threshold * n
+        some, every = (poor, poor) if not self.apart else (poor.any(), poor.all())
+        if not some:
+            return Selection(None, poor, cloud.log_weights, total)
+        chosen = self.resample(weights, n, rng)
+        carried: Any = 0.0
+        if factor is not None:
+            carried = -(factor[chosen] if not self.apart else np.take_along_axis(factor, chosen, 0))
+        if every:
+            return Selection(chosen, poor, carried, self._log_particles - gained)
+        own = np.arange(n).reshape((-1,) + (1,) * len(self.apart))
+        return Selection(
+            np.where(poor, chosen, own),
+            poor,
+            np.where(poor, carried, cloud.log_weights),
+            np.where(poor, self._log_particles - gained, total),
+        )
+
+    def _passed(
+        self,
+        steps: Sequence[Step],
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        ancestors: np.ndarray | None,
+        rng: np.random.Generator,
+    ) -> tuple[dict[str, np.ndarray], Any]:
+        """One forward pass over a slice, in blocks of particles: kept values and log weights."""
+        n, known = self.particles, self.plan.known(row)
+        if n <= self.block:
+            taken = {k: self._taken(k, v, ancestors) for k, v in before.items()}
+            state = _run(steps, Pass(rng, (n,), {**known, **taken}))
+            return {k: state.values[k] for k in self.kept}, state.log_weight
+        values: dict[str, np.ndarray] = {}
+        log: Any = 0.0
+        for low in range(0, n, self.block):
+            high = min(low + self.block, n)
+            part = None if ancestors is None else ancestors[low:high]
+            taken = {
+                k: self._taken(
+                    k,
+                    v if part is not None else self._cut(k, v, low, high),
+                    part,
+                )
+                for k, v in before.items()
+            }
+            state = _run(steps, Pass(rng, (high - low,), {**known, **taken}))
+            self._store(values, state.values, low, high)
+            weight = np.asarray(state.log_weight)
+            if weight.ndim <= len(self.lead):
+                log = weight  # nothing was seen, or nothing that depends on the particles
+                continue
+            if low == 0:
+                log = self._spare.get((n, *self.lead), np.dtype(float))
+            log[low:high] = weight
+        return values, log
+
+    def _store(
+        self, values: dict[str, np.ndarray], found: Mapping[str, np.ndarray], low: int, high: int
+    ) -> None:
+        for name in self.kept:
+            value = found[name]
+            shape = self.slices.first[name].value_shape
+            if value.ndim == len(shape):
+                values[name] = value  # the same for all particles
+                continue
+            if low == 0:
+                values[name] = self._spare.get((self.particles, *shape), value.dtype)
+            values[name][low:high] = value
+
+    def _cut(self, name: str, value: np.ndarray, low: int, high: int) -> np.ndarray:
+        """A block of a node's values, read-only."""
+        if value.ndim == len(self.slices.later[name].value_shape):
+            return value
+        part = value[low:high]
+        part.flags.writeable = False
+        return part
+
+    def _taken(self, name: str, value: np.ndarray, ancestors: np.ndarray | None) -> np.ndarray:
+        """A node's values of the slice before, of the ancestors of a block."""
+        if ancestors is None:
+            return value
+        node = self.slices.later[name]
+        if value.ndim == len(node.value_shape):
+            return value
+        if not self.apart:
+            found = value.take(ancestors, axis=0, mode="clip")  # they lie within
+        else:
+            found = along_plates(value, ancestors, node.plates, self.apart)
+        found.flags.writeable = False
+        return found
+
+    def _weighted(
+        self, row: Row, values: dict[str, np.ndarray], log: Any, selection: Selection
+    ) -> Cloud | None:
+        """The cloud of a slice; None where no weight is left somewhere."""
+        n, shape = self.particles, (self.particles, *self.lead)
+        log = selection.carried + log if np.ndim(selection.carried) else np.asarray(log)
+        if np.ndim(log) <= len(self.lead) and np.all(log == 0.0):
+            even = np.full(self.lead, float(n)) if self.lead else float(n)
+            return Cloud(
+                row.t, values, np.broadcast_to(0.0, shape), self._even, even, np.log(even),
+                np.log(even) - selection.spent, even, selection.ancestors, selection.resampled,
+            )  # fmt: skip
+        if log.shape != shape:
+            log = np.broadcast_to(log, shape)
+        level = _top(log)
+        weights = self._spare.get(shape, np.dtype(float))
+        total: Any = 0.0
+        squares: Any = 0.0
+        for low in range(0, n, self.block):
+            part = weights[low : low + self.block]
+            np.subtract(log[low : low + self.block], level, out=part)
+            np.exp(part, out=part)
+            total = total + np.add.reduce(part)
+            squares = squares + _squares(part)
+        if not (total > 0 if not self.lead else (total > 0).all()):
+            return None
+        log_total = level + (math.log(total) if not self.lead else np.log(total))
+        return Cloud(
+            row.t, values, log, weights, total, log_total, log_total - selection.spent,
+            total * total / squares, selection.ancestors, selection.resampled,
+        )  # fmt: skip
+
+    def _degenerate(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        values: Mapping[str, np.ndarray],
+        selection: Selection,
+    ) -> DegeneracyError:
+        """The error, with the first observed node at which no weight was left."""
+        taken = {k: self._taken(k, v, selection.ancestors) for k, v in before.items()}
+        known = {**self.plan.known(row), **taken, **values}
+        state = Pass(np.random.default_rng(0), (self.particles,), known)
+        model, node, which = self.slices.model(row.t), None, ""
+        for name in (n for n in self.slices.dynamic if n in row.seen):
+            WeighDrawn(model, model[name], self.apart)(state)
+            alive = np.asarray(np.any(np.asarray(state.log_weight) > -np.inf, axis=0))
+            if not alive.all():
+                node, at = name, first_index(~alive)
+                which = f" (plate element {at if len(at) > 1 else at[0]})" if at else ""
+                break
+        what = f"the value of {node!r}{which}" if node else "what was seen"
+        return DegeneracyError(
+            f"none of {self.particles} particles explains {what} in slice {row.t}: every weight is zero; use "
+            "more particles, a proposal= that looks at the observations, noise that is less narrow, or "
+            'on_degeneracy="rejuvenate"',
+            row.t,
+            node,
+        )
+
+
+def along_plates(
+    value: np.ndarray,
+    index: np.ndarray,
+    plates: tuple[str, ...],
+    apart: tuple[str, ...],
+) -> np.ndarray:
+    """``value[index]`` on the first axis; elements of the plates ``apart`` have indices of their own."""
+    ndim = 1 + len(plates)
+    order = [apart.index(p) if p in apart else None for p in plates]
+    shape = [len(index), *(index.shape[1 + k] if k is not None else 1 for k in order)]
+    first = index.transpose(0, *(1 + k for k in order if k is not None)).reshape(shape)
+    rest = [
+        np.arange(value.shape[axis]).reshape([-1 if a == axis else 1 for a in range(ndim)])
+        for axis in range(1, ndim)
+    ]
+    return value[(first, *rest)]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Spare:
+    """Large arrays that are used again: fresh ones cost the machine a page at a time."""
+
+    def __init__(self) -> None:
+        self._free: dict[tuple[Any, ...], list[np.ndarray]] = {}
+
+    def get(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        free = self._free.get((shape, dtype))
+        return free.pop() if free else np.empty(shape, dtype)
+
+    def put(self, *arrays: np.ndarray) -> None:
+        for array in arrays:
+            if array.flags.owndata and array.flags.writeable:
+                self._free.setdefault((array.shape, array.dtype), []).append(array)
+
+
+def _top(log: np.ndarray) -> Any:
+    """The largest log weight; 0 where all are minus infinity."""
+    level = np.maximum.reduce(log)
+    if log.ndim == 1:
+        return level if level > -np.inf else 0.0
+    return np.where(level > -np.inf, level, 0.0)
+
+
+def _squares(weights: np.ndarray) -> Any:
+    return weights @ weights if weights.ndim == 1 else np.einsum("i...,i...->...", weights, weights)
+
+
+def _run(steps: Sequence[Step], state: Pass) -> Pass:
+    for step in steps:
+        step(state)
+    return state

@@ -1,0 +1,383 @@
+"""``ParticleFilter``: options, refusals, the run over a series and the same moves one by one."""
+
+from __future__ import annotations
+
+import inspect
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import numpy as np
+
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices, read_row, read_static
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
+from bayesmc.engines.particles.optimal import OptimalPlan, why_not_optimal
+from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.smoothing import Backward, ancestors_of, carried
+from bayesmc.engines.particles.stages import GivenStage, PluggedIn, Rejuvenation
+from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
+from bayesmc.errors import UnsupportedError
+from bayesmc.network.forward import refuse_unsampled
+from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, seed_sequence, stream
+from bayesmc.resampling import Adaptive, scheme_of
+
+
+@dataclass(frozen=True)
+class ParticleFilter(FilterEngine):
+    """Sequential Monte Carlo on a template: sample what is hidden, weight by what is seen, resample.
+
+    Parameters
+    ----------
+    particles : int
+    resampling : str or callable
+        ``"multinomial"``, ``"stratified"``, ``"systematic"``, ``"residual"``, ``"ssp"``, or a function
+        ``(weights, draws, rng) -> sorted indices``.
+    ess_threshold : float
+        Particles are resampled on the way into a slice where they are worth less than this share of their
+        number: 1 resamples (nearly) always, 0 never (sequential importance sampling).
+
+    proposal : dict, optional
+        Node, or tuple of nodes drawn jointly -> a function whose arguments are the slice before
+        (``x_prev``), observed nodes of the slice, inputs, ``t`` or nodes drawn before, and which returns the
+        distribution to draw from, as for ``Importance``; weights are multiplied by p/q. It does not apply
+        where it names what is missing (an observation, or the slice before slice 0): there the node's own
+        density is drawn from. A detector mixed with the transition is a ``Mixture`` of both. ``"optimal"``
+        derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
+        is seen is affine in them, else its linearisation at each particle.
+    auxiliary : bool or callable
+        Resample with a look at the next row: particles are chosen by their weight times a first-stage
+        factor, by default the density of the row at the conditional means of what is hidden; or a function
+        of the slice before and observed nodes that returns log factors.
+    on_degeneracy : "raise" or "rejuvenate"
+        What to do where all weights vanish.
+    rejuvenation : dict, optional
+        Node -> density to draw it from then, given observed nodes, inputs or ``t``; all nodes that the next
+        slice reads. The slice is weighted as if that density were the model's, so its answers and the
+        evidence are biased; ``rejuvenated`` of the result says which slices.
+
+    trajectories : int, optional
+        Trajectories that ``smooth`` draws; by default as many as there are particles.
+    backward : "rejection" or "exact"
+        How ``smooth`` draws them: by rejection where the transition's height is known (time linear in the
+        particles, and the same law), else with all particles tried for each.
+
+    Raises
+    ------
+    DegeneracyError
+        From the filter, with the slice and the node at which no weight was left.
+
+    Notes
+    -----
+    Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
+    sequences in a plate are 64 filters in one array.
+
+    References
+    ----------
+    Gordon, Salmond and Smith (1993), IEE Proceedings F 140; Koller and Friedman (2009), sec. 15.3.3
+    (LW-2TBN); Doucet and Johansen (2011), A tutorial on particle filtering and smoothing; Pitt and Shephard
+    (1999), JASA 94; Okuma et al. (2004), A boosted particle filter.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 2.0))
+    >>> dbn.add("y", lambda x: bmc.StudentT(4.0, x, 0.5))
+    >>> filtered = bmc.filter(dbn, {"y": [1.2, 0.4, 0.7]}, engine=bmc.ParticleFilter(5000), rng=0)
+    >>> filtered.mean("x").shape, bool(filtered.log_marginal_likelihood < 0)
+    ((3,), True)
+    """
+
+    particles: int = 1000
+    resampling: str | Callable[..., np.ndarray] = "systematic"
+    ess_threshold: float = 0.5
+    proposal: Mapping[Any, Any] | str | None = field(default=None, hash=False)
+    auxiliary: bool | Callable[..., Any] = False
+    on_degeneracy: str = "raise"
+    rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
+    trajectories: int | None = None
+    backward: str = "rejection"
+
+    label: ClassVar[str] = "particle filter"
+
+    def __post_init__(self) -> None:
+        n = self.particles
+        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
+            raise ValueError(
+                f"ParticleFilter(particles={n!r}): give a number of particles, 1 or more, such as 10_000"
+            )
+        threshold = self.ess_threshold
+        if (
+            isinstance(threshold, bool)
+            or not isinstance(threshold, (int, float))
+            or not threshold >= 0
+        ):
+            raise ValueError(
+                f"ParticleFilter(ess_threshold={threshold!r}): give a share of the particles, 0 (never "
+                "resample) to 1 (always)"
+            )
+        scheme_of(self.resampling)
+        accepted = FUNCTION
+        for option in ("proposal", "rejuvenation"):
+            given = getattr(self, option)
+            if option == "proposal" and isinstance(given, str):
+                if given != "optimal":
+                    raise ValueError(
+                        f'ParticleFilter(proposal={given!r}): give "optimal", or a dict from node name to '
+                        f"{accepted}"
+                    )
+            elif given is not None:
+                checked = check_specification("ParticleFilter", given, accepted)
+                for key, spec in checked.items():
+                    as_function("ParticleFilter", key, spec, accepted)
+                object.__setattr__(self, option, MappingProxyType(checked))
+        if self.backward not in ("rejection", "exact"):
+            raise ValueError(
+                f'ParticleFilter(backward={self.backward!r}): give "rejection" or "exact"'
+            )
+        m = self.trajectories
+        if m is not None and (isinstance(m, bool) or not isinstance(m, (int, np.integer)) or m < 1):
+            raise ValueError(
+                f"ParticleFilter(trajectories={m!r}): give a number of them, 1 or more"
+            )
+        if self.on_degeneracy not in ("raise", "rejuvenate"):
+            raise ValueError(
+                f'ParticleFilter(on_degeneracy={self.on_degeneracy!r}): give "raise" or "rejuvenate"'
+            )
+        if (self.on_degeneracy == "rejuvenate") != (self.rejuvenation is not None):
+            raise ValueError(
+                'ParticleFilter: on_degeneracy="rejuvenate" and rejuvenation={node: density} go together'
+            )
+        if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
+            raise TypeError(
+                f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
+                "log factors"
+            )
+
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        common = super().refusal(problem)
+        if common is not None:
+            return common
+        known = {*problem.slices.template.static, *problem.series.observed}
+        if isinstance(self.proposal, str):
+            why = why_not_optimal(problem.slices, tuple(problem.series.observed))
+            if why is not None:
+                return why
+        else:
+            proposals = SliceProposals(problem.slices, self.proposal or {}, "ParticleFilter")
+            proposals.check(problem.series.observed.keys())
+        for model in (problem.slices.first, problem.slices.later):
+            inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
+            reason = refuse_unsampled(model, inside, "ParticleFilter")
+            if reason is not None:
+                return reason
+        return None
+
+    def describe(self, problem: SeriesProblem) -> dict[str, str]:
+        found = {}
+        for name in problem.slices.template.later:
+            node = problem.model[name]
+            seen = problem.series.observed.get(name)
+            if name in problem.slices.template.inputs:
+                found[name] = "input"
+            elif name in problem.slices.template.static:
+                found[name] = "static, known"
+            elif not node.is_stochastic:
+                found[name] = "computed"
+            elif seen is None:
+                found[name] = "sampled given its parents"
+            else:
+                found[name] = "observed, weights the particles"
+                if seen.mask is not None:
+                    found[name] += "; sampled where it is missing"
+        return found
+
+    def filter(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        keep: str | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> FilteredParticles:
+        if keep not in (None, "particles"):
+            raise ValueError(
+                f'keep={keep!r}: give "particles", or None for answers of constant size'
+            )
+        static = {n: o.value for n, o in problem.series.static.items()}
+        asked = [p for q in (queries or {}).values() for p in inspect.signature(q).parameters]
+        wanted = None if keep else [*problem.hidden, *asked]
+        mover = self._mover(problem.slices, static, wanted)
+        record = Record(problem, mover.layout, queries or {}, keep is not None)
+        rng = stream(seed, Purpose.FILTER)
+        rows = problem.series
+        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            cloud = None
+            for k in range(problem.steps):
+                row, old = rows.row(k), cloud
+                cloud = mover.first(row, rng) if old is None else mover.next(old, row, rng)
+                record.add(k, cloud)
+                if old is not None and keep is None:
+                    mover.recycle(old)
+                bar.advance()
+        return record.posterior(self)
+
+    def smooth(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> FilteredParticles:
+        if lag is not None:
+            return self._lagged(problem, seed, lag, queries or {}, progress)
+        sums = carried(problem.slices)
+        if sums:
+            raise UnsupportedError(
+                f"ParticleFilter: {sums[0]!r} is computed from its own past, so trajectories cannot be drawn "
+                "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
+            )
+        filtered = self.filter(problem, seed, keep="particles", progress=progress)
+        assert filtered.clouds is not None
+        static = {n: o.value for n, o in problem.series.static.items()}
+        mover = self._mover(problem.slices, static)
+        count = self.particles if self.trajectories is None else self.trajectories
+        backward = Backward(mover.plan, mover.layout, self.backward == "rejection")
+        with _quiet():
+            rng = stream(seed, Purpose.SMOOTH)
+            found = backward.trajectories(filtered.clouds, problem.series, count, rng)
+            layout = Layout(count, mover.apart, mover.lead)
+            record = Record(problem, layout, queries or {}, True)
+            for k, cloud in enumerate(found):
+                record.add(k, cloud)
+        return self._given_filtered(record.posterior(self, "smooth"), filtered)
+
+    def _lagged(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        lag: int,
+        queries: Queries,
+        progress: bool | None,
+    ) -> FilteredParticles:
+        """Slices by the particles of ``lag`` slices later, through their ancestors."""
+        static = {n: o.value for n, o in problem.series.static.items()}
+        mover = self._mover(problem.slices, static)
+        record = Record(problem, mover.layout, queries, False)
+        filtered = Record(problem, mover.layout, {}, False)
+        window: deque[Cloud] = deque(maxlen=lag + 1)
+        rng, last = stream(seed, Purpose.FILTER), problem.steps - 1
+        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            cloud = None
+            for k in range(problem.steps):
+                row = problem.series.row(k)
+                cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
+                filtered.add(k, cloud)
+                window.append(cloud)
+                while window and (len(window) > lag or k == last):
+                    values = ancestors_of(list(window), mover.layout, mover.slices)
+                    at = k - len(window) + 1
+                    record.add(at, cloud._replace(t=window[0].t, values=values))
+                    window.popleft()
+                bar.advance()
+        return self._given_filtered(record.posterior(self, "fixed-lag"), filtered.posterior(self))
+
+    def _given_filtered(
+        self, found: FilteredParticles, filtered: FilteredParticles
+    ) -> FilteredParticles:
+        """Smoothed answers with the filter's figures."""
+        found.log_marginal_increments = filtered.log_marginal_increments
+        found.log_marginal_likelihood = filtered.log_marginal_likelihood
+        found.weight_ess, found.resampled = filtered.weight_ess, filtered.resampled
+        found.unique_ancestors = filtered.unique_ancestors
+        found.rejuvenated = filtered.rejuvenated
+        return found
+
+    def start(
+        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
+    ) -> ParticleBelief:
+        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes."""
+        dbn.validate()
+        return ParticleBelief(dbn.copy(), seed_sequence(rng), static or {})
+
+    def step(
+        self,
+        belief: ParticleBelief,
+        observations: Mapping[str, Any] | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> ParticleBelief:
+        """The belief about the next slice, whose row this is; the old belief stays as it is.
+
+        Parameters
+        ----------
+        observations : dict, optional
+            Node -> its value in this slice, without an axis for time; what is left out is missing.
+        inputs : dict, optional
+            Input -> its value in this slice.
+        """
+        t, mover = belief.t + 1, belief.mover
+        slices, row = read_row(
+            belief.dbn, mover.slices if mover else None, t, observations, inputs, belief.inputs
+        )
+        if mover is None:
+            mover = self._mover(slices, read_static(slices, belief.static))
+        rng = stream(belief.seed, Purpose.FILTER)
+        if belief.chance is not None:
+            rng.bit_generator.state = belief.chance
+        with _quiet():
+            if belief.cloud is None:
+                cloud = mover.first(row, rng)
+            else:
+                cloud = mover.next(belief.cloud, row, rng)
+        total = belief.log_marginal_likelihood + cloud.increment
+        return ParticleBelief(
+            belief.dbn, belief.seed, belief.static, mover, cloud,
+            total if np.ndim(total) else float(total), rng.bit_generator.state,
+            {n: row.inputs[n] for n in slices.template.inputs},
+        )  # fmt: skip
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _mover(
+        self,
+        slices: Slices,
+        static: Mapping[str, np.ndarray],
+        kept: Sequence[str] | None = None,
+    ) -> Mover:
+        scheme: Any = scheme_of(self.resampling)
+        threshold = float(self.ess_threshold)
+        if isinstance(scheme, Adaptive):
+            scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
+        apart = plates_apart(slices)
+        if isinstance(self.proposal, str):
+            plan: SlicePlan = OptimalPlan(slices, apart, static)
+        else:
+            asked = self.proposal or {}
+            proposals = SliceProposals(slices, asked, "ParticleFilter") if asked else None
+            plan = SlicePlan(slices, apart, static, proposals)
+        stage: Any = None
+        if self.auxiliary is not False:
+            stage = PluggedIn(plan) if self.auxiliary is True else GivenStage(plan, self.auxiliary)
+        anew = Rejuvenation(plan, self.rejuvenation) if self.rejuvenation is not None else None
+        return Mover(slices, self.particles, scheme, threshold, plan, stage, anew, kept)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield

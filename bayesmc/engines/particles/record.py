@@ -1,0 +1,134 @@
+"""What a run over many slices keeps of its clouds: answers of constant size, or the particles themselves."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.filtering import Queries, observed_answers
+from bayesmc.engines.particles.belief import expectation, moments, table_of_states
+from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.results import SeriesPosterior
+
+
+class Record:
+    """Answers about each slice, written as the slices pass.
+
+    Parameters
+    ----------
+    problem : SeriesProblem
+    layout : Layout
+    queries : dict
+    keep : bool
+        Hold the clouds, too.
+    """
+
+    def __init__(
+        self, problem: SeriesProblem, layout: Layout, queries: Queries, keep: bool
+    ) -> None:
+        self.problem, self.layout, self.asked = problem, layout, queries
+        steps, model = problem.steps, problem.model
+        self.clouds: list[Cloud] | None = [] if keep else None
+        self.tables: dict[str, np.ndarray] = {}
+        self.means: dict[str, np.ndarray] = {}
+        self.variances: dict[str, np.ndarray] = {}
+        for name in problem.hidden:
+            node = model[name]
+            if node.domain is not None:
+                self.tables[name] = np.empty((steps, *node.plate_shape, node.domain.size))
+            else:
+                self.means[name] = np.empty((steps, *node.value_shape))
+                self.variances[name] = np.empty((steps, *node.value_shape))
+        self.queries: dict[str, list[np.ndarray]] = {n: [] for n in queries}
+        self.increments = np.empty((steps, *layout.lead))
+        self.ess = np.empty((steps, *layout.lead))
+        self.resampled = np.zeros((steps, *layout.lead), dtype=bool)
+        self.rejuvenated = np.zeros(steps, dtype=bool)
+        self.unique = np.full((steps, *layout.lead), layout.particles)
+        self._nodes = [(n, model[n]) for n in problem.hidden]
+
+    def add(self, k: int, cloud: Cloud) -> None:
+        """Take in the cloud of the k-th slice."""
+        layout = self.layout
+        self.increments[k] = cloud.increment
+        self.ess[k] = cloud.ess
+        self.resampled[k] = cloud.resampled
+        self.rejuvenated[k] = cloud.rejuvenated
+        if cloud.ancestors is not None:
+            changes = cloud.ancestors[1:] != cloud.ancestors[:-1]
+            self.unique[k] = np.count_nonzero(changes, axis=0) + 1
+        for name, node in self._nodes:
+            value = cloud.values[name]
+            if node.domain is not None:
+                self.tables[name][k] = table_of_states(layout, cloud, node, value)
+            elif value.ndim == len(node.value_shape):  # seen here, or the same for all particles
+                self.means[name][k], self.variances[name][k] = value, 0.0
+            else:
+                self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
+        for name, function in self.asked.items():
+            self.queries[name].append(expectation(layout, cloud, self.problem.model, function))
+        if self.clouds is not None:
+            self.clouds.append(cloud)
+
+    def posterior(self, engine: Any, kind: str = "filter") -> FilteredParticles:
+        """The answers of all slices."""
+        seen = observed_answers(self.problem)
+        found = FilteredParticles(
+            self.problem.model,
+            engine,
+            kind,
+            self.increments,
+            tables={**seen.tables, **self.tables},
+            means={**seen.means, **self.means},
+            variances={**seen.variances, **self.variances},
+            queries={n: np.stack(rows) for n, rows in self.queries.items()},
+            start=self.problem.series.start,
+        )
+        found.weight_ess, found.resampled = self.ess, self.resampled
+        found.unique_ancestors, found.rejuvenated = self.unique, self.rejuvenated
+        found.clouds, found.layout = self.clouds, self.layout
+        return found
+
+
+class FilteredParticles(SeriesPosterior):
+    """What a particle filter says of every slice.
+
+    Attributes
+    ----------
+    clouds : list of Cloud or None
+        Particles of all slices, with ``keep="particles"``.
+    """
+
+    clouds: list[Cloud] | None = None
+    layout: Layout | None = None
+
+    def particles(self, name: str) -> np.ndarray:
+        """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
+        clouds, layout = self._kept("particles")
+        node = self._node(name)
+        shape = (layout.particles, *node.value_shape)
+        rows = [np.broadcast_to(c.values[name], shape) for c in clouds]
+        return np.array(node.decode(np.stack(rows)), subok=True)
+
+    @property
+    def weights(self) -> np.ndarray:
+        """Normalised weights of all slices, shape ``(time, particles, *plates)``."""
+        clouds, _ = self._kept("weights")
+        return np.stack([c.weights / c.total for c in clouds])
+
+    @property
+    def ancestors(self) -> np.ndarray:
+        """Positions of the ancestors in the slice before, shape ``(time, particles, *plates)``."""
+        clouds, layout = self._kept("ancestors")
+        own = np.arange(layout.particles).reshape((-1,) + (1,) * len(layout.apart))
+        shape = (layout.particles, *layout.lead)
+        return np.stack(
+            [np.broadcast_to(own if c.ancestors is None else c.ancestors, shape) for c in clouds]
+        )
+
+    def _kept(self, what: str) -> tuple[list[Cloud], Layout]:
+        if self.clouds is None or self.layout is None:
+            raise self._not_kept(what)
+        return self.clouds, self.layout
