@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from bayesmc.distributions.base import Distribution, as_float
 from bayesmc.distributions.support import Support, real
 from bayesmc.shapes import Shape
 
+_ROOT_HALF = math.sqrt(0.5)
 _HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
 
 
@@ -44,6 +46,13 @@ class Normal(Distribution):
 
     def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
         loc, scale = as_float(loc), as_float(scale)
+        if (
+            not scale.ndim
+            and 0.0 < scale < math.inf
+            and math.isfinite(np.add.reduce(loc, axis=None))
+        ):
+            self.batch_shape, self.loc, self.scale = loc.shape, loc, scale  # the hottest of all
+            return
         self._set_batch(loc.shape, scale.shape)
         self.loc = self._finite("loc", loc)
         self.scale = self._positive("scale", scale)
@@ -55,6 +64,12 @@ class Normal(Distribution):
         return draws
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        if not self.scale.ndim and 1e-150 < self.scale < 1e150:
+            scale = float(self.scale)
+            z = np.asarray(x - self.loc, dtype=float)
+            z *= _ROOT_HALF / scale
+            z *= z
+            return np.subtract(-_HALF_LOG_2PI - math.log(scale), z, out=z if z.ndim else None)
         z = np.asarray((x - self.loc) / self.scale)
         z *= z  # in place: this is the hottest density there is
         z *= -0.5

@@ -24,6 +24,8 @@ FirstStage = Callable[[Mapping[str, np.ndarray], Row, np.random.Generator], np.n
 
 #: numbers of the largest node in a block of particles: its temporaries stay in cache
 BLOCK = 8192
+#: numbers up to which all particles are one block: a little too large is better than two
+WHOLE = 12288
 
 
 class Cloud(NamedTuple):
@@ -152,7 +154,8 @@ class Mover:
         self.first_stage, self.rejuvenate = first_stage, rejuvenate
         wanted = slices.dynamic if kept is None else (*slices.interface, *kept)
         self.kept = tuple(dict.fromkeys(wanted))
-        self.block = max(1, BLOCK // max(size_of(slices), 1))
+        numbers = max(size_of(slices), 1)
+        self.block = particles if particles * numbers <= WHOLE else max(1, BLOCK // numbers)
         self.lead = tuple(slices.first.sizes[p] for p in self.apart)
         self.layout = Layout(particles, self.apart, self.lead, self.block)
         self._log_particles = math.log(particles)
