@@ -1,7 +1,7 @@
 """The demonstration behind ``make demo``: all examples, one after the other.
 
-Two nets are asked with every engine that can answer about them, then come the figures. Each script
-also runs by itself; pictures go to ``out/``. ``--fast`` takes few draws.
+Two nets are asked with every engine that can answer about them, then come the figures, those of models
+over time last. Each script also runs by itself; pictures go to ``out/``. ``--fast`` takes few draws.
 """
 
 from __future__ import annotations
@@ -14,20 +14,27 @@ from examples import (
     diagnosis,
     expectation_and_marginal,
     faithful_gibbs,
+    growth_benchmark,
     ising_denoising,
     kernels_as_chains,
     markov_chains,
+    nile,
     old_faithful,
     parzen,
     picture,
     pushforward,
     rejection_and_importance,
+    stochastic_volatility,
+    three_views,
+    van_der_merwe,
+    weight_collapse,
 )
 
 NETS = (diagnosis, old_faithful)
 FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
+    weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
 )  # fmt: skip
 
 

@@ -99,6 +99,15 @@ def smooth(
     """Beliefs about every slice given all rows, or with ``lag`` given those up to so many slices later.
 
     Parameters and errors are those of ``filter``.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], initial=[0.5, 0.5])
+    >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+    >>> bmc.smooth(dbn, {"umbrella": [1, 1]}).probabilities("rain").round(3).tolist()
+    [[0.117, 0.883], [0.117, 0.883]]
     """
     problem = pose_series(dbn, observations, inputs)
     if lag is not None and (
@@ -123,6 +132,14 @@ def forecast(
     """Beliefs about the ``steps`` slices after the last row, observed nodes included.
 
     ``inputs`` have rows for those slices, too. Other parameters and errors are those of ``filter``.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(0.5 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> bmc.forecast(dbn, {"x": [2.0]}, steps=3).mean("x").tolist()
+    [1.0, 0.5, 0.25]
     """
     problem = pose_series(dbn, observations, inputs, ahead=steps)
     chosen = _engine(problem, engine)
@@ -142,6 +159,15 @@ def most_likely(
     """The most likely trajectory of all hidden nodes together: name -> user values, time first.
 
     It is one joint mode, as the Viterbi algorithm finds it, and not the sequence of each slice's own mode.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], ("no", "yes"), initial=[0.5, 0.5])
+    >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+    >>> bmc.most_likely(dbn, {"umbrella": [1, 0, 0]})["rain"].tolist()
+    ['yes', 'no', 'no']
     """
     problem = pose_series(dbn, observations, inputs)
     chosen = _engine(problem, engine)

@@ -58,7 +58,7 @@ class DynamicBayesNet:
     >>> evidence = dbn.unrolled_evidence({"y": [0.3, np.nan, 1.2]})
     >>> posterior = bmc.infer(net, evidence, engine=bmc.Exact())
     >>> float(posterior.mean("x[2]").round(4))
-    0.6122
+    0.675
 
     References
     ----------
