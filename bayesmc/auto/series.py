@@ -213,6 +213,8 @@ def _choose(problem: SeriesProblem) -> tuple[FilterEngine, tuple[str, ...], dict
     for candidate in _CANDIDATES:
         engine, name = candidate(), candidate.__name__
         reason = engine.refusal(problem)
+        if reason is None and (silent := engine.unanswered(problem)):
+            reason = f"it would not answer for {', '.join(map(repr, silent))}"
         if reason is None:
             return engine, (_WHY[name],), refused
         refused[name] = reason

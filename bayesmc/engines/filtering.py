@@ -34,6 +34,10 @@ class FilterEngine:
         """Why this engine cannot answer, or None; a family's own reasons come after the common ones."""
         return common_refusal(self, problem)
 
+    def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
+        """Hidden nodes that its answers would leave out."""
+        return ()
+
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         """What the engine does to each node of a slice."""
         raise NotImplementedError

@@ -12,7 +12,7 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.discrete.chain import most_likely
-from bayesmc.engines.discrete.limits import first_gap
+from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
@@ -44,7 +44,7 @@ class SliceAnswers:
             node = self.model[name]
             if name in self.reader.variables:
                 found.tables[name] = self._table(name, node)
-            elif self._can_tell(name, node):
+            elif not is_untold(self.plan, self.run.series, name, self.run.steps):
                 self._tell(name, node, found)
         return found
 
@@ -100,19 +100,6 @@ class SliceAnswers:
             for start, stop in self._stretches(scope):
                 self._place(out, start, stop, node, element, self.run.joint(scope, start, stop))
         return out
-
-    def _can_tell(self, name: str, node: CompiledNode) -> bool:
-        """Whether all that a node reads is known wherever it is missing itself."""
-        series = self.run.series
-        needed = np.ones((series.steps, *node.plate_shape), dtype=bool)
-        seen = series.observed.get(name)
-        if node.is_stochastic and seen is not None:
-            needed = np.zeros_like(needed) if seen.mask is None else ~seen.mask
-        needed[: series.steps - self.run.steps] = False
-        return all(
-            first_gap(self.plan, series, self.plan.terms[name, k], needed) is None
-            for k in (0, 1, 2)
-        )
 
     def _tell(self, name: str, node: CompiledNode, found: Answers) -> None:
         """Answers of a node that is no variable: averages over what it reads."""

@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, read_row, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, arguments_of, best_path
 from bayesmc.engines.discrete.belief import DiscreteBelief, window
-from bayesmc.engines.discrete.limits import size_refusal, why_unreadable
+from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
 from bayesmc.engines.discrete.path import path_values
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
@@ -89,6 +89,14 @@ class DiscreteFilter(FilterEngine):
             return common
         error = self._why_not(problem)
         return None if error is None else str(error)
+
+    def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
+        plan, series = self._plan(problem), problem.series
+        return tuple(
+            n
+            for n in problem.hidden
+            if n not in plan.reader.variables and is_untold(plan, series, n)
+        )
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         plan = self._plan(problem)

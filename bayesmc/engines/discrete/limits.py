@@ -85,6 +85,22 @@ def first_gap(
     return None
 
 
+def is_untold(plan: DiscreteSlices, series: Series, name: str, steps: int | None = None) -> bool:
+    """Whether a node that is no variable reads something missing where it is missing itself.
+
+    ``steps`` rows count, the last ones; all by default.
+    """
+    node = plan.slices.first[name]
+    needed = np.ones((series.steps, *node.plate_shape), dtype=bool)
+    seen = series.observed.get(name)
+    if node.is_stochastic and seen is not None:
+        needed = np.zeros_like(needed) if seen.mask is None else ~seen.mask
+    if steps is not None:
+        needed[: series.steps - steps] = False
+    terms = (plan.terms[name, kind] for kind in (0, 1, 2))
+    return any(first_gap(plan, series, term, needed) is not None for term in terms)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
