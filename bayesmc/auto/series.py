@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
+from bayesmc.dbn.series import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.filtering import FilterEngine, Queries
 from bayesmc.engines.kalman.filter import KalmanFilter
@@ -141,6 +142,7 @@ def forecast(
     >>> bmc.forecast(dbn, {"x": [2.0]}, steps=3).mean("x").tolist()
     [1.0, 0.5, 0.25]
     """
+    check_steps("forecast", steps)
     problem = pose_series(dbn, observations, inputs, ahead=steps)
     chosen = _engine(problem, engine)
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}

@@ -593,6 +593,19 @@ def test_options_that_do_not_fit_the_template_say_so(fault: str) -> None:
         bmc.filter(switching(), {"y": ROWS}, engine=engine, rng=0)
 
 
+def test_queries_of_unknown_nodes_say_which_there_are() -> None:
+    with pytest.raises(UnknownNodeError, match=r"queries=.'a': .* reads 'q'.*\['z', 'x', 'y'\]"):
+        bmc.filter(
+            switching(),
+            {"y": ROWS},
+            engine=bmc.ParticleFilter(9),
+            queries={"a": lambda q: q},
+            rng=0,
+        )
+    with pytest.raises(ValueError, match=r"forecast\(steps=0\)"):
+        bmc.forecast(switching(), {"y": ROWS}, steps=0)
+
+
 def test_options_are_values() -> None:
     one = bmc.ParticleFilter(10, proposal={"x": nearer})
     assert one == bmc.ParticleFilter(10, proposal={"x": nearer}) != bmc.ParticleFilter(11)

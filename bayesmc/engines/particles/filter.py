@@ -23,7 +23,7 @@ from bayesmc.engines.particles.smoothing import Backward, ancestors_of, carried
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn, Rejuvenation
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -214,7 +214,7 @@ class ParticleFilter(FilterEngine):
                 f'keep={keep!r}: give "particles", or None for answers of constant size'
             )
         static = {n: o.value for n, o in problem.series.static.items()}
-        asked = [p for q in (queries or {}).values() for p in inspect.signature(q).parameters]
+        asked = _asked(queries or {}, problem.slices)
         wanted = None if keep else [*problem.hidden, *asked]
         mover = self._mover(problem.slices, static, wanted)
         record = Record(problem, mover.layout, queries or {}, keep is not None)
@@ -375,6 +375,20 @@ class ParticleFilter(FilterEngine):
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _asked(queries: Queries, slices: Slices) -> list[str]:
+    """Nodes that queries read."""
+    found = []
+    for query, function in queries.items():
+        for name in inspect.signature(function).parameters:
+            if name not in slices.dynamic:
+                raise UnknownNodeError(
+                    f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice; there are "
+                    f"{list(slices.dynamic)}"
+                )
+            found.append(name)
+    return found
 
 
 @contextmanager
