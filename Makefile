@@ -67,7 +67,9 @@ clean:
 		echo "could not make .venv; on Debian and Ubuntu: apt install python3-venv" >&2; exit 1; }
 	@touch "$@"
 
-.venv-peers/.installed: benchmarks/peers/requirements.txt .venv/.created
+PEERS = benchmarks/peers/requirements
+.venv-peers/.installed: $(PEERS).txt $(PEERS)-alone.txt .venv/.created
 	$(PY) -m venv --clear .venv-peers
-	.venv-peers/bin/python -m pip install $(PIP_FLAGS) -r benchmarks/peers/requirements.txt
+	.venv-peers/bin/python -m pip install $(PIP_FLAGS) -r $(PEERS).txt
+	.venv-peers/bin/python -m pip install $(PIP_FLAGS) --no-deps -r $(PEERS)-alone.txt
 	@touch "$@"
