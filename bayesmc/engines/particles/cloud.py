@@ -311,8 +311,9 @@ class Mover:
     ) -> Cloud | None:
         """The cloud of a slice; None where no weight is left somewhere."""
         n, shape = self.particles, (self.particles, *self.lead)
-        log = selection.carried + log if np.ndim(selection.carried) else np.asarray(log)
-        if np.ndim(log) <= len(self.lead) and np.all(log == 0.0):
+        carried = selection.carried
+        log = carried + log if isinstance(carried, np.ndarray) else np.asarray(log)
+        if log.ndim <= len(self.lead) and np.all(log == 0.0):
             even = np.full(self.lead, float(n)) if self.lead else float(n)
             return Cloud(
                 row.t, values, np.broadcast_to(0.0, shape), self._even, even, np.log(even),
@@ -321,15 +322,7 @@ class Mover:
         if log.shape != shape:
             log = np.broadcast_to(log, shape)
         level = _top(log)
-        weights = self._spare.get(shape, np.dtype(float))
-        total: Any = 0.0
-        squares: Any = 0.0
-        for low in range(0, n, self.block):
-            part = weights[low : low + self.block]
-            np.subtract(log[low : low + self.block], level, out=part)
-            np.exp(part, out=part)
-            total = total + np.add.reduce(part)
-            squares = squares + _squares(part)
+        weights, total, squares = self._exponentials(log, level)
         if not (total > 0 if not self.lead else (total > 0).all()):
             return None
         log_total = level + (math.log(total) if not self.lead else np.log(total))
@@ -337,6 +330,23 @@ class Mover:
             row.t, values, log, weights, total, log_total, log_total - selection.spent,
             total * total / squares, selection.ancestors, selection.resampled,
         )  # fmt: skip
+
+    def _exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
+        """Weights relative to a level, block by block, their sums and the sums of their squares."""
+        if len(log) <= self.block:
+            weights = log - level
+            np.exp(weights, out=weights)
+            return weights, np.add.reduce(weights), _squares(weights)
+        weights = self._spare.get(log.shape, np.dtype(float))
+        total: Any = 0.0
+        squares: Any = 0.0
+        for low in range(0, len(log), self.block):
+            part = weights[low : low + self.block]
+            np.subtract(log[low : low + self.block], level, out=part)
+            np.exp(part, out=part)
+            total = total + np.add.reduce(part)
+            squares = squares + _squares(part)
+        return weights, total, squares
 
     def _degenerate(
         self,
