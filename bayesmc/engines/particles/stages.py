@@ -49,7 +49,7 @@ class PluggedIn:
         seen = frozenset(n for n, o in row.seen.items() if o.mask is None)
         if seen not in self._steps:
             self._steps[seen] = self._build(seen)
-        count = max((len(v) for v in before.values() if v.ndim), default=1)
+        count = _particles(self.plan, before)
         state = Pass(rng, (count,), {**self.plan.known(row), **before})
         for step in self._steps[seen]:
             step(state)
@@ -92,7 +92,7 @@ class GivenStage:
         self, before: Mapping[str, np.ndarray], row: Row, rng: np.random.Generator
     ) -> np.ndarray:
         values = {**self.plan.known(row), **before}
-        count = max((len(v) for v in before.values() if v.ndim), default=1)
+        count = _particles(self.plan, before)
         lead = tuple(self.plan.slices.first.sizes[p] for p in self.plan.apart)
         if any(p not in values for p in self.parents):  # what it looks at is missing
             return np.zeros((count, *lead))
@@ -178,6 +178,14 @@ class _Anew(Propose):
     ) -> None:
         if outside.any():
             state.weigh(np.where(outside, -np.inf, 0.0))
+
+
+def _particles(plan: SlicePlan, before: Mapping[str, np.ndarray]) -> int:
+    """How many particles the slice before has; what was seen has no axis for them."""
+    for name, value in before.items():
+        if value.ndim > len(plan.slices.later[name].value_shape):
+            return len(value)
+    return 1
 
 
 def _floored(log: np.ndarray) -> np.ndarray:
