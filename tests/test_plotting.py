@@ -230,6 +230,28 @@ def test_a_tree_has_no_crossings_and_parents_over_their_children() -> None:
         assert centres[parent][0] == pytest.approx(np.mean([centres[n][0] for n in pair]))
 
 
+def test_a_template_is_drawn_over_two_slices() -> None:
+    """Frames hold their slice only, arrows cross from one to the other, static nodes stand outside."""
+    dbn = bmc.DynamicBayesNet(plates={"beacon": 3})
+    dbn.input("u")
+    dbn.add_static("bias", bmc.Normal(0.0, 1.0))
+    dbn.add("x", lambda x_prev, u, t: bmc.Normal(x_prev + u, 1.0 + t), initial=bmc.Normal(0.0, 1.0))
+    dbn.add(
+        "y",
+        lambda x, y_prev, bias: bmc.Normal(x + 0.1 * y_prev + bias, 1.0),
+        initial=lambda x: bmc.Normal(x, 1.0),
+        plates="beacon",
+    )
+    ax = plot_dag(dbn, observed={"y": 0})
+    before, now = (box_of(shape_of(ax, f"plate slice {t}")) for t in ("t - 1", "t"))
+    assert not overlap(before, now)
+    for name, outer in (("x_prev", before), ("y_prev", before), ("x", now), ("y", now), ("u", now)):
+        assert holds(outer, box_of(shape_of(ax, name))), name
+    bias = box_of(shape_of(ax, "bias"))
+    assert not overlap(before, bias) and not overlap(now, bias)
+    assert len([p for p in ax.patches if isinstance(p, FancyArrowPatch)]) == 5
+
+
 def test_empty_net_is_drawn() -> None:
     assert not plot_dag(bmc.BayesNet()).patches
 

@@ -11,9 +11,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayesmc.dbn import DynamicBayesNet
 from bayesmc.network import BayesNet, Node
 from bayesmc.plotting.layout import Layout, Point, Rectangle, layered_layout
 from bayesmc.plotting.pyplot import pyplot
+from bayesmc.plotting.template import TwoSlices
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -33,13 +35,13 @@ ROW = 0.34  # inches for one row of the legend
 
 
 def plot_dag(
-    net: BayesNet,
+    net: BayesNet | DynamicBayesNet,
     *,
     observed: Collection[str] = (),
     ax: Axes | None = None,
     legend: bool = True,
 ) -> Axes:
-    """Draw the graph of a net with its plates.
+    """Draw the graph of a net with its plates, or of a template over two slices.
 
     Continuous nodes are ellipses, discrete ones rounded boxes; a deterministic node has a double
     border, an input a dashed one, and an observed node is shaded. Potentials are small black
@@ -47,7 +49,8 @@ def plot_dag(
 
     Parameters
     ----------
-    net : BayesNet
+    net : BayesNet or DynamicBayesNet
+        Of a template, a slice and what it reads of the slice before (``x_prev``), each in a frame.
     observed : collection of str
         Names of observed nodes; the evidence itself will do.
     ax : matplotlib.axes.Axes, optional
@@ -80,9 +83,10 @@ def plot_dag(
     ['discrete', 'observed', 'rain', 'wet']
     """
     plt = pyplot()
-    nodes = [net[name] for name in net]
-    shaded = {net[name].name for name in observed}
-    factors = net.potentials
+    drawn = TwoSlices(net) if isinstance(net, DynamicBayesNet) else net
+    nodes = [drawn[name] for name in drawn]
+    shaded = {drawn[name].name for name in observed}
+    factors: Any = drawn.potentials
     shapes = {node.name: _shape(node, node.name in shaded) for node in nodes}
     shapes |= {name: _factor_shape(name) for name in factors}
     every = {node.name: node for node in nodes} | factors
@@ -97,7 +101,7 @@ def plot_dag(
         pen.plate(rectangle, name)
     curves = [pen.edge(route, shapes[a], shapes[b]) for (a, b), route in layout.routes.items()]
     for name, rectangle in layout.plates.items():
-        pen.caption(rectangle, name, net.plates[name], curves)
+        pen.caption(rectangle, name, drawn.plates[name], curves)
     for name, shape in shapes.items():
         pen.node(layout.centres[name], shape, name)
     for (x, y), shape, text in _legend_places(rows, page):
