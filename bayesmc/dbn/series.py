@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -22,8 +22,14 @@ from bayesmc.network.node import Declaration
 from bayesmc.network.store import unknown
 from bayesmc.shapes import first_index, owned
 
-if TYPE_CHECKING:
-    from bayesmc.dbn.template import DynamicBayesNet
+
+class Compiled(Protocol):
+    """What data are read against: a template that compiles for the sizes that they settle."""
+
+    @property
+    def template(self) -> Template: ...
+
+    def slices(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Slices: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +103,7 @@ class Series:
 
 
 def read_series(
-    dbn: DynamicBayesNet,
+    dbn: Compiled,
     observations: Mapping[str, Any] | None,
     inputs: Mapping[str, Any] | None,
     steps: int | None = None,
@@ -137,7 +143,7 @@ def read_series(
 
 
 def read_row(
-    dbn: DynamicBayesNet,
+    dbn: Compiled,
     slices: Slices | None,
     t: int,
     observations: Mapping[str, Any] | None,

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn.series import check_steps, read_input_rows, sizes_of
+from bayesmc.dbn.series import Compiled, check_steps, read_input_rows, read_series, sizes_of
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet
 from bayesmc.network.forward import Pass, Step, refuse_unsampled, step_for
 from bayesmc.network.node import Declaration
-
-if TYPE_CHECKING:
-    from bayesmc.dbn.template import DynamicBayesNet
 
 
 def unroll(template: Template, steps: int, inputs: Mapping[str, Any] | None) -> BayesNet:
@@ -46,7 +43,7 @@ def unroll(template: Template, steps: int, inputs: Mapping[str, Any] | None) -> 
 
 
 def sampled(
-    dbn: DynamicBayesNet,
+    dbn: Compiled,
     steps: int,
     draws: int,
     inputs: Mapping[str, Any] | None,
@@ -57,7 +54,7 @@ def sampled(
     check_steps("sample", steps)
     if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 0:
         raise ValueError(f"sample(draws={draws!r}): draws is a number of draws, 0 or more")
-    slices, series = dbn.read(None, inputs, steps=steps, plates=plates)
+    slices, series = read_series(dbn, None, inputs, steps, plates)
     refusal = refuse_unsampled(slices.first, (), "sample") or refuse_unsampled(
         slices.later, (), "sample"
     )
