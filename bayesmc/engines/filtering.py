@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem, pose_series
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.results import SeriesPosterior
 
@@ -72,6 +72,46 @@ class FilterEngine:
         """The most likely trajectory of the hidden nodes, as user values, time first."""
         raise self._cannot("find the most likely trajectory")
 
+    def start(
+        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
+    ) -> Any:
+        """A belief that has absorbed nothing yet.
+
+        Parameters
+        ----------
+        static : dict, optional
+            Values of the static nodes.
+        rng : seed, SeedSequence, Generator or None
+            For filters that draw.
+        """
+        dbn.validate()
+        return self._nothing(dbn.copy(), dict(static or {}), rng)
+
+    def step(
+        self,
+        belief: Any,
+        observations: Mapping[str, Any] | None = None,
+        *,
+        inputs: Mapping[str, Any] | None = None,
+    ) -> Any:
+        """The belief about the next slice, whose row this is; the old belief stays as it is.
+
+        Parameters
+        ----------
+        observations : dict, optional
+            Node -> its value in this slice, without an axis for time; what is left out is missing.
+        inputs : dict, optional
+            Input -> its value in this slice.
+
+        Raises
+        ------
+        EvidenceError, UnsupportedError, DegeneracyError, ZeroProbabilityError
+        """
+        slices, row = read_row(
+            belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
+        )
+        return self._absorbed(belief, slices, row)
+
     def unsupported(
         self,
         dbn: Any,
@@ -84,6 +124,14 @@ class FilterEngine:
             return self.refusal(problem)
         except BayesmcError as error:  # options that do not fit the template
             return str(error)
+
+    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> Any:
+        """A family's belief before the first row."""
+        raise self._cannot("go row by row")
+
+    def _absorbed(self, belief: Any, slices: Slices, row: Row) -> Any:
+        """A family's belief after one more row."""
+        raise self._cannot("go row by row")
 
     def _cannot(self, what: str) -> UnsupportedError:
         return UnsupportedError(

@@ -51,6 +51,11 @@ class DiscreteBelief:
     run: Run | None = field(default=None, repr=False)
 
     @property
+    def slices(self) -> Slices | None:
+        """What rows are read against; None before the first."""
+        return None if self.run is None else self.run.plan.slices
+
+    @property
     def inputs(self) -> dict[str, np.ndarray]:
         """Inputs of the slice."""
         if self.run is None:

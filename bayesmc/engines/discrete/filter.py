@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, SeriesProblem, read_row, read_static
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, arguments_of, best_path
 from bayesmc.engines.discrete.belief import DiscreteBelief, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
@@ -159,40 +159,11 @@ class DiscreteFilter(FilterEngine):
         assert path is not None
         return path_values(run, path, problem.hidden)
 
-    def start(
-        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
-    ) -> DiscreteBelief:
-        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes.
+    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> DiscreteBelief:
+        return DiscreteBelief(dbn, dict(static))
 
-        ``rng`` is taken as other filters take it; nothing is random here.
-        """
-        dbn.validate()
-        return DiscreteBelief(dbn.copy(), dict(static or {}))
-
-    def step(
-        self,
-        belief: DiscreteBelief,
-        observations: Mapping[str, Any] | None = None,
-        *,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> DiscreteBelief:
-        """The belief about the next slice, whose row this is; the old belief stays as it is.
-
-        Parameters
-        ----------
-        observations : dict, optional
-            Node -> its value in this slice, without an axis for time; what is left out is missing.
-        inputs : dict, optional
-            Input -> its value in this slice.
-
-        Raises
-        ------
-        EvidenceError, ZeroProbabilityError, UnsupportedError
-        """
+    def _absorbed(self, belief: DiscreteBelief, slices: Slices, row: Row) -> DiscreteBelief:
         t, run = belief.t + 1, belief.run
-        slices, row = read_row(
-            belief.dbn, run.plan.slices if run else None, t, observations, inputs, belief.inputs
-        )
         if run is None:
             static = read_static(slices, belief.static)
             plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)

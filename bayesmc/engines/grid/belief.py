@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
@@ -56,6 +56,11 @@ class GridBelief:
         self.inputs = dict(inputs or {})
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if cells is None else cells.placed.row.t
+
+    @property
+    def slices(self) -> Slices | None:
+        """What rows are read against; None before the first."""
+        return None if self.mover is None else self.mover.model.slices
 
     @property
     def names(self) -> tuple[str, ...]:

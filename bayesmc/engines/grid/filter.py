@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices, read_row, read_static
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.exact import readable_bytes
 from bayesmc.engines.filtering import FilterEngine, Queries
@@ -227,34 +227,11 @@ class GridFilter(FilterEngine):
 
     # ---- one slice at a time ----------------------------------------------------------------
 
-    def start(
-        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
-    ) -> GridBelief:
-        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes."""
-        dbn.validate()
-        return GridBelief(dbn.copy(), static or {}, _quiet)
+    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
+        return GridBelief(dbn, static, _quiet)
 
-    def step(
-        self,
-        belief: GridBelief,
-        observations: Mapping[str, Any] | None = None,
-        *,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> GridBelief:
-        """The belief about the next slice, whose row this is; the old belief stays as it is.
-
-        Parameters
-        ----------
-        observations : dict, optional
-            Node -> its value in this slice, without an axis for time; what is left out is missing.
-        inputs : dict, optional
-            Input -> its value in this slice.
-        """
+    def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
         mover = belief.mover
-        slices = mover.model.slices if mover else None
-        slices, row = read_row(
-            belief.dbn, slices, belief.t + 1, observations, inputs, belief.inputs
-        )
         with _quiet():
             if mover is None:
                 model = self._model(slices, read_static(slices, belief.static))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, SeriesProblem, read_row, read_static
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import FilterEngine, Queries
 from bayesmc.engines.kalman.answers import filter_answers, smooth_answers
@@ -99,47 +99,19 @@ class GaussianFilter(FilterEngine):
         found = self.smooth(problem, seed, progress=progress)
         return {n: found.mean(n) for n in self._data(problem).layouts[0].rows}
 
-    def start(
-        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
-    ) -> GaussianBelief:
-        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes.
+    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GaussianBelief:
+        return GaussianBelief(dbn, static)
 
-        ``rng`` is not used: there is no chance in these filters.
-        """
-        dbn.validate()
-        return GaussianBelief(dbn.copy(), static or {})
-
-    def step(
-        self,
-        belief: GaussianBelief,
-        observations: Mapping[str, Any] | None = None,
-        *,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> GaussianBelief:
-        """The belief about the next slice, whose row this is; the old belief stays as it is.
-
-        Parameters
-        ----------
-        observations : dict, optional
-            Node -> its value in this slice, without an axis for time; what is left out is missing.
-        inputs : dict, optional
-            Input -> its value in this slice.
-
-        Raises
-        ------
-        EvidenceError, UnsupportedError, DegeneracyError
-        """
-        taker, t = belief.taker, belief.t + 1
-        slices, row = read_row(
-            belief.dbn, taker.slices if taker else None, t, observations, inputs, belief.inputs
-        )
+    def _absorbed(self, belief: GaussianBelief, slices: Slices, row: Row) -> GaussianBelief:
+        taker = belief.taker
         if taker is None:
             taker = RowTaker(self, slices, read_static(slices, belief.static))
         with quiet():
             taken = taker.take(row, belief.taken)
         total = belief.log_marginal_likelihood + taken.log_density
         return GaussianBelief(
-            belief.dbn, belief.static, t, taker, taken, total if np.ndim(total) else float(total),
+            belief.dbn, belief.static, belief.t + 1, taker, taken,
+            total if np.ndim(total) else float(total),
             {n: row.inputs[n] for n in slices.template.inputs},
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.engines.kalman.rows import RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError
@@ -158,6 +158,11 @@ class GaussianBelief:
         self.taker, self.taken = taker, taken
         self.log_marginal_likelihood = log_marginal_likelihood
         self.inputs = dict(inputs or {})
+
+    @property
+    def slices(self) -> Slices | None:
+        """What rows are read against; None before the first."""
+        return None if self.taker is None else self.taker.slices
 
     @property
     def layout(self) -> Layout:

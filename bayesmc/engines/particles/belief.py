@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
@@ -62,6 +62,11 @@ class ParticleBelief:
         self.inputs = dict(inputs or {})
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if cloud is None else cloud.t
+
+    @property
+    def slices(self) -> Slices | None:
+        """What rows are read against; None before the first."""
+        return None if self.mover is None else self.mover.slices
 
     @property
     def weights(self) -> np.ndarray:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices, read_row, read_static
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import FilterEngine, Queries
 from bayesmc.engines.particles.belief import ParticleBelief
@@ -304,33 +304,11 @@ class ParticleFilter(FilterEngine):
         found.rejuvenated = filtered.rejuvenated
         return found
 
-    def start(
-        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
-    ) -> ParticleBelief:
-        """A belief that has absorbed nothing yet; ``static`` gives the values of static nodes."""
-        dbn.validate()
-        return ParticleBelief(dbn.copy(), seed_sequence(rng), static or {})
+    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
+        return ParticleBelief(dbn, seed_sequence(rng), static)
 
-    def step(
-        self,
-        belief: ParticleBelief,
-        observations: Mapping[str, Any] | None = None,
-        *,
-        inputs: Mapping[str, Any] | None = None,
-    ) -> ParticleBelief:
-        """The belief about the next slice, whose row this is; the old belief stays as it is.
-
-        Parameters
-        ----------
-        observations : dict, optional
-            Node -> its value in this slice, without an axis for time; what is left out is missing.
-        inputs : dict, optional
-            Input -> its value in this slice.
-        """
-        t, mover = belief.t + 1, belief.mover
-        slices, row = read_row(
-            belief.dbn, mover.slices if mover else None, t, observations, inputs, belief.inputs
-        )
+    def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
+        mover = belief.mover
         if mover is None:
             mover = self._mover(slices, read_static(slices, belief.static))
         rng = stream(belief.seed, Purpose.FILTER)
