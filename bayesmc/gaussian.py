@@ -6,6 +6,7 @@ Leading axes are batch and broadcast. This room knows arrays only: no distributi
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.shapes import first_index
 
+_SMALL = 16  # rows of a matrix whose factor is kept
 _SYMMETRY = 1e-8  # of sqrt(a_ii a_jj): what rounding leaves of a product such as H S H'
 
 
@@ -134,6 +136,10 @@ def try_cholesky(cov: Any) -> tuple[np.ndarray, np.ndarray | None]:
     cov = np.asarray(cov, dtype=float)
     if cov.ndim < 2 or cov.shape[-1] != cov.shape[-2]:
         raise ShapeError(f"cov must have shape (..., d, d); got {cov.shape}")
+    if cov.ndim == 2 and cov.shape[-1] <= _SMALL:
+        factor = _root_of(cov.tobytes(), cov.shape[-1])
+        if factor is not None:
+            return factor, None
     try:
         factor, bad = np.linalg.cholesky(cov), None
     except np.linalg.LinAlgError:
@@ -146,6 +152,24 @@ def try_cholesky(cov: Any) -> tuple[np.ndarray, np.ndarray | None]:
     if not faulty.any():
         return factor, None
     return np.where(faulty[..., None, None], np.eye(cov.shape[-1]), factor), faulty
+
+
+@functools.lru_cache(maxsize=256)
+def _root_of(numbers: bytes, d: int) -> np.ndarray | None:
+    """The Cholesky factor of one small matrix, read-only; None where it is not symmetric positive definite.
+
+    A covariance that never changes is given again and again: by the slices of a filter, or by the sweeps of
+    a chain. The matrix itself is the key, since an array may be written to.
+    """
+    cov = np.frombuffer(numbers).reshape(d, d)
+    try:
+        factor = np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        return None
+    if not (np.isfinite(factor).all() and (cov == cov.T).all()):
+        return None
+    factor.flags.writeable = False
+    return factor
 
 
 def solve_lower(factor: np.ndarray, vector: np.ndarray) -> np.ndarray:

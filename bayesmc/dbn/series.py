@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -32,8 +32,7 @@ class Compiled(Protocol):
     def slices(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Slices: ...
 
 
-@dataclass(frozen=True, eq=False)
-class Row:
+class Row(NamedTuple):
     """What is known of one slice.
 
     Attributes

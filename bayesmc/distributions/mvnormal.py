@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.base import Distribution, all_finite, as_float
 from bayesmc.distributions.support import Support, real_vector
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.gaussian import solve_lower, try_cholesky
@@ -69,8 +69,10 @@ class MvNormal(Distribution):
             self._set_tril(loc, as_float(scale_tril))
         else:
             self._set_cov(loc, as_float(cov))
-        finite = np.isfinite(loc).all(axis=-1)
-        self.loc = self._check("loc", loc, finite, 0.0, "finite")
+        self.loc = loc
+        if not all_finite(loc):  # by its sum: looking at every vector costs more than a draw
+            finite = np.isfinite(loc).all(axis=-1)
+            self.loc = self._check("loc", loc, finite, 0.0, "finite")
 
     @property
     def scale_tril(self) -> np.ndarray:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from bayesmc.distributions.base import Distribution, as_float
+from bayesmc.distributions.base import Distribution, all_finite, as_float
 from bayesmc.distributions.support import Support, real
 from bayesmc.shapes import Shape
 
@@ -43,16 +43,16 @@ class Normal(Distribution):
     """
 
     parameter_ndim = {"loc": 0, "scale": 0}
+    #: the scale where it is one valid number
+    _number: float | None = None
 
     def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
         loc, scale = as_float(loc), as_float(scale)
-        if (
-            not scale.ndim
-            and 0.0 < scale < math.inf
-            and math.isfinite(np.add.reduce(loc, axis=None))
-        ):
-            self.batch_shape, self.loc, self.scale = loc.shape, loc, scale  # the hottest of all
-            return
+        if not scale.ndim:  # the hottest of all: a Python number is compared ten times faster
+            number = scale.item()
+            if 0.0 < number < math.inf and all_finite(loc):
+                self.batch_shape, self.loc, self.scale, self._number = loc.shape, loc, scale, number
+                return
         self._set_batch(loc.shape, scale.shape)
         self.loc = self._finite("loc", loc)
         self.scale = self._positive("scale", scale)
@@ -64,8 +64,8 @@ class Normal(Distribution):
         return draws
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        if not self.scale.ndim and 1e-150 < self.scale < 1e150:
-            scale = float(self.scale)
+        scale = self._number
+        if scale is not None and 1e-150 < scale < 1e150:
             z = np.asarray(x - self.loc, dtype=float)
             z *= _ROOT_HALF / scale
             z *= z

@@ -62,13 +62,13 @@ class SlicePlan:
 
     def steps(self, row: Row) -> list[Step]:
         """The steps of a row's slice."""
-        partly = any(seen.mask is not None for seen in row.seen.values())
-        key = (row.t == 0, frozenset(row.seen))
-        found = None if partly else self._kept.get(key)
+        for seen in row.seen.values():
+            if seen.mask is not None:
+                return self._build(row)
+        key = (row.t == 0, *row.seen)
+        found = self._kept.get(key)
         if found is None:
-            found = self._build(row)
-            if not partly:
-                self._kept[key] = found
+            found = self._kept[key] = self._build(row)
         return found
 
     def known(self, row: Row) -> dict[str, np.ndarray]:
@@ -227,17 +227,23 @@ class Quick:
         assert node.declaration.function is not None
         self.name, self.function, self.plain = node.name, node.declaration.function, plain
         self.parents, self.event_shape = node.parents, node.event_shape
+        times = (TIME, TIME + PREVIOUS)
+        self.times = tuple(k for k, p in enumerate(node.parents) if p in times)
 
     def distribution(self, state: Pass) -> Distribution | None:
         """The node's distribution, if there is nothing to say about it."""
         values = state.values
+        arguments: list[Any] = [values[p] for p in self.parents]
+        for k in self.times:  # the arithmetic of Python's numbers is the faster one
+            arguments[k] = arguments[k].item()
         try:
-            dist = self.function(*[values[p] for p in self.parents])
+            dist = self.function(*arguments)
         except Exception:  # whatever it is, the plain step explains it
             return None
         if not isinstance(dist, Distribution) or dist.invalid is not None:
             return None
-        fits = dist.batch_shape in ((), state.batch) and dist.event_shape == self.event_shape
+        batch = dist.batch_shape
+        fits = (batch == state.batch or batch == ()) and dist.event_shape == self.event_shape
         return dist if fits else None
 
 
@@ -261,7 +267,7 @@ class QuickWeigh(Quick):
         dist = self.distribution(state)
         if dist is not None:
             log = dist.log_prob_unchecked(state.values[self.name])
-            if not log.size or np.maximum.reduce(log, axis=None) < np.inf:  # false for NaN, too
+            if not log.size or log.item(log.argmax()) < math.inf:  # false for NaN, too
                 state.weigh(log)
                 return
         self.plain(state)

@@ -127,7 +127,8 @@ def systematic(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.
     draws = count_of(draws)
     positions = cumulative_offspring(weights, draws)
     # ceil(x - u) of the points k + u lie below x: the whole part of x + (1 - u), but for u = 0
-    positions += (1.0 - rng.random(positions.shape[1:] or None)) % 1.0
+    shift = rng.random(positions.shape[1:]) if positions.ndim > 1 else rng.random()
+    positions += (1.0 - shift) % 1.0
     return _unfolded(_closed(positions.astype(np.intp), positions, draws), draws)
 
 

@@ -97,7 +97,9 @@ def _checked(weights: np.ndarray) -> np.ndarray:
         raise ValueError(
             f"resampling: weights of shape {weights.shape}; give at least one, particles on axis 0"
         )
-    if np.minimum.reduce(weights, axis=None, initial=0.0) < 0:
+    if (
+        weights.size and weights.item(weights.argmin()) < 0
+    ):  # faster than a reduction, for few weights
         where = np.argwhere(weights < 0)[0].tolist()
         raise ValueError(
             f"resampling: the weight at {where} is negative ({weights[tuple(where)]}); "

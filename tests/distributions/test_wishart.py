@@ -97,7 +97,8 @@ def test_log_prob_keeps_its_digits_at_scales_of_bad_condition(
     dist = family(df, scale)
     for x in dist.sample(seed, 3):
         expected = extended_log_prob(family, df, scale, x)
-        assert dist.log_prob(x) == pytest.approx(expected, rel=1e-10, abs=1e-9)
+        lost = 1e-17 * np.linalg.cond(x)  # a draw may be all but singular; a tenth of the bound
+        assert dist.log_prob(x) == pytest.approx(expected, rel=1e-10, abs=max(1e-9, lost))
 
 
 def test_golden_log_densities() -> None:

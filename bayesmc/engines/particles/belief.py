@@ -14,6 +14,9 @@ from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import circular_variance, table_variance
 
+#: columns up to which sums over particles are taken column by column
+_COLUMNS = 32
+
 
 class ParticleBelief:
     """Particles of one slice, as ``ParticleFilter.start`` and ``step`` give them.
@@ -229,29 +232,37 @@ def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray)
     """Mean and variance of a node that is not finite, in blocks of particles."""
     if layout.apart or value.ndim == len(node.value_shape) or _is_angle(node):
         return _mean(layout, cloud, node, value), _variance(layout, cloud, node, value)
-    centre: Any = None
-    alone = True
+    flat = value if value.ndim == 1 else value.reshape(len(value), -1)
     first: Any = 0.0
     second: Any = 0.0
-    for low in range(0, len(value), layout.block):
-        part, weights = value[low : low + layout.block], cloud.weights[low : low + layout.block]
-        if part.ndim > 1:
-            part = part.reshape(len(part), -1)
+    centre: Any = None
+    for low in range(0, len(flat), layout.block):
+        part, weights = flat[low : low + layout.block], cloud.weights[low : low + layout.block]
+        here = weights.dot(part)
         if centre is None:  # near the mean, so that the squares do not cancel
-            alone = len(value) <= layout.block
-            share = cloud.total if alone else weights.sum()
-            centre = weights @ part / share if share > 0 else part[0]
-        off = part - centre
-        if not alone:
-            first = first + weights @ off
-        off *= off
-        second = second + weights @ off
+            share = cloud.total if len(part) == len(flat) else weights.sum()
+            centre = here / share if share > 0 else part[0]
+        first = first + here
+        second = second + _squares_about(part, centre, weights)
     mean, variance = first / cloud.total, second / cloud.total
-    if not alone:
-        variance = np.maximum(variance - mean * mean, 0.0)
+    if len(flat) > layout.block:
+        variance = np.maximum(variance - (mean - centre) ** 2, 0.0)
     if value.ndim == 1:
-        return mean + centre, variance
-    return (mean + centre).reshape(value.shape[1:]), variance.reshape(value.shape[1:])
+        return mean, variance
+    return mean.reshape(value.shape[1:]), variance.reshape(value.shape[1:])
+
+
+def _squares_about(part: np.ndarray, centre: Any, weights: np.ndarray) -> Any:
+    """Weighted sums of the squared distances of numbers, or of each of some columns, from a centre."""
+    if part.ndim == 1:
+        off = part - centre
+        off *= off
+        return weights.dot(off)
+    if part.shape[1] > _COLUMNS:
+        return weights.dot((part - centre) ** 2)
+    # column by column: broadcasting along a short last axis is ten times slower
+    columns = range(part.shape[1])
+    return np.array([_squares_about(part[:, j], centre[j], weights) for j in columns])
 
 
 def _average(

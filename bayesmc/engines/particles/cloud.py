@@ -157,6 +157,9 @@ class Mover:
         numbers = max(size_of(slices), 1)
         self.block = particles if particles * numbers <= WHOLE else max(1, BLOCK // numbers)
         self.lead = tuple(slices.first.sizes[p] for p in self.apart)
+        self._before = tuple((n, n + PREVIOUS) for n in slices.interface)
+        self._ranks = {n + PREVIOUS: len(slices.first[n].value_shape) for n in slices.dynamic}
+        self._ranks |= {n: len(slices.first[n].value_shape) for n in slices.dynamic}
         self.layout = Layout(particles, self.apart, self.lead, self.block)
         self._log_particles = math.log(particles)
         self._even = np.ones((particles, *self.lead))
@@ -175,7 +178,8 @@ class Mover:
 
     def next(self, cloud: Cloud, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of the next slice: resample if need be, move, weight."""
-        before = {n + PREVIOUS: cloud.values[n] for n in self.slices.interface}
+        values = cloud.values
+        before = {previous: values[n] for n, previous in self._before}
         return self._moved(row, before, self._selected(cloud, before, row, rng), rng)
 
     def _moved(
@@ -244,9 +248,13 @@ class Mover:
         """One forward pass over a slice, in blocks of particles: kept values and log weights."""
         n, known = self.particles, self.plan.known(row)
         if n <= self.block:
-            taken = {k: self._taken(k, v, ancestors) for k, v in before.items()}
-            state = _run(steps, Pass(rng, (n,), {**known, **taken}))
-            return {k: state.values[k] for k in self.kept}, state.log_weight
+            for name, value in before.items():
+                known[name] = self._taken(name, value, ancestors)
+            state = Pass(rng, (n,), known)
+            for step in steps:
+                step(state)
+            found = state.values
+            return {k: found[k] for k in self.kept}, state.log_weight
         values: dict[str, np.ndarray] = {}
         log: Any = 0.0
         for low in range(0, n, self.block):
@@ -260,7 +268,9 @@ class Mover:
                 )
                 for k, v in before.items()
             }
-            state = _run(steps, Pass(rng, (high - low,), {**known, **taken}))
+            state = Pass(rng, (high - low,), {**known, **taken})
+            for step in steps:
+                step(state)
             self._store(values, state.values, low, high)
             weight = np.asarray(state.log_weight)
             if weight.ndim <= len(self.lead):
@@ -276,17 +286,16 @@ class Mover:
     ) -> None:
         for name in self.kept:
             value = found[name]
-            shape = self.slices.first[name].value_shape
-            if value.ndim == len(shape):
+            if value.ndim == self._ranks[name]:
                 values[name] = value  # the same for all particles
                 continue
             if low == 0:
-                values[name] = self._spare.get((self.particles, *shape), value.dtype)
+                values[name] = self._spare.get((self.particles, *value.shape[1:]), value.dtype)
             values[name][low:high] = value
 
     def _cut(self, name: str, value: np.ndarray, low: int, high: int) -> np.ndarray:
         """A block of a node's values, read-only."""
-        if value.ndim == len(self.slices.later[name].value_shape):
+        if value.ndim == self._ranks[name]:
             return value
         part = value[low:high]
         part.flags.writeable = False
@@ -294,15 +303,12 @@ class Mover:
 
     def _taken(self, name: str, value: np.ndarray, ancestors: np.ndarray | None) -> np.ndarray:
         """A node's values of the slice before, of the ancestors of a block."""
-        if ancestors is None:
-            return value
-        node = self.slices.later[name]
-        if value.ndim == len(node.value_shape):
+        if ancestors is None or value.ndim == self._ranks[name]:
             return value
         if not self.apart:
             found = value.take(ancestors, axis=0, mode="clip")  # they lie within
         else:
-            found = along_plates(value, ancestors, node.plates, self.apart)
+            found = along_plates(value, ancestors, self.slices.later[name].plates, self.apart)
         found.flags.writeable = False
         return found
 
@@ -336,7 +342,7 @@ class Mover:
         if len(log) <= self.block:
             weights = log - level
             np.exp(weights, out=weights)
-            return weights, np.add.reduce(weights), _squares(weights)
+            return weights, self._sum(weights), _squares(weights)
         weights = self._spare.get(log.shape, np.dtype(float))
         total: Any = 0.0
         squares: Any = 0.0
@@ -344,9 +350,14 @@ class Mover:
             part = weights[low : low + self.block]
             np.subtract(log[low : low + self.block], level, out=part)
             np.exp(part, out=part)
-            total = total + np.add.reduce(part)
+            total = total + self._sum(part)
             squares = squares + _squares(part)
         return weights, total, squares
+
+    def _sum(self, weights: np.ndarray) -> Any:
+        if weights.ndim == 1:
+            return float(weights.dot(self._even[: len(weights)]))
+        return np.add.reduce(weights)
 
     def _degenerate(
         self,
@@ -416,17 +427,14 @@ class _Spare:
 
 def _top(log: np.ndarray) -> Any:
     """The largest log weight; 0 where all are minus infinity."""
-    level = np.maximum.reduce(log)
     if log.ndim == 1:
-        return level if level > -np.inf else 0.0
+        level = log.item(log.argmax())  # several times faster than a reduction, for short arrays
+        return level if level > -math.inf else 0.0
+    level = np.maximum.reduce(log)
     return np.where(level > -np.inf, level, 0.0)
 
 
 def _squares(weights: np.ndarray) -> Any:
-    return weights @ weights if weights.ndim == 1 else np.einsum("i...,i...->...", weights, weights)
-
-
-def _run(steps: Sequence[Step], state: Pass) -> Pass:
-    for step in steps:
-        step(state)
-    return state
+    if weights.ndim == 1:
+        return float(weights.dot(weights))
+    return np.einsum("i...,i...->...", weights, weights)

@@ -47,7 +47,7 @@ class Record:
         self.resampled = np.zeros((steps, *layout.lead), dtype=bool)
         self.rejuvenated = np.zeros(steps, dtype=bool)
         self.unique = np.full((steps, *layout.lead), layout.particles)
-        self._nodes = [(n, model[n]) for n in problem.hidden]
+        self._nodes = [(n, model[n], len(model[n].value_shape)) for n in problem.hidden]
 
     def add(self, k: int, cloud: Cloud) -> None:
         """Take in the cloud of the k-th slice."""
@@ -58,12 +58,13 @@ class Record:
         self.rejuvenated[k] = cloud.rejuvenated
         if cloud.ancestors is not None:
             changes = cloud.ancestors[1:] != cloud.ancestors[:-1]
-            self.unique[k] = np.count_nonzero(changes, axis=0) + 1
-        for name, node in self._nodes:
+            along = 0 if layout.apart else None  # without an axis it is ten times faster
+            self.unique[k] = np.count_nonzero(changes, axis=along) + 1
+        for name, node, rank in self._nodes:
             value = cloud.values[name]
             if node.domain is not None:
                 self.tables[name][k] = table_of_states(layout, cloud, node, value)
-            elif value.ndim == len(node.value_shape):  # seen here, or the same for all particles
+            elif value.ndim == rank:  # seen here, or the same for all particles
                 self.means[name][k], self.variances[name][k] = value, 0.0
             else:
                 self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
