@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple, Protocol
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -385,14 +386,25 @@ def _observed(node: CompiledNode, value: Any, steps: int) -> Observed | None:
             f"observations of {node.name!r}, which is a deterministic node and takes none; observe a "
             "stochastic node, or give it a narrow distribution"
         )
-    declaration: Declaration = node.declaration
-    plates = ("time", *declaration.plates)
-    timed = replace(
-        node,
-        declaration=replace(declaration, plates=plates),
-        plate_shape=(steps, *node.plate_shape),
-    )
-    return observe(timed, value)
+    return observe(_over_time(node, steps), value)
+
+
+def _over_time(node: CompiledNode, steps: int) -> CompiledNode:
+    """The node with time as its first plate; that of one slice is kept, for filters that go row by row."""
+    found = _ALONE.get(node) if steps == 1 else None
+    if found is None:
+        declaration: Declaration = node.declaration
+        found = replace(
+            node,
+            declaration=replace(declaration, plates=("time", *declaration.plates)),
+            plate_shape=(steps, *node.plate_shape),
+        )
+        if steps == 1:
+            _ALONE[node] = found
+    return found
+
+
+_ALONE: WeakKeyDictionary[CompiledNode, CompiledNode] = WeakKeyDictionary()
 
 
 def _is_missing(row: Any) -> bool:

@@ -81,8 +81,9 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
         )
     if every.all() and array.size:
         return None
-    filler = array[first_index(~missing)] if array.size else 0
-    filled = np.where(missing, filler, array) if missing.any() else array
+    filled = array
+    if missing.any():
+        filled = np.where(missing, array[first_index(~missing)], array)
     stored = store(node, filled)
     observed = np.asarray(~every)
     _check_support(node, stored, observed)

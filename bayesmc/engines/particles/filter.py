@@ -26,7 +26,7 @@ from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import UnknownNodeError, UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
-from bayesmc.randomness import Purpose, seed_sequence, stream
+from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, scheme_of
 
 
@@ -311,9 +311,8 @@ class ParticleFilter(FilterEngine):
         mover = belief.mover
         if mover is None:
             mover = self._mover(slices, read_static(slices, belief.static))
-        rng = stream(belief.seed, Purpose.FILTER)
-        if belief.chance is not None:
-            rng.bit_generator.state = belief.chance
+        chance = belief.chance
+        rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with _quiet():
             if belief.cloud is None:
                 cloud = mover.first(row, rng)
