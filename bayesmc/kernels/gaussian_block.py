@@ -1,19 +1,21 @@
 """Coupled Normal nodes drawn jointly: random effects and their mean, coefficients of one regression.
 
 Given everything else the block is Gaussian. Its precision and linear term are sums over the terms it
-enters, whose coefficients come from evaluating the user's functions at zero and at unit steps. The nodes of
-one plate that meet only element by element are eliminated first (many small matrices), then the rest (one
-dense matrix): the cost is linear in the elements of that plate.
+enters, whose coefficients come from evaluating the user's functions at zero and at unit steps. Elements of a
+plate that meet only one by one (many small matrices), or the slices of a chain (a band), are eliminated
+first, then the rest (one dense matrix): the cost is linear in those elements or slices. A precision that is
+what it was in the sweep before is not factorised again.
 
 References
 ----------
-Rue and Held (2005), Gaussian Markov Random Fields, sec. 2.3; Gelfand, Sahu and Carlin (1995), Biometrika 82,
-on why one at a time mixes slowly.
+Rue and Held (2005), Gaussian Markov Random Fields, sec. 2.3 and 2.4; Gelfand, Sahu and Carlin (1995),
+Biometrika 82, on why one at a time mixes slowly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,48 +23,65 @@ import numpy as np
 from bayesmc.distributions import LogNormal, MvNormal, Normal
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.gaussian_layout import BlockSums, Layout, solved
-from bayesmc.kernels.gaussian_terms import BlockTerm
+from bayesmc.kernels.gaussian_layout import BlockSums, Factor, Layout, factored, solved
+from bayesmc.kernels.gaussian_terms import BlockTerm, block_terms
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Term, Values
 from bayesmc.structure.traced import Untraceable, traced_term
 from bayesmc.tracing import TracedCall, Tracer
 
-#: components that one dense matrix may have
+#: components that one dense matrix may have, and how far from the diagonal a band may reach
 MAX_DENSE = 400
-#: nodes of a block, whose precision matrix is dense
-_MOST_NODES = 64
+#: numbers that are stored of one chain's precision
+_MAX_ENTRIES = 1 << 22
+#: nodes that are named to the user
+_SHOWN = 8
 _FAMILIES = (Normal, MvNormal, LogNormal)
 
 
 class GaussianBlock(Kernel):
-    """Draws several Normal nodes from their joint full conditional."""
+    """Draws several Normal nodes from their joint full conditional.
+
+    Parameters
+    ----------
+    blankets : dict
+        Of the block's nodes.
+    layout : Layout, optional
+        Made before.
+    """
 
     label = "conjugate block"
 
     def __init__(
-        self, target: Target, blankets: Mapping[str, Blanket], debug: bool = False
+        self,
+        target: Target,
+        blankets: Mapping[str, Blanket],
+        debug: bool = False,
+        layout: Layout | None = None,
     ) -> None:
         self.target = target
         self.names = tuple(blankets)
         self.debug = debug
         self.terms = target.terms_of(self.names)
         self.path = target.below(self.names)
-        self.layout = Layout(target, self.names, blankets, self.terms)
-        self.parts = [BlockTerm(target, blankets, self.layout, term) for term in self.terms]
-        self.match = "jointly Normal with " + ", ".join(self.names)
+        self.layout = layout or Layout(target, self.names, blankets, self.terms)
+        self.parts = block_terms(target, blankets, self.layout, self.terms)
+        self.match = "jointly Normal with " + _shortened(self.names)
         self._standing: tuple[Any, list[BlockTerm]] = (None, [])
         self._moving: list[BlockTerm] = []
+        #: the precision of the last sweep and its factor
+        self._last: tuple[np.ndarray, Factor] | None = None
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
-        sums = self._summed(self._at_zero(values), len(values[self.names[0]]))
+        sums = self._summed(values, len(values[self.names[0]]))
         noise = rng.standard_normal(sums.linear.shape)
-        draw, _, bad = solved(self.layout, sums, noise)
-        if bad.any():
+        factor = self._factored(sums.precision)
+        if (sums.bad | factor.bad).any():
             raise DensityError(self._why_bad(sums))
+        draw = factor.solved(sums.linear, noise)
         new = self.layout.split(draw, values)
         if self.debug:
             self._check(values, new, sums.precision, sums.linear)
@@ -73,27 +92,35 @@ class GaussianBlock(Kernel):
 
         Minus infinity where a parameter overflows or the precision is not positive definite.
         """
-        sums = self._summed(self._at_zero(values), count)
+        sums = self._summed(values, count)
         mean, log_det, bad = solved(self.layout, sums, None)
         log = sums.constant + 0.5 * np.vecdot(sums.linear, mean) - 0.5 * log_det
         return np.where(bad | np.isnan(log), -np.inf, log)
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _summed(self, base: Values, chains: int) -> BlockSums:
-        """What all terms say, given the state with the block at zero."""
+    def _summed(self, values: Values, chains: int) -> BlockSums:
+        """What all terms say, the block at zero."""
         sums = BlockSums(chains, self.layout)
         together, standing = self._standing
-        if together is not None and all(part.stands(base) for part in standing):
+        moving = self.parts
+        if together is not None and all(part.stands(values) for part in standing):
             sums.add(*together)
-            for part in self._moving:
+            moving = self._moving
+        if moving:
+            base = self._at_zero(values)
+            for part in moving:
                 part.add(base, sums)
-            return sums
-        for part in self.parts:
-            part.add(base, sums)
-        if together is None:
-            self._part_ways(base)
+            if together is None:
+                self._part_ways(base)
         return sums
+
+    def _factored(self, precision: np.ndarray) -> Factor:
+        """The factor of a precision: the last one, where that has not changed."""
+        last = self._last
+        if last is None or not np.array_equal(last[0], precision):
+            last = self._last = precision, factored(self.layout, precision)
+        return last[1]
 
     def _part_ways(self, base: Values) -> None:
         """Terms that say the same in every sweep are summed once, the others each time."""
@@ -113,9 +140,7 @@ class GaussianBlock(Kernel):
 
     def _at_zero(self, values: Values) -> Values:
         """The state with the block at zero (what is seen of it stays)."""
-        state = dict(values)
-        for name in self.names:
-            state[name] = self.layout.base[name]
+        state = {**values, **self.layout.base}
         for link in self.path:
             state[link], _ = self.target.model.evaluate(link, state)
         return state
@@ -151,26 +176,9 @@ def gaussian_blocks(
 ) -> list[GaussianBlock]:
     """Blocks of two or more coupled Normal nodes whose terms are jointly affine in them."""
     able = [n for n, b in blankets.items() if _is_able(target, b)]
-    groups: list[list[str]] = []
-    entered = {n: {t.name for t in target.terms_of((n,))} for n in able}
-    for name in able:
-        shared = [g for g in groups if any(entered[name] & entered[n] for n in g)]
-        merged = [name]
-        for group in shared:
-            if len(group) + len(merged) > _MOST_NODES:
-                continue  # a long chain is cut: each piece is drawn given its neighbours
-            if _jointly_affine(target, [*group, *merged], blankets):
-                merged = [*group, *merged]
-                groups.remove(group)
-        groups.append(merged)
     found = []
-    for group in groups:
-        order = [n for n in target.chain if n in group]
-        if len(order) < 2:
-            continue
-        block = GaussianBlock(target, {n: blankets[n] for n in order}, debug)
-        if block.layout.dg <= MAX_DENSE:
-            found.append(block)
+    for names in _joint_groups(target, able, blankets):
+        found += _fitting(target, names, blankets, debug)
     return found
 
 
@@ -196,7 +204,9 @@ def _is_affine(
     """Whether a term is Gaussian with a mean affine in the nodes, and nothing else of it varies with them."""
     if not names:
         try:
-            result = target.model.evaluate(term.name, {**target.model.probe, **target.known})[0]
+            known, probe = target.known, target.model.probe
+            values = {n: known[n] if n in known else probe[n] for n in term.parents}
+            result = target.model.evaluate(term.name, values)[0]
         except Exception:
             return False
         return type(result) in families
@@ -214,17 +224,94 @@ def _is_affine(
     )
 
 
-def _jointly_affine(target: Target, names: Sequence[str], blankets: Mapping[str, Blanket]) -> bool:
-    children: dict[str, list[tuple[str, str]]] = {}
-    for name in names:
+def _fitting(
+    target: Target, names: Sequence[str], blankets: Mapping[str, Blanket], debug: bool
+) -> list[GaussianBlock]:
+    """A group as one block, or cut into halves (each drawn given the other) where that is too large."""
+    if len(names) < 2:
+        return []
+    own = {n: blankets[n] for n in names}
+    layout = Layout(target, names, own, target.terms_of(names))
+    if max(layout.width, layout.dg) <= MAX_DENSE and layout.entries <= _MAX_ENTRIES:
+        return [GaussianBlock(target, own, debug, layout)]
+    half = len(names) // 2
+    halves = names[:half], names[half:]
+    return [block for part in halves for block in _fitting(target, part, blankets, debug)]
+
+
+@dataclass(eq=False)
+class _Group:
+    """Nodes whose terms are jointly affine in them, and how they enter each term."""
+
+    names: list[str]
+    #: term -> nodes that it reads, and the kinds of relation
+    children: dict[str, list[tuple[str, str]]]
+    #: when it got its last member
+    age: int
+    #: the group that it has become part of
+    into: _Group | None = None
+
+    def now(self) -> _Group:
+        group = self
+        while group.into is not None:
+            group = group.into
+        return group
+
+
+def _joint_groups(
+    target: Target, able: Sequence[str], blankets: Mapping[str, Blanket]
+) -> list[list[str]]:
+    """Nodes that can be drawn together, each group in the chain's order.
+
+    A node joins the groups whose terms it enters. Of two groups only the terms that both enter can stand in
+    the way, and the smaller goes into the larger, so a slice of a long chain costs what one of a short does.
+    """
+    place = {n: i for i, n in enumerate(target.chain)}
+    owners: dict[str, list[_Group]] = {}
+    groups: list[_Group] = []
+    for age, name in enumerate(able):
+        children: dict[str, list[tuple[str, str]]] = {}
         for child in blankets[name].children:
             children.setdefault(child.term.name, []).append((name, child.relation.kind))
-    for term in target.terms_of(tuple(names)):
-        found = children.get(term.name, [])
+        merged = alone = _Group([name], children, age)
+        terms = [t.name for t in target.terms_of((name,))]
+        shared = {g.now() for t in terms for g in owners.get(t, ())}
+        for group in sorted(shared, key=lambda g: g.age):
+            if _jointly_affine(target, group, merged):
+                merged = _merged(group, merged, age)
+        groups.append(alone)
+        for term in terms:
+            owners.setdefault(term, []).append(alone)
+    found = sorted((g for g in groups if g.into is None), key=lambda g: g.age)
+    return [sorted(g.names, key=place.__getitem__) for g in found]
+
+
+def _merged(one: _Group, other: _Group, age: int) -> _Group:
+    """Two groups as one: the larger, changed."""
+    small, large = sorted((one, other), key=lambda g: len(g.names))
+    small.into = large
+    large.age = age
+    large.names += small.names
+    for term, entering in small.children.items():
+        large.children.setdefault(term, []).extend(entering)
+    return large
+
+
+def _jointly_affine(target: Target, one: _Group, other: _Group) -> bool:
+    """Whether the terms that two groups share are affine in the nodes of both."""
+    small, large = sorted((one.children, other.children), key=len)
+    for name, these in small.items():
+        if name not in large:
+            continue
+        found = [*these, *large[name]]
         entering = tuple(dict.fromkeys(n for n, _ in found))
-        lookups = [n for n, kind in found if kind == "lookup"]
-        if len(lookups) > 1 or (lookups and len(entering) > 1):
+        if any(kind == "lookup" for _, kind in found):
             return False
-        if len(entering) > 1 and not _is_affine(target, entering, term):
+        if not _is_affine(target, entering, target.terms[name]):
             return False
     return True
+
+
+def _shortened(names: Sequence[str]) -> str:
+    shown = names if len(names) <= _SHOWN else (*names[:_SHOWN], f"... ({len(names)} nodes)")
+    return ", ".join(shown)

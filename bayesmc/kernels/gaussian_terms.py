@@ -1,60 +1,105 @@
-"""What one term says of a Normal block: rows of residuals, affine in the block, and their noise."""
+"""What terms say of a Normal block: rows of residuals, affine in the block, and their noise.
+
+Like terms (the transitions of a chain of slices) are one, in one more plate.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
+from operator import is_
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import LogNormal, MvNormal
+from bayesmc.errors import BayesmcError
 from bayesmc.kernels.gaussian_layout import BlockSums, Layout
+from bayesmc.kernels.gaussian_order import elements_read
 from bayesmc.structure.blanket import Blanket, Child
+from bayesmc.structure.like_functions import Slots, stack_arrays
+from bayesmc.structure.like_terms import FEWEST, LikeTerms, TermSum
 from bayesmc.structure.target import Target, Term, Values
 from bayesmc.structure.traced import Untraceable, traced_term
 from bayesmc.tracing import TracedCall, Tracer
 
+#: term -> the children by which the block's nodes enter it
+Entering = Mapping[str, Mapping[str, Child]]
+
+
+def block_terms(
+    target: Target, blankets: Mapping[str, Blanket], layout: Layout, terms: Sequence[Term]
+) -> list[BlockTerm]:
+    """The terms of a block, like ones as one, in the order in which they begin."""
+    entering: dict[str, dict[str, Child]] = {t.name: {} for t in terms}
+    for name, blanket in blankets.items():
+        for child in blanket.children:
+            entering[child.term.name][name] = child
+    stacked = _stacked(target, layout, terms, entering)
+    inside = {n for group in stacked.values() for n in group.names}
+    made = []
+    for term in terms:
+        if term.name in stacked:
+            group = stacked[term.name]
+            members = [target.terms[n] for n in group.names]
+            made.append(BlockTerm(target, blankets, layout, entering, members, group))
+        elif term.name not in inside:
+            made.append(BlockTerm(target, blankets, layout, entering, [term]))
+    return made
+
 
 class BlockTerm:
-    """What one term says of the block: rows ``constant + coefficients @ unknowns``, whitened.
+    """What one term, or a group of like ones, says of the block: rows ``constant + coefficients @ unknowns``.
 
     Coefficients and the data's part are kept where they cannot change; a noise that is the same for all
     elements of a chain then only scales what was summed before.
+
+    Parameters
+    ----------
+    entering : dict
+        Term -> node of the block -> how it enters.
+    members : sequence of Term
+    like : LikeTerms, optional
+        The members as one; of a single term the block's own functions are asked.
     """
 
     def __init__(
-        self, target: Target, blankets: Mapping[str, Blanket], layout: Layout, term: Term
+        self,
+        target: Target,
+        blankets: Mapping[str, Blanket],
+        layout: Layout,
+        entering: Entering,
+        members: Sequence[Term],
+        like: LikeTerms | None = None,
     ) -> None:
-        self.target, self.layout, self.term = target, layout, term
-        self.node = target.model[term.name]
-        self.own = term.name in layout.names
+        self.target, self.layout, self.blankets = target, layout, blankets
+        self.members, self.like = tuple(members), like
+        self.term = members[0] if like is None else like.term
+        self.shape = self.term.shape if like is None else like.shape
+        self.node = self.term.model[self.term.name]
+        self.own = self.term.name in layout.names
         self.d = math.prod(self.node.event_shape)
-        self.count = math.prod(term.shape)
+        self.count = math.prod(self.shape)
+        mask = self.term.mask
         #: elements that count
-        self.seen = self.count if term.mask is None else int(term.mask.sum())
-        self.children: dict[str, Child] = {}
-        for name, blanket in blankets.items():
-            for child in blanket.children:
-                if child.term is term:
-                    self.children[name] = child
-        self.blankets = blankets
+        self.seen = self.count if mask is None else int(mask.sum())
+        self.children = dict(entering[self.term.name])
         self.columns = [(n, c) for n in self.children for c in range(layout.dims[n])]
         self.dynamic = next(
             (n for n, c in self.children.items() if c.relation.kind == "lookup"), None
         )
-        above = target.hidden_above(term)
-        discrete = any(target.model[n].is_discrete for n in above)
-        sources = None if discrete or self.dynamic else _affine_sources(target, term, above)
         #: coefficients never change; nor does anything else but the noise; nor does that
-        self.constant = sources is not None
-        self.fixed = sources is not None and sources <= set(layout.names)
-        self.fixed &= self.own or term.name not in target.chain  # a hidden child's value changes
-        self.frozen = self.fixed and set(above) <= set(layout.names)
+        constancy = [self._constancy(t) for t in members]
+        self.constant, self.fixed, self.frozen = (all(c) for c in zip(*constancy, strict=True))
+        self._data = () if self.own else tuple(t.name for t in members)
+        self._known = [target.known.get(n) for n in self._data]
         self.kept: Any = None
         self.slopes: np.ndarray | None = None
         self.summed: Any = None
-        self.spots = None if self.dynamic else self._spots(())
+        if like is not None:
+            self._gather(like)
+        self.spots = None if self.dynamic else self._spots(entering, ())
+        self._entering = entering
 
     def add(self, base: Values, sums: BlockSums) -> None:
         """Add what the term says, given the state with the block at zero."""
@@ -62,17 +107,14 @@ class BlockTerm:
             sums.add(*self.summed)
             return
         fixed = self._is_fixed(base)
-        dist, _, keys = self._distribution(base)
-        if dist.invalid is not None:
-            lead = dist.invalid.shape[: max(dist.invalid.ndim - len(self.term.shape), 0)]
-            invalid = np.broadcast_to(dist.invalid, lead + self.term.shape).reshape(*lead, -1)
-            bad = np.asarray(invalid.any(axis=-1))
-            sums.mark(bad, f"node {self.term.name!r}: {dist.problem}")
-        spots = self.spots if self.spots is not None else self._spots(keys)
+        state = base if self.like is None else self._gathered(base)
+        dist, keys = self._evaluated(base, state)
+        self._mark_invalid(dist, sums)
+        spots = self.spots if self.spots is not None else self._spots(self._entering, keys)
         uniform = self._uniform_scale(dist)
         if fixed and not self.frozen and uniform is not None:
             if self.summed is None:
-                self.summed = _first(self._sums(*self._masked(*self._rows(base, dist)), spots))
+                self.summed = _first(self._sums(*self._masked(*self._rows(state, dist)), spots))
             weight = uniform**-2.0
             precision, linear, constant = self.summed
             constant = weight * constant - self.seen * np.log(uniform)
@@ -80,7 +122,7 @@ class BlockTerm:
             return
         rows = self.kept
         if rows is None or not fixed:
-            rows = self._rows(base, dist)
+            rows = self._rows(state, dist)
             self.kept = _first(rows) if fixed else None
         whitened, log_det = self._whitened(dist, *rows)
         precision, linear, constant = self._sums(*whitened, spots)
@@ -89,39 +131,87 @@ class BlockTerm:
             self.summed = _first(summed)
         sums.add(*summed)
 
-    def stands(self, base: Values) -> bool:
+    def stands(self, values: Values) -> bool:
         """Whether it says what it said before, which is known."""
-        return self.frozen and self.summed is not None and self._is_fixed(base)
+        return self.frozen and self.summed is not None and self._is_fixed(values)
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _is_fixed(self, base: Values) -> bool:
-        return self.fixed and (
-            self.own or base[self.term.name] is self.target.known[self.term.name]
-        )
+    def _constancy(self, term: Term) -> tuple[bool, bool, bool]:
+        """Whether the coefficients, all but the noise, and everything that a term says never change."""
+        target, names = self.target, self.layout.start
+        above = target.hidden_above(term)
+        discrete = any(target.model[n].is_discrete for n in above)
+        sources = None if discrete or self.dynamic else _affine_sources(target, term, above)
+        if sources is None:
+            return False, False, False
+        fixed = all(n in names for n in sources)
+        fixed &= self.own or term.name not in target.chain  # a hidden child's value changes
+        return True, fixed, fixed and all(n in names for n in above)
 
-    def _distribution(self, state: Values) -> tuple[Any, Any, Any]:
+    def _is_fixed(self, values: Values) -> bool:
+        return self.fixed and all(map(is_, [values[n] for n in self._data], self._known))
+
+    def _gather(self, like: LikeTerms) -> None:
+        """Which names stand for nodes of the block, at zero always, and which for others."""
+        sources, names = like.slots.sources, self.layout.start
+        base = self.layout.base
+        self._zero = {
+            n: stack_arrays([base[m] for m in these], len(self.target.model[n].value_shape))
+            for n, these in sources.items()
+            if n in names
+        }
+        others = {n: these for n, these in sources.items() if n not in names}
+        self._slots = Slots(self.target, others, len(self.members))
+
+    def _gathered(self, base: Values) -> Values:
+        return {**self._slots.gathered(base), **self._zero}
+
+    def _evaluated(self, base: Values, state: Values) -> tuple[Any, Any]:
+        """The distribution, and the index by which it read the block."""
+        try:
+            return self._distribution(state)
+        except BayesmcError:
+            if self.like is not None:
+                for term in self.members:  # the group knows the first one's name only
+                    term.distribution(base)
+            raise
+
+    def _distribution(self, state: Values) -> tuple[Any, Any]:
         if self.dynamic is not None:
-            return self.blankets[self.dynamic].distribution(self.children[self.dynamic], state)
-        return (*self.term.distribution(state), ())
+            child = self.children[self.dynamic]
+            dist, _, keys = self.blankets[self.dynamic].distribution(child, state)
+            return dist, keys
+        return self.term.distribution(state)[0], ()
+
+    def _mark_invalid(self, dist: Any, sums: BlockSums) -> None:
+        if dist.invalid is None:
+            return
+        lead = dist.invalid.shape[: max(dist.invalid.ndim - len(self.shape), 0)]
+        each = np.broadcast_to(dist.invalid, lead + self.shape)
+        invalid = np.asarray(each.reshape(*lead, len(self.members), -1).any(axis=-1))
+        bad = np.asarray(invalid.any(axis=-1))
+        if bad.any():
+            first = int(np.argmax(invalid.reshape(-1, len(self.members)).any(axis=0)))
+            sums.mark(bad, f"node {self.members[first].name!r}: {dist.problem}")
 
     def _uniform_scale(self, dist: Any) -> np.ndarray | None:
         """The noise of a scalar term where it is the same for all its elements, shape (chains or 1,)."""
         if self.d != 1 or isinstance(dist, MvNormal):
             return None
         scale = dist.scale
-        plates = len(self.term.shape)
+        plates = len(self.shape)
         if plates and scale.ndim >= 1 and any(n != 1 for n in scale.shape[-plates:]):
             return None
         return scale.reshape(-1)
 
-    def _rows(self, base: Values, dist: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _rows(self, state: Values, dist: Any) -> tuple[np.ndarray, np.ndarray]:
         """Residuals: coefficients ``(lead, elements, d, columns)``, constants ``(lead, elements, d)``."""
         zero = self._flat(dist.loc)
         if self.slopes is not None:
             slopes = self.slopes
         else:
-            steps = [self._flat(self._stepped(base, n, c).loc) - zero for n, c in self.columns]
+            steps = [self._flat(self._stepped(state, n, c).loc) - zero for n, c in self.columns]
             lead = np.broadcast_shapes((1,), *(s.shape[:1] for s in steps))
             slopes = np.zeros((*lead, self.count, self.d, len(steps)))
             for k, step in enumerate(steps):
@@ -130,30 +220,35 @@ class BlockTerm:
                 slopes = self.slopes = slopes[:1]
         coefficients = -slopes
         if not self.own:
-            value = base[self.term.name]
+            value = state[self.term.name]
             if isinstance(dist, LogNormal):
                 value = np.log(value)
             return coefficients, self._flat(value) - zero
-        free = self.layout.free[self.term.name].astype(float)
+        free = np.concatenate([self.layout.free[t.name] for t in self.members]).astype(float)
         identity = np.eye(self.d) * free[:, None, None]
         identity = np.broadcast_to(identity, (*coefficients.shape[:-1], self.d))
-        seen = self._flat(self.layout.base[self.term.name])
+        seen = self._flat(state[self.term.name])
         return np.concatenate([coefficients, identity], axis=-1), seen - zero
 
     def _stepped(self, base: Values, name: str, component: int) -> Any:
-        """The term's distribution with one component of all free elements of a node at one."""
-        node = self.layout.nodes[name]
-        step = np.zeros((1, self.layout.counts[name], self.layout.dims[name]))
-        step[0, self.layout.free[name], component] = 1.0
+        """The distribution with one component of all free elements of a node at one."""
         state = dict(base)
-        state[name] = base[name] + step.reshape(1, *node.value_shape)
-        for link in self.target.below((name,)):
-            state[link], _ = self.target.model.evaluate(link, state)
+        state[name] = base[name] + self._step(name, component).reshape(base[name].shape)
+        if self.like is None:
+            for link in self.target.below((name,)):
+                state[link], _ = self.target.model.evaluate(link, state)
         return self._distribution(state)[0]
+
+    def _step(self, name: str, component: int) -> np.ndarray:
+        layout = self.layout
+        names = (name,) if self.like is None else self.like.slots.sources[name]
+        step = np.zeros((len(names), layout.counts[name], layout.dims[name]))
+        step[..., component] = [layout.free[n] for n in names]
+        return step
 
     def _flat(self, array: np.ndarray) -> np.ndarray:
         """``(*lead, *plates, *event)`` as ``(lead, elements, d)``."""
-        shape = self.term.shape + self.node.event_shape
+        shape = self.shape + self.node.event_shape
         array = np.asarray(array)
         lead = array.shape[: max(array.ndim - len(shape), 0)]
         full = np.broadcast_to(array, lead + shape)
@@ -168,8 +263,8 @@ class BlockTerm:
         joint = np.concatenate([rows, np.broadcast_to(rest, shape)[..., None]], axis=-1)
         if isinstance(dist, MvNormal):
             factor = dist.scale_tril
-            lead = factor.shape[: max(factor.ndim - 2 - len(self.term.shape), 0)]
-            factor = np.broadcast_to(factor, (*lead, *self.term.shape, self.d, self.d))
+            lead = factor.shape[: max(factor.ndim - 2 - len(self.shape), 0)]
+            factor = np.broadcast_to(factor, (*lead, *self.shape, self.d, self.d))
             factor = factor.reshape(math.prod(lead), self.count, self.d, self.d)
             joint = np.linalg.solve(factor, joint)
             log_scale = np.log(np.linalg.diagonal(factor)).sum(axis=-1)
@@ -188,32 +283,30 @@ class BlockTerm:
             return rows, rest
         return rows * mask.reshape(-1, 1, 1), rest * mask.reshape(-1, 1)
 
-    def _spots(self, keys: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _spots(self, entering: Entering, keys: Any) -> tuple[np.ndarray, np.ndarray]:
         """Positions of the columns ``(lead, elements, columns)``, and entries of their pairs."""
-        places = []
-        for name, component in self.columns:
-            at = self._elements_of(name, keys)
-            places.append(self.layout.place(name, component, at))
-        if self.own:
-            own = np.arange(self.count)[None]
-            places += [self.layout.place(self.term.name, c, own) for c in range(self.d)]
-        at = np.stack(np.broadcast_arrays(*places), axis=-1)
+        each = [self._places(entering, term, keys) for term in self.members]
+        at = each[0] if len(each) == 1 else np.concatenate(each, axis=1)
         return at, self.layout.entry(at[..., :, None], at[..., None, :])
 
-    def _elements_of(self, name: str, keys: Any) -> np.ndarray:
-        """Element of a node that each element of the term depends on, shape (lead, elements)."""
-        relation = self.children[name].relation
-        if relation.kind == "lookup":
-            index = relation.index_of(keys, self.term.shape)
-            return index.reshape(-1, self.count)
-        if relation.kind == "rows":
-            return relation.rows[0][None]
-        node = self.layout.nodes[name]
-        if not node.plates:
-            return np.zeros((1, self.count), dtype=np.intp)
-        at = np.unravel_index(np.arange(self.count), self.term.shape)
-        picked = [at[self.term.plates.index(p)] for p in node.plates]
-        return np.ravel_multi_index(picked, node.plate_shape)[None]
+    def _places(self, entering: Entering, term: Term, keys: Any) -> np.ndarray:
+        """Positions of the columns of one term, shape (lead, its elements, columns)."""
+        layout = self.layout
+        count = math.prod(term.shape)
+        found = []
+        for first, component in self.columns:
+            name = first
+            if self.like is not None:  # the node in the same place
+                name = term.scope[self.members[0].scope.index(first)]
+            relation = entering[term.name][name].relation
+            elements = elements_read(relation, term)
+            if elements is None:
+                elements = relation.index_of(keys, term.shape).reshape(-1, count)
+            found.append(layout.place(name, component, np.atleast_2d(elements)))
+        if self.own:
+            own = np.arange(count)[None]
+            found += [layout.place(term.name, c, own) for c in range(self.d)]
+        return np.stack(np.broadcast_arrays(*found), axis=-1)
 
     def _sums(
         self,
@@ -232,6 +325,35 @@ class BlockTerm:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _stacked(
+    target: Target, layout: Layout, terms: Sequence[Term], entering: Entering
+) -> dict[str, LikeTerms]:
+    """Groups of like terms that the block's nodes enter alike, by the first of each."""
+    alike: dict[Hashable, list[Term]] = {}
+    for term in terms:
+        key = _how_entered(target, layout, term, entering[term.name])
+        if key is not None:
+            alike.setdefault(key, []).append(term)
+    many = [t for t in alike.values() if len(t) >= FEWEST]
+    return {group.names[0]: group for t in many for group in TermSum(target, t).groups}
+
+
+def _how_entered(
+    target: Target, layout: Layout, term: Term, children: Mapping[str, Child]
+) -> Hashable | None:
+    """How the block enters a term: in which places; None where not directly, or by varying indices."""
+    if any(c.relation.kind == "lookup" for c in children.values()):
+        return None
+    if not set(target.below(tuple(children))).isdisjoint(term.scope) if children else False:
+        return None
+    kinds = tuple((n in layout.start, _kind(children.get(n))) for n in term.scope)
+    return kinds if set(children) <= set(term.scope) else None
+
+
+def _kind(child: Child | None) -> str | None:
+    return None if child is None else child.relation.kind
 
 
 def _affine_sources(target: Target, term: Term, above: tuple[str, ...]) -> set[str] | None:

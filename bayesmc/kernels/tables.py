@@ -27,6 +27,8 @@ _COMPARED = 6
 _GROUP_ENTRIES = 1 << 22
 #: conditionals of a group: its matrix of strides stays small beside the states that it multiplies
 _GROUP_SIZE = 48
+#: nodes of a blanket that are gathered one by one in groups of more: long chains, whose matrix is mostly zero
+_GATHERED = 4
 
 
 def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
@@ -104,8 +106,7 @@ class TableSweep(Kernel):
         chains = len(values[self.names[0]])
         # one more row of ones carries where the tables of a group begin
         codes = np.ones((len(self.rows) + 1, chains), dtype=np.float32)
-        for row, name in enumerate(self.rows):
-            codes[row] = values[name]
+        codes[:-1] = np.concatenate([values[n] for n in self.rows]).reshape(-1, chains)
         draws = sum(group.count for group in self.groups)
         levels = np.ascontiguousarray(rng.random((chains, draws)).T)
         begin = 0
@@ -176,14 +177,17 @@ class RowSums(Kernel):
 class _Group:
     """Conditionals that are drawn together: no two meet, and all are compared or all searched.
 
-    Positions in their tables are one product of a matrix of strides with the states of all nodes.
+    Positions in their tables are one product of a matrix of strides with the states of all nodes; in a large
+    group, whose blankets are small, the states of every first, every second ... neighbour are gathered.
     """
 
     def __init__(self, part: Sequence[Conditional], place: Mapping[str, int]) -> None:
         self.part = tuple(part)
         self.count = len(part)
         self.width = _width(part[0])
-        self.columns, self.strides = _strides(part, place, self.width)
+        self.near = _neighbours(part, place, self.width) if self.count > _GROUP_SIZE else []
+        if not self.near:
+            self.columns, self.strides = _strides(part, place, self.width)
         self.edges = _searched(part, self.width) if self.width > 1 else _compared(part)
         dead = np.concatenate([c.probs.sum(axis=1) == 0 for c in part])
         self.impossible = dead if dead.any() else None
@@ -199,8 +203,7 @@ class _Group:
 
     def draw(self, codes: np.ndarray, levels: np.ndarray) -> None:
         """Replace the states of its nodes in ``codes`` (nodes and a row of ones, chains)."""
-        read = codes if self.columns is None else codes[self.columns]
-        index = (self.strides @ read).astype(np.intp)
+        index = self._positions(codes).astype(np.intp)
         if self.impossible is not None:
             self._check(index)
         new = self._search(index, levels) if self.width > 1 else self._compare(index, levels)
@@ -209,6 +212,16 @@ class _Group:
             return
         for rows, states, drawn in zip(self.written, self.states, new, strict=True):
             codes[rows] = states[:, drawn]
+
+    def _positions(self, codes: np.ndarray) -> np.ndarray:
+        """Where the tables are read, shape (part, chains)."""
+        if not self.near:
+            return self.strides @ (codes if self.columns is None else codes[self.columns])
+        rows, strides = self.near[0]
+        index = strides * codes.take(rows, axis=0)
+        for rows, strides in self.near[1:]:
+            index += strides * codes.take(rows, axis=0)
+        return index
 
     def _compare(self, index: np.ndarray, levels: np.ndarray) -> np.ndarray:
         new = np.zeros(levels.shape, dtype=np.uint8)
@@ -293,15 +306,26 @@ def _parts(colour: Sequence[Conditional]) -> Iterator[list[Conditional]]:
     for c in colour:
         by_width.setdefault(_width(c), []).append(c)
     for width, members in by_width.items():
-        part: list[Conditional] = []
-        entries = 0
-        for c in sorted(members, key=lambda c: -c.states):
-            size = len(c.probs) * width
-            if part and (entries + size > _GROUP_ENTRIES or len(part) == _GROUP_SIZE):
-                yield part
-                part, entries = [], 0
-            part.append(c)
-            entries += size
+        few = [c for c in members if len(c.blanket) <= _GATHERED]
+        if len(few) <= _GROUP_SIZE:
+            yield from _cut(members, width, _GROUP_SIZE)
+            continue
+        yield from _cut(few, width, len(few))
+        yield from _cut([c for c in members if len(c.blanket) > _GATHERED], width, _GROUP_SIZE)
+
+
+def _cut(members: Sequence[Conditional], width: int, most: int) -> Iterator[list[Conditional]]:
+    """Groups of at most so many conditionals, and of not too many table entries."""
+    part: list[Conditional] = []
+    entries = 0
+    for c in sorted(members, key=lambda c: -c.states):
+        size = len(c.probs) * width
+        if part and (entries + size > _GROUP_ENTRIES or len(part) == most):
+            yield part
+            part, entries = [], 0
+        part.append(c)
+        entries += size
+    if part:
         yield part
 
 
@@ -326,6 +350,23 @@ def _strides(
         strides[row, at[ones]] = begin
         begin += len(c.probs) * width
     return columns, strides
+
+
+def _neighbours(
+    part: Sequence[Conditional], place: Mapping[str, int], width: int
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rows of the states that each conditional reads, and their weights ``(part, 1)``; where tables begin."""
+    ones = len(place)
+    count = max(len(c.blanket) for c in part) + 1
+    rows = np.full((count, len(part)), ones)
+    strides = np.zeros((count, len(part), 1), dtype=np.float32)
+    begin = 0
+    for i, c in enumerate(part):
+        strides[0, i] = begin
+        rows[1 : len(c.blanket) + 1, i] = [place[n] for n in c.blanket]
+        strides[1 : len(c.blanket) + 1, i, 0] = np.multiply(c.strides, width)
+        begin += len(c.probs) * width
+    return list(zip(rows, strides, strict=True))
 
 
 def _compared(part: Sequence[Conditional]) -> list[tuple[int, np.ndarray]]:

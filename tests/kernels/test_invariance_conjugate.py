@@ -236,6 +236,24 @@ def _vectors() -> Model:
     return Model(net, ("y", "z"), ("centre", "x"))
 
 
+def _slices() -> Model:
+    """A chain of slices about a level that all share: like terms are one, and the slices are a band."""
+    net = bmc.BayesNet()
+    net.add("sd", bmc.Uniform(0.5, 1.5))
+    net.add("level", bmc.Normal(0.5, 1.0))
+    net.add("x0", lambda level, sd: bmc.Normal(level, 2 * sd))
+    for t in range(1, 26):
+        net.add(
+            f"x{t}",
+            lambda x, level, sd: bmc.Normal(level + 0.7 * (x - level), sd),
+            parents=[f"x{t - 1}", "level", "sd"],
+        )
+    for t in range(26):
+        net.add(f"y{t}", lambda x, t=t: bmc.Normal(1 - x, 0.6 + t / 26), parents=[f"x{t}"])
+    states = tuple(f"x{t}" for t in range(26))
+    return Model(net, tuple(f"y{t}" for t in range(26)), ("level", *states))
+
+
 def _blankets(target: Target, names: tuple[str, ...]) -> dict[str, Blanket]:
     return {n: Blanket(target, n) for n in names}
 
@@ -257,14 +275,14 @@ class _Wide(GaussianBlock):
     """Draws with a variance for a standard deviation."""
 
     def step(self, values: Any, memory: Any, rng: Any, warmup: bool) -> Any:
-        sums = self._summed(self._at_zero(values), len(values[self.names[0]]))
+        sums = self._summed(values, len(values[self.names[0]]))
         noise = rng.standard_normal(sums.linear.shape)
         mean, *_ = gaussian_layout.solved(self.layout, sums, None)
         draw, *_ = gaussian_layout.solved(self.layout, sums, noise)
         return self.layout.split(mean + 2.0 * (draw - mean), values), memory
 
 
-MODELS = {"coupled": _coupled(), "grown": _grown(), "vectors": _vectors()}
+MODELS = {"coupled": _coupled(), "grown": _grown(), "vectors": _vectors(), "slices": _slices()}
 BLOCKS = {
     name: Case(
         m,
@@ -310,7 +328,7 @@ class _NoDeterminant(GaussianBlock):
     """Integrates the exponential, and forgets what is in front of it."""
 
     def log_integral(self, values: Any, count: int) -> np.ndarray:
-        sums = self._summed(self._at_zero(values), count)
+        sums = self._summed(values, count)
         return sums.constant + 0.5 * np.vecdot(
             sums.linear, gaussian_layout.solved(self.layout, sums, None)[0]
         )

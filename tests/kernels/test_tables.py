@@ -242,7 +242,9 @@ def test_nodes_that_meet_are_not_drawn_together(monkeypatch: pytest.MonkeyPatch)
     assert stationarity(target, [wrong], 200_000, 1) < 1e-12
 
 
-def test_positions_in_long_sweeps_are_right() -> None:
+@pytest.mark.parametrize("gathered", [0, 4])
+def test_positions_in_long_sweeps_are_right(gathered: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "_GATHERED", gathered)
     # differences to the neighbours are seen, so that each node follows from those beside it and no
     # state may change; more nodes than one group reads
     count, rng = 200, np.random.default_rng(3)
@@ -261,7 +263,10 @@ def test_positions_in_long_sweeps_are_right() -> None:
     target = target_of(pose(net, evidence))
     [kernel], left = table_kernels(target, [(n,) for n in target.chain])
     assert not left and isinstance(kernel, TableSweep)
-    assert any(group.columns is not None for group in kernel.groups)
+    if gathered:
+        assert any(group.near for group in kernel.groups)
+    else:
+        assert any(group.columns is not None for group in kernel.groups)
     shifts = np.arange(6) % 3
     values = {**target.known}
     for t in range(count):
@@ -275,6 +280,28 @@ def test_positions_in_long_sweeps_are_right() -> None:
     broken = {**values, "x7": ((values["x7"] + 1) % 3).astype(np.uint8)}
     with pytest.raises(ZeroProbabilityError, match="'x"):
         kernel.step(broken, {}, np.random.Generator(np.random.SFC64(0)), False)
+
+
+def test_gathered_and_multiplied_positions_draw_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(4)
+    net = bmc.BayesNet()
+    net.table("x0", [], [0.2, 0.3, 0.5])
+    for t in range(1, 150):
+        net.table(f"x{t}", [f"x{t - 1}"], rng.dirichlet(np.ones(3), size=3))
+        net.table(f"y{t}", [f"x{t}"], rng.dirichlet(np.ones(2), size=3))
+    target = target_of(pose(net, {f"y{t}": int(rng.integers(2)) for t in range(1, 150)}))
+    values = started(target, 20, 0)
+    drawn = []
+    for gathered in (0, 4):
+        monkeypatch.setattr(tables, "_GATHERED", gathered)
+        [kernel], left = table_kernels(target, [(n,) for n in target.chain])
+        assert not left and isinstance(kernel, TableSweep)
+        assert len(kernel.groups) == (2 if gathered else 4)
+        new, _ = kernel.step(values, {}, np.random.default_rng(1), False)
+        drawn.append(np.stack([new[n] for n in target.chain]))
+    np.testing.assert_array_equal(*drawn)
+    before = np.stack([values[n] for n in target.chain])
+    assert (drawn[0] != before).mean() > 0.2
 
 
 def test_what_is_seen_of_a_plate_stays() -> None:
