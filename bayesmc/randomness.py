@@ -6,7 +6,6 @@ spawned from, so a seed sequence can be used twice and give the same draws twice
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from enum import IntEnum
 from typing import Any
 
@@ -58,7 +57,7 @@ def stream(seed: np.random.SeedSequence, purpose: Purpose, unit: int = 0) -> np.
     return np.random.Generator(np.random.SFC64(child))
 
 
-def resumed(state: Mapping[str, Any]) -> np.random.Generator:
+def resumed(state: Any) -> np.random.Generator:
     """A generator that goes on where another one of ``stream`` was; ``state`` is its bit generator's."""
     bits = np.random.SFC64(_ANY)
     bits.state = state

@@ -76,6 +76,25 @@ def unused_sizes(taken: Iterable[int], count: int) -> Sequence[int]:
     return sizes
 
 
+def unravelled(codes: np.ndarray, shape: Shape) -> tuple[np.ndarray, ...]:
+    """What ``np.unravel_index`` gives, digit by digit.
+
+    NumPy 2.4 gives wrong indices for arrays of shape ``(n, 1)`` with more than 8,192 rows.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.shapes import unravelled
+    >>> [part.tolist() for part in unravelled(np.array([0, 5]), (2, 3))]
+    [[0, 1], [0, 2]]
+    """
+    found = []
+    for size in reversed(shape):
+        codes, digit = np.divmod(codes, size)
+        found.append(digit)
+    return tuple(reversed(found))
+
+
 def first_index(mask: np.ndarray) -> Shape:
     """Index of the first True in ``mask``, in C order."""
     return tuple(int(i) for i in np.unravel_index(int(np.argmax(mask)), mask.shape))

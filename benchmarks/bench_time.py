@@ -1,16 +1,19 @@
 """Filters beside loops written by hand, the same fused by numba, ``particles`` and FilterPy.
 
-``python -m benchmarks.bench_time``; ``--short`` leaves out a million particles and repeats less. Every
+``python -m benchmarks.bench_time``; ``--short`` leaves out a million particles, takes a tenth of the
+online steps and repeats less. Every
 figure of bayesmc is a whole call, reading the series included; templates are compiled once before,
 as they are for a user who filters one series after another.
 """
 
 from __future__ import annotations
 
+import resource
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -34,7 +37,7 @@ PARTICLES = {1_000: 100, 10_000: 100, 100_000: 100, 1_000_000: 10}  # to slices 
 MORE_STATES = (1_000, 10_000, 100_000)
 HMM_STEPS, SEQUENCES, BATCHED_STEPS, KALMAN_STEPS = 100_000, 64, 10_000, 10_000
 CHAINS = {10: 100, 100: 50, 1_000: 20}  # slices to sweeps timed
-PATIENCE = 1.0  # seconds for one call on a chain, beyond which a longer one is left out
+ONLINE_STEPS, ONLINE_PARTICLES = 100_000, 100
 BUDGET = 4.0  # seconds for one entry of a table
 
 GOAL_PARTICLE, GOAL_EXACT = 1.5, 1.25
@@ -67,7 +70,8 @@ def main(arguments: Sequence[str] = ()) -> None:
         print(_hmm(peers, repeats) + "\n", flush=True)
         print(_batched(repeats) + "\n", flush=True)
         print(_kalman(peers, repeats) + "\n", flush=True)
-    print(_smoothing(repeats), flush=True)
+    print(_smoothing(repeats) + "\n", flush=True)
+    print(_online(ONLINE_STEPS // 10 if short else ONLINE_STEPS), flush=True)
 
 
 class Filters(Worker):
@@ -218,24 +222,46 @@ def _smoothing(repeats: int) -> str:
     y = models_time.volatility_series(max(CHAINS))
     for name in ("chain", "volatility"):
         dbn = getattr(models_time, name)(bmc)
-        shortest = longer = 0.0
+        shortest = 0.0
         for steps, sweeps in CHAINS.items():
             label = f"{name}, {steps} slices"
-            if longer > PATIENCE:
-                rows.append([label, "", "", "", "left out: a call on the shorter took too long"])
-                continue
             net, evidence = dbn.unroll(steps), dbn.unrolled_evidence({"y": y[:steps]})
             calls = {k: _gibbs(net, evidence, k * sweeps) for k in (1, 5)}
             times = interleave(
                 {"once": calls[1], "more": calls[5]}, repeats, budget=BUDGET, warmup=1
             )
             once, more = times["once"].median, times["more"].median
-            sweep, longer = (more - once) / (4 * sweeps), once
+            sweep = (more - once) / (4 * sweeps)
             shortest = shortest or sweep
             goal = f"goal {GOAL_CHAIN}" if steps == max(CHAINS) else ""
             rows.append([label, 1e6 * sweep, once - sweeps * sweep, sweep / shortest, goal])
     header = ["", "us per sweep", "once, s", "over the short", ""]
     return table("Gibbs smoothing of an unrolled chain, bayesmc", header, rows)
+
+
+def _online(steps: int) -> str:
+    """Row by row: what a step costs, and whether the process grows."""
+    dbn, engine = models_time.growth(bmc), bmc.ParticleFilter(ONLINE_PARTICLES)
+    y = models_time.growth_series(1_000)[1:]
+    belief = engine.start(dbn, rng=0)
+    rows: list[list[object]] = []
+    start = perf_counter()
+    for k in range(steps):
+        belief = engine.step(belief, {"y": y[k % len(y)]})
+        if k + 1 in (steps // 100, steps // 2, steps):
+            spent = perf_counter() - start
+            rows.append([f"{k + 1} steps", 1e6 * spent / (k + 1), _resident()])
+    header = ["", "us per step", "process, MiB"]
+    return table(f"Online steps of a filter of {ONLINE_PARTICLES} particles", header, rows)
+
+
+def _resident() -> float:
+    """Memory that the process has now, where the system says so; else the most it ever had."""
+    try:
+        with open("/proc/self/statm") as file:
+            return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+    except OSError:
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
 def _gibbs(net: Any, evidence: Mapping[str, Any], draws: int) -> Callable[[], object]:

@@ -19,10 +19,27 @@ def explain(
     engine: Any = None,
     *,
     inputs: Mapping[str, Any] | None = None,
+    question: str = "filter",
 ) -> Explanation:
     """Which engine would answer, why, what it does to each node, and why anything better was refused.
 
     It prints the explanation and returns it.
+
+    Parameters
+    ----------
+    net : BayesNet, FactorGraph or DynamicBayesNet
+    evidence : dict, optional
+        Evidence; for a template, observations with time first.
+    engine : optional
+        One to ask about; None for the one that would be chosen.
+    inputs : dict, optional
+    question : str
+        For templates: ``"filter"``, ``"smooth"``, ``"fixed-lag"``, ``"forecast"`` or ``"most_likely"``.
+
+    Raises
+    ------
+    UnsupportedError
+        No engine can answer.
 
     Examples
     --------
@@ -35,7 +52,7 @@ def explain(
       a  eliminated
     """
     if isinstance(net, DynamicBayesNet) and not isinstance(engine, Engine):
-        explanation = explained_series(net, evidence, engine, inputs)
+        explanation = explained_series(net, evidence, engine, inputs, question)
     else:
         explanation = explained(net, evidence, engine, inputs)
     print(explanation)

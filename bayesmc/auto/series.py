@@ -11,7 +11,8 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.series import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries
+from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.errors import UnsupportedError
@@ -23,12 +24,15 @@ _CANDIDATES: tuple[type[FilterEngine], ...] = (
     DiscreteFilter,
     KalmanFilter,
     ParticleFilter,
+    GridFilter,
 )
 _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
     "ParticleFilter": "every hidden node can be sampled given its parents",
+    "GridFilter": "every hidden node is finite, an angle, or on a bounded interval",
 }
+_QUESTIONS = ("filter", "smooth", "fixed-lag", "forecast", "most_likely")
 
 
 def filter(
@@ -81,7 +85,7 @@ def filter(
     (3,)
     """
     problem = pose_series(dbn, observations, inputs)
-    chosen = _engine(problem, engine)
+    chosen = _engine(problem, engine, Asked("filter", keep, tuple(queries or ())))
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options)
 
@@ -115,7 +119,8 @@ def smooth(
         isinstance(lag, bool) or not isinstance(lag, (int, np.integer)) or lag < 0
     ):
         raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
-    chosen = _engine(problem, engine)
+    kind = "smooth" if lag is None else "fixed-lag"
+    chosen = _engine(problem, engine, Asked(kind, None, tuple(queries or ())))
     return chosen.smooth(problem, seed_sequence(rng), lag=lag, queries=queries, progress=progress)
 
 
@@ -144,7 +149,7 @@ def forecast(
     """
     check_steps("forecast", steps)
     problem = pose_series(dbn, observations, inputs, ahead=steps)
-    chosen = _engine(problem, engine)
+    chosen = _engine(problem, engine, Asked("forecast", None, tuple(queries or ())))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
 
@@ -172,7 +177,7 @@ def most_likely(
     ['yes', 'no', 'no']
     """
     problem = pose_series(dbn, observations, inputs)
-    chosen = _engine(problem, engine)
+    chosen = _engine(problem, engine, Asked("most_likely"))
     return chosen.most_likely(problem, seed_sequence(rng), progress)
 
 
@@ -181,14 +186,19 @@ def explained_series(
     observations: Mapping[str, Any] | None,
     engine: FilterEngine | None,
     inputs: Mapping[str, Any] | None,
+    question: str,
 ) -> Explanation:
     """See ``explain``."""
-    problem = pose_series(dbn, observations, inputs)
+    if question not in _QUESTIONS:
+        raise ValueError(
+            f"explain(question={question!r}): there are {', '.join(map(repr, _QUESTIONS))}"
+        )
+    problem, asked = pose_series(dbn, observations, inputs), Asked(question)
     if engine is None:
-        chosen, reasons, refused = _choose(problem)
+        chosen, reasons, refused = _choose(problem, asked)
         return Explanation(chosen, reasons, refused, chosen.describe(problem))
     checked = _checked(engine)
-    why = checked.refusal(problem)
+    why = _why_not(checked, problem, asked)
     if why is None:
         return Explanation(checked, ("it was asked for",), {}, checked.describe(problem))
     reasons = ("it was asked for, but it cannot answer",)
@@ -198,30 +208,38 @@ def explained_series(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _engine(problem: SeriesProblem, engine: FilterEngine | None) -> FilterEngine:
+def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -> FilterEngine:
     """The engine asked for, or the one chosen; a refusal is raised with an alternative."""
     if engine is None:
-        return _choose(problem)[0]
+        return _choose(problem, asked)[0]
     reason = _checked(engine).refusal(problem)
     if reason is None:
-        return engine
+        return engine  # what else it cannot do, its own method says best
     others = [c() for c in _CANDIDATES if not isinstance(engine, c)]
-    able = next((type(o).__name__ for o in others if o.refusal(problem) is None), None)
+    able = next((type(o).__name__ for o in others if _why_not(o, problem, asked) is None), None)
     raise UnsupportedError(reason if able is None else f"{reason}. {able}() can answer")
 
 
-def _choose(problem: SeriesProblem) -> tuple[FilterEngine, tuple[str, ...], dict[str, str]]:
+def _choose(
+    problem: SeriesProblem, asked: Asked
+) -> tuple[FilterEngine, tuple[str, ...], dict[str, str]]:
     refused: dict[str, str] = {}
     for candidate in _CANDIDATES:
         engine, name = candidate(), candidate.__name__
-        reason = engine.refusal(problem)
+        reason = _why_not(engine, problem, asked)
         if reason is None and (silent := engine.unanswered(problem)):
             reason = f"it would not answer for {', '.join(map(repr, silent))}"
         if reason is None:
             return engine, (_WHY[name],), refused
         refused[name] = reason
     whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
-    raise UnsupportedError(f"filter: no engine can answer. {whys}")
+    raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
+
+
+def _why_not(engine: FilterEngine, problem: SeriesProblem, asked: Asked) -> str | None:
+    """Why an engine has no answer, or None."""
+    reason = engine.refusal(problem)
+    return engine.unable(problem, asked) if reason is None else reason
 
 
 def _checked(engine: Any) -> FilterEngine:

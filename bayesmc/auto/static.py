@@ -10,6 +10,7 @@ from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.exact_plan import too_large_to_search
+from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.gibbs_plan import plan_of
 from bayesmc.engines.unrolled import pose_any
@@ -157,6 +158,11 @@ def _checked(engine: Any) -> Any:
     if isinstance(engine, type):
         raise TypeError(
             f"engine={engine.__name__} is a class; give an instance: {engine.__name__}()"
+        )
+    if isinstance(engine, FilterEngine):
+        raise TypeError(
+            f"engine={type(engine).__name__}(...) answers over time; call filter, smooth, forecast or "
+            "most_likely with it, or give infer a static engine (Gibbs(draws), ParticleGibbs(...), ...)"
         )
     if not isinstance(engine, Engine):
         raise TypeError(

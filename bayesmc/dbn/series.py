@@ -326,13 +326,18 @@ def _check_observed(template: Template, name: str) -> None:
 def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
     if inputs is not None and not isinstance(inputs, Mapping):
         raise EvidenceError(f"inputs is a {type(inputs).__name__}; give a dict from name to rows")
-    for name in inputs or {}:
+    inputs = inputs or {}
+    for name in inputs:
         if name not in template.inputs:
             raise EvidenceError(
                 f"inputs= gives {name!r}, which is not a declared input; the inputs are "
                 f"{list(template.inputs)}"
             )
-    return dict(inputs or {})
+        if np.ndim(inputs[name]) == 0:
+            raise EvidenceError(
+                f"inputs of {name!r}: {inputs[name]!r} has no axis for time; give one row per slice"
+            )
+    return dict(inputs)
 
 
 def _rows(name: str, value: Any) -> Any:
@@ -366,7 +371,12 @@ def _count(
         )
     if not wanted and not ahead:
         raise EvidenceError("no observations and no inputs: give at least one series, time first")
-    return wanted.pop() if wanted else ahead
+    count = wanted.pop() if wanted else ahead
+    if not count:
+        raise EvidenceError(
+            f"the series of {', '.join(map(repr, {**observed, **inputs}))} have no rows; give one per slice"
+        )
+    return count
 
 
 def _padded(found: Observed | None, node: CompiledNode, ahead: int) -> Observed | None:

@@ -116,6 +116,14 @@ class Template:
                         f"node {name!r}: initial= has the parent {parent!r}: {unknown(self.later, parent)}"
                     )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+
+        def bare(declarations: Mapping[str, Declaration]) -> dict[str, Declaration]:
+            return {n: replace(d, function=None) for n, d in declarations.items()}
+
+        return {**self.__dict__, "later": bare(self.later), "first": bare(self.first)}
+
     def slice_zero(self) -> dict[str, Declaration]:
         """Declarations of slice 0."""
         return {TIME: _CLOCK[TIME], **{n: self.first.get(n, d) for n, d in self.later.items()}}
@@ -163,6 +171,11 @@ class Slices:
     template: Template
     first: Model
     later: Model
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        models = {"first": self.first.without_functions(), "later": self.later.without_functions()}
+        return {**self.__dict__, **models}
 
     def model(self, t: int) -> Model:
         """The model of slice ``t``."""

@@ -399,6 +399,11 @@ class DynamicBayesNet:
             first = self._read(
                 name, lambda net: net.table(name, (), initial, states, plates=plates)
             )
+        elif isinstance(initial, (int, float, np.number)):
+            raise ModelError(
+                f"node {name!r}: initial={initial!r} is a number; give the distribution of slice 0, such as "
+                "Normal(0.0, 1.0), a function that returns one, or a list of probabilities"
+            )
         elif initial is not None:
             options: dict[str, Any] = {"vectorize": vectorize and callable(initial)}
             first = self._read(

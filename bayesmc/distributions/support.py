@@ -105,6 +105,12 @@ class Support:
             return None
         return np.arange(size) + int(_first(self.low))
 
+    def angles(self, size: int) -> np.ndarray:
+        """Which of the ``size`` components of a value are angles, shape (size,)."""
+        if self.kind != "product":
+            return np.full(size, self.kind == "circle")
+        return np.concatenate([part.angles(max(count, 1)) for part, count in self.parts])
+
     def contains(self, x: Any) -> np.ndarray:
         """Whether each value lies in the support; event axes are reduced, NaN never does."""
         x = np.asarray(x)

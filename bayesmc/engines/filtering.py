@@ -13,11 +13,28 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
-from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.errors import BayesmcError, EvidenceError, ModelError, UnsupportedError
 from bayesmc.results import SeriesPosterior
 
 #: functions whose expectation is wanted in every slice, by name
 Queries = Mapping[str, Callable[..., Any]]
+
+
+class Asked(NamedTuple):
+    """What is asked of the slices.
+
+    Attributes
+    ----------
+    what : str
+        ``"filter"``, ``"smooth"``, ``"fixed-lag"``, ``"forecast"`` or ``"most_likely"``.
+    keep : str or None
+    queries : tuple of str
+        Names of functions whose expectations are wanted.
+    """
+
+    what: str = "filter"
+    keep: str | None = None
+    queries: tuple[str, ...] = ()
 
 
 class FilterEngine:
@@ -29,10 +46,27 @@ class FilterEngine:
 
     #: what stands beside the progress bar
     label: ClassVar[str] = ""
+    #: whether it has particles that can be kept, and whether it answers for functions of nodes
+    keeps: ClassVar[bool] = False
+    #: what its ``start`` and ``step`` return
+    belief: ClassVar[type] = object
+    takes_queries: ClassVar[bool] = True
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         """Why this engine cannot answer, or None; a family's own reasons come after the common ones."""
         return common_refusal(self, problem)
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        """Why this engine has no answer to what is asked of a problem that it does not refuse, or None."""
+        if asked.what in ("smooth", "fixed-lag") and type(self).smooth is FilterEngine.smooth:
+            return f"{type(self).__name__} does not smooth"
+        if asked.what == "most_likely" and type(self).most_likely is FilterEngine.most_likely:
+            return f"{type(self).__name__} does not find the most likely trajectory"
+        if asked.keep is not None and not self.keeps:
+            return f"{type(self).__name__} has no particles to keep"
+        if asked.queries and not self.takes_queries:
+            return f"{type(self).__name__} does not answer queries={list(asked.queries)}"
+        return None
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         """Hidden nodes that its answers would leave out."""
@@ -83,9 +117,35 @@ class FilterEngine:
             Values of the static nodes.
         rng : seed, SeedSequence, Generator or None
             For filters that draw.
+
+        Raises
+        ------
+        ModelError, EvidenceError, UnsupportedError
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+        >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+        >>> engine = bmc.KalmanFilter()
+        >>> belief = engine.step(engine.start(dbn), {"y": 1.0})
+        >>> belief.t, float(belief.mean("x"))
+        (0, 0.5)
         """
+        if not isinstance(dbn, DynamicBayesNet):
+            raise ModelError(
+                f"{type(self).__name__}().start: expected a DynamicBayesNet, not {type(dbn).__name__}"
+            )
         dbn.validate()
-        return self._nothing(dbn.copy(), dict(static or {}), rng)
+        given = dict(static or {})
+        known = dbn.template.static
+        for name in given:
+            if name not in known:
+                raise EvidenceError(
+                    f"static= gives {name!r}, which is no static node; there are {list(known)}"
+                )
+        return self._nothing(dbn.copy(), given, rng)
 
     def step(
         self,
@@ -107,6 +167,12 @@ class FilterEngine:
         ------
         EvidenceError, UnsupportedError, DegeneracyError, ZeroProbabilityError
         """
+        family: Any = self.belief
+        if not isinstance(belief, family):
+            raise TypeError(
+                f"{type(self).__name__}().step: the belief is a {type(belief).__name__}; give what start or "
+                "step of this kind of filter returned"
+            )
         slices, row = read_row(
             belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
         )
@@ -135,8 +201,8 @@ class FilterEngine:
 
     def _cannot(self, what: str) -> UnsupportedError:
         return UnsupportedError(
-            f"{type(self).__name__} does not {what}; use engine=None, which finds one that does, or ask a "
-            "static engine on dbn.unroll(steps)"
+            f"{type(self).__name__} does not {what}; use engine=None, which finds one that does where "
+            "there is one, or ask a static engine on dbn.unroll(steps)"
         )
 
 

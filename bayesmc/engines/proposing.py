@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import CycleError
+from bayesmc.errors import CycleError, UnsupportedError
 from bayesmc.kernels.proposal import (
     Parts,
     Proposal,
@@ -53,7 +53,8 @@ def proposal_steps(
     """
     by_target = {name: p for p in proposals for name in p.names}
     ordered: dict[str, Step] = {}
-    for name in _order(model, observed, by_target):
+    engine = proposals[0].engine if proposals else ""
+    for name in _order(model, observed, by_target, engine):
         proposal = by_target.get(name)
         if proposal is None:
             ordered[name] = steps[name]
@@ -126,6 +127,11 @@ class Propose:
 
     def _draw_split(self, dist: Distribution, batch: Shape, state: Pass) -> None:
         """Draw a block as one vector and split it in order."""
+        if self.apart:
+            raise UnsupportedError(
+                f"{self.proposal.what}: it returns one vector, but elements of plate {self.apart[0]!r} are "
+                "filtered separately and need a density each; return a dict, {node: distribution}"
+            )
         check_vector(self.nodes, dist, self.observed.keys())
         fit(self.proposal.declaration, dist, batch, ())
         alive = state.alive
@@ -159,7 +165,10 @@ class Propose:
 
 
 def _order(
-    model: Model, observed: Mapping[str, Observed], by_target: Mapping[str, Proposal]
+    model: Model,
+    observed: Mapping[str, Observed],
+    by_target: Mapping[str, Proposal],
+    engine: str,
 ) -> list[str]:
     """Names in an order of drawing, a block by its first name.
 
@@ -175,7 +184,7 @@ def _order(
     partly = [n for n in cycle.path if n in observed]
     hint = f" ({partly[0]!r} is observed only in part, so it is drawn)" if partly else ""
     raise CycleError(
-        f"Importance: the proposals need each other in a cycle: {' -> '.join(cycle.path)}{hint}; a "
+        f"{engine}: the proposals need each other in a cycle: {' -> '.join(cycle.path)}{hint}; a "
         "proposal may name evidence, inputs and nodes that do not depend on its targets",
         cycle.path,
     )

@@ -34,6 +34,9 @@ from bayesmc.network.forward import (
 from bayesmc.network.store import unknown
 from bayesmc.structure import Table
 
+#: numbers of a node that nothing reads that count as one
+_WIDE = 64
+
 
 class SlicePlan:
     """Steps of the slices of a template, by which nodes are seen.
@@ -165,14 +168,20 @@ class SliceProposals:
             if not any(p.endswith(PREVIOUS) for p in later.parents):
                 self.first.append(bound(engine, slices.first, key, function))
 
-    def check(self, observed: Set[str]) -> None:
-        """Refuse proposals that look at nodes which a series never observes.
+    def check(self, observed: Set[str], throughout: Set[str]) -> None:
+        """Refuse proposals that look at nodes which a series never observes, or draw what it always does.
 
         Raises
         ------
         ModelError
         """
         for proposal in self.later:
+            always = [n for n in proposal.names if n in throughout]
+            if always:
+                raise ModelError(
+                    f"{proposal.what}: {always[0]!r} is observed in every slice, so nothing is drawn; "
+                    "propose hidden nodes"
+                )
             never = sorted(self._looks[proposal.key] - observed)
             if never:
                 raise ModelError(
@@ -300,8 +309,14 @@ class TableWeighApart:
 
 
 def size_of(slices: Slices) -> int:
-    """Numbers that the largest node of a slice holds."""
-    return max((math.prod(slices.first[n].value_shape) for n in slices.dynamic), default=1)
+    """Numbers per particle by which blocks of particles are measured: those of the largest node.
+
+    What nothing reads (most often it is seen) counts for a fraction: a scan of a laser is a wide node, but
+    its density takes a few numbers of each particle, and small blocks would cost more than they save.
+    """
+    read = {p for n in slices.dynamic for p in slices.later[n].parents} | set(slices.interface)
+    sizes = {n: math.prod(slices.first[n].value_shape) for n in slices.dynamic}
+    return max((k if n in read else k // _WIDE for n, k in sizes.items()), default=1)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -235,7 +235,10 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
         return
     if node.support.event_ndim not in (0, len(node.event_shape)):
         return
-    outside = ~np.asarray(node.support.contains(stored)) & observed
+    inside = np.asarray(node.support.contains(stored))
+    if event and node.support.event_ndim == 0:  # an interval, for every component of a vector
+        inside = np.asarray(inside.all(axis=event))
+    outside = ~inside & observed
     if outside.any():
         at = first_index(outside)
         raise EvidenceError(

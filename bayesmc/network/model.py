@@ -8,8 +8,10 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,6 +64,14 @@ class CompiledNode:
     @property
     def plates(self) -> tuple[str, ...]:
         return self.declaration.plates
+
+    @cached_property
+    def angles(self) -> np.ndarray | None:
+        """Which components of a value are angles, shape ``event_shape``; None where none is."""
+        if self.support is None:
+            return None
+        found = self.support.angles(math.prod(self.event_shape)).reshape(self.event_shape)
+        return found if found.any() else None
 
     @property
     def value_shape(self) -> Shape:

@@ -11,7 +11,7 @@ caller's affair.
 
 from __future__ import annotations
 
-from bayesmc.resampling.adaptive import Adaptive, Resampled, scheme_of
+from bayesmc.resampling.adaptive import Adaptive, Resampled, checked, scheme_of
 from bayesmc.resampling.schemes import (
     SCHEMES,
     Scheme,
@@ -28,6 +28,7 @@ __all__ = [
     "Adaptive",
     "Resampled",
     "Scheme",
+    "checked",
     "ess",
     "multinomial",
     "residual",

@@ -158,3 +158,36 @@ def scheme_of(resampling: str | Scheme | Adaptive) -> Scheme | Adaptive:
         f"resampling={resampling!r} is no scheme{hint}; there are "
         f"{', '.join(map(repr, SCHEMES))}, or a function of (weights, draws, rng)"
     )
+
+
+def checked(scheme: Scheme) -> Scheme:
+    """A scheme that is given weights which sum to 1, and whose indices are looked at; ours need neither.
+
+    Raises
+    ------
+    ValueError
+        From the scheme returned: the indices have another shape, are no whole numbers, lie outside the
+        particles, or are not sorted.
+    """
+    if scheme in SCHEMES.values():
+        return scheme
+
+    def looked_at(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:
+        found = np.asarray(scheme(weights / weights.sum(axis=0), draws, rng))
+        name = getattr(scheme, "__name__", repr(scheme))
+        shape = (draws, *weights.shape[1:])
+        if found.shape != shape or found.dtype.kind not in "iu":
+            raise ValueError(
+                f"resampling={name} returns shape {found.shape} of dtype {found.dtype}; it returns {draws} "
+                f"sorted indices, shape {shape}"
+            )
+        if found.size and not 0 <= found.min() <= found.max() < len(weights):
+            raise ValueError(
+                f"resampling={name} returns indices from {found.min()} to {found.max()}; there are "
+                f"{len(weights)} particles, 0 to {len(weights) - 1}"
+            )
+        if (found[1:] < found[:-1]).any():
+            raise ValueError(f"resampling={name} returns indices that are not sorted; sort them")
+        return found.astype(np.intp, copy=False)
+
+    return looked_at

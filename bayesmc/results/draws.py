@@ -86,16 +86,21 @@ class DrawsPosterior(Posterior):
 
     def mean(self, name: str) -> np.ndarray:
         values = self._values(name, "mean")
-        if self._is_circular(name):
-            return np.arctan2(self._average(np.sin(values)), self._average(np.cos(values)))
-        return self._average(values)
+        angles = self.model.nodes[name].angles
+        if angles is None:
+            return self._average(values)
+        turned = np.arctan2(self._average(np.sin(values)), self._average(np.cos(values)))
+        return np.where(angles, turned, self._average(values))
 
     def var(self, name: str) -> np.ndarray:
         values = self._values(name, "var")
-        if self._is_circular(name):
-            return circular_variance(self._average(np.cos(values)), self._average(np.sin(values)))
         with np.errstate(over="ignore", invalid="ignore"):  # a draw of weight zero may be infinite
-            return self._average((values - self._average(values)) ** 2)
+            spread = self._average((values - self._average(values)) ** 2)
+        angles = self.model.nodes[name].angles
+        if angles is None:
+            return spread
+        turned = circular_variance(self._average(np.cos(values)), self._average(np.sin(values)))
+        return np.where(angles, turned, spread)
 
     def cov(self, *names: str) -> np.ndarray:
         if not names:
@@ -111,9 +116,11 @@ class DrawsPosterior(Posterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         values = self._full(name, "quantile")
-        if self._is_circular(name):  # an order needs a cut: opposite the mean
+        angles = self.model.nodes[name].angles
+        if angles is not None:  # an order needs a cut: opposite the mean
             mean = self.mean(name)
-            values = mean + np.remainder(values - mean + np.pi, 2 * np.pi) - np.pi
+            near = mean + np.remainder(values - mean + np.pi, 2 * np.pi) - np.pi
+            values = np.where(angles, near, values)
         flat = values.reshape((math.prod(self._shape), *values.shape[2:]))
         levels = np.asarray(q, dtype=float)
         if not ((levels >= 0) & (levels <= 1)).all():

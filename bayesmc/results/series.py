@@ -38,6 +38,8 @@ class SeriesPosterior:
         Whether particles were resampled on the way into a slice.
     unique_ancestors : ndarray of int or None
         Particles of the slice before that have offspring in this one.
+    rejuvenated : ndarray of bool or None
+        Whether particles were drawn anew, since no weight was left; evidence and answers are biased then.
     queries : dict
         Name -> expectation of a function in every slice, time first.
 
@@ -142,6 +144,10 @@ class SeriesPosterior:
         if self.weight_ess is not None:
             found.weight_ess = self.weight_ess[-steps:]
         return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without the model's functions."""
+        return {**self.__dict__, "model": self.model.without_functions()}
 
     def __repr__(self) -> str:
         engine = type(self.engine).__name__

@@ -10,26 +10,24 @@ Interception by ``__array_ufunc__`` and ``__array_function__``: NumPy enhancemen
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from bayesmc.tracing import claims as rules
 from bayesmc.tracing.affine import function_keeps_affine, ufunc_keeps_affine
+from bayesmc.tracing.arraylike import SHAPE_FUNCTIONS as _SHAPE_FUNCTIONS
+from bayesmc.tracing.arraylike import ArrayLike
 from bayesmc.tracing.margins import margin_of
-from bayesmc.tracing.standin import Claims, StandIn, bare, is_foreign, leaves, locked, stand_ins
+from bayesmc.tracing.standin import Claims, bare, is_foreign, leaves, locked, stand_ins
 
 #: functions that hand numbers to callbacks or files
 _SHOWING = frozenset(
     (np.apply_along_axis, np.apply_over_axes, np.piecewise, np.save, np.savez, np.savetxt)
 )
-#: functions of an array's shape alone
-_SHAPE_FUNCTIONS = frozenset((np.shape, np.ndim, np.size, np.zeros_like, np.ones_like))
 
 
-class Tracer(NDArrayOperatorsMixin, StandIn):
+class Tracer(ArrayLike):
     """Stands for an array that varies with some traced values.
 
     Parameters
@@ -116,28 +114,6 @@ class Tracer(NDArrayOperatorsMixin, StandIn):
     def example(self) -> np.ndarray:
         """The value of what it stands for at the example's values (for who traces, not for functions)."""
         return self._value
-
-    # ---- what an array tells of itself --------------------------------------------------------
-
-    @property
-    def size(self) -> int:
-        return self._value.size
-
-    @property
-    def dtype(self) -> np.dtype:
-        return self._value.dtype
-
-    @property
-    def flags(self) -> SimpleNamespace:
-        return SimpleNamespace(writeable=False)
-
-    @property
-    def T(self) -> Any:  # noqa: N802
-        return np.transpose(self)
-
-    @property
-    def mT(self) -> Any:  # noqa: N802
-        return np.matrix_transpose(self)
 
     def __repr__(self) -> str:
         state = "affine" if self.is_affine else f"not affine after {self.reason}"
@@ -234,41 +210,7 @@ class Tracer(NDArrayOperatorsMixin, StandIn):
         known = rules.after_cast(self, True) if kept else rules.after_mixing([self])
         return Tracer._derived(self._value, self.reason, known)
 
-    # ---- methods of arrays -------------------------------------------------------------------
-
-    def transpose(self, *axes: Any) -> Any:
-        order = axes[0] if len(axes) == 1 and not isinstance(axes[0], int) else axes or None
-        return np.transpose(self, order)
-
-    def reshape(self, *shape: Any) -> Any:
-        wanted = shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape
-        return np.reshape(self, wanted)
-
-    def sum(self, *args: Any, **kwargs: Any) -> Any:
-        return np.sum(self, *args, **kwargs)
-
-    def mean(self, *args: Any, **kwargs: Any) -> Any:
-        return np.mean(self, *args, **kwargs)
-
-    def cumsum(self, *args: Any, **kwargs: Any) -> Any:
-        return np.cumsum(self, *args, **kwargs)
-
-    def dot(self, other: Any) -> Any:
-        return np.dot(self, other)
-
-    def take(self, indices: Any, axis: int | None = None) -> Any:
-        return np.take(self, indices, axis=axis)
-
-    def squeeze(self, axis: Any = None) -> Any:
-        return np.squeeze(self, axis=axis)
-
-    def swapaxes(self, first: int, second: int) -> Any:
-        return np.swapaxes(self, first, second)
-
-    def ravel(self) -> Any:
-        return self.reshape(-1)
-
-    flatten = ravel
+    # ---- copies and other types ----------------------------------------------------------------
 
     def copy(self) -> Any:
         return Tracer._derived(self._value, self.reason, rules.after_cast(self, True))
@@ -281,40 +223,11 @@ class Tracer(NDArrayOperatorsMixin, StandIn):
         known = rules.after_cast(self, kept and self._value.dtype.kind in "fiub")
         return Tracer._derived(self._value.astype(dtype), reason, known)
 
-    # ---- what would show the numbers -----------------------------------------------------------
-
     def _refuse(self, what: str) -> TypeError:
         names = ", ".join(sorted(self.sources))
         return TypeError(
             f"it asks for {what} of {names}, where only NumPy operations can be followed"
         )
-
-    def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
-        raise self._refuse("a plain array")
-
-    def __bool__(self) -> bool:
-        raise self._refuse("the truth")
-
-    def __float__(self) -> float:
-        raise self._refuse("float()")
-
-    def __int__(self) -> int:
-        raise self._refuse("int()")
-
-    def __complex__(self) -> complex:
-        raise self._refuse("complex()")
-
-    def __index__(self) -> int:
-        raise self._refuse("an index")
-
-    def __iter__(self) -> Any:
-        raise self._refuse("iteration")
-
-    def __contains__(self, item: Any) -> bool:
-        raise self._refuse("membership")
-
-    def __hash__(self) -> int:
-        raise self._refuse("the hash")
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -567,3 +567,21 @@ def test_describe_says_what_happens_to_each_node() -> None:
     problem = bmc.explain(dbn, {"y": [0.1, 0.2]}, engine=ENGINE)
     assert "state with 2 values" in str(problem)
     assert "likelihood" in str(problem)
+
+
+def test_the_most_likely_path_of_a_long_series() -> None:
+    # NumPy unravels (n, 1) indices wrongly beyond 8,192 rows; the path is checked against plain Viterbi
+    rows = np.array([[0.9, 0.08, 0.02], [0.05, 0.9, 0.05], [0.02, 0.08, 0.9]])
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("w", ["w_prev"], rows, initial=[1 / 3] * 3)
+    dbn.add("y", lambda w: bmc.Normal(1.0 * w, 1.0))
+    y = dbn.sample(9000, rng=0)["y"][0]
+    log, best = -0.5 * (y[0] - np.arange(3)) ** 2, []
+    for seen in y[1:]:
+        reached = log[:, None] + np.log(rows)
+        best.append(reached.argmax(axis=0))
+        log = reached.max(axis=0) - 0.5 * (seen - np.arange(3)) ** 2
+    path = [int(log.argmax())]
+    for chosen in reversed(best):
+        path.append(int(chosen[path[-1]]))
+    np.testing.assert_array_equal(bmc.most_likely(dbn, {"y": y})["w"], path[::-1])

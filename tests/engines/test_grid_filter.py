@@ -652,7 +652,8 @@ def test_localisation_in_a_corridor() -> None:
 @pytest.mark.parametrize(
     ("dbn", "points", "said"),
     [
-        (linear(), (-1.0, 3.0, 200), ["slice 0 add up to 0.8.* leaks over the edges"]),
+        (linear(), (-1.0, 3.0, 200), ["slice 0 add up to 0.8.* leaks over the edges",
+                                      "'x' in slice 0 goes on beyond its grid.* at -0.99, is 0.029 of"]),
         (linear(a=0.0, q=0.1), np.arange(-11.8, 14.0, 0.5),
          ["slice 1 add up to 1.99.* too wide for a density as narrow", "1 of .* stands on one cell"]),
         (linear(r=0.05), (-12.0, 14.0, 100), ["1 of the belief about 'x' .* stands on one cell"]),
@@ -668,6 +669,140 @@ def test_too_small_and_too_coarse_grids_warn(dbn, points, said) -> None:
     assert [w.category for w in caught] == [GridWarning] * len(said)
     for warning, pattern in zip(caught, said, strict=True):
         assert re.search(pattern, str(warning.message)), warning.message
+
+
+def walk(start: float = 1.0) -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, start))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    return dbn
+
+
+def said_of(call, *args, **options) -> list[str]:
+    """Messages of the warnings about a grid."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        call(*args, **options)
+    assert all(w.category is GridWarning for w in caught)
+    return [str(w.message) for w in caught]
+
+
+def test_beliefs_that_leave_the_grid_warn() -> None:
+    """Before its row slice 3 fits; after it the mean is 7.41, outside: every question says so, once."""
+    dbn, engine = walk(), GridFilter({"x": (-6.0, 6.0, 200)})
+    rows = {"y": [0.0, 0.0, 0.0, 12.0]}
+    assert unrolled(dbn, rows, 4).mean("x[3]") == pytest.approx(7.41, abs=0.01)
+    for call in (bmc.filter, bmc.smooth):
+        (message,) = said_of(call, dbn, rows, engine=engine)
+        assert re.search(
+            r"about 'x' in slice 3 goes on beyond its grid.* at 5.97, is 1 of.*wider grid", message
+        )
+    (message,) = said_of(bmc.most_likely, dbn, rows, engine=engine)
+    assert "most likely value of 'x' in slice 3 is the outer point of its grid, 5.97" in message
+    more = {"y": [*rows["y"], 12.0, 12.0]}
+    assert len(said_of(bmc.most_likely, dbn, more, engine=engine)) == 1
+
+    def online() -> None:
+        belief = engine.start(dbn)
+        for y in more["y"]:
+            belief = engine.step(belief, {"y": y})
+
+    messages = said_of(online)
+    assert sum("goes on beyond its grid" in m for m in messages) == 1
+    assert any(
+        "slice 4 add up to" in m for m in messages
+    )  # the mass before the row, a slice too late
+    ahead = said_of(bmc.forecast, dbn, {"y": [0.0]}, steps=5, engine=engine)
+    assert any("'x' in slice 4 goes on beyond" in m for m in ahead)
+    quiet = GridFilter({"x": (-6.0, 6.0, 200)}, tolerance=np.inf)
+    for call in (bmc.filter, bmc.most_likely):
+        assert said_of(call, dbn, rows, engine=quiet) == []
+    wide = GridFilter({"x": (-6.0, 14.0, 300)})
+    for call in (bmc.filter, bmc.smooth, bmc.most_likely):
+        assert said_of(call, dbn, rows, engine=wide) == []
+
+
+def test_only_smoothing_may_leave_the_grid() -> None:
+    """Filtered beliefs fit; a later row moves that of slice 0, N(0, 1) so far, to about N(2.9, 0.7)."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.1 * x_prev, 0.1), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.05))
+    engine, rows = GridFilter({"x": (-4.2, 4.2, 400)}), {"y": [np.nan, 0.6]}
+    assert said_of(bmc.filter, dbn, rows, engine=engine) == []
+    for options in ({}, {"lag": 1}):
+        (message,) = said_of(bmc.smooth, dbn, rows, engine=engine, **options)
+        assert "'x' in slice 0 goes on beyond its grid" in message
+
+
+@pytest.mark.parametrize(
+    ("x", "initial", "grid", "warns"),
+    [
+        # a density that is highest at its bound
+        (lambda x_prev: bmc.Exponential(1.0 + 0 * x_prev), bmc.Exponential(1.0), (0.0, 20.0, 200), False),
+        (lambda x_prev: bmc.Exponential(1.0 + 0 * x_prev), bmc.Exponential(1.0), (0.5, 20.0, 200), True),
+        (lambda x_prev: bmc.Exponential(1.0 + 0 * x_prev), bmc.Exponential(1.0), (0.0, 3.0, 200), True),
+        (lambda x_prev: bmc.Uniform(0.0, 1.0 + x_prev), bmc.Uniform(0.0, 1.0), (0.0, 9.0, 400), False),
+        (lambda x_prev: bmc.Beta(1 + x_prev, 1.0), bmc.Uniform(0.0, 1.0), (0.0, 1.0, 100), False),
+        (lambda x_prev: bmc.Beta(1 + x_prev, 1.0), bmc.Uniform(0.0, 1.0), (0.0, 0.8, 100), True),
+        # the circle, whole and in part
+        (lambda x_prev: bmc.VonMises(x_prev, 1.0), bmc.VonMises(3.0, 1.0), (-np.pi, np.pi, 90), False),
+        (lambda x_prev: bmc.VonMises(x_prev, 1.0), bmc.VonMises(3.0, 1.0), (-3.0, 3.0, 90), True),
+        # counts
+        (lambda x_prev: bmc.Poisson(0.5 + 0 * x_prev), bmc.Poisson(0.5), np.arange(20), False),
+        (lambda x_prev: bmc.Poisson(0.5 + 0 * x_prev), bmc.Poisson(0.5), np.arange(1, 20), True),
+        (lambda x_prev: bmc.Poisson(9.0 + 0 * x_prev), bmc.Poisson(9.0), np.arange(14), True),
+        # slice 0 is bounded, later ones are not
+        (lambda x_prev: bmc.Normal(0.1 * x_prev, 0.5), bmc.Uniform(-3.0, 3.0), (-3.0, 3.0, 200), False),
+    ],
+)  # fmt: skip
+def test_which_ends_are_open(x, initial, grid, warns) -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", x, initial=initial)
+    dbn.add("y", lambda x: bmc.Normal(x, 5.0))
+    rows = {"y": [0.5, 0.5]}
+    found = said_of(bmc.filter, dbn, rows, engine=GridFilter({"x": grid}))
+    assert any("goes on beyond its grid" in m for m in found) == warns
+
+
+@pytest.mark.parametrize("rule", ["trapezoid", "simpson", "gauss-legendre"])
+def test_ends_of_other_rules(rule) -> None:
+    """Points at the bound, and just inside it."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Beta(1.2, 1.0 + x_prev), initial=bmc.Uniform(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    for grid, warns in (((0.0, 1.0, 101), False), ((0.0, 0.7, 101), True)):
+        found = said_of(
+            bmc.filter, dbn, {"y": [0.3, 0.4]}, engine=GridFilter({"x": grid}, quadrature=rule)
+        )
+        assert any("goes on beyond its grid" in m for m in found) == warns
+
+
+def test_edges_of_vectors_and_of_plates() -> None:
+    """The component and the element that leave are found; what is seen has no edge."""
+    dbn = bmc.DynamicBayesNet(plates={"who": 3})
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), plates="who",
+            initial=bmc.Normal(0.0, 1.0))  # fmt: skip
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0), plates="who")
+    engine = GridFilter({"x": (-8.0, 8.0, 160)})
+    fine = np.array([[0.0, 1.0, -1.0], [0.5, 1.0, 0.0]])
+    assert said_of(bmc.smooth, dbn, {"y": fine}, engine=engine) == []
+    off = fine + [[0.0, 0.0, 0.0], [0.0, -14.0, 0.0]]
+    (message,) = said_of(bmc.filter, dbn, {"y": off}, engine=engine)
+    assert "'x' in slice 1" in message and "at -7.95" in message
+    far = fine - [[0.0, 0.0, 0.0], [0.0, 0.0, 40.0]]
+    (message,) = said_of(bmc.most_likely, dbn, {"y": far}, engine=engine)
+    assert "'x' in slice 1 is the outer point of its grid, -7.95" in message
+    seen = {"x": np.array([[np.nan, 7.99, 0.0], [0.2, np.nan, np.nan]]), "y": fine}
+    partly = said_of(bmc.filter, dbn, seen, engine=GridFilter({"x": (-14.0, 14.0, 160)}))
+    assert partly == []
+    pair = bmc.DynamicBayesNet()
+    pair.add("v", lambda v_prev: bmc.MvNormal(v_prev, 0.3 * np.eye(2)),
+             initial=bmc.MvNormal(np.zeros(2), np.eye(2)))  # fmt: skip
+    pair.add("y", lambda v: bmc.Normal(v[..., 1], 0.5))
+    grids = {"v": [(-6.0, 6.0, 40), (-3.5, 3.5, 40)]}
+    (message,) = said_of(bmc.filter, pair, {"y": [0.0, 4.5]}, engine=GridFilter(grids))
+    assert "'v' in slice 1" in message and "at 3.41" in message
+    assert said_of(bmc.filter, pair, {"y": [0.0, 1.0]}, engine=GridFilter(grids)) == []
 
 
 def test_refusals() -> None:

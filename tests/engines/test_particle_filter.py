@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.dbn import pose_series
 from bayesmc.engines.particles import cloud as particle
 from bayesmc.engines.particles.cloud import Mover, Selection
 from bayesmc.errors import (
@@ -29,6 +28,9 @@ from bayesmc.resampling import SCHEMES, Adaptive
 
 ROWS = np.array([0.3, 1.5, np.nan, 2.0, 1.1])
 
+# few particles, so that many runs are cheap
+pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
+
 
 def switching(runs: int = 0) -> bmc.DynamicBayesNet:
     """A regime, a level that it drives, a noisy reading: ``runs`` of them side by side, or one."""
@@ -42,6 +44,13 @@ def switching(runs: int = 0) -> bmc.DynamicBayesNet:
         plates=own,
     )
     dbn.add("y", lambda x: bmc.Normal(x, 0.7), plates=own)
+    return dbn
+
+
+def linear() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.8 * x_prev, 0.9), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.7))
     return dbn
 
 
@@ -204,74 +213,12 @@ def test_planted_faults_bias_the_evidence(fault: str, monkeypatch: pytest.Monkey
     assert abs(deviation(estimates(**options), EVIDENCE)) > 4
 
 
-def test_the_optimal_proposal_leaves_weights_of_one_ancestor_even() -> None:
-    """Where it is exact the weight is p(y | x before), whatever was drawn."""
-    engine = bmc.ParticleFilter(200, proposal="optimal")
-    found = bmc.filter(linear(), {"y": [0.7]}, engine=engine, rng=0)
-    assert found.weight_ess[0] == pytest.approx(200)
-    assert found.log_marginal_likelihood == pytest.approx(
-        float(bmc.Normal(0.0, np.sqrt(1.49)).log_prob(0.7))
-    )
-
-
-def tracked() -> bmc.DynamicBayesNet:
-    """Vectors, two hidden nodes in a row, a computed one, a plate of readings, counts."""
-    dbn = bmc.DynamicBayesNet(plates={"s": 2})
-    still = bmc.MvNormal(np.zeros(2), np.eye(2))
-    dbn.add("v", lambda v_prev: bmc.MvNormal(0.9 * v_prev, 0.3 * np.eye(2)), initial=still)
-    dbn.add(
-        "p",
-        lambda p_prev, v: bmc.Normal(p_prev + v[..., 0], 0.2),
-        initial=bmc.Normal(0.0, 1.0),
-    )
-    dbn.add("q", lambda p, v: p + v[..., 1])
-    dbn.add("y", lambda q: bmc.Normal(q, 0.1), plates="s")
-    dbn.add("c", lambda v: bmc.Poisson(np.exp(0.5 * v[..., 0])))
-    return dbn
-
-
-def test_the_optimal_proposal_of_a_nonlinear_block() -> None:
-    """Of the same evidence as 100 times the particles of the bootstrap filter, with far less spread."""
-    rows = tracked().sample(12, 1, rng=0)
-    rows = {"y": rows["y"][0], "c": rows["c"][0]}
-    engine = bmc.ParticleFilter(300, proposal="optimal")
-    found = [
-        bmc.filter(tracked(), rows, engine=engine, rng=k).log_marginal_likelihood for k in range(20)
-    ]
-    plain = bmc.filter(tracked(), rows, engine=bmc.ParticleFilter(30_000), rng=1)
-    assert np.std(found) < 0.6
-    assert abs(np.mean(found) - plain.log_marginal_likelihood) < 0.6
-
-
-def test_the_optimal_proposal_is_refused_for_other_families() -> None:
-    dbn = bmc.DynamicBayesNet()
-    dbn.add("x", lambda x_prev: bmc.StudentT(3.0, x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
-    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
-    with pytest.raises(
-        UnsupportedError, match="'x' is StudentT, and such a proposal is derived for"
-    ):
-        bmc.filter(dbn, {"y": [0.0]}, engine=bmc.ParticleFilter(9, proposal="optimal"), rng=0)
-    with pytest.raises(ValueError, match='give "optimal", or a dict'):
-        bmc.ParticleFilter(9, proposal="best")
-
-
 def test_slice_zero_may_have_an_order_of_its_own() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.add("b", lambda b_prev: bmc.Normal(b_prev, 1.0), initial=lambda a: bmc.Normal(a, 1.0))
     dbn.add("a", lambda a_prev: bmc.Normal(a_prev, 1.0), initial=bmc.Normal(2.0, 1.0))
     found = bmc.filter(dbn, {"b": [None, None]}, engine=bmc.ParticleFilter(20_000), rng=0)
     assert abs(found.mean("b")[1] - 2.0) < 0.1
-
-
-def test_running_sums_are_not_drawn_backwards() -> None:
-    dbn = bmc.DynamicBayesNet()
-    dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
-    dbn.add("p", lambda p_prev, v: p_prev + v, initial=lambda v: v)
-    dbn.add("y", lambda p: bmc.Normal(p, 1.0))
-    with pytest.raises(UnsupportedError, match="'p' is computed from its own past.*lag="):
-        bmc.smooth(dbn, {"y": [0.1, 0.2]}, engine=bmc.ParticleFilter(50), rng=0)
-    lagged = bmc.smooth(dbn, {"y": [0.1, 0.2]}, engine=bmc.ParticleFilter(50), rng=0, lag=1)
-    assert lagged.steps == 2
 
 
 def test_one_filter_is_unbiased_like_many() -> None:
@@ -459,82 +406,6 @@ def test_angles_are_averaged_around_the_circle() -> None:
     filtered = bmc.filter(dbn, {"y": [3.1, -3.1, 3.1]}, engine=bmc.ParticleFilter(5000), rng=0)
     assert np.all(np.abs(np.abs(filtered.mean("a")) - np.pi) < 0.15)
     assert np.all(filtered.std("a") < 0.3)
-
-
-# ---- smoothing ----------------------------------------------------------------------------------
-
-
-def linear() -> bmc.DynamicBayesNet:
-    dbn = bmc.DynamicBayesNet()
-    dbn.add("x", lambda x_prev: bmc.Normal(0.8 * x_prev, 0.9), initial=bmc.Normal(0.0, 1.0))
-    dbn.add("y", lambda x: bmc.Normal(x, 0.7))
-    return dbn
-
-
-SMOOTHED = {
-    "switching": (switching, {"backward": "exact", "trajectories": 300}),
-    "linear, by rejection": (linear, {"backward": "rejection", "trajectories": 2000}),
-    "linear, exactly": (linear, {"backward": "exact", "trajectories": 300}),
-}
-
-
-@pytest.mark.parametrize("case", SMOOTHED)
-def test_trajectories_are_those_of_the_unrolled_net(case: str) -> None:
-    """Means of 16 independent runs within 4 standard errors of their own spread, Holm over slices (1e-3)."""
-    build, options = SMOOTHED[case]
-    engine = bmc.ParticleFilter(1000, **options)
-    runs = [bmc.smooth(build(), {"y": ROWS}, engine=engine, rng=k) for k in range(16)]
-    exact = exact_of(build(), {"y": ROWS})
-    assert abs(worst(runs, exact)) < 5.5  # t with 15 degrees of freedom: 6e-5 each
-    spread = np.mean([r.std("x") for r in runs], axis=0)
-    np.testing.assert_allclose(spread, [exact.std(f"x[{t}]") for t in range(5)], rtol=0.06)
-
-
-def worst(runs: list[Any], exact: Any) -> float:
-    found = np.array([r.mean("x") for r in runs])
-    wanted = np.array([exact.mean(f"x[{t}]") for t in range(found.shape[1])])
-    error = found.std(axis=0, ddof=1) / np.sqrt(len(found))
-    return float(np.abs((found.mean(axis=0) - wanted) / error).max())
-
-
-def test_backward_simulation_without_the_transition_is_caught(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    from bayesmc.engines.particles.smoothing import Backward
-
-    monkeypatch.setattr(
-        Backward,
-        "log_densities",
-        lambda self, cloud, after, *_: np.zeros((len(after["x"]), len(cloud.weights))),
-    )
-    engine = bmc.ParticleFilter(1000, backward="exact", trajectories=300)
-    runs = [bmc.smooth(linear(), {"y": ROWS}, engine=engine, rng=k) for k in range(16)]
-    assert worst(runs, exact_of(linear(), {"y": ROWS})) > 8
-
-
-def test_rejection_accepts_and_draws_the_rest_exactly() -> None:
-    from bayesmc.engines.particles.smoothing import Backward
-    from bayesmc.randomness import Purpose, seed_sequence, stream
-
-    engine = bmc.ParticleFilter(2000)
-    filtered = bmc.filter(linear(), {"y": ROWS}, engine=engine, rng=0, keep="particles")
-    problem = pose_series(linear(), {"y": ROWS})
-    mover = engine._mover(problem.slices, {})
-    backward = Backward(mover.plan, mover.layout)
-    rng = stream(seed_sequence(1), Purpose.SMOOTH)
-    backward.trajectories(filtered.clouds, problem.series, 500, rng)
-    assert backward.accepted + backward.exact == 500 * 4
-    assert backward.accepted > 0.9 * 500 * 4
-
-
-def test_a_fixed_lag_is_the_smoother_of_so_many_rows() -> None:
-    """20,000 particles: slices given rows up to two later, to 0.05."""
-    found = bmc.smooth(linear(), {"y": ROWS}, lag=2, engine=bmc.ParticleFilter(20_000), rng=0)
-    assert found.kind == "fixed-lag"
-    for t in range(5):
-        rows = {"y": ROWS[: min(t + 3, 5)]}
-        exact = exact_of(linear(), rows)
-        assert abs(found.mean("x")[t] - exact.mean(f"x[{t}]")) < 0.05
 
 
 # ---- what goes wrong ----------------------------------------------------------------------------

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.distributions.support import nonnegative
 from bayesmc.errors import EvidenceError
 from bayesmc.network import pose
 
@@ -220,3 +221,14 @@ def test_a_support_that_depends_on_parents_is_left_to_the_density():
     net.add("u", lambda top: bmc.Uniform(0.0, top))
     posterior = bmc.infer(net, {"u": 4.0}, engine=bmc.LikelihoodWeighting(2000), rng=0)
     assert posterior.probability(lambda top: top >= 4.0) == pytest.approx(1.0)
+
+
+def test_an_interval_holds_for_every_component_of_a_vector(monkeypatch):
+    monkeypatch.setattr(bmc.MvNormal, "support", nonnegative)
+    net = bmc.BayesNet(plates={"k": 2})
+    net.add("v", bmc.MvNormal(np.zeros(3), np.eye(3)), plates="k")
+    bad = np.ones((2, 3))
+    assert pose(net, {"v": bad}).observed["v"].mask is None
+    bad[1, 2] = -1.0
+    with pytest.raises(EvidenceError, match="outside its support"):
+        pose(net, {"v": bad})

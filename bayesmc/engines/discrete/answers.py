@@ -21,6 +21,7 @@ from bayesmc.engines.filtering import Answers, Queries
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import circular_variance
+from bayesmc.shapes import unravelled
 
 
 class SliceAnswers:
@@ -300,7 +301,7 @@ def best_path(run: Run) -> dict[Variable, np.ndarray] | None:
         if path is None:
             return None
         shape = tuple(plan.cards[v] for v in chain.state)
-        states = np.unravel_index(path, shape) if shape else ()
+        states = unravelled(path, shape)
         own = dict(zip(chain.state, states, strict=True))
         for variable in chain.inside:
             own[variable] = np.empty((run.steps, run.sequences), dtype=np.intp)
@@ -338,7 +339,7 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
             at = [_on_path(states, v, start - run.first, stop - run.first) for v in border]
             best = table[(here, there, *at)].argmax(axis=-1)
             best = np.broadcast_to(best, (rows.count, run.sequences))
-            for variable, state in zip(group, np.unravel_index(best, sizes), strict=True):
+            for variable, state in zip(group, unravelled(best, sizes), strict=True):
                 states[variable][start - run.first : stop - run.first] = state
 
 

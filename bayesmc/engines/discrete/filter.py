@@ -71,6 +71,7 @@ class DiscreteFilter(FilterEngine):
     max_bytes: float = 2.0 * 2**30
 
     label: ClassVar[str] = "discrete filter"
+    belief: ClassVar[type] = DiscreteBelief
 
     def __post_init__(self) -> None:
         n = self.max_states
@@ -298,6 +299,9 @@ class DiscretePosterior(SeriesPosterior):
         self._answers = answers
         return self
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_answers": None}
+
     def pairs(self, name: str) -> np.ndarray:
         """Joint tables of a node in two slices in a row, ``(time - 1, *plates, states before, states)``.
 
@@ -311,7 +315,12 @@ class DiscretePosterior(SeriesPosterior):
         if name not in self.model.nodes:
             raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
         answers = self._answers
-        if answers is None or (1, name, 0) not in answers.plan.cards or not answers.hands_on(name):
+        if answers is None:
+            raise QueryError(
+                f"pairs({name!r}): joint tables need the run behind the answers, which neither a forecast "
+                "nor a pickle carries; ask the result of filter or smooth itself"
+            )
+        if (1, name, 0) not in answers.plan.cards or not answers.hands_on(name):
             raise QueryError(
                 f"pairs({name!r}): the node is no hidden finite node that the next slice reads"
             )

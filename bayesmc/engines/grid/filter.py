@@ -52,7 +52,9 @@ class GridFilter(FilterEngine):
         one that does not fit is refused ahead.
     tolerance : float
         Mass lost or gained in one slice from which on a ``GridWarning`` says that the grid is too small or
-        too coarse; ``inf`` for never.
+        too coarse, and share of the highest density from which on one says that a belief goes on beyond its
+        grid: in an outer cell whose node's support does not end there. ``inf`` for never. Each is said once
+        a run, of the first slice.
 
     Notes
     -----
@@ -88,6 +90,7 @@ class GridFilter(FilterEngine):
     tolerance: float = 0.01
 
     label: ClassVar[str] = "grid filter"
+    belief: ClassVar[type] = GridBelief
 
     def __post_init__(self) -> None:
         if not isinstance(self.grid, Mapping):

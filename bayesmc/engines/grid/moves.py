@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import Row
+from bayesmc.engines.grid.edges import Edges
 from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.sources import previous
 from bayesmc.engines.grid.tables import Factor, GridModel
@@ -64,11 +65,13 @@ class GridMover:
     ----------
     model : GridModel
     tolerance : float
-        Mass that may be lost or gained before a ``GridWarning``.
+        Mass that may be lost or gained, and density in an outer cell beside the highest, before a
+        ``GridWarning``.
     """
 
     def __init__(self, model: GridModel, tolerance: float) -> None:
         self.model, self.tolerance = model, tolerance
+        self.edges = Edges(model.slices, model.axes)
         self.warned: set[str] = set()
 
     def move(self, cells: Cells | None, row: Row) -> Cells:
@@ -106,6 +109,7 @@ class GridMover:
         total = probs.sum(axis=axes) if axes else probs
         probs = probs / total
         self._check_cells(probs, now)
+        self._check_edges(probs, now)
         return Cells(now, probs, predicted, np.asarray(level + np.log(total)))
 
     def back(self, cells: Cells, after: Cells, smoothed: np.ndarray) -> np.ndarray:
@@ -115,7 +119,9 @@ class GridMover:
         found = contract(self.pair(cells, after, smoothed), labels)
         probs = dense(found, labels, (*before.shape, *model.lead))
         axes = tuple(range(len(before.scalars)))
-        return probs / (probs.sum(axis=axes) if axes else 1.0)
+        probs = probs / (probs.sum(axis=axes) if axes else 1.0)
+        self._check_edges(probs, before)
+        return probs
 
     def pair(self, cells: Cells, after: Cells, smoothed: np.ndarray) -> list[Term]:
         """Terms whose product is the joint belief about a slice and the one after, whose belief is given."""
@@ -150,7 +156,9 @@ class GridMover:
             history.append([f[1] for f in found])
             placed.append(now)
             advance()
-        return _traced(value, history, placed, elements, lead)
+        path = _traced(value, history, placed, elements, lead)
+        self._check_path(path, placed)
+        return path
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -237,6 +245,39 @@ class GridMover:
                 warnings.warn(
                     f"GridFilter: {top:.3g} of the belief about {name!r} in slice {now.row.t} stands on one "
                     "cell, so moments and likelihood are no better than a cell is wide; give a finer grid",
+                    GridWarning,
+                    stacklevel=2,
+                )
+                return
+
+    def _check_edges(self, probs: np.ndarray, now: Placed) -> None:
+        """Warn where a belief, after its row, goes on beyond the grid."""
+        if "edges" in self.warned or not np.isfinite(self.tolerance):
+            return
+        outer = self.edges.highest(probs, now)
+        if outer is None or outer.share <= self.tolerance:
+            return
+        self.warned.add("edges")
+        warnings.warn(
+            f"GridFilter: the belief about {outer.name!r} in slice {now.row.t} goes on beyond its grid: the "
+            f"density in the outer cell, at {outer.point:.4g}, is {outer.share:.2g} of the highest, and what "
+            "lies outside is left out; give a wider grid",
+            GridWarning,
+            stacklevel=2,
+        )
+
+    def _check_path(
+        self, path: Sequence[Mapping[Label, np.ndarray]], placed: Sequence[Placed]
+    ) -> None:
+        """Warn where the best path runs along the edge of the grid."""
+        if not np.isfinite(self.tolerance):
+            return
+        for positions, now in zip(path, placed, strict=True):
+            outer = self.edges.reached(positions, now)
+            if outer is not None:
+                warnings.warn(
+                    f"GridFilter: the most likely value of {outer.name!r} in slice {now.row.t} is the outer "
+                    f"point of its grid, {outer.point:.4g}, and may lie outside; give a wider grid",
                     GridWarning,
                     stacklevel=2,
                 )

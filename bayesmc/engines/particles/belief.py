@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,8 @@ class ParticleBelief:
         Normalised weights; the plates are those that are filtered separately.
     ancestors : ndarray of int or None
         Positions among the particles of the slice before; None where everybody has itself.
+    rejuvenated : bool or ndarray of bool
+        Whether they were drawn anew, since no weight was left (``on_degeneracy="rejuvenate"``).
 
     Examples
     --------
@@ -91,6 +93,11 @@ class ParticleBelief:
         return self._cloud.ancestors
 
     @property
+    def rejuvenated(self) -> Any:
+        found = self._cloud.rejuvenated
+        return found if np.ndim(found) else bool(found)
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Nodes whose particles are kept."""
         return tuple(self._cloud.values)
@@ -128,6 +135,20 @@ class ParticleBelief:
         """Mean of a function of nodes of the slice, whose arguments have a leading axis of particles."""
         return expectation(self._mover.layout, self._cloud, self._mover.slices.first, function)
 
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probability of an event: a function of nodes of the slice that returns booleans."""
+        return probability(self._mover.layout, self._cloud, self._mover.slices.first, function)
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles, shape ``(*q.shape, *plates, *event)``; those of angles are cut opposite the mean."""
+        node, value = self._found(name)
+        return quantiles(self._mover.layout, self._cloud, node, value, q)
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Covariance matrix of all numbers of the named nodes, in order; of one number, its variance."""
+        found = [self._found(name) for name in names]
+        return covariance(self._mover.layout, self._cloud, found)
+
     def __repr__(self) -> str:
         if self.cloud is None:
             return "ParticleBelief(nothing absorbed yet)"
@@ -159,9 +180,13 @@ class ParticleBelief:
 
 
 def expectation(
-    layout: Layout, cloud: Cloud, model: Model, function: Callable[..., Any]
+    layout: Layout,
+    cloud: Cloud,
+    model: Model,
+    function: Callable[..., Any],
+    read: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> np.ndarray:
-    """Weighted mean of a function's values, shape what one value has."""
+    """Weighted mean of a function's values as ``read`` has them, shape what one value has."""
     arguments = []
     for name in inspect.signature(function).parameters:
         if name not in cloud.values:
@@ -172,7 +197,7 @@ def expectation(
         node = model[name]
         shape = (layout.particles, *node.value_shape)
         arguments.append(node.decode(np.broadcast_to(cloud.values[name], shape)))
-    values = np.asarray(function(*arguments))
+    values = read(np.asarray(function(*arguments)))
     if not values.ndim or len(values) != layout.particles:
         raise QueryError(
             f"a query returns shape {values.shape}; it must return one value per particle, the axis of "
@@ -187,6 +212,66 @@ def expectation(
     share = np.asarray(cloud.total)
     total = share.reshape(share.shape + (1,) * (values.ndim - 1 - share.ndim))
     return (lead * values).sum(axis=0) / total
+
+
+def probability(
+    layout: Layout, cloud: Cloud, model: Model, event: Callable[..., Any]
+) -> np.ndarray:
+    """Weighted share of the particles for which an event holds."""
+
+    def counted(values: np.ndarray) -> np.ndarray:
+        if values.dtype.kind != "b":
+            raise QueryError(
+                f"probability: the function returns {values.dtype} values, not booleans; use expectation"
+            )
+        return values.astype(float)
+
+    return expectation(layout, cloud, model, event, counted)
+
+
+def quantiles(
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray, q: Any
+) -> np.ndarray:
+    """Weighted quantiles of a node that is not made of labels, shape ``(*q.shape, *plates, *event)``."""
+    levels = np.asarray(q, dtype=float)
+    if not ((levels >= 0) & (levels <= 1)).all():
+        raise ValueError(f"quantile({node.name!r}, {q!r}): quantiles lie between 0 and 1")
+    numbers = np.broadcast_to(_values(node, value), (layout.particles, *node.value_shape))
+    if node.angles is not None:  # an order needs a cut: opposite the mean
+        mean = _mean(layout, cloud, node, value)
+        near = mean + np.remainder(numbers - mean + np.pi, 2 * np.pi) - np.pi
+        numbers = np.where(node.angles, near, numbers)
+    at = [node.plates.index(p) for p in layout.apart if p in node.plates]
+    shape = [1] * numbers.ndim
+    for axis, size in zip(at, layout.lead, strict=False):
+        shape[1 + axis] = size
+    shape[0] = layout.particles
+    weights = cloud.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
+    weights = np.broadcast_to(weights, numbers.shape)
+    return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
+
+
+def covariance(
+    layout: Layout, cloud: Cloud, found: Sequence[tuple[CompiledNode, np.ndarray]]
+) -> np.ndarray:
+    """Weighted covariances of all numbers of some nodes."""
+    if not found:
+        raise UnknownNodeError("cov(): name at least one node")
+    if layout.apart:
+        raise QueryError(
+            f"cov: elements of plate {layout.apart[0]!r} are filtered separately, each with weights of its "
+            "own; use var, or expectation of a product"
+        )
+    n = layout.particles
+    columns = [
+        np.broadcast_to(_values(node, value), (n, *node.value_shape)).reshape(n, -1)
+        for node, value in found
+    ]
+    flat = np.concatenate(columns, axis=1).astype(float)
+    shares = cloud.weights / cloud.total
+    flat = flat - shares @ flat
+    matrix = (flat * shares[:, None]).T @ flat
+    return matrix[0, 0] if matrix.size == 1 else matrix
 
 
 def table_of_states(
@@ -212,9 +297,10 @@ def _mean(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -
         return table_of_states(layout, cloud, node, value) @ _numbers(node)
     if value.ndim == len(node.value_shape):
         return value
-    if _is_angle(node):
-        return np.arctan2(*_turn(layout, cloud, node, value))
-    return _average(layout, cloud, node, value)
+    if node.angles is None:
+        return _average(layout, cloud, node, value)
+    turned = np.arctan2(*_turn(layout, cloud, node, value))
+    return np.where(node.angles, turned, _average(layout, cloud, node, value))
 
 
 def _variance(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
@@ -222,15 +308,16 @@ def _variance(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarra
         return table_variance(table_of_states(layout, cloud, node, value), _numbers(node))
     if value.ndim == len(node.value_shape):
         return np.zeros(node.value_shape)
-    if _is_angle(node):
-        return circular_variance(*_turn(layout, cloud, node, value))
     off = value - _average(layout, cloud, node, value)
-    return _average(layout, cloud, node, off * off)
+    spread = _average(layout, cloud, node, off * off)
+    if node.angles is None:
+        return spread
+    return np.where(node.angles, circular_variance(*_turn(layout, cloud, node, value)), spread)
 
 
 def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
     """Mean and variance of a node that is not finite, in blocks of particles."""
-    if layout.apart or value.ndim == len(node.value_shape) or _is_angle(node):
+    if layout.apart or value.ndim == len(node.value_shape) or node.angles is not None:
         return _mean(layout, cloud, node, value), _variance(layout, cloud, node, value)
     flat = value if value.ndim == 1 else value.reshape(len(value), -1)
     first: Any = 0.0
@@ -292,8 +379,8 @@ def _turn(
     return sine, _average(layout, cloud, node, np.cos(value))
 
 
-def _is_angle(node: CompiledNode) -> bool:
-    return node.support is not None and node.support.kind == "circle"
+def _values(node: CompiledNode, value: np.ndarray) -> np.ndarray:
+    return value if node.domain is None else _numbers(node)[value]
 
 
 def _numbers(node: CompiledNode) -> np.ndarray:

@@ -51,8 +51,8 @@ class Cloud(NamedTuple):
     ancestors : ndarray of int or None
         Positions in the cloud before, sorted; None where every particle has itself.
     resampled : ndarray of bool, shape (*apart,)
-    rejuvenated : bool
-        Whether they were drawn anew, since all weights had vanished.
+    rejuvenated : ndarray of bool, shape (*apart,)
+        Whether they were drawn anew, since all weights had vanished; such particles have no ancestors.
     """
 
     t: int
@@ -65,7 +65,7 @@ class Cloud(NamedTuple):
     ess: Any
     ancestors: np.ndarray | None = None
     resampled: Any = False
-    rejuvenated: bool = False
+    rejuvenated: Any = False
 
 
 @dataclass(frozen=True)
@@ -191,15 +191,49 @@ class Mover:
     ) -> Cloud:
         values, log = self._passed(self.plan.steps(row), row, before, selection.ancestors, rng)
         cloud = self._weighted(row, values, log, selection)
-        if cloud is not None:
+        if _has_weight(cloud):
             return cloud
         if self.rejuvenate is not None:
-            values, log = self._passed(self.rejuvenate(row), row, before, selection.ancestors, rng)
-            fresh = Selection(None, True, 0.0, self._log_particles)
-            cloud = self._weighted(row, values, log, fresh)
-            if cloud is not None:
-                return cloud._replace(rejuvenated=True)
-        raise self._degenerate(row, before, values, selection)
+            cloud = self._renewed(self.rejuvenate(row), row, before, cloud, selection, rng)
+            if _has_weight(cloud):
+                return cloud
+        raise self._degenerate(row, before, cloud.values, selection)
+
+    def _renewed(
+        self,
+        steps: Sequence[Step],
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        cloud: Cloud,
+        selection: Selection,
+        rng: np.random.Generator,
+    ) -> Cloud:
+        """A cloud begun anew where it has no weight left; plate elements that have some stay as they are."""
+        dead = ~np.asarray(cloud.total > 0)
+        values, log = self._passed(steps, row, before, selection.ancestors, rng)
+        fresh = Selection(selection.ancestors, True, 0.0, self._log_particles)
+        new = self._weighted(row, values, log, fresh)
+        if not self.lead:
+            return new._replace(rejuvenated=True)
+        mixed = {k: self._either(k, dead, v, cloud.values[k]) for k, v in new.values.items()}
+        either = Selection(
+            selection.ancestors,
+            dead | selection.resampled,
+            0.0,
+            np.where(dead, self._log_particles, selection.spent),
+        )
+        log = np.where(dead, new.log_weights, cloud.log_weights)
+        return self._weighted(row, mixed, log, either)._replace(rejuvenated=dead)
+
+    def _either(self, name: str, dead: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+        """A node's values: new ones in some elements of the plates apart, old ones in the others."""
+        plates = self.slices.later[name].plates
+        if any(p not in plates for p in self.apart):
+            return new  # it hangs on nothing that was drawn
+        at = [self.apart.index(p) for p in plates if p in self.apart]
+        shape = [self.slices.first.sizes[p] if p in self.apart else 1 for p in plates]
+        rank = self._ranks[name] - len(plates)
+        return np.where(dead.transpose(at).reshape(*shape, *(1,) * rank), new, old)
 
     def _selected(
         self,
@@ -314,8 +348,8 @@ class Mover:
 
     def _weighted(
         self, row: Row, values: dict[str, np.ndarray], log: Any, selection: Selection
-    ) -> Cloud | None:
-        """The cloud of a slice; None where no weight is left somewhere."""
+    ) -> Cloud:
+        """The cloud of a slice; its ``total`` is not positive where no weight is left."""
         n, shape = self.particles, (self.particles, *self.lead)
         carried = selection.carried
         log = carried + log if isinstance(carried, np.ndarray) else np.asarray(log)
@@ -329,12 +363,12 @@ class Mover:
             log = np.broadcast_to(log, shape)
         level = _top(log)
         weights, total, squares = self._exponentials(log, level)
-        if not (total > 0 if not self.lead else (total > 0).all()):
-            return None
-        log_total = level + (math.log(total) if not self.lead else np.log(total))
+        log_total = level + (
+            np.log(total) if self.lead else math.log(total) if total > 0 else -math.inf
+        )
         return Cloud(
             row.t, values, log, weights, total, log_total, log_total - selection.spent,
-            total * total / squares, selection.ancestors, selection.resampled,
+            _ratio(total * total, squares), selection.ancestors, selection.resampled,
         )  # fmt: skip
 
     def _exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
@@ -423,6 +457,15 @@ class _Spare:
         for array in arrays:
             if array.flags.owndata and array.flags.writeable:
                 self._free.setdefault((array.shape, array.dtype), []).append(array)
+
+
+def _has_weight(cloud: Cloud) -> bool:
+    total = cloud.total
+    return bool(total > 0 if isinstance(total, float) else (total > 0).all())
+
+
+def _ratio(above: Any, below: Any) -> Any:
+    return above / below if not isinstance(below, float) or below else math.nan
 
 
 def _top(log: np.ndarray) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -14,20 +15,23 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
 from bayesmc.engines.particles.optimal import OptimalPlan, why_not_optimal
 from bayesmc.engines.particles.record import FilteredParticles, Record
-from bayesmc.engines.particles.smoothing import Backward, ancestors_of, carried
+from bayesmc.engines.particles.smoothing import Backward, carried, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn, Rejuvenation
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
-from bayesmc.resampling import Adaptive, scheme_of
+from bayesmc.resampling import Adaptive, checked, scheme_of
+
+#: equally weighted particles below which a slice rests on a single one
+_COLLAPSED = 2.0
 
 
 @dataclass(frozen=True)
@@ -37,9 +41,10 @@ class ParticleFilter(FilterEngine):
     Parameters
     ----------
     particles : int
-    resampling : str or callable
+    resampling : str, callable or Adaptive
         ``"multinomial"``, ``"stratified"``, ``"systematic"``, ``"residual"``, ``"ssp"``, or a function
-        ``(weights, draws, rng) -> sorted indices``.
+        ``(weights, draws, rng) -> sorted indices``; an ``Adaptive`` brings its own threshold, which is taken
+        instead of ``ess_threshold``.
     ess_threshold : float
         Particles are resampled on the way into a slice where they are worth less than this share of their
         number: 1 resamples (nearly) always, 0 never (sequential importance sampling).
@@ -74,6 +79,11 @@ class ParticleFilter(FilterEngine):
     DegeneracyError
         From the filter, with the slice and the node at which no weight was left.
 
+    Warns
+    -----
+    LowEssWarning
+        From the filter, where a slice rests on what is little more than one particle.
+
     Notes
     -----
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
@@ -107,6 +117,8 @@ class ParticleFilter(FilterEngine):
     backward: str = "rejection"
 
     label: ClassVar[str] = "particle filter"
+    keeps: ClassVar[bool] = True
+    belief: ClassVar[type] = ParticleBelief
 
     def __post_init__(self) -> None:
         n = self.particles
@@ -162,7 +174,33 @@ class ParticleFilter(FilterEngine):
                 "log factors"
             )
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        state = dict(self.__dict__)
+        for option in ("proposal", "rejuvenation"):
+            if isinstance(state[option], Mapping):
+                state[option] = dict.fromkeys(state[option])
+        for option in ("resampling", "auxiliary"):
+            state[option] = None if callable(state[option]) else state[option]
+        return state
+
+    def __copy__(self) -> ParticleFilter:
+        return self
+
+    def __deepcopy__(self, memo: Any) -> ParticleFilter:
+        return self
+
+    def _require_functions(self) -> None:
+        given = [*(self.rejuvenation or {}).values(), self.resampling, self.auxiliary]
+        if isinstance(self.proposal, Mapping):
+            given += self.proposal.values()
+        if any(value is None for value in given):
+            raise UnsupportedError(
+                "ParticleFilter: this engine was unpickled, and pickles carry no functions; make it anew"
+            )
+
     def refusal(self, problem: SeriesProblem) -> str | None:
+        self._require_functions()
         common = super().refusal(problem)
         if common is not None:
             return common
@@ -173,13 +211,18 @@ class ParticleFilter(FilterEngine):
                 return why
         else:
             proposals = SliceProposals(problem.slices, self.proposal or {}, "ParticleFilter")
-            proposals.check(problem.series.observed.keys())
+            seen = problem.series.observed
+            proposals.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
         for model in (problem.slices.first, problem.slices.later):
             inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
             reason = refuse_unsampled(model, inside, "ParticleFilter")
             if reason is not None:
                 return reason
         return None
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        sums = carried(problem.slices) if asked.what == "smooth" else ()
+        return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = {}
@@ -229,6 +272,7 @@ class ParticleFilter(FilterEngine):
                 if old is not None and keep is None:
                     mover.recycle(old)
                 bar.advance()
+        self._warn_of_collapse(record, rows.start)
         return record.posterior(self)
 
     def smooth(
@@ -244,10 +288,7 @@ class ParticleFilter(FilterEngine):
             return self._lagged(problem, seed, lag, queries or {}, progress)
         sums = carried(problem.slices)
         if sums:
-            raise UnsupportedError(
-                f"ParticleFilter: {sums[0]!r} is computed from its own past, so trajectories cannot be drawn "
-                "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
-            )
+            raise UnsupportedError(_not_backwards(sums[0]))
         filtered = self.filter(problem, seed, keep="particles", progress=progress)
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}
@@ -286,11 +327,11 @@ class ParticleFilter(FilterEngine):
                 filtered.add(k, cloud)
                 window.append(cloud)
                 while window and (len(window) > lag or k == last):
-                    values = ancestors_of(list(window), mover.layout, mover.slices)
                     at = k - len(window) + 1
-                    record.add(at, cloud._replace(t=window[0].t, values=values))
+                    record.add(at, lagged(list(window), mover.layout, mover.slices))
                     window.popleft()
                 bar.advance()
+        self._warn_of_collapse(filtered, problem.series.start)
         return self._given_filtered(record.posterior(self, "fixed-lag"), filtered.posterior(self))
 
     def _given_filtered(
@@ -327,16 +368,34 @@ class ParticleFilter(FilterEngine):
 
     # ---- private -------------------------------------------------------------------------------
 
+    def _warn_of_collapse(self, record: Record, start: int) -> None:
+        """One warning where a slice rests on what is little more than one particle."""
+        ess = record.ess.reshape(len(record.ess), -1).min(axis=1)
+        poor = np.flatnonzero(ess < min(_COLLAPSED, 0.9 * self.particles))
+        if poor.size:
+            worst = int(poor[ess[poor].argmin()])
+            others = f" (and {poor.size - 1} others)" if poor.size > 1 else ""
+            warnings.warn(
+                f"ParticleFilter: in slice {start + worst}{others} the {self.particles} particles are worth "
+                f"only {ess[worst]:.1f} equally weighted ones (weight_ess), so means, spreads and the "
+                "evidence rest on one of them: use more particles, a proposal= that looks at the "
+                "observations, or noise that is less narrow",
+                LowEssWarning,
+                stacklevel=4,
+            )
+
     def _mover(
         self,
         slices: Slices,
         static: Mapping[str, np.ndarray],
         kept: Sequence[str] | None = None,
     ) -> Mover:
+        self._require_functions()
         scheme: Any = scheme_of(self.resampling)
         threshold = float(self.ess_threshold)
         if isinstance(scheme, Adaptive):
             scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
+        scheme = checked(scheme)
         apart = plates_apart(slices)
         if isinstance(self.proposal, str):
             plan: SlicePlan = OptimalPlan(slices, apart, static)
@@ -345,13 +404,22 @@ class ParticleFilter(FilterEngine):
             proposals = SliceProposals(slices, asked, "ParticleFilter") if asked else None
             plan = SlicePlan(slices, apart, static, proposals)
         stage: Any = None
-        if self.auxiliary is not False:
-            stage = PluggedIn(plan) if self.auxiliary is True else GivenStage(plan, self.auxiliary)
+        if callable(self.auxiliary):
+            stage = GivenStage(plan, self.auxiliary, self.particles)
+        elif self.auxiliary:
+            stage = PluggedIn(plan, self.particles)
         anew = Rejuvenation(plan, self.rejuvenation) if self.rejuvenation is not None else None
         return Mover(slices, self.particles, scheme, threshold, plan, stage, anew, kept)
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _not_backwards(name: str) -> str:
+    return (
+        f"ParticleFilter: {name!r} is computed from its own past, so trajectories cannot be drawn "
+        "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
+    )
 
 
 def _asked(queries: Queries, slices: Slices) -> list[str]:

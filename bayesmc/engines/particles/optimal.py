@@ -1,9 +1,13 @@
 """The proposal that looks at the row, derived from the declared densities: ``proposal="optimal"``.
 
 For every particle the hidden numbers of a slice are taken as jointly Gaussian given the slice before, and
-what was seen as Gaussian given them, both made linear at the prediction: an extended Kalman update from a
-known start. Where transitions are Normal and means of what is seen are affine this is exactly
-p(x_t | x_{t-1}, y_t), the proposal of least variance; elsewhere weights p/q make up for the difference.
+what was seen as Gaussian given them (``lookahead``). Where transitions are Normal and means of what is seen
+are affine this is exactly p(x_t | x_{t-1}, y_t), the proposal of least variance; elsewhere weights p/q make
+up for the difference.
+
+A slice is cut into *groups*: a hidden node that is no Gaussian (a finite one, say) and depends on numbers of
+a group is drawn once these are, and what depends on it makes the next group. Numbers that nothing seen
+depends on within their group are drawn from their own densities.
 
 References
 ----------
@@ -13,22 +17,23 @@ Statistics and Computing 10, sec. II-D; van der Merwe et al. (2000), The unscent
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import Row, Slices
-from bayesmc.distributions import MvNormal, Normal
+from bayesmc.distributions import Distribution, MvNormal, Normal
+from bayesmc.engines.particles.lookahead import Guarded, LookAhead
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError
-from bayesmc.network import CompiledNode, Model
-from bayesmc.network.forward import Pass, Step
+from bayesmc.network import CompiledNode, Model, Observed
+from bayesmc.network.forward import Step
+from bayesmc.structure.affine import why_not_linear
 
-#: balances the rounding of a central difference against its curvature
-_STEP = float(np.finfo(float).eps ** (1 / 3))
-_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+#: states of a finite node that a mean and a variance describe
+_TWO = 2
 
 
 class OptimalPlan(SlicePlan):
@@ -36,237 +41,203 @@ class OptimalPlan(SlicePlan):
 
     def _build(self, row: Row) -> list[Step]:
         model = self.slices.model(row.t)
-        block = [n for n in hidden_numbers(self.slices, row) if n in model.nodes]
-        seen = _looked_at(model, self.slices, row, block)
-        if not block or not seen:
+        order = order_of(model, self.slices)
+        groups = groups_of(model, order, row.seen, lambda name: has_moments(model, name))
+        if not any(group.block for group in groups):
             return super()._build(row)
-        order = [n for n in model.nodes if n in self.slices.dynamic]
-        below = _below(model, order, block)
-        first = [n for n in order if n not in below and n not in block]
-        steps = [self.step(row, n) for n in first]
-        steps.append(LookAhead(model, block, seen, order, self.apart))
-        for name in order:
-            if name in block:
-                steps.append(self.factor(row, name))
-            elif name in below:
-                steps.append(self.step(row, name))
+        steps: list[Step] = []
+        for group in groups:
+            steps += [self.step(row, n) for n in group.before]
+            if group.block:
+                steps += self._looking(row, group, order)
+            steps += [self.step(row, n) for n in group.after if n not in group.block]
         return steps
 
+    def _looking(self, row: Row, group: Group, order: Sequence[str]) -> list[Step]:
+        """Draw a block, and weigh it by p/q."""
+        model = self.slices.model(row.t)
+        seen = {n: row.seen[n].mask for n in group.seen}
+        affine = is_affine(model, group)
+        look = LookAhead(model, group.block, seen, order, self.apart, affine)
+        between = {n for name in group.block for n in look.between[name]}
+        inside = [n for n in order if n in between or n in group.block]
+        own = [self.step(row, n) for n in inside]
+        factors = [
+            step if n in between else self.factor(row, n)
+            for n, step in zip(inside, own, strict=True)
+        ]
+        return [look, *factors] if affine else [Guarded(look, own, factors)]
 
-def why_not_optimal(slices: Slices, observed: Sequence[str]) -> str | None:
+
+class Group(NamedTuple):
+    """A part of a slice in which hidden numbers are looked at together.
+
+    Attributes
+    ----------
+    before : tuple of str
+        Nodes that do not depend on numbers of the group, in the order in which steps are taken.
+    block : tuple of str
+        Hidden numbers that something seen depends on.
+    seen : tuple of str
+        What is looked at.
+    after : tuple of str
+        All others of the group, the block included.
+    """
+
+    before: tuple[str, ...]
+    block: tuple[str, ...]
+    seen: tuple[str, ...]
+    after: tuple[str, ...]
+
+
+def groups_of(
+    model: Model,
+    order: Sequence[str],
+    seen: Mapping[str, Observed],
+    looks: Callable[[str], bool],
+) -> list[Group]:
+    """A slice cut into groups, whose steps in turn respect the net's order.
+
+    Parameters
+    ----------
+    order : sequence of str
+        Nodes of the slice, parents first.
+    looks : callable
+        Whether a seen node has moments to look at.
+    """
+    at: dict[str, int] = {}  # the group in which a step is taken
+    below: dict[str, bool] = {}  # whether it depends on numbers of its group
+    looked: dict[str, int] = {}
+    for name in order:
+        above = [p for p in model[name].parents if p in at and not _in_full(seen, p)]
+        group = max((at[p] for p in above), default=0)
+        hot = any(at[p] == group and (below[p] or _is_number(model, p, seen)) for p in above)
+        if hot and name in seen and looks(name):
+            looked[name] = group
+        known = not model[name].is_stochastic or _in_full(seen, name)
+        if hot and not known and not _is_number(model, name, seen):
+            group, hot = group + 1, False
+        at[name], below[name] = group, hot
+    needed: dict[str, set[int]] = {name: {group} for name, group in looked.items()}
+    for name in reversed(order):
+        if name in looked or (name in needed and not _in_full(seen, name)):
+            for parent in model[name].parents:
+                if parent in at and at[parent] in needed[name] and not _in_full(seen, parent):
+                    if _is_number(model, parent, seen) or below[parent]:
+                        needed.setdefault(parent, set()).add(at[parent])
+    groups = []
+    for k in range(1 + max(at.values(), default=0)):
+        own = [n for n in order if at[n] == k]
+        numbers = {n for n in own if _is_number(model, n, seen)}
+        groups.append(
+            Group(
+                tuple(n for n in own if not below[n] and n not in numbers),
+                tuple(n for n in own if n in numbers and n in needed),
+                tuple(n for n in order if looked.get(n) == k),
+                tuple(n for n in own if below[n] or n in numbers),
+            )
+        )
+    return groups
+
+
+def order_of(model: Model, slices: Slices) -> list[str]:
+    """Nodes of a slice, parents first; slice 0 may have its own order."""
+    return [n for n in model.nodes if n in slices.dynamic]
+
+
+def has_moments(model: Model, name: str) -> bool:
+    """Whether a node has a mean and a variance that say where its value is."""
+
+    def find() -> bool:
+        node = model[name]
+        if node.domain is not None and node.domain.size > _TWO:
+            return False
+        try:
+            dist, _ = model.evaluate(name, model.probe)
+            spread = dist.cov if node.event_shape else dist.var
+            return bool(np.isfinite(np.asarray(dist.mean)).all() and np.isfinite(spread).all())
+        except (BayesmcError, AttributeError, NotImplementedError):
+            return False
+
+    return _once(model, ("moments", name), find)
+
+
+def family_of(model: Model, name: str) -> type[Distribution]:
+    """The family that a node's function returns."""
+    return _once(model, ("family", name), lambda: type(model.evaluate(name, model.probe)[0]))
+
+
+def is_affine(model: Model, group: Group) -> bool:
+    """Whether a group is proved linear-Gaussian in its block, all else being known."""
+    return _once(model, (group.block, group.seen), lambda: _prove_affine(model, group))
+
+
+def why_not_optimal(slices: Slices, observed: Collection[str]) -> str | None:
     """Why no such proposal can be derived, or None."""
     for model in (slices.first, slices.later):
-        for name in slices.dynamic:
+        informed: set[str] = set()
+        for name in reversed(order_of(model, slices)):
             node = model[name]
-            if not node.is_stochastic or node.is_discrete or name in observed:
+            if name in observed or name in informed:
+                informed |= set(node.parents)
+            hidden = node.is_stochastic and not node.is_discrete and name not in observed
+            if not hidden or name not in informed or _is_gaussian(model, name):
                 continue
-            dist, _ = model.evaluate(name, model.probe)
-            if not isinstance(dist, (Normal, MvNormal)):
-                return (
-                    f'ParticleFilter(proposal="optimal"): {name!r} is {type(dist).__name__}, and such a '
-                    "proposal is derived for Normal and MvNormal nodes only; give proposal={...} yourself"
-                )
-    return None
-
-
-def hidden_numbers(slices: Slices, row: Row) -> list[str]:
-    """Hidden continuous nodes of a slice, parents first."""
-    model = slices.model(row.t)
-    return [
-        n
-        for n in model.nodes
-        if n in slices.dynamic
-        and model[n].is_stochastic
-        and not model[n].is_discrete
-        and n not in row.seen
-    ]
-
-
-class LookAhead:
-    """Draws a block of numbers from their law given what was seen, made Gaussian, and weighs by 1/q."""
-
-    def __init__(
-        self,
-        model: Model,
-        block: Sequence[str],
-        seen: Sequence[str],
-        order: Sequence[str],
-        apart: tuple[str, ...],
-    ) -> None:
-        self.model, self.block, self.seen = model, list(block), list(seen)
-        self.order, self.apart = list(order), apart
-        self.lead = tuple(model.sizes[p] for p in apart)
-        self.sizes = [_numbers_of(model[n], apart) for n in self.block]
-        self.total = sum(self.sizes)
-
-    def __call__(self, state: Pass) -> None:
-        shape = (*state.batch, *self.lead)
-        mean, cov = np.zeros((*shape, self.total)), np.zeros((*shape, self.total, self.total))
-        at = 0
-        for name, size in zip(self.block, self.sizes, strict=True):
-            spread = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
-            centre, slopes, noise = self._linear(state, name, size, mean, spread, at)
-            mean[..., at : at + size] = centre
-            cross = slopes @ cov[..., :at, :at]
-            cov[..., at : at + size, :at] = cross
-            cov[..., :at, at : at + size] = np.swapaxes(cross, -1, -2)
-            cov[..., at : at + size, at : at + size] = cross @ np.swapaxes(slopes, -1, -2) + noise
-            at += size
-        for name in self.seen:
-            mean, cov = self._updated(state, name, mean, cov)
-        root = _root(cov)
-        noise = state.rng.standard_normal((*shape, self.total))
-        draw = mean + np.matvec(root, noise)
-        log_q = -0.5 * np.vecdot(noise, noise) - self.total * _HALF_LOG_2PI
-        log_q -= np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
-        state.values.update(self._split(draw))
-        state.weigh(-log_q)
-
-    # ---- private -------------------------------------------------------------------------------
-
-    def _updated(
-        self, state: Pass, name: str, mean: np.ndarray, cov: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and covariance given the value of one seen node."""
-        size = _numbers_of(self.model[name], self.apart)
-        spread = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
-        centre, slopes, noise = self._linear(state, name, size, mean, spread, self.total)
-        value = self._flat(self.model[name], np.asarray(state.values[name], dtype=float))
-        gain = cov @ np.swapaxes(slopes, -1, -2)
-        inner = slopes @ gain + noise
-        weights = np.swapaxes(np.linalg.solve(inner, np.swapaxes(gain, -1, -2)), -1, -2)
-        mean = mean + np.matvec(weights, value - centre)
-        cov = cov - weights @ np.swapaxes(gain, -1, -2)
-        return mean, 0.5 * (cov + np.swapaxes(cov, -1, -2))
-
-    def _linear(
-        self, state: Pass, name: str, size: int, mean: np.ndarray, spread: np.ndarray, count: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A node's mean where the block is expected, its slopes in the first ``count`` numbers, its noise."""
-        steps = _STEP * np.maximum(np.abs(mean), np.maximum(spread, 1e-3))
-        points = np.broadcast_to(mean, (1 + 2 * count, *mean.shape)).copy()
-        for k in range(count):
-            points[1 + k, ..., k] += steps[..., k]
-            points[1 + count + k, ..., k] -= steps[..., k]
-        values = {**state.values, **self._split(points)}
-        for other in self.order:  # what is computed between the block and the node
-            node = self.model[other]
-            if other == name:
-                break
-            if not node.is_stochastic and all(p in values for p in node.parents):
-                found, _ = self.model.evaluate(other, values)
-                values[other] = np.asarray(found)
-        dist, _ = self.model.evaluate(name, values)
-        node = self.model[name]
-        lead = (len(points), *mean.shape[:-1])
-        loc = self._spread_out(
-            node, np.asarray(dist.mean, dtype=float), lead, len(node.event_shape)
-        )
-        loc = loc.reshape(*lead, size)
-        slopes = np.zeros((*mean.shape[:-1], size, count))
-        for k in range(count):
-            rise = loc[1 + k] - loc[1 + count + k]
-            slopes[..., k] = rise / (2 * steps[..., k, None])
-        return loc[0], slopes, self._noise(node, dist, lead, size)
-
-    def _noise(self, node: CompiledNode, dist: Any, lead: tuple[int, ...], size: int) -> np.ndarray:
-        """Covariance of a node given the block where that is expected."""
-        if node.event_shape:
-            cov = self._spread_out(node, np.asarray(dist.cov, dtype=float), lead, 2)
-            inner = node.event_shape[-1]
-            cov = cov.reshape(*lead, size // inner, inner, inner)[0]
-            full = np.zeros((*cov.shape[:-3], size, size))
-            for k in range(size // inner):
-                part = slice(k * inner, (k + 1) * inner)
-                full[..., part, part] = cov[..., k, :, :]
-            return full
-        var = self._spread_out(node, np.asarray(dist.var, dtype=float), lead, 0)
-        return var.reshape(*lead, size)[0][..., None] * np.eye(size)
-
-    def _spread_out(
-        self, node: CompiledNode, array: np.ndarray, lead: tuple[int, ...], event_ndim: int
-    ) -> np.ndarray:
-        """With all axes, plates apart right after the batch, shape ``(*lead, *other plates, *event)``."""
-        event = array.shape[array.ndim - event_ndim :]
-        batch = lead[: len(lead) - len(self.lead)]
-        full = np.broadcast_to(array, (*batch, *node.plate_shape, *event))
-        order = [node.plates.index(p) for p in self.apart]
-        order += [k for k, p in enumerate(node.plates) if p not in self.apart]
-        first = len(batch)
-        tail = range(first + len(node.plates), full.ndim)
-        return full.transpose(*range(first), *(first + k for k in order), *tail)
-
-    def _flat(self, node: CompiledNode, value: np.ndarray) -> np.ndarray:
-        """A seen value, shape ``(*apart, numbers)``."""
-        moved = self._spread_out(node, value, self.lead, len(node.event_shape))
-        return moved.reshape(*self.lead, -1)
-
-    def _split(self, joined: np.ndarray) -> dict[str, np.ndarray]:
-        """Values of the block's nodes, ``(*batch, *plates, *event)``."""
-        found, at = {}, 0
-        batch = joined.shape[: joined.ndim - 1 - len(self.lead)]
-        for name, size in zip(self.block, self.sizes, strict=True):
-            node = self.model[name]
-            others = [
-                n for p, n in zip(node.plates, node.plate_shape, strict=True) if p not in self.apart
-            ]
-            part = joined[..., at : at + size].reshape(
-                *batch, *self.lead, *others, *node.event_shape
+            family = family_of(model, name).__name__
+            return (
+                f'ParticleFilter(proposal="optimal"): {name!r} is {family}, and such a '
+                "proposal is derived for Normal and MvNormal nodes only; give proposal={...} yourself"
             )
-            at += size
-            back = [*self.apart, *(p for p in node.plates if p not in self.apart)]
-            first = len(batch)
-            order = [first + back.index(p) for p in node.plates]
-            tail = range(first + len(node.plates), part.ndim)
-            part = np.ascontiguousarray(part.transpose(*range(first), *order, *tail))
-            part.flags.writeable = False
-            found[name] = part
-        return found
+    return None
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _numbers_of(node: CompiledNode, apart: tuple[str, ...]) -> int:
-    others = [n for p, n in zip(node.plates, node.plate_shape, strict=True) if p not in apart]
-    return math.prod(others) * math.prod(node.event_shape)
+def _is_gaussian(model: Model, name: str) -> bool:
+    return issubclass(family_of(model, name), (Normal, MvNormal))
 
 
-def _below(model: Model, order: Sequence[str], block: Sequence[str]) -> set[str]:
-    """Nodes of a slice that depend on a block."""
-    reached = set(block)
-    for name in order:
-        if reached & set(model[name].parents):
-            reached.add(name)
-    return reached - set(block)
+def _is_number(model: Model, name: str, seen: Mapping[str, Observed]) -> bool:
+    """Whether a node is a hidden number that a block may hold."""
+    node: CompiledNode = model[name]
+    if name in seen or not node.is_stochastic or node.is_discrete or node.domain is not None:
+        return False
+    return _is_gaussian(model, name)
 
 
-def _looked_at(model: Model, slices: Slices, row: Row, block: Sequence[str]) -> list[str]:
-    """Seen nodes, in full, that depend on the block and have a mean and a variance."""
-    order = [n for n in model.nodes if n in slices.dynamic]
-    found = []
-    for name in order:
-        seen = row.seen.get(name)
-        if seen is None or seen.mask is not None or name not in _below(model, order, block):
+def _in_full(seen: Mapping[str, Observed], name: str) -> bool:
+    return name in seen and seen[name].mask is None
+
+
+def _prove_affine(model: Model, group: Group) -> bool:
+    inner = {*group.block, *group.seen}
+    nodes: dict[str, CompiledNode] = {}
+    todo = list(inner)
+    while todo:
+        name = todo.pop()
+        node = model[name]
+        if name in nodes:
             continue
-        try:
-            dist, _ = model.evaluate(name, model.probe)
-            spread = dist.cov if model[name].event_shape else dist.var
-            if np.isfinite(np.asarray(dist.mean)).all() and np.isfinite(np.asarray(spread)).all():
-                found.append(name)
-        except (BayesmcError, AttributeError, NotImplementedError):
+        if node.is_stochastic and name not in inner:  # known here, whatever its density is
+            nodes[name] = replace(node, links=(), declaration=replace(node.declaration, parents=()))
             continue
-    return found
+        nodes[name] = node
+        todo += node.parents
+    ordered = {n: nodes[n] for n in model.nodes if n in nodes}
+    known = {
+        n: Observed(np.asarray(model.probe[n]))
+        for n, node in ordered.items()
+        if node.is_stochastic and n not in group.block
+    }
+    inputs = {n: model.probe[n] for n in ordered if model[n].kind in ("input", "fixed")}
+    part = replace(model, nodes=ordered, potentials={}, cache={})
+    return why_not_linear(part, known, inputs) is None
 
 
-def _root(cov: np.ndarray) -> np.ndarray:
-    """Lower Cholesky factors; rounding is made up for on the diagonal."""
-    try:
-        return np.linalg.cholesky(cov)
-    except np.linalg.LinAlgError:
-        size = np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 1e-300)
-        scale = np.sqrt(size)
-        unit = cov / (scale[..., :, None] * scale[..., None, :])
-        values, vectors = np.linalg.eigh(unit)
-        fixed = (vectors * np.maximum(values, 1e-12)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
-        return scale[..., :, None] * np.linalg.cholesky(fixed)
+def _once(model: Model, key: Any, find: Callable[[], Any]) -> Any:
+    """What was found of a model before, or is found now: rows with gaps have their steps built anew."""
+    kept = model.cache.setdefault("looking ahead", {})
+    if key not in kept:
+        kept[key] = find()
+    return kept[key]

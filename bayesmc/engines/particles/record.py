@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries, observed_answers
-from bayesmc.engines.particles.belief import expectation, moments, table_of_states
+from bayesmc.engines.particles.belief import (
+    covariance,
+    expectation,
+    moments,
+    probability,
+    quantiles,
+    table_of_states,
+)
 from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.results import SeriesPosterior
 
@@ -45,7 +53,7 @@ class Record:
         self.increments = np.empty((steps, *layout.lead))
         self.ess = np.empty((steps, *layout.lead))
         self.resampled = np.zeros((steps, *layout.lead), dtype=bool)
-        self.rejuvenated = np.zeros(steps, dtype=bool)
+        self.rejuvenated = np.zeros((steps, *layout.lead), dtype=bool)
         self.unique = np.full((steps, *layout.lead), layout.particles)
         self._nodes = [(n, model[n], len(model[n].value_shape)) for n in problem.hidden]
 
@@ -55,11 +63,13 @@ class Record:
         self.increments[k] = cloud.increment
         self.ess[k] = cloud.ess
         self.resampled[k] = cloud.resampled
-        self.rejuvenated[k] = cloud.rejuvenated
         if cloud.ancestors is not None:
             changes = cloud.ancestors[1:] != cloud.ancestors[:-1]
             along = 0 if layout.apart else None  # without an axis it is ten times faster
             self.unique[k] = np.count_nonzero(changes, axis=along) + 1
+        if cloud.rejuvenated is not False:
+            self.rejuvenated[k] = cloud.rejuvenated
+            self.unique[k] = np.where(cloud.rejuvenated, 0, self.unique[k])
         for name, node, rank in self._nodes:
             value = cloud.values[name]
             if node.domain is not None:
@@ -99,7 +109,19 @@ class FilteredParticles(SeriesPosterior):
     Attributes
     ----------
     clouds : list of Cloud or None
-        Particles of all slices, with ``keep="particles"``.
+        Particles of all slices, with ``keep="particles"``; functions of nodes, quantiles and covariances can
+        be asked for then.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 1.0), initial=bmc.Normal(0.0, 2.0))
+    >>> dbn.add("y", lambda x: bmc.StudentT(4.0, x, 0.5))
+    >>> engine = bmc.ParticleFilter(1000)
+    >>> filtered = bmc.filter(dbn, {"y": [1.2, 0.4]}, engine=engine, rng=0, keep="particles")
+    >>> filtered.quantile("x", [0.1, 0.9]).shape, filtered.probability(lambda x: x > 0).shape
+    ((2, 2), (2,))
     """
 
     clouds: list[Cloud] | None = None
@@ -121,13 +143,41 @@ class FilteredParticles(SeriesPosterior):
 
     @property
     def ancestors(self) -> np.ndarray:
-        """Positions of the ancestors in the slice before, shape ``(time, particles, *plates)``."""
+        """Positions of the ancestors in the slice before, shape ``(time, particles, *plates)``.
+
+        Particles that were drawn anew have none: -1.
+        """
         clouds, layout = self._kept("ancestors")
         own = np.arange(layout.particles).reshape((-1,) + (1,) * len(layout.apart))
         shape = (layout.particles, *layout.lead)
-        return np.stack(
-            [np.broadcast_to(own if c.ancestors is None else c.ancestors, shape) for c in clouds]
-        )
+        rows = []
+        for cloud in clouds:
+            found = own if cloud.ancestors is None else cloud.ancestors
+            rows.append(np.broadcast_to(np.where(cloud.rejuvenated, -1, found), shape))
+        return np.stack(rows)
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Means of a function of nodes of a slice, time first; see ``ParticleBelief.expectation``."""
+        clouds, layout = self._kept("expectation")
+        return np.stack([expectation(layout, c, self.model, function) for c in clouds])
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probabilities of an event (a function that returns booleans), time first."""
+        clouds, layout = self._kept("probability")
+        return np.stack([probability(layout, c, self.model, function) for c in clouds])
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
+        clouds, layout = self._kept("quantile")
+        node = self._node(name)
+        return np.stack([quantiles(layout, c, node, c.values[name], q) for c in clouds])
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""
+        clouds, layout = self._kept("cov")
+        nodes = [self._node(name) for name in names]
+        rows = [covariance(layout, c, [(n, c.values[n.name]) for n in nodes]) for c in clouds]
+        return np.stack(rows)
 
     def _kept(self, what: str) -> tuple[list[Cloud], Layout]:
         if self.clouds is None or self.layout is None:

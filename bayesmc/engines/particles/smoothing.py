@@ -5,6 +5,12 @@ the density of what was drawn after it. Exactly that costs trajectories x partic
 density is known to be bounded, particles are drawn by weight and accepted with its share of the bound
 instead, and only what is still open after some rounds is drawn exactly.
 
+Elements of plates that are filtered separately have a past each: positions have shape ``(rows, *apart)``, and
+what is still open is packed to the front in every element for itself.
+
+Where a filter began anew (rejuvenation), nothing is known of how its particles came about: there both kinds
+of smoothing take the slice before as the filter left it.
+
 References
 ----------
 Godsill, Doucet and West (2004), Monte Carlo smoothing for nonlinear time series, JASA 99; Douc, Garivier,
@@ -14,23 +20,23 @@ fast particle smoothing.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Series, Slices
 from bayesmc.distributions import Cauchy, Laplace, MvNormal, Normal, StudentT
 from bayesmc.engines.particles.cloud import Cloud, Layout, along_plates, even_cloud
-from bayesmc.engines.slice_steps import SlicePlan
-from bayesmc.network.forward import Compute, Pass, Step, WeighDrawn
-from bayesmc.resampling import systematic
+from bayesmc.engines.slice_steps import SlicePlan, size_of
+from bayesmc.network.forward import Compute, Pass, Step, WeighDrawn, summed
+from bayesmc.resampling import multinomial, systematic
 
-#: pairs of trajectories and particles in one call
+#: numbers of all pairs of trajectories and particles in one call
 _PAIRS = 1 << 18
 #: rounds of rejection before what is open is drawn exactly
 _ROUNDS = 40
-#: families that are highest at ``loc``
+#: families that are highest at ``loc``; a family derived from one of them need not be
 _LOCATION = (Normal, MvNormal, StudentT, Laplace, Cauchy)
 
 
@@ -50,7 +56,8 @@ class Backward:
         self.plan, self.layout = plan, layout
         self.slices: Slices = plan.slices
         self.steps, self.crossing = _crossing(plan)
-        self.rejection = rejection and not layout.apart and _is_bounded(plan, self.crossing)
+        self.computed = [step for step in self.steps if isinstance(step, Compute)]
+        self.rejection = rejection and _is_bounded(plan, self.crossing)
         #: draws accepted by the bound, and drawn exactly
         self.accepted = self.exact = 0
 
@@ -60,43 +67,64 @@ class Backward:
         """So many trajectories, as one cloud of equal weights per slice."""
         layout = Layout(count, self.layout.apart, self.layout.lead)
         last = clouds[-1]
-        index = systematic(last.weights, count, rng)
-        index = rng.permuted(index, axis=0) if count > 1 else index
-        found = [even_cloud(last.t, self._taken(last, index), layout)]
+        values = self._taken(last.values, _at_random(last, count, rng))
+        found = [even_cloud(last.t, values, layout)]
         for k in range(len(clouds) - 2, -1, -1):
-            index = self._drawn(clouds[k], found[-1], series, k, rng)
-            found.append(even_cloud(clouds[k].t, self._taken(clouds[k], index), layout))
+            after = found[-1]
+            index = self._drawn(clouds[k], after, series, k, clouds[k + 1].rejuvenated, rng)
+            values = self._taken(clouds[k].values, index)
+            found[-1] = after._replace(values=self._computed(values, after.values, series, k))
+            found.append(even_cloud(clouds[k].t, values, layout))
         return found[::-1]
 
     def log_densities(
-        self, cloud: Cloud, after: dict[str, np.ndarray], series: Series, k: int
+        self, cloud: Cloud, after: Mapping[str, np.ndarray], series: Series, k: int, draws: int
     ) -> np.ndarray:
-        """Log density of slices ``after`` the k-th given every particle, shape (draws, particles, *apart)."""
+        """Log density of slices ``after`` the k-th given every particle, shape (draws, particles, *apart).
+
+        What was seen has no axis for draws or particles, so their numbers come from elsewhere.
+        """
         before = {
             n: v[None] if v.ndim > self._trailing(n) else v for n, v in self._before(cloud).items()
         }
         now = {n: v[:, None] if v.ndim > self._trailing(n) else v for n, v in after.items()}
-        draws = max((len(v) for n, v in after.items() if v.ndim > self._trailing(n)), default=1)
         return self._log(before, now, series, k, (draws, self.layout.particles))
 
     # ---- private -------------------------------------------------------------------------------
 
     def _drawn(
-        self, cloud: Cloud, after: Cloud, series: Series, k: int, rng: np.random.Generator
+        self,
+        cloud: Cloud,
+        after: Cloud,
+        series: Series,
+        k: int,
+        anew: bool | np.ndarray,
+        rng: np.random.Generator,
     ) -> np.ndarray:
-        """For every trajectory a particle of the k-th cloud, shape (draws, *apart)."""
-        count = len(after.weights)
-        found = np.empty((count, *self.layout.lead), dtype=np.intp)
-        open_ = np.arange(count)
-        if self.rejection:
-            open_ = self._by_rejection(cloud, after, series, k, rng, found)
-        block = max(1, _PAIRS // self.layout.particles)
-        for low in range(0, len(open_), block):
-            mine = open_[low : low + block]
-            values = {n: _rows(v, mine, self._trailing(n)) for n, v in after.values.items()}
-            log = self.log_densities(cloud, values, series, k) + cloud.log_weights
-            found[mine] = _picked(log, rng)
-        self.exact += len(open_)
+        """For every trajectory a particle of the k-th cloud, shape (draws, *apart).
+
+        Where the slice after began ``anew``, its density given the one before means nothing.
+        """
+        shape = (len(after.weights), *self.layout.lead)
+        found = np.empty(shape, dtype=np.intp)
+        if np.any(anew):
+            found[...] = _at_random(cloud, len(found), rng)
+        own = np.arange(len(found)).reshape((-1,) + (1,) * len(self.layout.lead))
+        rows, wanted = _packed(
+            np.broadcast_to(own, shape), np.broadcast_to(~np.asarray(anew), shape)
+        )
+        if self.rejection and len(rows):
+            rows, wanted = self._by_rejection(cloud, after, series, k, rows, wanted, found, rng)
+        block = max(1, _PAIRS // (self.layout.particles * max(size_of(self.slices), 1)))
+        for low in range(0, len(rows), block):
+            mine, asked = rows[low : low + block], wanted[low : low + block]
+            values = self._taken(after.values, mine)
+            log = self.log_densities(cloud, values, series, k, len(mine)) + cloud.log_weights
+            # where no particle explains what came after, there is only the filter's word
+            explained = np.any(log > -np.inf, axis=1, keepdims=True)
+            log = log if explained.all() else np.where(explained, log, cloud.log_weights)
+            _put(found, mine, _picked(log, rng), asked)
+        self.exact += int(np.count_nonzero(wanted))
         return found
 
     def _by_rejection(
@@ -105,85 +133,97 @@ class Backward:
         after: Cloud,
         series: Series,
         k: int,
-        rng: np.random.Generator,
+        rows: np.ndarray,
+        wanted: np.ndarray,
         found: np.ndarray,
-    ) -> np.ndarray:
-        """Fill ``found`` where a draw was accepted; gives the trajectories that are still open."""
-        open_ = np.arange(len(found))
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Fill ``found`` where a draw was accepted; gives what is still open, as it was given."""
         bound = self._bound(cloud, series, k)
-        if not math.isfinite(bound):
-            return open_
-        edges = np.cumsum(cloud.weights)
-        edges /= edges[-1]
-        before = self._before(cloud)
+        if not np.isfinite(bound).all():
+            return rows, wanted
+        supply, before = _Supply(cloud.weights, len(rows), rng), self._before(cloud)
         for _ in range(_ROUNDS):
-            tried = np.searchsorted(edges, rng.random(len(open_)), side="right")
-            tried = np.minimum(tried, len(edges) - 1)
-            old = {n: _rows(v, tried, self._trailing(n)) for n, v in before.items()}
-            new = {n: _rows(v, open_, self._trailing(n)) for n, v in after.values.items()}
-            log = self._log(old, new, series, k, (len(open_),))
-            good = -rng.standard_exponential(len(open_)) < log - bound
-            found[open_[good]] = tried[good]
-            self.accepted += int(good.sum())
-            open_ = open_[~good]
-            if not len(open_) or good.mean() < 1.0 / self.layout.particles:
-                break
-        return open_
+            tried = supply.take(len(rows))
+            old, new = self._taken(before, tried), self._taken(after.values, rows)
+            log = self._log(old, new, series, k, (len(rows),))
+            good = wanted & (-rng.standard_exponential(rows.shape) < log - bound)
+            _put(found, rows, tried, good)
+            accepted = int(np.count_nonzero(good))
+            self.accepted += accepted
+            rows, wanted = _packed(rows, wanted & ~good)
+            if not len(rows) or accepted * self.layout.particles < good.size:
+                break  # what a round costs is no longer saved
+        return rows, wanted
 
-    def _bound(self, cloud: Cloud, series: Series, k: int) -> float:
-        """The largest log density that the slice after the k-th can have after any particle."""
-        row, model = series.row(k + 1), self.slices.later
-        before = {n + PREVIOUS: v for n, v in self._before(cloud).items()}
-        state = Pass(
-            np.random.default_rng(0), (self.layout.particles,), {**self.plan.known(row), **before}
-        )
-        total = 0.0
+    def _bound(self, cloud: Cloud, series: Series, k: int) -> np.ndarray:
+        """The largest log density of the slice after the k-th given any particle, shape (*apart,).
+
+        Infinite where none is known.
+        """
+        row, model, apart = series.row(k + 1), self.slices.later, self.layout.apart
+        known = {**self.plan.known(row)}
+        known |= {n + PREVIOUS: v for n, v in self._before(cloud).items()}
+        total = np.zeros(self.layout.lead)
         for name in self.slices.dynamic:
             node = model[name]
-            if name not in self.crossing:
-                continue
-            if node.domain is not None:
+            if name not in self.crossing or node.domain is not None:
                 continue  # a probability is at most one
-            dist, _ = model.evaluate(name, state.values)
-            top = np.asarray(dist.log_prob(dist.loc))
-            lead = np.broadcast_shapes(top.shape, (1,) * (1 + len(node.plates)))
-            full = np.broadcast_to(top.reshape(lead), (lead[0], *node.plate_shape))
-            total += float(full.reshape(len(full), -1).sum(axis=1).max())
+            dist, _ = model.evaluate(name, known)
+            if type(dist) not in _LOCATION:  # its function may return one family now, another then
+                return np.full(self.layout.lead, np.inf)
+            top = summed(np.asarray(dist.log_prob(dist.loc)), node, apart)
+            total = total + (top.max(axis=0) if top.ndim > len(apart) else top)
         return total
 
     def _log(
         self,
-        before: dict[str, np.ndarray],
-        now: dict[str, np.ndarray],
+        before: Mapping[str, np.ndarray],
+        now: Mapping[str, np.ndarray],
         series: Series,
         k: int,
         batch: tuple[int, ...],
     ) -> np.ndarray:
         """Log density of the slice after the k-th: factors that the slice before enters."""
-        known = {**self.plan.known(series.row(k + 1)), **now}  # fillers stand for what is missing
-        known |= {n + PREVIOUS: v for n, v in before.items()}
-        state = Pass(np.random.default_rng(0), batch, known)
-        for step in self.steps:
-            step(state)
+        state = self._passed(self.steps, before, now, series, k, batch)
         return np.broadcast_to(
             np.asarray(state.log_weight, dtype=float), (*batch, *self.layout.lead)
         )
 
+    def _computed(
+        self,
+        before: Mapping[str, np.ndarray],
+        now: Mapping[str, np.ndarray],
+        series: Series,
+        k: int,
+    ) -> dict[str, np.ndarray]:
+        """Values of the slice after the k-th, with what is computed from the slice before as now drawn."""
+        if not self.computed:
+            return dict(now)
+        state = self._passed(self.computed, before, now, series, k, ())
+        return {name: state.values[name] for name in now}
+
+    def _passed(
+        self,
+        steps: Sequence[Step],
+        before: Mapping[str, np.ndarray],
+        now: Mapping[str, np.ndarray],
+        series: Series,
+        k: int,
+        batch: tuple[int, ...],
+    ) -> Pass:
+        known = {**self.plan.known(series.row(k + 1)), **now}  # fillers stand for what is missing
+        known |= {n + PREVIOUS: before[n] for n in self.slices.interface}
+        state = Pass(np.random.default_rng(0), batch, known)
+        for step in steps:
+            step(state)
+        return state
+
     def _before(self, cloud: Cloud) -> dict[str, np.ndarray]:
         return {n: cloud.values[n] for n in self.slices.interface}
 
-    def _taken(self, cloud: Cloud, index: np.ndarray) -> dict[str, np.ndarray]:
-        """Values of chosen particles of a cloud."""
-        found = {}
-        for name, value in cloud.values.items():
-            node = self.slices.later[name]
-            if value.ndim == len(node.value_shape):
-                found[name] = value
-            elif not self.layout.apart:
-                found[name] = value.take(index, axis=0)
-            else:
-                found[name] = along_plates(value, index, node.plates, self.layout.apart)
-        return found
+    def _taken(self, values: Mapping[str, np.ndarray], index: np.ndarray) -> dict[str, np.ndarray]:
+        return _taken(values, index, self.slices, self.layout.apart)
 
     def _trailing(self, name: str) -> int:
         return len(self.slices.later[name].value_shape)
@@ -205,35 +245,92 @@ def carried(slices: Slices) -> tuple[str, ...]:
     return tuple(found)
 
 
-def ancestors_of(clouds: Sequence[Cloud], layout: Layout, slices: Slices) -> dict[str, np.ndarray]:
-    """Values in the first of some clouds in a row of the ancestors of the particles of the last."""
+def lagged(clouds: Sequence[Cloud], layout: Layout, slices: Slices) -> Cloud:
+    """What the last of some clouds in a row says of the first: ancestors of its particles, with its weights.
+
+    A particle that was drawn anew has no ancestors. Where that happened, the last cloud before it speaks.
+    """
+    shape = (layout.particles, *layout.lead)
+    own = np.arange(shape[0]).reshape((-1,) + (1,) * len(layout.lead))
     index: np.ndarray | None = None
-    for cloud in reversed(clouds[1:]):
-        if cloud.ancestors is None:
-            continue
-        index = cloud.ancestors if index is None else _composed(cloud.ancestors, index)
+    spoken = clouds[-1]
+    for before, cloud in reversed(list(pairwise(clouds))):
+        anew = np.asarray(cloud.rejuvenated)
+        if not anew.all() and cloud.ancestors is not None:
+            ancestors = np.where(anew, own, cloud.ancestors)
+            index = ancestors if index is None else np.take_along_axis(ancestors, index, axis=0)
+        if anew.any():
+            spoken = _either(anew, before, spoken)
+            index = None if index is None else np.where(anew, own, index)
     values = clouds[0].values
-    if index is None:
-        return values
-    found = {}
-    for name, value in values.items():
-        node = slices.later[name]
-        if value.ndim == len(node.value_shape):
-            found[name] = value
-        elif not layout.apart:
-            found[name] = value.take(index, axis=0)
-        else:
-            found[name] = along_plates(value, index, node.plates, layout.apart)
-    return found
+    if index is not None:
+        values = _taken(values, index, slices, layout.apart)
+    return spoken._replace(t=clouds[0].t, values=values)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _composed(ancestors: np.ndarray, index: np.ndarray) -> np.ndarray:
-    if ancestors.ndim == 1:
-        return ancestors[index]
-    return np.take_along_axis(ancestors, index, axis=0)
+class _Supply:
+    """Independent positions by weight, shape (count, *apart), made many at a time."""
+
+    def __init__(self, weights: np.ndarray, size: int, rng: np.random.Generator) -> None:
+        self.weights, self.size, self.rng = weights, size, rng
+        self._left = np.empty((0, *weights.shape[1:]), dtype=np.intp)
+
+    def take(self, count: int) -> np.ndarray:
+        if count > len(self._left):
+            sorted_ = multinomial(self.weights, max(self.size, count), self.rng)
+            self._left = self.rng.permuted(sorted_, axis=0)
+        found, self._left = self._left[:count], self._left[count:]
+        return found
+
+
+def _at_random(cloud: Cloud, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Positions by the cloud's weights, in no order, shape (count, *apart)."""
+    return rng.permuted(systematic(cloud.weights, count, rng), axis=0)
+
+
+def _taken(
+    values: Mapping[str, np.ndarray], index: np.ndarray, slices: Slices, apart: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Values at chosen positions, shape (rows, *apart); what all particles agree on stays as it is."""
+    found = {}
+    for name, value in values.items():
+        node = slices.later[name]
+        if value.ndim == len(node.value_shape):
+            found[name] = value
+        elif not apart:
+            found[name] = value.take(index, axis=0)
+        else:
+            found[name] = along_plates(value, index, node.plates, apart)
+    return found
+
+
+def _packed(rows: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of which something is wanted: to the front in every element, cut where nobody wants more."""
+    most = int(wanted.sum(axis=0).max())
+    order = np.argsort(~wanted, axis=0, kind="stable")[:most]
+    return np.take_along_axis(rows, order, axis=0), np.take_along_axis(wanted, order, axis=0)
+
+
+def _put(found: np.ndarray, rows: np.ndarray, values: np.ndarray, where: np.ndarray) -> None:
+    """``found[rows] = values`` in every element, where asked for."""
+    old = np.take_along_axis(found, rows, axis=0)
+    np.put_along_axis(found, rows, np.where(where, values, old), axis=0)
+
+
+def _either(anew: np.ndarray, before: Cloud, after: Cloud) -> Cloud:
+    """A cloud with the weights of the one ``before`` in some elements of the plates apart."""
+    if not anew.ndim:
+        return before
+    return after._replace(
+        log_weights=np.where(anew, before.log_weights, after.log_weights),
+        weights=np.where(anew, before.weights, after.weights),
+        total=np.where(anew, before.total, after.total),
+        log_total=np.where(anew, before.log_total, after.log_total),
+        ess=np.where(anew, before.ess, after.ess),
+    )
 
 
 def _crossing(plan: SlicePlan) -> tuple[list[Step], frozenset[str]]:
@@ -266,13 +363,9 @@ def _is_bounded(plan: SlicePlan, crossing: frozenset[str]) -> bool:
         if own & set(node.parents):
             return False
         dist, _ = model.evaluate(name, {**model.probe, **plan.static})
-        if not isinstance(dist, _LOCATION):
+        if type(dist) not in _LOCATION:
             return False
     return True
-
-
-def _rows(value: np.ndarray, index: np.ndarray, trailing: int) -> np.ndarray:
-    return value if value.ndim == trailing else value.take(index, axis=0)
 
 
 def _picked(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:

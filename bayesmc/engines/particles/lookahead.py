@@ -1,0 +1,386 @@
+"""A block of hidden numbers as a Gaussian, given the slice before and what was seen below the block.
+
+Means are made linear where the block is expected (central differences) and moments are taken there: an
+extended Kalman update from a known start, one for every particle. It gives a density to draw the block from
+and the density of what was seen. Which nodes make a block is not decided here (``optimal``).
+
+Nodes on a circle count differences the short way round.
+
+References
+----------
+Doucet, Godsill and Andrieu (2000), On sequential Monte Carlo sampling methods for Bayesian filtering,
+Statistics and Computing 10, sec. II-D.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.distributions import WrappedNormal
+from bayesmc.distributions.circular import wrap_angle
+from bayesmc.network import CompiledNode, Model
+from bayesmc.network.forward import Pass, Step, run
+
+#: balances the rounding of a central difference against its curvature
+_STEP = float(np.finfo(float).eps ** (1 / 3))
+#: times that means are made linear anew, where the block is now expected
+_TURNS = 5
+#: standard deviations by which the block may still have moved in the last of them
+_STILL = 0.01
+#: share of the particles that a guarded block draws from its own densities
+SHARE = 0.1
+_HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
+#: variance in square radians from which on a Gaussian is no picture of an angle: it has more than one mode
+_TURNED = 1.0
+
+
+class Belief(NamedTuple):
+    """A block given what was seen, for every particle.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (*batch, *apart, numbers)
+    cov : ndarray, shape (*batch, *apart, numbers, numbers)
+    log_density : ndarray, shape (*batch, *apart)
+        Of what was seen, the block integrated out.
+    """
+
+    mean: np.ndarray
+    cov: np.ndarray
+    log_density: np.ndarray
+
+
+class LookAhead:
+    """Draws a block of numbers from their law given what was seen, made Gaussian, and weighs by 1/q.
+
+    Parameters
+    ----------
+    model : Model
+    block : sequence of str
+        Normal and MvNormal nodes, parents first.
+    seen : dict
+        Node that depends on the block -> mask of the elements seen, shape ``plates``; None for all.
+    order : sequence of str
+        Nodes of the slice, parents first.
+    apart : tuple of str
+        Plates whose elements have blocks of their own.
+    affine : bool
+        Whether all means are affine in the block: differences may take long steps, which lose no digits.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        block: Sequence[str],
+        seen: Mapping[str, np.ndarray | None],
+        order: Sequence[str],
+        apart: tuple[str, ...],
+        affine: bool = False,
+    ) -> None:
+        self.model, self.block, self.seen = model, list(block), dict(seen)
+        self.apart, self.affine = apart, affine
+        self.share = 1.0 if affine else _STEP
+        self.lead = tuple(model.sizes[p] for p in apart)
+        self.sizes = [self._numbers(model[n]) for n in self.block]
+        self.total = sum(self.sizes)
+        self.between = {n: _between(model, order, block, n) for n in (*self.block, *self.seen)}
+        self.masks = {
+            n: self._flat(
+                model[n], np.broadcast_to(_over_events(m, model[n]), model[n].value_shape)
+            )
+            for n, m in self.seen.items()
+            if m is not None
+        }
+
+    def __call__(self, state: Pass) -> None:
+        state.weigh(-self.draw(state, self.believed(state)))
+
+    def believed(self, state: Pass) -> Belief:
+        """The block given its parents, whose values are in place, and what was seen.
+
+        Means that are not affine are made linear again where the block is then expected (Gauss-Newton steps).
+        """
+        shape = (*state.batch, *self.lead)
+        mean, cov = np.zeros((*shape, self.total)), np.zeros((*shape, self.total, self.total))
+        at = 0
+        for name, size in zip(self.block, self.sizes, strict=True):
+            own = slice(at, at + size)
+            centre, slopes, noise = self._linear(state, name, size, mean, cov, at)
+            cross = _times(slopes, cov[..., :at, :at])
+            mean[..., own] = centre
+            cov[..., own, :at] = cross
+            cov[..., :at, own] = np.swapaxes(cross, -1, -2)
+            cov[..., own, own] = _times(cross, np.swapaxes(slopes, -1, -2)) + noise
+            at += size
+        start = belief = Belief(mean, cov, np.zeros(shape))
+        for turn in range(1 if self.affine else _TURNS):
+            at_mean, belief = belief.mean, start
+            for name in self.seen:
+                point = belief.mean if turn == 0 else at_mean
+                belief = self._updated(state, name, belief, point)
+            moved = np.abs(belief.mean - at_mean)
+            spread = np.sqrt(np.diagonal(belief.cov, axis1=-2, axis2=-1))
+            if not (moved > _STILL * spread).any():
+                break
+        return belief
+
+    def draw(self, state: Pass, belief: Belief) -> np.ndarray:
+        """Put a draw of the block among the values; its log density, shape ``(*batch, *apart)``."""
+        root = _root(belief.cov)
+        noise = state.rng.standard_normal(belief.mean.shape)
+        state.values.update(self._split(belief.mean + _applied(root, noise)))
+        return self._log_normal(noise, root)
+
+    def log_density(self, values: Mapping[str, np.ndarray], belief: Belief) -> np.ndarray:
+        """The log density of a block's values, shape ``(*batch, *apart)``."""
+        batch = belief.mean.shape[: belief.mean.ndim - 1]
+        parts = [self._flat(self.model[n], values[n], batch) for n in self.block]
+        root, off = _root(belief.cov), np.concatenate(parts, axis=-1) - belief.mean
+        one = self.total == 1
+        noise = off / root[..., 0] if one else np.linalg.solve(root, off[..., None])[..., 0]
+        return self._log_normal(noise, root)
+
+    def along(self, flags: np.ndarray, node: CompiledNode) -> np.ndarray:
+        """What is said of every block, shape ``(*batch, *apart)``, laid along a node's values."""
+        first = flags.ndim - len(self.apart)
+        order = [first + self.apart.index(p) for p in node.plates if p in self.apart]
+        moved = flags.transpose(*range(first), *order)
+        sizes = [
+            n if p in self.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
+        ]
+        return moved.reshape(*flags.shape[:first], *sizes, *(1,) * len(node.event_shape))
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _log_normal(self, noise: np.ndarray, root: np.ndarray) -> np.ndarray:
+        log = -0.5 * np.vecdot(noise, noise) - self.total * _HALF_LOG_2PI
+        found: np.ndarray = log - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
+        return found
+
+    def _updated(self, state: Pass, name: str, belief: Belief, point: np.ndarray) -> Belief:
+        """The belief given the value of one seen node, made linear at a point."""
+        mean, cov, log_density = belief
+        node = self.model[name]
+        size = self._numbers(node)
+        centre, slopes, noise = self._linear(state, name, size, point, cov, self.total)
+        off = self._flat(node, np.asarray(state.values[name], dtype=float)) - centre
+        off = wrap_angle(off) if _is_angle(node) else off
+        off = off - _applied(slopes, mean - point)
+        inner = _times(_times(slopes, cov), np.swapaxes(slopes, -1, -2)) + noise
+        var = np.diagonal(inner, axis1=-2, axis2=-1)
+        alone: Any = 0.0
+        blind = ~(np.isfinite(off) & np.isfinite(var) & (var > 0))
+        if name in self.masks:
+            blind |= ~self.masks[name]
+        if _is_angle(node):
+            wide = (var > _TURNED) & ~blind
+            spread, at = np.sqrt(np.where(wide, var, 1.0)), np.where(wide, off, 0.0)
+            alone = np.where(wide, WrappedNormal(0.0, spread).log_prob(at), 0.0).sum(axis=-1)
+            blind |= wide
+        if blind.any():  # these tell nothing of the block: no slope, and noise of their own
+            slopes = np.where(blind[..., None], 0.0, slopes)
+            off = np.where(blind, 0.0, off)
+            apart = blind[..., :, None] | blind[..., None, :]
+            noise = np.where(apart, np.eye(size), noise)
+            alone = alone + _HALF_LOG_2PI * blind.sum(axis=-1)
+        gain = _times(cov, np.swapaxes(slopes, -1, -2))
+        inner = _times(slopes, gain) + noise
+        if size == 1:
+            weights = gain / inner
+            log = -0.5 * (off[..., 0] ** 2 / inner[..., 0, 0] + np.log(inner[..., 0, 0]))
+        else:
+            weights = np.swapaxes(np.linalg.solve(inner, np.swapaxes(gain, -1, -2)), -1, -2)
+            distance = np.vecdot(off, np.linalg.solve(inner, off[..., None])[..., 0])
+            log = -0.5 * (distance + np.linalg.slogdet(inner)[1])
+        log_density = log_density + log - size * _HALF_LOG_2PI + alone
+        rest = np.eye(self.total) - _times(weights, slopes)
+        cov = _times(_times(rest, cov), np.swapaxes(rest, -1, -2))  # Joseph's form: it stays positive
+        cov = cov + _times(_times(weights, noise), np.swapaxes(weights, -1, -2))
+        return Belief(mean + _applied(weights, off), cov, log_density)
+
+    def _linear(
+        self, state: Pass, name: str, size: int, mean: np.ndarray, cov: np.ndarray, count: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A node's mean where the block is expected, its slopes in the first ``count`` numbers, its noise."""
+        spread = np.sqrt(np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 0.0))
+        steps = self.share * np.maximum(np.abs(mean), np.maximum(spread, 1e-3))
+        points = np.broadcast_to(mean, (1 + 2 * count, *mean.shape)).copy()
+        for k in range(count):
+            points[1 + k, ..., k] += steps[..., k]
+            points[1 + count + k, ..., k] -= steps[..., k]
+        values = {**state.values, **self._split(points)}
+        for other in self.between[name]:
+            found, _ = self.model.evaluate(other, values)
+            values[other] = np.asarray(found)
+        dist, _ = self.model.evaluate(name, values)
+        node = self.model[name]
+        lead = (len(points), *mean.shape[:-1])
+        loc = self._spread_out(
+            node, np.asarray(dist.mean, dtype=float), lead, len(node.event_shape)
+        )
+        loc = loc.reshape(*lead, size)
+        slopes = np.zeros((*mean.shape[:-1], size, count))
+        for k in range(count):
+            rise = loc[1 + k] - loc[1 + count + k]
+            rise = wrap_angle(rise) if _is_angle(node) else rise
+            slopes[..., k] = rise / (2 * steps[..., k, None])
+        return loc[0], slopes, self._noise(node, dist, lead, size)
+
+    def _noise(self, node: CompiledNode, dist: Any, lead: tuple[int, ...], size: int) -> np.ndarray:
+        """Covariance of a node given the block where that is expected."""
+        if node.event_shape:
+            cov = self._spread_out(node, np.asarray(dist.cov, dtype=float), lead, 2)
+            inner = node.event_shape[-1]
+            cov = cov.reshape(*lead, size // inner, inner, inner)[0]
+            full = np.zeros((*cov.shape[:-3], size, size))
+            for k in range(size // inner):
+                part = slice(k * inner, (k + 1) * inner)
+                full[..., part, part] = cov[..., k, :, :]
+            return full
+        var = self._spread_out(node, np.asarray(dist.var, dtype=float), lead, 0)
+        full = np.zeros((*lead[1:], size, size))
+        index = np.arange(size)
+        full[..., index, index] = var.reshape(*lead, size)[0]
+        return full
+
+    def _numbers(self, node: CompiledNode) -> int:
+        """How many numbers a node has, plates apart not counted."""
+        sizes = zip(node.plates, node.plate_shape, strict=True)
+        return math.prod(n for p, n in sizes if p not in self.apart) * math.prod(node.event_shape)
+
+    def _spread_out(
+        self, node: CompiledNode, array: np.ndarray, lead: tuple[int, ...], event_ndim: int
+    ) -> np.ndarray:
+        """With all axes, plates apart right after the batch, shape ``(*lead, *other plates, *event)``."""
+        event = array.shape[array.ndim - event_ndim :]
+        batch = lead[: len(lead) - len(self.lead)]
+        full = np.broadcast_to(array, (*batch, *node.plate_shape, *event))
+        order = [node.plates.index(p) for p in self.apart]
+        order += [k for k, p in enumerate(node.plates) if p not in self.apart]
+        first = len(batch)
+        tail = range(first + len(node.plates), full.ndim)
+        return full.transpose(*range(first), *(first + k for k in order), *tail)
+
+    def _flat(
+        self, node: CompiledNode, value: np.ndarray, lead: tuple[int, ...] | None = None
+    ) -> np.ndarray:
+        """A value, shape ``(*lead, numbers)``; ``lead`` ends in the plates apart, and is these by default."""
+        lead = self.lead if lead is None else lead
+        moved = self._spread_out(node, value, lead, len(node.event_shape))
+        return moved.reshape(*lead, -1)
+
+    def _split(self, joined: np.ndarray) -> dict[str, np.ndarray]:
+        """Values of the block's nodes, ``(*batch, *plates, *event)``."""
+        found, at = {}, 0
+        batch = joined.shape[: joined.ndim - 1 - len(self.lead)]
+        for name, size in zip(self.block, self.sizes, strict=True):
+            node = self.model[name]
+            others = [
+                n for p, n in zip(node.plates, node.plate_shape, strict=True) if p not in self.apart
+            ]
+            part = joined[..., at : at + size].reshape(
+                *batch, *self.lead, *others, *node.event_shape
+            )
+            at += size
+            back = [*self.apart, *(p for p in node.plates if p not in self.apart)]
+            first = len(batch)
+            order = [first + back.index(p) for p in node.plates]
+            tail = range(first + len(node.plates), part.ndim)
+            part = np.ascontiguousarray(part.transpose(*range(first), *order, *tail))
+            part.flags.writeable = False
+            found[name] = part
+        return found
+
+
+class Guarded:
+    """Draws a block by looking ahead, a share of the particles from its own densities instead; weighs by p/q.
+
+    A Gaussian can be far too narrow where means are not affine. In the mixture no weight is more than
+    1 / ``SHARE`` of what it is when all are drawn from their own densities (Hesterberg 1995, Weighted average
+    importance sampling and defensive mixture distributions, Technometrics 37).
+
+    Parameters
+    ----------
+    look : LookAhead
+    own : sequence of steps
+        Draw the block from its own densities, and compute what lies between.
+    factors : sequence of steps
+        Compute what lies between, and weigh by the block's own densities.
+    """
+
+    def __init__(self, look: LookAhead, own: Sequence[Step], factors: Sequence[Step]) -> None:
+        self.look, self.own, self.factors = look, own, factors
+
+    def __call__(self, state: Pass) -> None:
+        look = self.look
+        belief = look.believed(state)
+        shape = belief.log_density.shape
+        alive = state.alive.reshape(state.batch + (1,) * len(look.apart))
+        dead = np.where(alive, 0.0, -np.inf)  # bad parameters are excused there
+        plain = run(self.own, Pass(state.rng, state.batch, dict(state.values), dead))
+        look.draw(state, belief)
+        plainly = state.rng.random(shape) < SHARE
+        for name in look.block:
+            at = look.along(plainly, look.model[name])
+            mixed = np.where(at, plain.values[name], state.values[name])
+            mixed.flags.writeable = False
+            state.values[name] = mixed
+        drawn = run(self.factors, Pass(state.rng, state.batch, dict(state.values), dead))
+        log_p = np.broadcast_to(drawn.log_weight, shape)
+        log_q = look.log_density(state.values, belief)
+        mixture = np.logaddexp(math.log1p(-SHARE) + log_q, math.log(SHARE) + log_p)
+        state.weigh(log_p - mixture)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _between(
+    model: Model, order: Sequence[str], block: Sequence[str], name: str
+) -> tuple[str, ...]:
+    """What is computed from a block on the way to a node, parents first."""
+    reached, above = set(block), {name}
+    for other in order:
+        if not model[other].is_stochastic and reached & set(model[other].parents):
+            reached.add(other)
+    for other in reversed(order):
+        computed = other in reached and not model[other].is_stochastic
+        if computed and any(other in model[n].parents for n in above):
+            above.add(other)
+    return tuple(n for n in order if n in above - {name})
+
+
+def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """``a @ b``; with one number between them, which is the common case, many times faster."""
+    return a * b if a.shape[-1] == 1 else a @ b
+
+
+def _applied(a: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return a[..., 0] * x if a.shape[-1] == 1 else np.matvec(a, x)
+
+
+def _over_events(mask: np.ndarray, node: CompiledNode) -> np.ndarray:
+    return mask.reshape(mask.shape + (1,) * len(node.event_shape))
+
+
+def _is_angle(node: CompiledNode) -> bool:
+    return node.support is not None and node.support.kind == "circle"
+
+
+def _root(cov: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factors; rounding is made up for on the diagonal."""
+    if cov.shape[-1] == 1:
+        return np.sqrt(np.maximum(cov, 1e-300))
+    try:
+        return np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:
+        size = np.maximum(np.diagonal(cov, axis1=-2, axis2=-1), 1e-300)
+        scale = np.sqrt(size)
+        unit = cov / (scale[..., :, None] * scale[..., None, :])
+        values, vectors = np.linalg.eigh(unit)
+        fixed = (vectors * np.maximum(values, 1e-12)[..., None, :]) @ np.swapaxes(vectors, -1, -2)
+        return scale[..., :, None] * np.linalg.cholesky(fixed)
