@@ -58,7 +58,9 @@ from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
 from bayesmc.engines.metropolis import MetropolisHastings
 from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.rejection import Rejection
 from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.network import BayesNet, FactorGraph
@@ -102,6 +104,7 @@ __all__ = [
     "InverseGamma",
     "InverseWishart",
     "Joint",
+    "KLD",
     "KalmanFilter",
     "KernelDensity",
     "Laplace",
@@ -122,6 +125,7 @@ __all__ = [
     "Poisson",
     "Posterior",
     "RandomWalk",
+    "Recovery",
     "Rejection",
     "SeriesPosterior",
     "StudentT",

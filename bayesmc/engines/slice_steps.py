@@ -154,7 +154,7 @@ class SliceProposals:
         self._looks: dict[Key, frozenset[str]] = {}
         for key, spec in given.items():
             for name in names_of(key):
-                _check_target(slices, name, f"{engine}: proposal for {key!r}")
+                check_target(slices, name, f"{engine}: proposal for {key!r}")
             function = as_function(engine, key, spec, FUNCTION)
             later = bound(engine, slices.later, key, function)
             if not later.is_independent:
@@ -319,10 +319,13 @@ def size_of(slices: Slices) -> int:
     return max((k if n in read else k // _WIDE for n, k in sizes.items()), default=1)
 
 
-# ---- private ------------------------------------------------------------------------------------
+def check_target(slices: Slices, name: str, what: str) -> None:
+    """Refuse what is not drawn in a slice as the target of a density.
 
-
-def _check_target(slices: Slices, name: str, what: str) -> None:
+    Raises
+    ------
+    UnknownNodeError, ModelError
+    """
     template = slices.template
     if name not in template.later:
         raise UnknownNodeError(f"{what}: {unknown(template.later, name)}")
@@ -332,6 +335,9 @@ def _check_target(slices: Slices, name: str, what: str) -> None:
         raise ModelError(
             f"{what}: {name!r} is {kind} and not drawn in a slice; propose a stochastic node"
         )
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _below(slices: Slices, names: tuple[str, ...]) -> frozenset[str]:

@@ -855,6 +855,13 @@ def test_refusals() -> None:
         ({"grid": [1, 2]}, "give a dict"),
         ({"grid": {"z": (0, 1, 10)}}, "'z' is no node with a density"),
         ({"grid": {"x": (1.0, 0.0, 10)}}, "low < high"),
+        ({"grid": {"x": (0.0, np.inf, 10)}}, "low < high"),
+        ({"grid": {"x": (0.0, 1.0, 10.5)}}, "whole number of cells"),
+        ({"grid": {"x": (0.0, 1.0, 1)}}, "2 or more"),
+        ({"grid": {"x": (0.0, 1.0, np.nan)}}, "whole number of cells"),
+        ({"grid": {"x": (-5.0, 5.0)}}, "for points give a list or an array"),
+        ({"grid": {"x": (-5.0, 0.0, 5.0, 6.0)}}, "for points give a list or an array"),
+        ({"grid": {"x": ("low", "high", 10)}}, "no .low, high, cells."),
         ({"grid": {"x": [1.0]}}, "two finite ones or more"),
         ({"grid": {"x": [1.0, 1.0]}}, "must increase"),
         ({"grid": {"x": [(0, 1, 10), (0, 1, 10)]}}, "1 components, but 2 grids"),
@@ -871,6 +878,19 @@ def test_refusals() -> None:
 def test_options_that_are_none(options, fault) -> None:
     with pytest.raises((ValueError, ModelError), match=fault):
         bmc.filter(linear(), {"y": [0.1]}, engine=GridFilter(**options))
+
+
+def test_a_tuple_is_an_interval_and_a_list_is_points() -> None:
+    """A count of cells that came out of a division is a float, and no point."""
+    whole, float_ = (
+        bmc.filter(linear(), {"y": [0.1]}, engine=GridFilter({"x": (-8.0, 8.0, cells)}))
+        for cells in (100, 100.0)
+    )
+    assert len(whole.grid("x")) == len(float_.grid("x")) == 100
+    np.testing.assert_array_equal(whole.mean("x"), float_.mean("x"))
+    with pytest.warns(GridWarning):
+        points = bmc.filter(linear(), {"y": [0.1]}, engine=GridFilter({"x": [-8.0, 8.0, 100.0]}))
+    assert points.grid("x").tolist() == [-8.0, 8.0, 100.0]
 
 
 def test_impossible_rows_and_bad_parameters() -> None:

@@ -182,7 +182,7 @@ def test_the_evidence_of_random_templates_is_unbiased(scheme: str, threshold: fl
 
 def forget_weights(mover: Mover, *arguments: Any) -> Selection:
     found = REAL_SELECTED(mover, *arguments)
-    return Selection(found.ancestors, found.resampled, 0.0, np.log(mover.particles))
+    return found._replace(carried=0.0, spent=np.log(mover.particles))
 
 
 def forget_first_stage(mover: Mover, *arguments: Any) -> Selection:

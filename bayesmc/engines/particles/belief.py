@@ -105,7 +105,7 @@ class ParticleBelief:
     def particles(self, name: str) -> np.ndarray:
         """Values of all particles, ``(particles, *plates, *event)``, not weighted."""
         node, value = self._found(name)
-        full = np.broadcast_to(value, (self._mover.particles, *node.value_shape))
+        full = np.broadcast_to(value, (len(self._cloud.weights), *node.value_shape))
         return np.array(node.decode(full), subok=True)
 
     def mean(self, name: str) -> np.ndarray:
@@ -153,7 +153,7 @@ class ParticleBelief:
         if self.cloud is None:
             return "ParticleBelief(nothing absorbed yet)"
         ess = np.round(self.weight_ess, 1)
-        return f"ParticleBelief(t={self.t}, {self._mover.particles} particles, ess={ess})"
+        return f"ParticleBelief(t={self.t}, {len(self._cloud.weights)} particles, ess={ess})"
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -195,13 +195,13 @@ def expectation(
                 f"{list(cloud.values)}"
             )
         node = model[name]
-        shape = (layout.particles, *node.value_shape)
+        shape = (len(cloud.weights), *node.value_shape)
         arguments.append(node.decode(np.broadcast_to(cloud.values[name], shape)))
     values = read(np.asarray(function(*arguments)))
-    if not values.ndim or len(values) != layout.particles:
+    if not values.ndim or len(values) != len(cloud.weights):
         raise QueryError(
             f"a query returns shape {values.shape}; it must return one value per particle, the axis of "
-            f"{layout.particles} particles first"
+            f"{len(cloud.weights)} particles first"
         )
     if layout.apart and values.shape[1 : 1 + len(layout.apart)] != layout.lead:
         raise QueryError(
@@ -236,7 +236,7 @@ def quantiles(
     levels = np.asarray(q, dtype=float)
     if not ((levels >= 0) & (levels <= 1)).all():
         raise ValueError(f"quantile({node.name!r}, {q!r}): quantiles lie between 0 and 1")
-    numbers = np.broadcast_to(_values(node, value), (layout.particles, *node.value_shape))
+    numbers = np.broadcast_to(_values(node, value), (len(cloud.weights), *node.value_shape))
     if node.angles is not None:  # an order needs a cut: opposite the mean
         mean = _mean(layout, cloud, node, value)
         near = mean + np.remainder(numbers - mean + np.pi, 2 * np.pi) - np.pi
@@ -245,7 +245,7 @@ def quantiles(
     shape = [1] * numbers.ndim
     for axis, size in zip(at, layout.lead, strict=False):
         shape[1 + axis] = size
-    shape[0] = layout.particles
+    shape[0] = len(cloud.weights)
     weights = cloud.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
     weights = np.broadcast_to(weights, numbers.shape)
     return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
@@ -262,7 +262,7 @@ def covariance(
             f"cov: elements of plate {layout.apart[0]!r} are filtered separately, each with weights of its "
             "own; use var, or expectation of a product"
         )
-    n = layout.particles
+    n = len(cloud.weights)
     columns = [
         np.broadcast_to(_values(node, value), (n, *node.value_shape)).reshape(n, -1)
         for node, value in found

@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
+from bayesmc.engines.particles.counts import KLD
+from bayesmc.engines.particles.recovery import Averages, LostSteps
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn
@@ -53,6 +55,10 @@ class Cloud(NamedTuple):
     resampled : ndarray of bool, shape (*apart,)
     rejuvenated : ndarray of bool, shape (*apart,)
         Whether they were drawn anew, since all weights had vanished; such particles have no ancestors.
+    averages : Averages or None
+        How well the last rows were explained, where recovery looks at that.
+    anew : int
+        Particles that recovery let begin anew.
     """
 
     t: int
@@ -66,6 +72,8 @@ class Cloud(NamedTuple):
     ancestors: np.ndarray | None = None
     resampled: Any = False
     rejuvenated: Any = False
+    averages: Averages | None = None
+    anew: int = 0
 
 
 @dataclass(frozen=True)
@@ -102,6 +110,8 @@ class Selection(NamedTuple):
 
     Attributes
     ----------
+    particles : int
+        Of the next slice.
     ancestors : ndarray of int or None
         Sorted positions; None where everybody has one.
     resampled : bool or ndarray of bool, shape (*apart,)
@@ -111,6 +121,7 @@ class Selection(NamedTuple):
         Log of what their sum stands for: an increment is the log of the new sum, less this.
     """
 
+    particles: int
     ancestors: np.ndarray | None
     resampled: Any
     carried: Any
@@ -135,6 +146,10 @@ class Mover:
         ``row -> steps`` of a slice that does not look at the slice before, for where all weights vanish.
     kept : sequence of str, optional
         Nodes whose values clouds hold besides those that the next slice reads; all by default.
+    counts : KLD, optional
+        How many particles a slice needs, ``particles`` at most.
+    recovery : LostSteps, optional
+        Lets a share of the particles begin anew.
     """
 
     def __init__(
@@ -147,7 +162,10 @@ class Mover:
         first_stage: FirstStage | None = None,
         rejuvenate: Callable[[Row], Sequence[Step]] | None = None,
         kept: Sequence[str] | None = None,
+        counts: KLD | None = None,
+        recovery: LostSteps | None = None,
     ) -> None:
+        self.counts, self.recovery = counts, recovery
         self.slices, self.particles = slices, particles
         self.resample, self.threshold = resample, threshold
         self.plan, self.apart = plan, plan.apart
@@ -168,28 +186,32 @@ class Mover:
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""
-        start = Selection(None, np.zeros(self.lead, dtype=bool), 0.0, self._log_particles)
-        return self._moved(row, {}, start, rng)
+        n, never = self.particles, np.zeros(self.lead, dtype=bool)
+        return self._moved(row, {}, Selection(n, None, never, 0.0, self._log_particles), None, rng)
 
     def recycle(self, cloud: Cloud) -> None:
         """Take back the large arrays of a cloud that nobody will look at again."""
-        if self.particles > self.block:
+        if self.particles > self.block and self.counts is None:
             self._spare.put(cloud.weights, cloud.log_weights, *cloud.values.values())
 
     def next(self, cloud: Cloud, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of the next slice: resample if need be, move, weight."""
         values = cloud.values
         before = {previous: values[n] for n, previous in self._before}
-        return self._moved(row, before, self._selected(cloud, before, row, rng), rng)
+        selection = self._selected(cloud, before, row, rng)
+        return self._moved(row, before, selection, cloud.averages, rng)
 
     def _moved(
         self,
         row: Row,
         before: Mapping[str, np.ndarray],
         selection: Selection,
+        averages: Averages | None,
         rng: np.random.Generator,
     ) -> Cloud:
-        values, log = self._passed(self.plan.steps(row), row, before, selection.ancestors, rng)
+        values, log = self._passed(self.plan.steps(row), row, before, selection, rng)
+        if self.recovery is not None:
+            return self._recovered(row, before, selection, averages, values, log, rng)
         cloud = self._weighted(row, values, log, selection)
         if _has_weight(cloud):
             return cloud
@@ -198,6 +220,50 @@ class Mover:
             if _has_weight(cloud):
                 return cloud
         raise self._degenerate(row, before, cloud.values, selection)
+
+    def _recovered(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        selection: Selection,
+        averages: Averages | None,
+        values: dict[str, np.ndarray],
+        log: Any,
+        rng: np.random.Generator,
+    ) -> Cloud:
+        """The cloud where a share of the particles has begun anew."""
+        recovery, n = self.recovery, selection.particles
+        assert recovery is not None
+        lost = np.zeros(0, dtype=np.intp)
+        if before:
+            lost = np.flatnonzero(rng.random(n) < recovery.options.share_of(averages))
+        if lost.size:
+            own = lost if selection.ancestors is None else selection.ancestors[lost]
+            known = self.plan.known(row)
+            known |= {name: self._taken(name, value, own) for name, value in before.items()}
+            state = Pass(rng, (lost.size,), known)
+            for step in recovery.steps(row):
+                step(state)
+            values = {k: self._placed(k, v, state.values[k], lost, n) for k, v in values.items()}
+            log = np.array(np.broadcast_to(log, (n,)), dtype=float)
+            log[lost] = state.log_weight
+        cloud = self._weighted(row, values, log, selection)
+        if not _has_weight(cloud):
+            raise self._degenerate(row, before, cloud.values, selection)
+        if row.seen:
+            averages = recovery.options.averaged(averages, cloud.increment)
+        return cloud._replace(averages=averages, anew=int(lost.size))
+
+    def _placed(
+        self, name: str, value: np.ndarray, new: np.ndarray, at: np.ndarray, n: int
+    ) -> np.ndarray:
+        """A node's values with some particles replaced."""
+        rank = self._ranks[name]
+        if value.ndim == rank and new.ndim == rank:
+            return value  # seen, or the same for all
+        found = np.array(value if value.ndim > rank else np.broadcast_to(value, (n, *value.shape)))
+        found[at] = new
+        return found
 
     def _renewed(
         self,
@@ -210,17 +276,19 @@ class Mover:
     ) -> Cloud:
         """A cloud begun anew where it has no weight left; plate elements that have some stay as they are."""
         dead = ~np.asarray(cloud.total > 0)
-        values, log = self._passed(steps, row, before, selection.ancestors, rng)
-        fresh = Selection(selection.ancestors, True, 0.0, self._log_particles)
+        values, log = self._passed(steps, row, before, selection, rng)
+        everyone = math.log(selection.particles)
+        fresh = Selection(selection.particles, selection.ancestors, True, 0.0, everyone)
         new = self._weighted(row, values, log, fresh)
         if not self.lead:
             return new._replace(rejuvenated=True)
         mixed = {k: self._either(k, dead, v, cloud.values[k]) for k, v in new.values.items()}
         either = Selection(
+            selection.particles,
             selection.ancestors,
             dead | selection.resampled,
             0.0,
-            np.where(dead, self._log_particles, selection.spent),
+            np.where(dead, everyone, selection.spent),
         )
         log = np.where(dead, new.log_weights, cloud.log_weights)
         return self._weighted(row, mixed, log, either)._replace(rejuvenated=dead)
@@ -243,7 +311,7 @@ class Mover:
         rng: np.random.Generator,
     ) -> Selection:
         """Resample where weights are uneven; with a first stage, by what the next row makes of them."""
-        n, total = self.particles, cloud.log_total
+        n, total = len(cloud.weights), cloud.log_total
         weights, ess, factor, gained = cloud.weights, cloud.ess, None, 0.0
         if self.first_stage is not None and row.seen:
             factor = self.first_stage(before, row, rng)
@@ -254,33 +322,50 @@ class Mover:
             ess = chosen_from**2 / _squares(weights)
             gained = level + np.log(chosen_from) - total
         poor = ess < self.threshold * n
+        if self.counts is not None:
+            return self._counted(self.counts, cloud, bool(poor), rng)
         some, every = (poor, poor) if not self.apart else (poor.any(), poor.all())
         if not some:
-            return Selection(None, poor, cloud.log_weights, total)
+            return Selection(n, None, poor, cloud.log_weights, total)
         chosen = self.resample(weights, n, rng)
         carried: Any = 0.0
         if factor is not None:
             carried = -(factor[chosen] if not self.apart else np.take_along_axis(factor, chosen, 0))
         if every:
-            return Selection(chosen, poor, carried, self._log_particles - gained)
+            return Selection(n, chosen, poor, carried, self._log_particles - gained)
         own = np.arange(n).reshape((-1,) + (1,) * len(self.apart))
         return Selection(
+            n,
             np.where(poor, chosen, own),
             poor,
             np.where(poor, carried, cloud.log_weights),
             np.where(poor, self._log_particles - gained, total),
         )
 
+    def _counted(
+        self, counts: KLD, cloud: Cloud, poor: bool, rng: np.random.Generator
+    ) -> Selection:
+        """As many particles as the belief needs; they are left alone where that is what there are."""
+        n = len(cloud.weights)
+        chosen = self.resample(cloud.weights, self.particles, rng)
+        taken = {k: self._taken(k, cloud.values[k], chosen) for k in counts.widths}
+        needed = min(counts.needed(counts.bins(taken)), self.particles)
+        if not poor and 0.8 * n <= needed <= n:
+            return Selection(n, None, False, cloud.log_weights, cloud.log_total)
+        if needed < self.particles:
+            chosen = self.resample(cloud.weights, needed, rng)
+        return Selection(needed, chosen, True, 0.0, math.log(needed))
+
     def _passed(
         self,
         steps: Sequence[Step],
         row: Row,
         before: Mapping[str, np.ndarray],
-        ancestors: np.ndarray | None,
+        selection: Selection,
         rng: np.random.Generator,
     ) -> tuple[dict[str, np.ndarray], Any]:
         """One forward pass over a slice, in blocks of particles: kept values and log weights."""
-        n, known = self.particles, self.plan.known(row)
+        n, ancestors, known = selection.particles, selection.ancestors, self.plan.known(row)
         if n <= self.block:
             for name, value in before.items():
                 known[name] = self._taken(name, value, ancestors)
@@ -305,7 +390,7 @@ class Mover:
             state = Pass(rng, (high - low,), {**known, **taken})
             for step in steps:
                 step(state)
-            self._store(values, state.values, low, high)
+            self._store(values, state.values, low, high, n)
             weight = np.asarray(state.log_weight)
             if weight.ndim <= len(self.lead):
                 log = weight  # nothing was seen, or nothing that depends on the particles
@@ -316,7 +401,12 @@ class Mover:
         return values, log
 
     def _store(
-        self, values: dict[str, np.ndarray], found: Mapping[str, np.ndarray], low: int, high: int
+        self,
+        values: dict[str, np.ndarray],
+        found: Mapping[str, np.ndarray],
+        low: int,
+        high: int,
+        n: int,
     ) -> None:
         for name in self.kept:
             value = found[name]
@@ -324,7 +414,7 @@ class Mover:
                 values[name] = value  # the same for all particles
                 continue
             if low == 0:
-                values[name] = self._spare.get((self.particles, *value.shape[1:]), value.dtype)
+                values[name] = self._spare.get((n, *value.shape[1:]), value.dtype)
             values[name][low:high] = value
 
     def _cut(self, name: str, value: np.ndarray, low: int, high: int) -> np.ndarray:
@@ -350,13 +440,13 @@ class Mover:
         self, row: Row, values: dict[str, np.ndarray], log: Any, selection: Selection
     ) -> Cloud:
         """The cloud of a slice; its ``total`` is not positive where no weight is left."""
-        n, shape = self.particles, (self.particles, *self.lead)
+        n, shape = selection.particles, (selection.particles, *self.lead)
         carried = selection.carried
         log = carried + log if isinstance(carried, np.ndarray) else np.asarray(log)
         if log.ndim <= len(self.lead) and np.all(log == 0.0):
             even = np.full(self.lead, float(n)) if self.lead else float(n)
             return Cloud(
-                row.t, values, np.broadcast_to(0.0, shape), self._even, even, np.log(even),
+                row.t, values, np.broadcast_to(0.0, shape), self._even[:n], even, np.log(even),
                 np.log(even) - selection.spent, even, selection.ancestors, selection.resampled,
             )  # fmt: skip
         if log.shape != shape:
@@ -403,7 +493,7 @@ class Mover:
         """The error, with the first observed node at which no weight was left."""
         taken = {k: self._taken(k, v, selection.ancestors) for k, v in before.items()}
         known = {**self.plan.known(row), **taken, **values}
-        state = Pass(np.random.default_rng(0), (self.particles,), known)
+        state = Pass(np.random.default_rng(0), (selection.particles,), known)
         model, node, which = self.slices.model(row.t), None, ""
         for name in (n for n in self.slices.dynamic if n in row.seen):
             WeighDrawn(model, model[name], self.apart)(state)
@@ -414,9 +504,9 @@ class Mover:
                 break
         what = f"the value of {node!r}{which}" if node else "what was seen"
         return DegeneracyError(
-            f"none of {self.particles} particles explains {what} in slice {row.t}: every weight is zero; use "
-            "more particles, a proposal= that looks at the observations, noise that is less narrow, or "
-            'on_degeneracy="rejuvenate"',
+            f"none of {selection.particles} particles explains {what} in slice {row.t}: every weight is "
+            "zero; use more particles, a proposal= that looks at the observations, less narrow noise, "
+            'or on_degeneracy="rejuvenate"',
             row.t,
             node,
         )

@@ -16,12 +16,15 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries
+from bayesmc.engines.particles.anew import Lost, Rejuvenation
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
+from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.optimal import OptimalPlan, why_not_optimal
 from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.smoothing import Backward, carried, lagged
-from bayesmc.engines.particles.stages import GivenStage, PluggedIn, Rejuvenation
+from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
@@ -68,6 +71,12 @@ class ParticleFilter(FilterEngine):
         slice reads. The slice is weighted as if that density were the model's, so its answers and the
         evidence are biased; ``rejuvenated`` of the result says which slices.
 
+    adapt : KLD, optional
+        How many particles a slice needs, at most ``particles``: many where the belief is wide, few where it
+        is narrow. Particles are then resampled whenever their number changes.
+    recovery : Recovery, optional
+        Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
+
     trajectories : int, optional
         Trajectories that ``smooth`` draws; by default as many as there are particles.
     backward : "rejection" or "exact"
@@ -113,6 +122,8 @@ class ParticleFilter(FilterEngine):
     auxiliary: bool | Callable[..., Any] = False
     on_degeneracy: str = "raise"
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
+    adapt: KLD | None = None
+    recovery: Recovery | None = None
     trajectories: int | None = None
     backward: str = "rejection"
 
@@ -151,6 +162,18 @@ class ParticleFilter(FilterEngine):
                 for key, spec in checked.items():
                     as_function("ParticleFilter", key, spec, accepted)
                 object.__setattr__(self, option, MappingProxyType(checked))
+        for option, kind in (("adapt", KLD), ("recovery", Recovery)):
+            given = getattr(self, option)
+            if given is not None and not isinstance(given, kind):
+                raise TypeError(
+                    f"ParticleFilter({option}={given!r}): give a {kind.__name__}(...), or None"
+                )
+        if self.recovery is not None and self.rejuvenation is not None:
+            raise ValueError(
+                "ParticleFilter: recovery= and rejuvenation= both begin anew; give one of them"
+            )
+        if self.adapt is not None and self.auxiliary is not False:
+            raise ValueError("ParticleFilter: adapt= and auxiliary= do not go together")
         if self.backward not in ("rejection", "exact"):
             raise ValueError(
                 f'ParticleFilter(backward={self.backward!r}): give "rejection" or "exact"'
@@ -194,7 +217,8 @@ class ParticleFilter(FilterEngine):
         given = [*(self.rejuvenation or {}).values(), self.resampling, self.auxiliary]
         if isinstance(self.proposal, Mapping):
             given += self.proposal.values()
-        if any(value is None for value in given):
+        whole = self.recovery is None or self.recovery.is_whole
+        if not whole or any(value is None for value in given):
             raise UnsupportedError(
                 "ParticleFilter: this engine was unpickled, and pickles carry no functions; make it anew"
             )
@@ -204,6 +228,15 @@ class ParticleFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        apart = plates_apart(problem.slices)
+        for option in ("adapt", "recovery"):
+            if getattr(self, option) is not None and apart:
+                return (
+                    f"ParticleFilter: {option}= is for one filter, and elements of plate {apart[0]!r} are "
+                    "filtered separately; filter them one by one"
+                )
+        if self.adapt is not None:
+            self.adapt.check(problem.slices.later, problem.slices.interface)
         known = {*problem.slices.template.static, *problem.series.observed}
         if isinstance(self.proposal, str):
             why = why_not_optimal(problem.slices, tuple(problem.series.observed))
@@ -221,6 +254,8 @@ class ParticleFilter(FilterEngine):
         return None
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
+            return _NOT_SMOOTHED
         sums = carried(problem.slices) if asked.what == "smooth" else ()
         return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
@@ -284,6 +319,8 @@ class ParticleFilter(FilterEngine):
         queries: Queries | None = None,
         progress: bool | None = None,
     ) -> FilteredParticles:
+        if self.adapt is not None or self.recovery is not None:
+            raise UnsupportedError(_NOT_SMOOTHED)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
         sums = carried(problem.slices)
@@ -409,10 +446,20 @@ class ParticleFilter(FilterEngine):
         elif self.auxiliary:
             stage = PluggedIn(plan, self.particles)
         anew = Rejuvenation(plan, self.rejuvenation) if self.rejuvenation is not None else None
-        return Mover(slices, self.particles, scheme, threshold, plan, stage, anew, kept)
+        lost = Lost(plan, self.recovery) if self.recovery is not None else None
+        wanted = kept if kept is None or self.adapt is None else [*kept, *self.adapt.widths]
+        return Mover(
+            slices, self.particles, scheme, threshold, plan, stage, anew, wanted, self.adapt, lost
+        )
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+_NOT_SMOOTHED = (
+    "ParticleFilter: particles whose number changes (adapt=), or that begin anew (recovery=), are not "
+    "smoothed; leave these out, and declare what can happen in the transition"
+)
 
 
 def _not_backwards(name: str) -> str:

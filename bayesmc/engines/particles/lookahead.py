@@ -198,7 +198,8 @@ class LookAhead:
             log = -0.5 * (distance + np.linalg.slogdet(inner)[1])
         log_density = log_density + log - size * _HALF_LOG_2PI + alone
         rest = np.eye(self.total) - _times(weights, slopes)
-        cov = _times(_times(rest, cov), np.swapaxes(rest, -1, -2))  # Joseph's form: it stays positive
+        # Joseph's form: it stays positive, however sharp the row is
+        cov = _times(_times(rest, cov), np.swapaxes(rest, -1, -2))
         cov = cov + _times(_times(weights, noise), np.swapaxes(weights, -1, -2))
         return Belief(mean + _applied(weights, off), cov, log_density)
 

@@ -18,6 +18,7 @@ from bayesmc.engines.particles.belief import (
     table_of_states,
 )
 from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.errors import QueryError
 from bayesmc.results import SeriesPosterior
 
 
@@ -55,6 +56,8 @@ class Record:
         self.resampled = np.zeros((steps, *layout.lead), dtype=bool)
         self.rejuvenated = np.zeros((steps, *layout.lead), dtype=bool)
         self.unique = np.full((steps, *layout.lead), layout.particles)
+        self.counts = np.empty(steps, dtype=np.intp)
+        self.anew = np.zeros(steps, dtype=np.intp)
         self._nodes = [(n, model[n], len(model[n].value_shape)) for n in problem.hidden]
 
     def add(self, k: int, cloud: Cloud) -> None:
@@ -63,6 +66,7 @@ class Record:
         self.increments[k] = cloud.increment
         self.ess[k] = cloud.ess
         self.resampled[k] = cloud.resampled
+        self.counts[k], self.anew[k] = len(cloud.weights), cloud.anew
         if cloud.ancestors is not None:
             changes = cloud.ancestors[1:] != cloud.ancestors[:-1]
             along = 0 if layout.apart else None  # without an axis it is ten times faster
@@ -99,6 +103,7 @@ class Record:
         )
         found.weight_ess, found.resampled = self.ess, self.resampled
         found.unique_ancestors, found.rejuvenated = self.unique, self.rejuvenated
+        found.counts, found.anew = self.counts, self.anew
         found.clouds, found.layout = self.clouds, self.layout
         return found
 
@@ -111,6 +116,10 @@ class FilteredParticles(SeriesPosterior):
     clouds : list of Cloud or None
         Particles of all slices, with ``keep="particles"``; functions of nodes, quantiles and covariances can
         be asked for then.
+    counts : ndarray of int, shape (time,)
+        Particles of each slice: always as many, unless ``adapt=`` says otherwise.
+    anew : ndarray of int, shape (time,)
+        How many of them ``recovery=`` let begin anew.
 
     Examples
     --------
@@ -124,12 +133,14 @@ class FilteredParticles(SeriesPosterior):
     ((2, 2), (2,))
     """
 
+    counts: np.ndarray | None = None
+    anew: np.ndarray | None = None
     clouds: list[Cloud] | None = None
     layout: Layout | None = None
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
-        clouds, layout = self._kept("particles")
+        clouds, layout = self._alike("particles")
         node = self._node(name)
         shape = (layout.particles, *node.value_shape)
         rows = [np.broadcast_to(c.values[name], shape) for c in clouds]
@@ -138,7 +149,7 @@ class FilteredParticles(SeriesPosterior):
     @property
     def weights(self) -> np.ndarray:
         """Normalised weights of all slices, shape ``(time, particles, *plates)``."""
-        clouds, _ = self._kept("weights")
+        clouds, _ = self._alike("weights")
         return np.stack([c.weights / c.total for c in clouds])
 
     @property
@@ -147,7 +158,7 @@ class FilteredParticles(SeriesPosterior):
 
         Particles that were drawn anew have none: -1.
         """
-        clouds, layout = self._kept("ancestors")
+        clouds, layout = self._alike("ancestors")
         own = np.arange(layout.particles).reshape((-1,) + (1,) * len(layout.apart))
         shape = (layout.particles, *layout.lead)
         rows = []
@@ -178,6 +189,15 @@ class FilteredParticles(SeriesPosterior):
         nodes = [self._node(name) for name in names]
         rows = [covariance(layout, c, [(n, c.values[n.name]) for n in nodes]) for c in clouds]
         return np.stack(rows)
+
+    def _alike(self, what: str) -> tuple[list[Cloud], Layout]:
+        """The clouds, where each has as many particles."""
+        clouds, layout = self._kept(what)
+        if any(len(c.weights) != layout.particles for c in clouds):
+            raise QueryError(
+                f"{what}: the number of particles changes from slice to slice (adapt=); see .clouds"
+            )
+        return clouds, layout
 
     def _kept(self, what: str) -> tuple[list[Cloud], Layout]:
         if self.clouds is None or self.layout is None:

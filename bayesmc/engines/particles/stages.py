@@ -1,8 +1,7 @@
-"""What an auxiliary filter and a rejuvenating one do besides moving: look ahead, and begin anew.
+"""What an auxiliary filter does besides moving: it looks ahead.
 
 A *first stage* gives every particle a factor by what the next row would make of it, before it is moved; its
-offspring are weighted by the rest. *Rejuvenation* draws a slice from densities that do not look at the slice
-before, where no particle explains what was seen.
+offspring are weighted by the rest.
 
 References
 ----------
@@ -21,12 +20,9 @@ from bayesmc.dbn import Row
 from bayesmc.distributions import MvNormal, Normal, VonMises, WrappedNormal
 from bayesmc.engines.particles.lookahead import LookAhead
 from bayesmc.engines.particles.optimal import family_of, groups_of, is_affine, order_of
-from bayesmc.engines.proposal import FUNCTION, as_function, bound
-from bayesmc.engines.proposing import Propose
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import ModelError, UnknownNodeError
-from bayesmc.kernels.proposal import Key, names_of
-from bayesmc.network import CompiledNode, Model
+from bayesmc.network import CompiledNode
 from bayesmc.network.align import Aligner
 from bayesmc.network.forward import Pass, Step
 from bayesmc.network.model import arguments_of
@@ -55,8 +51,8 @@ class PluggedIn:
     offspring bounded; with ``proposal="optimal"`` they are all equal (the fully adapted filter).
 
     Elsewhere it is an estimate, which may be far below the density for some particles. It is mixed with its
-    mean over the particles, so no factor is less than a tenth of that mean: where weights were even, no weight
-    of an offspring is more than ten times what it is without a first stage.
+    mean over the particles, so no factor is less than a tenth of that mean: where weights were even, no
+    weight of an offspring is more than ten times what it is without a first stage.
 
     Parameters
     ----------
@@ -130,44 +126,6 @@ class GivenStage:
                 f"per particle, shape {(*batch, *lead)}"
             )
         return _floored(np.broadcast_to(found, (self.particles, *lead)))
-
-
-class Rejuvenation:
-    """Steps of a slice whose nodes are drawn from given densities, without a look at the slice before.
-
-    The weights are those of what was seen, as if the given densities were the model's: the answers of the
-    slice, and the evidence, are biased by that.
-    """
-
-    def __init__(self, plan: SlicePlan, given: Mapping[Key, Any]) -> None:
-        self.plan = plan
-        self.drawn = {n for key in given for n in names_of(key)}
-        self.first = [self._bound(plan.slices.first, k, v) for k, v in given.items()]
-        self.later = [self._bound(plan.slices.later, k, v) for k, v in given.items()]
-        short = [n for n in plan.slices.interface if plan.slices.later[n].is_stochastic]
-        missing = sorted(set(short) - self.drawn)
-        if missing:
-            raise ModelError(
-                f"ParticleFilter: rejuvenation= says nothing of {missing[0]!r}, which the next slice reads; "
-                "give a density for each of " + ", ".join(map(repr, short))
-            )
-
-    def __call__(self, row: Row) -> Sequence[Step]:
-        model = self.plan.slices.model(row.t)
-        by_target = {n: p for p in (self.first if row.t == 0 else self.later) for n in p.names}
-        found: list[Step] = []
-        done: set[str] = set()
-        for name in self.plan.slices.dynamic:
-            if name in row.seen or name not in by_target:
-                found.append(self.plan.step(row, name))
-            elif name not in done:
-                found.append(_Anew(model, row.seen, by_target[name], self.plan.apart))
-                done |= set(by_target[name].names)
-        return found
-
-    def _bound(self, model: Model, key: Key, spec: Any) -> Any:
-        function = as_function("ParticleFilter", key, spec, FUNCTION)
-        return bound("ParticleFilter", model, key, function)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -280,16 +238,6 @@ class _Integrated:
         state.weigh(belief.log_density)
         if self.drawn:
             self.look.draw(state, belief)
-
-
-class _Anew(Propose):
-    """Draws that are taken as they come: nothing is divided out of the weight."""
-
-    def _divide(
-        self, log_q: np.ndarray, outside: np.ndarray, alive: np.ndarray, state: Pass
-    ) -> None:
-        if outside.any():
-            state.weigh(np.where(outside, -np.inf, 0.0))
 
 
 def _type(node: CompiledNode) -> Any:

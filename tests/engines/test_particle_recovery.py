@@ -1,0 +1,211 @@
+"""Particles that begin anew in every slice, and numbers of particles that follow the belief."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.engines.particles import anew
+
+ROWS = {"y": np.r_[np.full(3, 2.0), np.full(4, 8.0)]}
+ANYWHERE = bmc.Uniform(0.0, 10.0)
+SHARE = 0.1
+
+# few particles, so that many runs are cheap
+pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
+
+
+def walk() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 0.3), initial=ANYWHERE)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    return dbn
+
+
+def jumping() -> bmc.DynamicBayesNet:
+    """The same with the jump declared: what recovery with a constant share comes to."""
+    dbn = bmc.DynamicBayesNet()
+    weights = [1 - SHARE, SHARE]
+
+    @dbn.node(initial=ANYWHERE)
+    def x(x_prev):
+        return bmc.Mixture(weights, [bmc.Normal(x_prev, 0.3), ANYWHERE])
+
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    return dbn
+
+
+EXACT = bmc.filter(jumping(), ROWS, engine=bmc.GridFilter({"x": (-3.0, 13.0, 1600)}))
+
+
+def ratios(recovery: bmc.Recovery, runs: int = 400) -> np.ndarray:
+    engine = bmc.ParticleFilter(300, recovery=recovery)
+    logs = [
+        bmc.filter(walk(), ROWS, engine=engine, rng=seed).log_marginal_likelihood
+        for seed in range(runs)
+    ]
+    return np.exp(np.array(logs) - EXACT.log_marginal_likelihood)
+
+
+def deviation(found: np.ndarray) -> float:
+    return abs(found.mean() - 1.0) / (found.std(ddof=1) / np.sqrt(len(found)))
+
+
+AIMED: dict[str, Any] = {"x": lambda y: bmc.Truncated(bmc.Normal(y, 0.8), 0.0, 10.0)}
+
+
+@pytest.mark.parametrize("proposal", [None, AIMED], ids=["from the density", "aimed"])
+def test_the_evidence_is_that_of_the_declared_jump(proposal: Any) -> None:
+    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each)
+    found = ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, proposal=proposal))
+    assert deviation(found) < 4
+
+
+def test_a_proposal_that_is_not_weighed_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(anew._Density, "__call__", lambda self, state: None)
+    assert deviation(ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, proposal=AIMED))) > 8
+
+
+def test_answers_find_back_after_a_jump() -> None:
+    recovery = bmc.Recovery({"x": ANYWHERE}, share=SHARE, proposal=AIMED)
+    engine = bmc.ParticleFilter(20_000, recovery=recovery)
+    found = bmc.filter(walk(), ROWS, engine=engine, rng=0)
+    # standard errors below .01; fourteen figures, alpha 1e-6
+    np.testing.assert_allclose(found.mean("x"), EXACT.mean("x"), atol=0.08)
+    np.testing.assert_allclose(found.std("x"), EXACT.std("x"), atol=0.08)
+    assert found.anew[0] == 0 and (abs(found.anew[1:] - 2000) < 6 * np.sqrt(2000)).all()
+    without = bmc.filter(walk(), ROWS, engine=bmc.ParticleFilter(20_000), rng=0)
+    assert abs(without.mean("x")[3] - EXACT.mean("x")[3]) > 1  # the control
+
+
+def test_the_share_follows_how_well_rows_are_explained() -> None:
+    recovery = bmc.Recovery({"x": ANYWHERE}, slow=0.01, fast=0.9, proposal=AIMED)
+    engine = bmc.ParticleFilter(5000, recovery=recovery)
+    rows = {"y": np.r_[np.full(10, 2.0), np.full(6, 8.0)]}
+    found = bmc.filter(walk(), rows, engine=engine, rng=0)
+    assert found.anew[:10].mean() < 500 and found.anew[11] > 2000
+    assert abs(found.mean("x")[-1] - 8.0) < 0.5
+    # row by row it is the same
+    belief = engine.start(walk(), rng=0)
+    for row in rows["y"]:
+        belief = engine.step(belief, {"y": row})
+    assert belief.mean("x") == found.mean("x")[-1]
+
+
+def test_a_belief_that_narrows_needs_fewer_particles() -> None:
+    engine = bmc.ParticleFilter(20_000, adapt=bmc.KLD({"x": 0.05}, least=200))
+    found = bmc.filter(walk(), ROWS, engine=engine, rng=0, keep="particles")
+    plain = bmc.filter(walk(), ROWS, engine=bmc.ParticleFilter(20_000), rng=0)
+    assert found.counts[0] == 20_000 and (found.counts[1:3] < 2000).all()
+    assert (found.counts >= 200).all()
+    # some 600 particles: standard error .02; three figures, alpha 1e-4
+    np.testing.assert_allclose(found.mean("x")[:3], plain.mean("x")[:3], atol=0.1)
+    assert found.quantile("x", 0.5).shape == (7,)
+    with pytest.raises(bmc.errors.QueryError, match="changes from slice to slice"):
+        found.particles("x")
+
+
+def test_the_evidence_of_an_adapted_number_is_unbiased() -> None:
+    exact = bmc.filter(walk(), ROWS, engine=bmc.GridFilter({"x": (-3.0, 13.0, 1600)}))
+    engine = bmc.ParticleFilter(2000, adapt=bmc.KLD({"x": 0.2}, least=400, error=0.02))
+    rows = {"y": ROWS["y"][:3]}
+    exact_log = exact.log_marginal_increments[:3].sum()
+    logs = [
+        bmc.filter(walk(), rows, engine=engine, rng=seed).log_marginal_likelihood
+        for seed in range(400)
+    ]
+    # numbers that look at the particles are biased in theory, at the order of 1/N (alpha 6e-5)
+    assert deviation(np.exp(np.array(logs) - exact_log)) < 4
+
+
+@pytest.mark.parametrize("bins", [2, 10, 1000])
+def test_the_bound_is_the_quantile_of_chi_square(bins: int) -> None:
+    from scipy import stats
+
+    exact = stats.chi2.ppf(0.99, bins - 1) / (2 * 0.05)  # Fox (2003), eq. 6
+    assert bmc.KLD({"x": 1.0}, least=1).needed(bins) == pytest.approx(exact, rel=0.01, abs=2)
+
+
+def test_bins_of_vectors_are_counted() -> None:
+    values = {"v": np.array([[0.1, 0.1], [0.2, 0.3], [0.9, 0.1], [0.1, -0.1]])}
+    assert bmc.KLD({"v": 0.5}).bins(values) == 3
+    assert bmc.KLD({"v": [0.5, 5.0]}).bins(values) == 3
+    assert bmc.KLD({"v": [5.0, 5.0]}).bins(values) == 2
+    far = {"v": np.array([[0.0, 0.0], [1e17, 1e17], [1e17, 0.0]])}
+    assert bmc.KLD({"v": 1.0}).bins(far) == 3
+
+
+def test_options_travel_without_functions() -> None:
+    recovery = bmc.Recovery({"x": ANYWHERE}, share=SHARE, proposal=AIMED)
+    engine = bmc.ParticleFilter(100, recovery=recovery)
+    found = bmc.filter(walk(), ROWS, engine=engine, rng=0)
+    again = pickle.loads(pickle.dumps(found))
+    np.testing.assert_array_equal(again.anew, found.anew)
+    with pytest.raises(bmc.errors.UnsupportedError, match="unpickled"):
+        bmc.filter(walk(), ROWS, engine=again.engine)
+    adapted = bmc.ParticleFilter(100, adapt=bmc.KLD({"x": 0.5}))
+    assert pickle.loads(pickle.dumps(adapted)).adapt.widths == {"x": 0.5}
+
+
+WRONG: dict[str, tuple[Any, type[Exception], str]] = {
+    "no share": (lambda: bmc.Recovery({"x": ANYWHERE}), ValueError, "nothing would begin anew"),
+    "large share": (lambda: bmc.Recovery({"x": ANYWHERE}, share=1.5), ValueError, "0 to 1"),
+    "rates": (lambda: bmc.Recovery({"x": ANYWHERE}, slow=0.5, fast=0.1), ValueError, "slow < fast"),
+    "tuple": (lambda: bmc.Recovery({("x", "y"): ANYWHERE}, share=0.1), TypeError, "name one node"),
+    "no dict": (lambda: bmc.Recovery(ANYWHERE, share=0.1), TypeError, "dict from node name"),
+    "no widths": (lambda: bmc.KLD({}), ValueError, "width of its bins"),
+    "zero width": (lambda: bmc.KLD({"x": 0.0}), ValueError, "positive number"),
+    "error": (lambda: bmc.KLD({"x": 1.0}, error=0.0), ValueError, "above 0"),
+    "class": (lambda: bmc.ParticleFilter(10, adapt=bmc.KLD), TypeError, r"give a KLD\("),
+    "both": (
+        lambda: bmc.ParticleFilter(
+            10,
+            recovery=bmc.Recovery({"x": ANYWHERE}, share=0.1),
+            on_degeneracy="rejuvenate",
+            rejuvenation={"x": ANYWHERE},
+        ),
+        ValueError,
+        "give one of them",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_wrong_options_are_named(name: str) -> None:
+    make, error, message = WRONG[name]
+    with pytest.raises(error, match=message):
+        make()
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"recovery": bmc.Recovery({"q": ANYWHERE}, share=0.1)}, "UnknownNodeError", "'q'"),
+        (
+            {"recovery": bmc.Recovery({"y": ANYWHERE}, share=0.1)},
+            "ModelError",
+            "says nothing of 'x'",
+        ),
+        ({"adapt": bmc.KLD({"q": 1.0})}, "UnknownNodeError", "'q'"),
+        ({"adapt": bmc.KLD({"y": 1.0})}, "ModelError", "does not read"),
+        ({"adapt": bmc.KLD({"x": [1.0, 2.0]})}, "ModelError", "gives 2 for it"),
+    ],
+)
+def test_options_that_do_not_fit_the_template(options: Any, error: str, message: str) -> None:
+    with pytest.raises(getattr(bmc.errors, error), match=message):
+        bmc.filter(walk(), ROWS, engine=bmc.ParticleFilter(50, **options), rng=0)
+
+
+def test_neither_is_smoothed_or_for_plates_apart() -> None:
+    engine = bmc.ParticleFilter(50, adapt=bmc.KLD({"x": 0.5}))
+    with pytest.raises(bmc.errors.UnsupportedError, match="not smoothed"):
+        bmc.smooth(walk(), ROWS, engine=engine)
+    dbn = bmc.DynamicBayesNet(plates={"k": 2})
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 0.3), initial=ANYWHERE, plates="k")
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5), plates="k")
+    with pytest.raises(bmc.errors.UnsupportedError, match="filtered separately"):
+        bmc.filter(dbn, {"y": np.zeros((2, 2))}, engine=engine)
