@@ -16,12 +16,14 @@ Proceedings F 140; in the lectures of de Freitas the three variances are paramet
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc.errors import LowEssWarning
 from examples import picture
 
 START, STATE, SEEN = (
@@ -91,7 +93,9 @@ def engines(cells: int = CELLS) -> dict[str, Any]:
 def filtered(dbn: bmc.DynamicBayesNet, y: np.ndarray, engine: Any) -> Any:
     """Beliefs of one engine about all runs; densities are not kept."""
     keep = "summaries" if isinstance(engine, bmc.GridFilter) else None
-    return bmc.filter(dbn, {"y": y}, engine=engine, rng=1, keep=keep)
+    with warnings.catch_warnings():  # fifty particles are few, which is what the table shows
+        warnings.simplefilter("ignore", LowEssWarning)
+        return bmc.filter(dbn, {"y": y}, engine=engine, rng=1, keep=keep)
 
 
 def error(mean: np.ndarray, x: np.ndarray) -> tuple[float, float]:

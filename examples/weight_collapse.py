@@ -56,7 +56,9 @@ def filtered(y: np.ndarray, threshold: float, copies: int = COPIES) -> Any:
     """Independent particle filters on the same series, all particles kept."""
     engine = bmc.ParticleFilter(PARTICLES, ess_threshold=threshold)
     rows = {"y": np.repeat(y[:, None], copies, axis=1)}
-    return bmc.filter(walk(copies), rows, engine=engine, rng=1, keep="particles")
+    with warnings.catch_warnings():  # the collapse is what is to be seen
+        warnings.simplefilter("ignore", LowEssWarning)
+        return bmc.filter(walk(copies), rows, engine=engine, rng=1, keep="particles")
 
 
 def sequential_log_weights(found: Any, slices: int) -> np.ndarray:

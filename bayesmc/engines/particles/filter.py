@@ -35,6 +35,8 @@ from bayesmc.resampling import Adaptive, checked, scheme_of
 
 #: equally weighted particles below which a slice rests on a single one
 _COLLAPSED = 2.0
+#: share of such slices from which on a warning says so
+_MANY = 0.1
 
 
 @dataclass(frozen=True)
@@ -59,11 +61,13 @@ class ParticleFilter(FilterEngine):
         where it names what is missing (an observation, or the slice before slice 0): there the node's own
         density is drawn from. A detector mixed with the transition is a ``Mixture`` of both. ``"optimal"``
         derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
-        is seen is affine in them, else its linearisation at each particle.
+        is seen is affine in them; else it is made linear a few times at each particle, and a tenth of the
+        particles is drawn from their own densities.
     auxiliary : bool or callable
         Resample with a look at the next row: particles are chosen by their weight times a first-stage
-        factor, by default the density of the row at the conditional means of what is hidden; or a function
-        of the slice before and observed nodes that returns log factors.
+        factor, by default the density of the row given the slice before: exact where means are affine, else
+        an estimate mixed with a tenth of its mean. Or a function of the slice before and observed nodes that
+        returns log factors.
     on_degeneracy : "raise" or "rejuvenate"
         What to do where all weights vanish.
     rejuvenation : dict, optional
@@ -91,7 +95,7 @@ class ParticleFilter(FilterEngine):
     Warns
     -----
     LowEssWarning
-        From the filter, where a slice rests on what is little more than one particle.
+        From the filter, where more than a tenth of the slices rest on little more than one particle.
 
     Notes
     -----
@@ -406,17 +410,22 @@ class ParticleFilter(FilterEngine):
     # ---- private -------------------------------------------------------------------------------
 
     def _warn_of_collapse(self, record: Record, start: int) -> None:
-        """One warning where a slice rests on what is little more than one particle."""
-        ess = record.ess.reshape(len(record.ess), -1).min(axis=1)
-        poor = np.flatnonzero(ess < min(_COLLAPSED, 0.9 * self.particles))
-        if poor.size:
-            worst = int(poor[ess[poor].argmin()])
-            others = f" (and {poor.size - 1} others)" if poor.size > 1 else ""
+        """One warning where many slices rest on what is little more than one particle.
+
+        A surprising row now and then does that to any filter, and the next rows mend it.
+        """
+        ess = record.ess.reshape(len(record.ess), -1)
+        poor = ess < min(_COLLAPSED, 0.9 * self.particles)
+        share = poor.mean(axis=0)
+        worst = int(share.argmax())
+        if share[worst] > _MANY:
+            own = ess[:, worst]
+            at = int(own.argmin())
             warnings.warn(
-                f"ParticleFilter: in slice {start + worst}{others} the {self.particles} particles are worth "
-                f"only {ess[worst]:.1f} equally weighted ones (weight_ess), so means, spreads and the "
-                "evidence rest on one of them: use more particles, a proposal= that looks at the "
-                "observations, or noise that is less narrow",
+                f"ParticleFilter: in {int(poor[:, worst].sum())} of {len(own)} slices the {self.particles} "
+                f"particles are worth less than {_COLLAPSED:g} equally weighted ones (weight_ess; "
+                f"{own[at]:.1f} in slice {start + at}), so means, spreads and the evidence rest on one of "
+                "them: use more particles, a proposal= that looks at the observations, or less narrow noise",
                 LowEssWarning,
                 stacklevel=4,
             )
