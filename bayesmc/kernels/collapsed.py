@@ -12,16 +12,17 @@ Liu, Wong and Kong (1994), Biometrika 81, on collapsing; van Dyk and Park (2008)
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 
 import numpy as np
 
 from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.gaussian_block import GaussianBlock
+from bayesmc.kernels.gaussian_block import GaussianBlock, shortened
 from bayesmc.kernels.slice import slice_move
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.target import Target, Values
 
 #: sweeps of the warmup that are watched
@@ -66,16 +67,21 @@ class CollapsedBlock(Kernel):
             self.transforms[name] = transform_of(support)
         inside = {id(t) for t in block.terms}
         self.others = {
-            name: [c for c in blanket.children if id(c.term) not in inside]
-            for name, blanket in blankets.items()
+            name: TermSum(target, [c.term for c in b.children if id(c.term) not in inside])
+            for name, b in blankets.items()
         }
-        self.needed = _scope(target, block, blankets)
+        #: what follows from a node, the block apart
+        self.links = {
+            name: tuple(n for n in target.below((name,)) if n not in block.path)
+            for name in blankets
+        }
+        self.needed = _alike(target, _scope(target, block, blankets))
         self.match = block.match
 
     def words(self, name: str) -> tuple[str, str]:
         if name not in self.blankets:
             return self.block.words(name)
-        block = ", ".join(self.block.names)
+        block = shortened(self.block.names)
         if name not in self.alone:
             return "collapsed slice", f"{block} integrated out, if slow otherwise"
         label, match = self.alone[name].words(name)
@@ -151,16 +157,24 @@ class CollapsedBlock(Kernel):
         lead = x.shape
         count = math.prod(lead)
         state = dict(values)
-        for other in self.needed:
-            value = values[other]
-            wide = np.broadcast_to(value, (*lead[:-1], *value.shape))
-            state[other] = wide.reshape(count, *value.shape[1:])
+        if count > lead[-1]:
+            state.update(self._repeated(values, count // lead[-1]))
         state[name] = x.reshape(count)
-        self.target.refresh(state, (name,))
+        self.target.compute(state, self.links[name])
         log = self.block.log_integral(state, count) + self.blankets[name].own_log(state)
-        for child in self.others[name]:
-            log = log + self.blankets[name].child_log(child, state)
+        log = log + self.others[name].log_density(state)
         return np.broadcast_to(log, (count,)).reshape(lead)
+
+    def _repeated(self, values: Values, times: int) -> Values:
+        """What is needed besides, once for each of several candidates, those of like shapes as one."""
+        found: Values = {}
+        for names in self.needed:
+            first = values[names[0]]
+            rows = np.concatenate([values[n] for n in names]).reshape(len(names), 1, *first.shape)
+            wide = np.broadcast_to(rows, (len(names), times, *first.shape))
+            wide = wide.reshape(len(names), times * len(first), *first.shape[1:])
+            found.update(zip(names, wide, strict=True))
+        return found
 
     def _watched(self, state: Values, memory: Memory) -> Memory:
         """Notes where the nodes are; at the end of the watch, which of them are slow."""
@@ -192,7 +206,7 @@ def governing(
     """The scales, and other numbers, that can be drawn with a block integrated out."""
     layout = block.layout
     found: dict[str, Blanket] = {}
-    if layout.dg > _MAX_DENSE or layout.n * layout.dl > _MAX_LOCAL:
+    if layout.dg > _MAX_DENSE or layout.cut > _MAX_LOCAL:
         return found
     inside = {id(t) for t in block.terms}
     for name, blanket in blankets.items():
@@ -214,7 +228,7 @@ def governing(
 def _scope(
     target: Target, block: GaussianBlock, blankets: Mapping[str, Blanket]
 ) -> tuple[str, ...]:
-    """Hidden nodes whose values the block's terms and the nodes' own read."""
+    """Hidden nodes whose values the block's terms and the nodes' own read, the block's own apart."""
     terms = {t.name: t for t in block.terms}
     for blanket in blankets.values():
         terms.update({c.term.name: c.term for c in blanket.children})
@@ -230,7 +244,18 @@ def _scope(
         if name in target.links:
             todo += target.model[name].parents
     hidden = (*target.chain, *target.links)
+    found -= {*block.names, *block.path}  # these are put at zero
     return tuple(n for n in hidden if n in found)
+
+
+def _alike(target: Target, names: Sequence[str]) -> tuple[list[str], ...]:
+    """Nodes by the shape and the type of their values."""
+    groups: dict[Hashable, list[str]] = {}
+    for name in names:
+        node = target.model[name]
+        codes = None if node.domain is None else node.domain.dtype.str
+        groups.setdefault((node.value_shape, node.is_discrete, codes), []).append(name)
+    return tuple(groups.values())
 
 
 def _widened(memory: Memory, name: str, step: float) -> Memory:

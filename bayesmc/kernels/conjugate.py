@@ -12,6 +12,7 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 2-3, 11.3; Plummer, J
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
@@ -22,14 +23,17 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conjugate_children import Partner, partner_of
+from bayesmc.kernels.conjugate_children import Partner
 from bayesmc.kernels.conjugate_components import CountedShares, PlanarStep, quick_step
 from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Naturals, split_prior
+from bayesmc.kernels.conjugate_like import partners_of
+from bayesmc.kernels.conjugate_matching import Match, match_of
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.precisions import keep_precision
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.like_children import with_like_children
 from bayesmc.structure.target import Values
 
 
@@ -226,9 +230,14 @@ class Conjugate(Kernel):
         width = np.where(np.isfinite(span), span, np.maximum(np.abs(now), 1e-3))
 
         def log_density(tried: np.ndarray) -> np.ndarray:
-            return np.broadcast_to(self.blanket.log_density(values, tried, members), tried.shape)
+            return np.broadcast_to(self._density.log_density(values, tried, members), tried.shape)
 
         return slice_move(log_density, now, width, rng, low, high)
+
+    @cached_property
+    def _density(self) -> Blanket:
+        """What slice steps ask."""
+        return with_like_children(self.blanket)
 
     # ---- verified conjugacy --------------------------------------------------------------------
 
@@ -316,10 +325,11 @@ def conjugate_kernel(
         return f"a {type(prior if base is None else base).__name__} prior has no conjugate pair"
     best, reason = (-1, False), ""
     for kind in kinds:
-        partners, found = _matched(blanket, kind, base, bounds, pairs)
+        matches, found = _matched(blanket, kind, base, bounds, pairs)
         if not isinstance(found, str):
+            partners = partners_of(blanket, kind, matches)
             return Conjugate(blanket, kind, partners, found, debug)
-        told = (len(partners), "makes no conjugate pair" not in found)
+        told = (len(matches), "makes no conjugate pair" not in found)
         if told > best:  # of a flat prior's kinds, the one that fits most children says most
             best, reason = told, found
     return reason
@@ -379,33 +389,33 @@ def _matched(
     base: Distribution | None,
     bounds: Bounds | None,
     pairs: Sequence[Pair],
-) -> tuple[list[Partner], float | str]:
-    """The partners of children, and the power that is Gamma (1 if none is) or a reason of refusal."""
-    partners: list[Partner] = []
+) -> tuple[list[Match], float | str]:
+    """The pairs of children, and the power that is Gamma (1 if none is) or a reason of refusal."""
+    matches: list[Match] = []
     if base is None:
         low, high = (np.asarray(b, dtype=float) for b in bounds)  # type: ignore[union-attr]
         if np.isnan(kind.flat(low, high)[0]).any():
-            return partners, "its flat prior reaches beyond what the parameter allows"
+            return matches, "its flat prior reaches beyond what the parameter allows"
     power = kind.power(base)
     for child in blanket.children:
-        partner = partner_of(blanket, child, kind, pairs)
-        if partner is None:
+        match = match_of(blanket, child, kind, pairs)
+        if match is None:
             continue
-        if isinstance(partner, str):
-            return partners, partner
+        if isinstance(match, str):
+            return matches, match
         if kind.name == "scale":
-            wanted = partner.pair.exponent * partner.power
+            wanted = match.pair.exponent * match.power
             if power is not None and wanted != power:
                 prior = f"a {type(base).__name__} prior" if base is not None else "another child"
-                return partners, (
+                return matches, (
                     f"the density of child {child.term.name!r} has the power {wanted:g} of it in its "
                     f"exponential, and {prior} the power {power:g}: no conjugate pair"
                 )
             power = wanted
-        partners.append(partner)
-    if not partners:
-        return partners, "no child varies with it"
-    return partners, 1.0 if power is None else power
+        matches.append(match)
+    if not matches:
+        return matches, "no child varies with it"
+    return matches, 1.0 if power is None else power
 
 
 def _probed_prior(blanket: Blanket) -> Distribution | None:
@@ -414,7 +424,7 @@ def _probed_prior(blanket: Blanket) -> Distribution | None:
     target = blanket.target
     try:
         with marking_invalid(), np.errstate(all="ignore"):
-            return blanket.own.distribution({**target.model.probe, **target.known})[0]
+            return blanket.own.distribution(ChainMap(target.known, target.model.probe))[0]
     except Exception:
         return None
 

@@ -1,14 +1,15 @@
-"""Children of a conjugate node: which pair each makes with the node's prior, and what it adds.
+"""What a child of a conjugate node adds to the node's full conditional.
 
-A pair is proved by tracing the child's function; its coefficients come from calling that function with the
+The coefficients of the pair that it makes (``conjugate_matching``) come from calling its function with the
 node at a neutral value (and at unit steps, for means). What cannot change from sweep to sweep is worked
 out once: slopes where the mean is affine in everything hidden, and all of it where nothing else is hidden.
+Many like children are one partner, see ``conjugate_like``.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from typing import Any
 
@@ -20,16 +21,12 @@ from bayesmc.errors import BayesmcError
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements, Groups, counted
 from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, slope_of
 from bayesmc.kernels.conjugate_kinds import Kind, Naturals
-from bayesmc.kernels.conjugate_labels import (
-    ByLabel,
-    by_label,
-    read_directly,
-)
-from bayesmc.kernels.conjugate_pairs import Pair
+from bayesmc.kernels.conjugate_labels import ByLabel, by_label, read_directly
+from bayesmc.kernels.conjugate_matching import Match
 from bayesmc.kernels.conjugate_sums import Collector
 from bayesmc.shapes import Shape
-from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.target import Values
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target, Term, Values
 from bayesmc.structure.traced import Untraceable, traced_term
 from bayesmc.tracing import TracedCall, Tracer
 
@@ -37,22 +34,20 @@ from bayesmc.tracing import TracedCall, Tracer
 class Partner:
     """One child with the pair that it makes.
 
-    Attributes
+    Parameters
     ----------
-    pair : Pair
-    power : float
-        The power of the node in the parameter (1 for copies and means).
-    is_copy : bool
-        Whether the parameter is the node's value.
+    match : Match
+        The child and the pair.
+    settle : bool
+        Whether what never changes is worked out, which takes some calls.
     """
 
-    def __init__(
-        self, blanket: Blanket, child: Child, kind: Kind, pair: Pair, power: float, is_copy: bool
-    ) -> None:
-        self.blanket, self.child, self.kind = blanket, child, kind
-        self.pair, self.power, self.is_copy = pair, power, is_copy
-        self.term = child.term
-        self.node = blanket.target.model[child.term.name]
+    def __init__(self, blanket: Blanket, match: Match, kind: Kind, settle: bool = True) -> None:
+        self.blanket, self.kind = blanket, kind
+        self.child, self.pair = match.child, match.pair
+        self.power, self.is_copy = match.power, match.is_copy
+        self.term, self.relation = self.child.term, self.child.relation
+        self.node = self.term.model[self.term.name]
         neutral = kind.neutral(blanket.event_shape)
         axes = (1,) * (1 + len(blanket.node.plates))
         self._neutral = neutral.reshape(axes + neutral.shape)
@@ -65,8 +60,9 @@ class Partner:
         self._fixed: Naturals | None = None
         self._way: ByLabel | None = None
         self.is_mean_by_label = False
-        with marking_invalid(), np.errstate(all="ignore"):
-            self._settle()
+        if settle:
+            with marking_invalid(), np.errstate(all="ignore"):
+                self._settle()
 
     def natural(self, values: Values, members: np.ndarray | None) -> Naturals:
         """What the child adds, natural parameters ``(lead, *plates, ...)`` or ``(lead, members, ...)``."""
@@ -129,10 +125,11 @@ class Partner:
 
         Looked up at the first step, when all kernels have been made.
         """
-        alone = self.pair.child is Categorical and not self.blanket.node.plates
-        if not alone or self.blanket.target.seen(self.term.name) is not None:
+        alone = self.pair.child is Categorical and len(self.terms) == 1
+        if not alone or self.blanket.node.plates:
             return None
-        return counted(self.blanket.target, self.term)
+        target = self.blanket.target
+        return None if target.seen(self.term.name) is not None else counted(target, self.term)
 
     @property
     def _event_ndim(self) -> int:
@@ -145,20 +142,19 @@ class Partner:
             if self._way.direct is not None:
                 return self._way.looked(values)
             return self._way.evaluated(values, self._moved if steps else self._neutral, steps)
-        dist, batch, keys = self._distribution(values, members, steps)
-        value = values[self.term.name]
-        if dist.invalid is not None:
-            self.term.log_of(dist, batch, value)  # raises where that is the model's fault
-        data = self._data if self._data is not None else self._data_of(value)
-        collector = Collector(self.child.relation, self.term.shape, keys, members)
-        return Evaluated(dist, steps, len(self.term.shape), data, collector)
-
-    def _distribution(
-        self, values: Values, members: np.ndarray | None, steps: bool
-    ) -> tuple[Distribution, Shape, tuple[Any, ...]]:
         candidate = self._full(self._moved if steps else self._neutral, members)
         state = self.blanket.placed(values, candidate, members)
-        return self.blanket.distribution(self.child, state)
+        dist, keys = self._valid(state)
+        data = self._data if self._data is not None else self._data_of(self._value(values))
+        collector = Collector(self.relation, self.shape, keys, members)
+        return Evaluated(dist, steps, len(self.shape), data, collector)
+
+    def _valid(self, state: Values) -> tuple[Distribution, tuple[Any, ...]]:
+        """The distribution, and the index by which it read the node; raises where the model is at fault."""
+        dist, batch, keys = self._distribution(state)
+        if dist.invalid is not None:
+            self.term.log_of(dist, batch, self._value(state))
+        return dist, keys
 
     def _full(self, candidate: np.ndarray, members: np.ndarray | None) -> np.ndarray:
         """A candidate for every element, or for those of a class."""
@@ -172,7 +168,7 @@ class Partner:
         domain = self.node.domain
         if domain is not None and (domain.low or self.kind.name != "shares"):
             value = domain.to_support(value)
-        if value.ndim == len(self.node.value_shape):
+        if value.ndim == len(self.shape) + self._event_ndim:
             value = value[None]
         if self.kind.name != "shares":
             value = TRANSFORMS[self.pair.transform](value)
@@ -180,32 +176,55 @@ class Partner:
 
     def _known_data(self) -> Elements | None:
         target = self.blanket.target
-        if not target.is_known(self.term.name):
+        if not all(target.is_known(t.name) for t in self.terms):
             return None
         with np.errstate(all="ignore"):
-            return self._data_of(target.known[self.term.name])
+            return self._data_of(self._value(target.known))
+
+    # ---- the child as such --------------------------------------------------------------------
+
+    @property
+    def terms(self) -> tuple[Term, ...]:
+        """The child, or those that are one here."""
+        return (self.term,)
+
+    @property
+    def shape(self) -> Shape:
+        """Of its elements."""
+        return self.term.shape
+
+    def _distribution(self, state: Values) -> tuple[Distribution, Shape, tuple[Any, ...]]:
+        """Its distribution, the batch of its parents, and the index by which it read the node."""
+        return self.blanket.distribution(self.child, state)
+
+    def _value(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What was drawn from it, shape ``(chains, *shape, *event)``, without chains where it is known."""
+        return values[self.term.name]
+
+    def _find_way(self) -> ByLabel | None:
+        return by_label(self.blanket, self.child, self.pair)
 
     # ---- what never changes -------------------------------------------------------------------
 
     def _settle(self) -> None:
         """Find sums by label, constant slopes and constant children."""
-        alone = self.child.relation.kind != "whole" and len(self.child.relation.rows) <= 1
+        alone = self.relation.kind != "whole" and len(self.relation.rows) <= 1
         if not alone or len(self.blanket.classes) > 1:
             return
         target, name = self.blanket.target, self.blanket.name
-        above = target.hidden_above(self.term)
+        above = dict.fromkeys(n for t in self.terms for n in target.hidden_above(t))
         members = self.blanket.classes[0]
-        if above == (name,) and target.is_known(self.term.name):
+        if list(above) == [name] and self._data is not None:
             value = np.broadcast_to(self._neutral, (1, *self.blanket.node.value_shape))
             self._fixed = self._natural({**target.known, name: value}, members)
             return
         if members is None and self.pair.by_label:
-            self._way = by_label(self.blanket, self.child, self.pair)
+            self._way = self._find_way()
         if self._way is not None:
             if self.is_copy or self.pair.form != "multiple":
-                self._read_directly(above)
+                self._read_directly(tuple(above))
         elif self.kind.name == "mean":
-            self._find_slope(above, members)
+            self._find_slope(tuple(above), members)
 
     def _read_directly(self, above: tuple[str, ...]) -> None:
         """Leave out calls of the function where its parameters are plain nodes by label."""
@@ -214,7 +233,7 @@ class Partner:
         if example is not None and self.kind.name == "mean":
             # the mean varies with this node and the label alone
             dist, _ = self._way.at_labels(example, self._moved)
-            self._slope = slope_of(dist, len(self.term.shape), self._steps)
+            self._slope = slope_of(dist, len(self.shape), self._steps)
             self.is_mean_by_label = self._is_itself(self._slope)
 
     def _is_itself(self, slope: np.ndarray) -> bool:
@@ -231,82 +250,32 @@ class Partner:
         target = self.blanket.target
         if any(target.model[n].is_discrete for n in above):
             return
-        try:
-            result = traced_term(target, above, self.term).result
-        except Untraceable:
-            return
-        loc = result.arguments["loc"] if isinstance(result, TracedCall) else None
-        if not (isinstance(loc, Tracer) and loc.is_affine):
+        if not all(_mean_is_affine(target, t) for t in self.terms):
             return
         # values that can be: the noise may depend on some of these nodes, too
-        state = target.example(above)
+        drawn = [t.name for t in self.terms if t.name in target.chain]
+        state = target.example((*above, *drawn))
+        candidate = self._full(self._moved, members)
         try:
-            dist, _, _ = self._distribution(state, members, True)
+            dist, _, _ = self._distribution(self.blanket.placed(state, candidate, members))
         except BayesmcError:
             return
-        slope = slope_of(dist, len(self.term.shape), self._steps)
+        slope = slope_of(dist, len(self.shape), self._steps)
         if np.isfinite(slope).all():
             self._slope = slope
-
-
-def partner_of(
-    blanket: Blanket, child: Child, kind: Kind, pairs: Sequence[Pair]
-) -> Partner | str | None:
-    """The pair that a child makes with a kind, None where it does not vary with the node, or why not."""
-    term = child.term
-    if term.is_potential:
-        return f"it enters the potential {term.name!r}"
-    try:
-        result = traced_term(blanket.target, (blanket.name,), term).result
-    except Untraceable as error:
-        return f"child {term.name!r} cannot be followed ({error})"
-    if isinstance(result, Distribution):
-        return None
-    if not isinstance(result, TracedCall):
-        return f"child {term.name!r} is no distribution that can be followed"
-    family: Any = result.function
-    traced = result.traced
-    mine = [p for p in pairs if p.kind == kind.name and p.child is family]
-    if not mine:
-        return f"child {term.name!r} is {family.__name__}, which makes no conjugate pair"
-    if len(traced) > 1:
-        return f"it enters {_listed(traced)} of child {term.name!r}"
-    ((parameter, value),) = traced.items()
-    pair = next((p for p in mine if p.parameter == parameter), None)
-    if pair is None or not isinstance(value, Tracer):
-        return f"it enters the {parameter} of {family.__name__} {term.name!r}"
-    reason = _why_not(blanket, child, pair, value)
-    if reason is not None:
-        return f"the {parameter} of child {term.name!r} {reason}"
-    power = 1.0 if pair.form != "power" else value.power
-    assert power is not None
-    return Partner(blanket, child, kind, pair, power, value.is_copy)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _why_not(blanket: Blanket, child: Child, pair: Pair, value: Tracer) -> str | None:
-    """Why a parameter does not have the form that the pair wants, or None."""
-    name = blanket.name
-    if pair.form == "affine":
-        return (
-            None if value.is_affine else f"is not known to be affine in it (after {value.reason})"
-        )
-    relation = child.relation
-    if relation.kind == "whole" or len(relation.rows) > 1 or len(value.sources) > 1:
-        return f"may depend on several elements of {name!r}"
-    if pair.form == "power":
-        return (
-            None if value.power is not None else "is not known to be a power of it times a constant"
-        )
-    if pair.form == "multiple":
-        if value.power == 1.0 and value.whole_event:
-            return None
-        return "is not known to be its value times a number"
-    if not value.is_copy or (blanket.event_shape and not value.whole_event):
-        return "is not known to be its value itself"
-    return None
+def _mean_is_affine(target: Target, term: Term) -> bool:
+    """Whether a term's mean is affine in all hidden nodes that it varies with together."""
+    try:
+        result = traced_term(target, target.hidden_above(term), term).result
+    except Untraceable:
+        return False
+    loc = result.arguments["loc"] if isinstance(result, TracedCall) else None
+    return isinstance(loc, Tracer) and loc.is_affine
 
 
 def _steps(blanket: Blanket) -> np.ndarray:
@@ -329,7 +298,3 @@ def _stepped(neutral: np.ndarray, steps: np.ndarray, event_shape: Shape) -> np.n
 def _last(array: np.ndarray) -> np.ndarray:
     """The first axis moved to the end."""
     return array.transpose((*range(1, array.ndim), 0))
-
-
-def _listed(traced: dict[str, Any]) -> str:
-    return " and ".join(traced)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import is_
 from typing import Any
 
 import numpy as np
@@ -35,8 +36,8 @@ from bayesmc.tracing import TracedCall, Tracer
 MAX_DENSE = 400
 #: numbers that are stored of one chain's precision
 _MAX_ENTRIES = 1 << 22
-#: nodes that are named to the user
-_SHOWN = 8
+#: nodes that are all named to the user, and how many of more
+_SHOWN, _FEW = 8, 4
 _FAMILIES = (Normal, MvNormal, LogNormal)
 
 
@@ -67,8 +68,10 @@ class GaussianBlock(Kernel):
         self.path = target.below(self.names)
         self.layout = layout or Layout(target, self.names, blankets, self.terms)
         self.parts = block_terms(target, blankets, self.layout, self.terms)
-        self.match = "jointly Normal with " + _shortened(self.names)
-        self._standing: tuple[Any, list[BlockTerm]] = (None, [])
+        self.match = "jointly Normal with " + shortened(self.names)
+        #: what terms say that say the same in every sweep, and the data of which that holds
+        self._standing: Any = None
+        self._seen: Values = {}
         self._moving: list[BlockTerm] = []
         #: the precision of the last sweep and its factor
         self._last: tuple[np.ndarray, Factor] | None = None
@@ -102,16 +105,15 @@ class GaussianBlock(Kernel):
     def _summed(self, values: Values, chains: int) -> BlockSums:
         """What all terms say, the block at zero."""
         sums = BlockSums(chains, self.layout)
-        together, standing = self._standing
         moving = self.parts
-        if together is not None and all(part.stands(values) for part in standing):
-            sums.add(*together)
+        if self._stands(values):
+            sums.add(*self._standing)
             moving = self._moving
         if moving:
             base = self._at_zero(values)
             for part in moving:
                 part.add(base, sums)
-            if together is None:
+            if self._standing is None:
                 self._part_ways(base)
         return sums
 
@@ -128,21 +130,28 @@ class GaussianBlock(Kernel):
         self._moving = [p for p in self.parts if not p.stands(base)]
         if standing:
             columns = zip(*(p.summed for p in standing), strict=True)
-            self._standing = tuple(sum(c) for c in columns), standing
+            self._standing = tuple(sum(c) for c in columns)
+            self._seen = {n: base[n] for p in standing for n in p.data}
+
+    def _stands(self, values: Values) -> bool:
+        """Whether all terms that were summed once still say the same."""
+        seen = self._seen
+        return self._standing is not None and all(
+            map(is_, map(values.__getitem__, seen), seen.values())
+        )
 
     def _why_bad(self, sums: BlockSums) -> str:
         if sums.problem is not None:
             return str(sums.problem)
         return (
-            f"nodes {', '.join(map(repr, self.names))}: their joint precision given the others is not "
+            f"nodes {shortened(self.names, quoted=True)}: their joint precision given the others is not "
             "positive definite; a scale is near zero or infinite"
         )
 
     def _at_zero(self, values: Values) -> Values:
         """The state with the block at zero (what is seen of it stays)."""
         state = {**values, **self.layout.base}
-        for link in self.path:
-            state[link], _ = self.target.model.evaluate(link, state)
+        self.target.compute(state, self.path)
         return state
 
     def _check(
@@ -163,7 +172,7 @@ class GaussianBlock(Kernel):
             gauss.append(np.vecdot(linear, x) - 0.5 * np.vecdot(x, np.matvec(dense, x)))
             sizes.append(np.abs(np.vecdot(linear, x)) + np.abs(np.vecdot(x, np.matvec(dense, x))))
         check_ratio(
-            ", ".join(self.names),
+            shortened(self.names),
             self.match,
             logs[1] - logs[0],
             gauss[1] - gauss[0],
@@ -180,6 +189,21 @@ def gaussian_blocks(
     for names in _joint_groups(target, able, blankets):
         found += _fitting(target, names, blankets, debug)
     return found
+
+
+def shortened(names: Sequence[str], quoted: bool = False) -> str:
+    """The first few names, and how many there are.
+
+    Examples
+    --------
+    >>> from bayesmc.kernels.gaussian_block import shortened
+    >>> shortened([f"x[{t}]" for t in range(1000)])
+    'x[0], x[1], x[2], x[3], ... (1000 nodes)'
+    """
+    shown = [repr(n) if quoted else n for n in names]
+    if len(names) > _SHOWN:
+        shown = [*shown[:_FEW], f"... ({len(names)} nodes)"]
+    return ", ".join(shown)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -310,8 +334,3 @@ def _jointly_affine(target: Target, one: _Group, other: _Group) -> bool:
         if not _is_affine(target, entering, target.terms[name]):
             return False
     return True
-
-
-def _shortened(names: Sequence[str]) -> str:
-    shown = names if len(names) <= _SHOWN else (*names[:_SHOWN], f"... ({len(names)} nodes)")
-    return ", ".join(shown)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.kernels.gaussian_band import Band, Blocks, cholesky, lapack
+from bayesmc.kernels.gaussian_band import Band, cholesky, lapack
 from bayesmc.kernels.gaussian_order import Components, order_of
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Term, Values
@@ -56,10 +56,6 @@ class Layout:
         self.size = len(self.position)
         self.cut, self.dg = self.first.size, order.rest
         self.width = self.first.width if isinstance(self.first, Band) else 0
-        #: matrices that are eliminated first, and rows of each; of a band every column counts as one
-        self.n, self.dl = self.cut, 1
-        if isinstance(self.first, Blocks):
-            self.n, self.dl = self.first.count, self.first.width
         self.entries = order.entries + 1
         self._partly = tuple(n for n in names if not self.free[n].all())
         self._units = self._diagonal_of_seen()

@@ -6,7 +6,7 @@ Like terms (the transitions of a chain of slices) are one, in one more plate.
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from operator import is_
 from typing import Any
 
@@ -16,6 +16,7 @@ from bayesmc.distributions import LogNormal, MvNormal
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.gaussian_layout import BlockSums, Layout
 from bayesmc.kernels.gaussian_order import elements_read
+from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket, Child
 from bayesmc.structure.like_functions import Slots, stack_arrays
 from bayesmc.structure.like_terms import FEWEST, LikeTerms, TermSum
@@ -35,17 +36,18 @@ def block_terms(
     for name, blanket in blankets.items():
         for child in blanket.children:
             entering[child.term.name][name] = child
-    stacked = _stacked(target, layout, terms, entering)
-    inside = {n for group in stacked.values() for n in group.names}
-    made = []
+    parts = {}
+    inside: set[str] = set()
+    for group in _stacked(target, layout, terms, entering):
+        members = [target.terms[n] for n in group.names]
+        part = BlockTerm(target, blankets, layout, entering, members, group)
+        if part.constant or not part.linked:
+            parts[group.names[0]] = part
+            inside |= set(group.names)
     for term in terms:
-        if term.name in stacked:
-            group = stacked[term.name]
-            members = [target.terms[n] for n in group.names]
-            made.append(BlockTerm(target, blankets, layout, entering, members, group))
-        elif term.name not in inside:
-            made.append(BlockTerm(target, blankets, layout, entering, [term]))
-    return made
+        if term.name not in inside:
+            parts[term.name] = BlockTerm(target, blankets, layout, entering, [term])
+    return [parts[t.name] for t in terms if t.name in parts]
 
 
 class BlockTerm:
@@ -84,15 +86,17 @@ class BlockTerm:
         #: elements that count
         self.seen = self.count if mask is None else int(mask.sum())
         self.children = dict(entering[self.term.name])
-        self.columns = [(n, c) for n in self.children for c in range(layout.dims[n])]
+        self.columns = self._columns(self.children)
+        #: the block enters like terms through deterministic nodes: slopes are found one by one
+        self.linked = like is not None and _is_linked(target, self.term, self.children)
         self.dynamic = next(
             (n for n, c in self.children.items() if c.relation.kind == "lookup"), None
         )
         #: coefficients never change; nor does anything else but the noise; nor does that
         constancy = [self._constancy(t) for t in members]
         self.constant, self.fixed, self.frozen = (all(c) for c in zip(*constancy, strict=True))
-        self._data = () if self.own else tuple(t.name for t in members)
-        self._known = [target.known.get(n) for n in self._data]
+        self.data = () if self.own else tuple(t.name for t in members)
+        self._known = [target.known.get(n) for n in self.data]
         self.kept: Any = None
         self.slopes: np.ndarray | None = None
         self.summed: Any = None
@@ -114,7 +118,8 @@ class BlockTerm:
         uniform = self._uniform_scale(dist)
         if fixed and not self.frozen and uniform is not None:
             if self.summed is None:
-                self.summed = _first(self._sums(*self._masked(*self._rows(state, dist)), spots))
+                rows = self._rows(base, state, dist)
+                self.summed = _first(self._sums(*self._masked(*rows), spots))
             weight = uniform**-2.0
             precision, linear, constant = self.summed
             constant = weight * constant - self.seen * np.log(uniform)
@@ -122,7 +127,7 @@ class BlockTerm:
             return
         rows = self.kept
         if rows is None or not fixed:
-            rows = self._rows(state, dist)
+            rows = self._rows(base, state, dist)
             self.kept = _first(rows) if fixed else None
         whitened, log_det = self._whitened(dist, *rows)
         precision, linear, constant = self._sums(*whitened, spots)
@@ -150,7 +155,7 @@ class BlockTerm:
         return True, fixed, fixed and all(n in names for n in above)
 
     def _is_fixed(self, values: Values) -> bool:
-        return self.fixed and all(map(is_, [values[n] for n in self._data], self._known))
+        return self.fixed and all(map(is_, [values[n] for n in self.data], self._known))
 
     def _gather(self, like: LikeTerms) -> None:
         """Which names stand for nodes of the block, at zero always, and which for others."""
@@ -205,9 +210,11 @@ class BlockTerm:
             return None
         return scale.reshape(-1)
 
-    def _rows(self, state: Values, dist: Any) -> tuple[np.ndarray, np.ndarray]:
+    def _rows(self, base: Values, state: Values, dist: Any) -> tuple[np.ndarray, np.ndarray]:
         """Residuals: coefficients ``(lead, elements, d, columns)``, constants ``(lead, elements, d)``."""
         zero = self._flat(dist.loc)
+        if self.linked and self.slopes is None:
+            self.slopes = self._slopes_one_by_one(base)
         if self.slopes is not None:
             slopes = self.slopes
         else:
@@ -235,9 +242,25 @@ class BlockTerm:
         state = dict(base)
         state[name] = base[name] + self._step(name, component).reshape(base[name].shape)
         if self.like is None:
-            for link in self.target.below((name,)):
-                state[link], _ = self.target.model.evaluate(link, state)
+            self.target.compute(state, self.target.between((name,), self.term))
         return self._distribution(state)[0]
+
+    def _slopes_one_by_one(self, base: Values) -> np.ndarray:
+        """Constant slopes of like terms, each from its own functions, shape (1, elements, d, columns)."""
+        layout, found = self.layout, []
+        for term in self.members:
+            dist: Any = term.distribution(base)[0]
+            zero = self._flat(dist.loc, term.shape)
+            steps = []
+            for name, component in self._columns(self._entering[term.name]):
+                step = np.zeros((layout.counts[name], layout.dims[name]))
+                step[:, component] = layout.free[name]
+                state = {**base, name: base[name] + step.reshape(base[name].shape)}
+                self.target.compute(state, self.target.between((name,), term))
+                dist = term.distribution(state)[0]
+                steps.append(self._flat(dist.loc, term.shape)[0] - zero[0])
+            found.append(np.stack(steps, axis=-1))
+        return np.concatenate(found)[None]
 
     def _step(self, name: str, component: int) -> np.ndarray:
         layout = self.layout
@@ -246,13 +269,18 @@ class BlockTerm:
         step[..., component] = [layout.free[n] for n in names]
         return step
 
-    def _flat(self, array: np.ndarray) -> np.ndarray:
+    def _columns(self, names: Iterable[str]) -> list[tuple[str, int]]:
+        """The components of some nodes."""
+        return [(n, c) for n in names for c in range(self.layout.dims[n])]
+
+    def _flat(self, array: np.ndarray, plates: Shape | None = None) -> np.ndarray:
         """``(*lead, *plates, *event)`` as ``(lead, elements, d)``."""
-        shape = self.shape + self.node.event_shape
+        plates = self.shape if plates is None else plates
+        shape = plates + self.node.event_shape
         array = np.asarray(array)
         lead = array.shape[: max(array.ndim - len(shape), 0)]
         full = np.broadcast_to(array, lead + shape)
-        return full.reshape(math.prod(lead), self.count, self.d)
+        return full.reshape(math.prod(lead), math.prod(plates), self.d)
 
     def _whitened(
         self, dist: Any, rows: np.ndarray, rest: np.ndarray
@@ -294,10 +322,13 @@ class BlockTerm:
         layout = self.layout
         count = math.prod(term.shape)
         found = []
-        for first, component in self.columns:
-            name = first
-            if self.like is not None:  # the node in the same place
-                name = term.scope[self.members[0].scope.index(first)]
+        columns = self.columns
+        if self.linked:
+            columns = self._columns(entering[term.name])
+        elif self.like is not None:  # the nodes in the same places
+            scope = self.members[0].scope
+            columns = [(term.scope[scope.index(n)], c) for n, c in columns]
+        for name, component in columns:
             relation = entering[term.name][name].relation
             elements = elements_read(relation, term)
             if elements is None:
@@ -329,27 +360,33 @@ class BlockTerm:
 
 def _stacked(
     target: Target, layout: Layout, terms: Sequence[Term], entering: Entering
-) -> dict[str, LikeTerms]:
-    """Groups of like terms that the block's nodes enter alike, by the first of each."""
+) -> list[LikeTerms]:
+    """Groups of like terms that the block's nodes enter alike."""
     alike: dict[Hashable, list[Term]] = {}
     for term in terms:
         key = _how_entered(target, layout, term, entering[term.name])
         if key is not None:
             alike.setdefault(key, []).append(term)
     many = [t for t in alike.values() if len(t) >= FEWEST]
-    return {group.names[0]: group for t in many for group in TermSum(target, t).groups}
+    return [group for t in many for group in TermSum(target, t).groups]
 
 
 def _how_entered(
     target: Target, layout: Layout, term: Term, children: Mapping[str, Child]
 ) -> Hashable | None:
-    """How the block enters a term: in which places; None where not directly, or by varying indices."""
+    """How the block enters a term: in which places, or with how many columns; None by varying indices."""
     if any(c.relation.kind == "lookup" for c in children.values()):
         return None
-    if not set(target.below(tuple(children))).isdisjoint(term.scope) if children else False:
-        return None
+    if _is_linked(target, term, children):
+        own = tuple(n in layout.start for n in term.scope)
+        return own, tuple(layout.dims[n] for n in children)
     kinds = tuple((n in layout.start, _kind(children.get(n))) for n in term.scope)
     return kinds if set(children) <= set(term.scope) else None
+
+
+def _is_linked(target: Target, term: Term, children: Iterable[str]) -> bool:
+    """Whether some nodes enter a term through deterministic ones."""
+    return bool(target.between(tuple(children), term))
 
 
 def _kind(child: Child | None) -> str | None:

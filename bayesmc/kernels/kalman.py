@@ -76,13 +76,15 @@ def condition(rows: np.ndarray, observed: int, carried: int | None = None) -> Co
     if k < r:
         rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], r - k))], axis=-1)
         k = r
-    alone = rows.ndim == 2 and rows.size > 0
-    lower, turn = (_by_lapack if alone else _by_numpy)(rows, carried)
-    signs = np.copysign(1.0, lower.diagonal(0, -2, -1))
-    lower *= signs[..., None, :]
-    if turn is not None:
-        turn[..., :r] *= signs[..., None, :]
     p = observed
+    if rows.ndim == 2 and rows.size:
+        lower, turn = _by_lapack(rows, carried)
+        return Conditioned(lower[:p, :p], lower[p:, :p], lower[p:, p:], turn)
+    lower, turn = _by_numpy(rows, carried)
+    signs = np.copysign(1.0, lower.diagonal(0, -2, -1))[..., None, :]
+    lower *= signs
+    if turn is not None:
+        turn[..., :r] *= signs
     return Conditioned(lower[..., :p, :p], lower[..., p:, :p], lower[..., p:, p:], turn)
 
 
@@ -128,21 +130,17 @@ class Turned(NamedTuple):
     spread: np.ndarray
 
 
-def turned(found: Conditioned, carried: int) -> Turned:
-    """Split a transformation; ``carried`` entries of the later slice are known to the slice after it."""
-    assert found.turn is not None
-    p = found.root.shape[-1]
-    rest = found.turn[..., p + carried :]
+def turned(turn: np.ndarray, observed: int, carried: int) -> Turned:
+    """Split a transformation; ``carried`` entries of the later slice are known to the slice after it.
+
+    With spread S of the later slice's noise, that of the earlier one's is ``link @ S @ link.T + spread``.
+    """
+    rest = turn[..., observed + carried :]
     return Turned(
-        found.turn[..., :p],
-        found.turn[..., p : p + carried],
+        turn[..., :observed],
+        turn[..., observed : observed + carried],
         rest @ np.matrix_transpose(rest),
     )
-
-
-def back(step: Turned, spread: np.ndarray) -> np.ndarray:
-    """Covariance of the noise of the slice before, given that of the slice after."""
-    return step.link @ spread @ np.matrix_transpose(step.link) + step.spread
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -165,14 +163,17 @@ def _by_lapack(rows: np.ndarray, carried: int | None) -> tuple[np.ndarray, np.nd
     """Householder by LAPACK's own interface: a third of the time of ``numpy.linalg.qr`` on small matrices."""
     lapack = _lapack()
     r, k = rows.shape
-    packed, tau = lapack.dgeqrf(rows.T, overwrite_a=1)[:2]
+    packed, tau, _, _ = lapack.dgeqrf(rows.T, overwrite_a=1)
     lower = packed.T[:, :r] * _lower_mask(r)
+    signs = np.copysign(1.0, lower.diagonal())
+    lower *= signs
     if carried is None:
         return lower, None
     square = np.zeros((k, k), order="F")
     square[:, :r] = packed
-    full = lapack.dorgqr(square, tau, overwrite_a=1)[0]
-    return lower, full[:carried].copy()
+    turn = lapack.dorgqr(square, tau, overwrite_a=1)[0][:carried].copy()
+    turn[:, :r] *= signs
+    return lower, turn
 
 
 def _by_numpy(rows: np.ndarray, carried: int | None) -> tuple[np.ndarray, np.ndarray | None]:

@@ -125,8 +125,7 @@ class Blanket:
             lead = candidate.shape[: candidate.ndim - len(self.node.value_shape)]
             candidate = np.broadcast_to(candidate, lead + self.node.value_shape)
         state[self.name] = candidate
-        for link in self.path:
-            state[link], _ = self.target.model.evaluate(link, state)
+        self.target.compute(state, self.path)
         return state
 
     def own_log(

@@ -7,7 +7,7 @@ it tries. Here the children get a group axis, as if they were one child in one m
 from __future__ import annotations
 
 import copy
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +17,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
 from bayesmc.network import Model
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.like_functions import GROUP, Signatures, in_model, some_states
+from bayesmc.structure.like_functions import GROUP, in_model
 from bayesmc.structure.like_terms import FEWEST, LikeTerms, like_terms, repeated
 from bayesmc.structure.target import Values
 
@@ -34,7 +34,7 @@ class GroupedBlanket(Blanket):
         taken = {n for terms, _ in groups for n in terms.names}
         self.alone = tuple(c for c in self.children if c.term.name not in taken)
         #: for each group a blanket that knows its functions
-        self._asked = [_in_model(blanket, terms.model) for terms, _ in groups]
+        self._asked = [in_model_of(blanket, terms.model) for terms, _ in groups]
 
     def log_density(
         self,
@@ -98,10 +98,10 @@ def with_like_children(blanket: Blanket) -> Blanket:
     ... )
     True
     """
-    found = _alike(blanket)
+    found = like_children(blanket, blanket.children)
     if not found:
         return blanket
-    states = some_states(blanket.target)
+    states = blanket.target.states
     if states is None:
         return blanket
     groups = []
@@ -112,22 +112,23 @@ def with_like_children(blanket: Blanket) -> Blanket:
     return GroupedBlanket(blanket, groups) if groups else blanket
 
 
-# ---- private ------------------------------------------------------------------------------------
+def like_children(
+    blanket: Blanket,
+    children: Sequence[Child],
+    also: Callable[[Child], Hashable] | None = None,
+) -> list[list[Child]]:
+    """Children by what they are and how they depend on the node, where there are many.
 
-
-def _in_model(blanket: Blanket, model: Model) -> Blanket:
-    asked = copy.copy(blanket)
-    asked.target = in_model(blanket.target, model, blanket.target.terms)
-    return asked
-
-
-def _alike(blanket: Blanket) -> list[list[Child]]:
-    """Children by what they are and how they depend on the node, where there are many."""
-    if len(blanket.children) < FEWEST:
+    Parameters
+    ----------
+    also : callable, optional
+        What else must be equal within a group.
+    """
+    if len(children) < FEWEST:
         return []
-    signatures = Signatures(blanket.target)
+    signatures = blanket.target.signatures
     groups: dict[Hashable, list[Child]] = {}
-    for child in blanket.children:
+    for child in children:
         signature = signatures.of(child.term.name)
         if signature is None:
             continue
@@ -136,9 +137,36 @@ def _alike(blanket: Blanket) -> list[list[Child]]:
         # the node, and what follows from it, in the same places
         reached = tuple(n == blanket.name or n in blanket.path for n in scope)
         how = (relation.kind, relation.foreign, relation.coupled, relation.term_plates)
-        key = (signature.key, reached, repeated(scope), source, how, len(relation.rows))
+        more = None if also is None else also(child)
+        key = (signature.key, reached, repeated(scope), source, how, len(relation.rows), more)
         groups.setdefault(key, []).append(child)
     return [g for g in groups.values() if len(g) >= FEWEST]
+
+
+def as_one_child(
+    blanket: Blanket, children: Sequence[Child], states: Values
+) -> tuple[LikeTerms, Child] | None:
+    """Like children as one, whose relation has the group as one more plate; None where they cannot be.
+
+    Whether the one says what they say is for the caller to check.
+    """
+    terms = like_terms(blanket.target, [c.term for c in children], states)
+    if terms is None:
+        return None
+    first = children[0].relation
+    rows = tuple(np.concatenate(r) for r in zip(*(c.relation.rows for c in children), strict=True))
+    relation = replace(first, term_plates=(GROUP, *first.term_plates), rows=rows, _kept={})
+    return terms, Child(terms.term, relation)
+
+
+def in_model_of(blanket: Blanket, model: Model) -> Blanket:
+    """The blanket, asking a model in which a function has the numbers of a group."""
+    asked = copy.copy(blanket)
+    asked.target = in_model(blanket.target, model, blanket.target.terms)
+    return asked
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _grouped(
@@ -146,15 +174,9 @@ def _grouped(
 ) -> tuple[LikeTerms, Child] | None:
     """Like children as one; None where that would not say what they say."""
     try:
-        terms = like_terms(blanket.target, [c.term for c in children], states)
-        if terms is None:
+        group = as_one_child(blanket, children, states)
+        if group is None:
             return None
-        first = children[0].relation
-        rows = tuple(
-            np.concatenate(r) for r in zip(*(c.relation.rows for c in children), strict=True)
-        )
-        relation = replace(first, term_plates=(GROUP, *first.term_plates), rows=rows, _kept={})
-        group = terms, Child(terms.term, relation)
         return group if _agrees(blanket, children, group, states) else None
     except BayesmcError:  # at some state, perhaps one that is impossible
         return None

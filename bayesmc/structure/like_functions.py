@@ -14,7 +14,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from operator import is_
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,15 +23,16 @@ from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.align import Aligner
 from bayesmc.network.domain import Domain
+from bayesmc.shapes import Shape
 from bayesmc.structure.likeness import Skeleton, same_number, skeleton, with_numbers
-from bayesmc.structure.target import Target, Term, Values
+
+if TYPE_CHECKING:  # a target recomputes like links as one
+    from bayesmc.structure.target import Target, Term, Values
 
 #: stands for a parent that only lengthens the batch
 GROUP = "\0group"
 #: relative error that rounding may make
 _EXACT = 1e-12
-#: states on which functions are compared
-_STATES = 6
 #: event axes that numbers may meet
 _EVENT_NDIM = 3
 
@@ -230,13 +231,12 @@ def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:
     lead = first.ndim - trailing
     if len(arrays) == 1:
         return first if not lead else first.reshape(*first.shape[:lead], 1, *first.shape[lead:])
-    if any(a.shape != first.shape for a in arrays):  # some of them are known
-        arrays = np.broadcast_arrays(*arrays)
-        first = arrays[0]
-        lead = first.ndim - trailing
-    if not first.ndim:
-        return np.array(arrays)
-    rows = np.concatenate(arrays).reshape(len(arrays), *first.shape)
+    shapes = [a.shape for a in arrays]
+    if shapes.count(first.shape) == len(arrays):
+        rows = _rows(arrays)
+    else:  # some of them are known, or have more candidates
+        rows = _broadcast_rows(arrays, shapes)
+        lead = rows.ndim - 1 - trailing
     return rows.swapaxes(0, 1) if lead == 1 else np.moveaxis(rows, 0, lead)
 
 
@@ -245,22 +245,6 @@ def in_model(target: Target, model: Model, terms: Mapping[str, Term]) -> Target:
     problem = replace(target.problem, model=model, cache={})
     own = {name: replace(term, model=model) for name, term in terms.items()}
     return replace(target, problem=problem, terms=own, _below={})
-
-
-def some_states(target: Target) -> Values | None:
-    """Reachable values of all nodes, ``(states, *plates, *event)``; None where they cannot be had."""
-    model = target.model
-    values: Values = dict(target.known)
-    for name in target.chain:
-        shape = model[name].value_shape
-        full = np.broadcast_to(model.probe[name], model.probe_shape + shape)
-        values[name] = full.reshape(-1, *shape)[:_STATES]
-    try:
-        with marking_invalid(), np.errstate(all="ignore"):
-            target.refresh(values, target.chain)
-    except BayesmcError:
-        return None
-    return values
 
 
 def close(a: np.ndarray, b: np.ndarray) -> bool:
@@ -277,6 +261,25 @@ def value_key(node: CompiledNode) -> Hashable:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _rows(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Arrays of one shape as the rows of one."""
+    shape = arrays[0].shape
+    return np.concatenate(arrays).reshape(len(arrays), *shape) if shape else np.array(arrays)
+
+
+def _broadcast_rows(arrays: Sequence[np.ndarray], shapes: Sequence[Shape]) -> np.ndarray:
+    """Arrays of few shapes as the rows of one."""
+    places: dict[Shape, list[int]] = {}
+    for i, shape in enumerate(shapes):
+        places.setdefault(shape, []).append(i)
+    full = np.broadcast_shapes(*places)
+    rows = np.empty((len(arrays), *full), np.result_type(*{a.dtype for a in arrays}))
+    for shape, at in places.items():
+        part = _rows([arrays[i] for i in at])
+        rows[at] = part.reshape(len(at), *(1,) * (len(full) - len(shape)), *shape)
+    return rows
 
 
 def _once(names: Sequence[str]) -> tuple[str, ...]:

@@ -14,10 +14,8 @@ from bayesmc.network import Model
 from bayesmc.shapes import broadcast_shapes
 from bayesmc.structure.like_functions import (
     LikeFunctions,
-    Signatures,
     Slots,
     close,
-    some_states,
 )
 from bayesmc.structure.target import Target, Term, Values
 
@@ -110,7 +108,7 @@ class TermSum:
 
 def like_terms(target: Target, terms: Sequence[Term], states: Values) -> LikeTerms | None:
     """Terms of equal signatures as one; None where their numbers do not broadcast."""
-    signatures = Signatures(target)
+    signatures = target.signatures
     found = [signatures.of(t.name) for t in terms]
     alike = LikeFunctions(tuple(t.name for t in terms), tuple(s for s in found if s is not None))
     scopes = [s.scope for s in alike.signatures]
@@ -134,14 +132,14 @@ def repeated(scope: Sequence[str]) -> tuple[int, ...]:
 
 
 def _groups(target: Target, terms: Sequence[Term]) -> list[LikeTerms]:
-    signatures = Signatures(target)
+    signatures = target.signatures
     alike: dict[Hashable, list[Term]] = {}
     for term in terms:
         signature = signatures.of(term.name)
         if signature is not None:
             alike.setdefault((signature.key, repeated(signature.scope)), []).append(term)
     many = [g for g in alike.values() if len(g) >= FEWEST]
-    states = some_states(target) if many else None
+    states = target.states if many else None
     if states is None:
         return []
     found = []

@@ -25,11 +25,9 @@ from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_functions import (
     LikeFunctions,
     Signature,
-    Signatures,
     Slots,
     close,
     in_model,
-    some_states,
     stack_arrays,
     value_key,
 )
@@ -137,12 +135,11 @@ def stacks(
         if form is not None:
             alike.setdefault(form.key, []).append(form)
     found: list[StackedBlanket] = []
-    states = None
     for group in alike.values():
         for members in _apart(group):
             if len(members) < FEWEST:
                 continue
-            states = some_states(target) if states is None else states
+            states = target.states
             if states is None:
                 return [], list(names)
             stack = _stacked(target, members, states)
@@ -181,7 +178,7 @@ class _Forms:
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self._signatures = Signatures(target)
+        self._signatures = target.signatures
         self._numbers: dict[Hashable, int] = {}
 
     def of(self, blanket: Blanket) -> _Form | None:

@@ -15,12 +15,17 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import DensityError
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError, DensityError
 from bayesmc.network import Model, Observed, Problem
 from bayesmc.network.model import invalid_error
 from bayesmc.shapes import Shape, broadcast_shapes
+from bayesmc.structure.like_functions import Signatures
+from bayesmc.structure.like_links import FEWEST, LinkSteps
 
 Values = dict[str, np.ndarray]
+#: rows of the states on which functions are compared
+_STATES = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,12 +157,27 @@ class Target:
             reached.add(name)
             if not self.model[name].is_stochastic:
                 todo += self.model[name].parents
-        return tuple(n for n in self.chain if n in reached)
+        return self._in_order(n for n in reached if self.model[n].is_stochastic)
 
     def free_elements(self, name: str) -> np.ndarray | None:
         """Flat plate elements of a chain node that are hidden; None where all are."""
         seen = self.seen(name)
         return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
+
+    @cached_property
+    def _order(self) -> dict[str, int]:
+        """Hidden node -> its place, nodes of the chain and deterministic ones apart."""
+        return {name: k for names in (self.chain, self.links) for k, name in enumerate(names)}
+
+    def _in_order(self, names: Iterable[str]) -> tuple[str, ...]:
+        """Nodes of the chain, or links, as they stand there; others are left out."""
+        found = [n for n in names if n in self._order]
+        return tuple(sorted(found, key=self._order.__getitem__))
+
+    @cached_property
+    def _link_steps(self) -> dict[tuple[str, ...], LinkSteps]:
+        """How some deterministic nodes are recomputed."""
+        return {}
 
     @cached_property
     def _place(self) -> dict[str, int]:
@@ -194,19 +214,71 @@ class Target:
                     if link not in reached:
                         reached.add(link)
                         todo.append(link)
-            found = self._below[key] = tuple(n for n in self.links if n in reached)
+            found = self._below[key] = self._in_order(reached)
         return found
+
+    def between(self, names: Iterable[str], term: Term) -> tuple[str, ...]:
+        """Deterministic nodes through which some nodes reach a term, parents first."""
+        above: set[str] = set()
+        todo = list(term.parents)
+        while todo:
+            name = todo.pop()
+            if name not in above and name in self._order and not self.model[name].is_stochastic:
+                above.add(name)
+                todo += self.model[name].parents
+        reached = set(names)
+        found = []
+        for link in self._in_order(above):
+            if not reached.isdisjoint(self.model[link].parents):
+                reached.add(link)
+                found.append(link)
+        return tuple(found)
 
     def refresh(self, values: Values, moved: Iterable[str]) -> None:
         """Recompute the deterministic nodes that depend on nodes that moved."""
-        for link in self.below(moved):
-            values[link], _ = self.model.evaluate(link, values)
+        self.compute(values, self.below(moved))
+
+    def compute(self, values: Values, links: tuple[str, ...]) -> None:
+        """Recompute some deterministic nodes, given parents first; many like ones in one call."""
+        if len(links) < FEWEST:
+            for link in links:
+                values[link], _ = self.model.evaluate(link, values)
+            return
+        steps = self._link_steps.get(links)
+        if steps is None:
+            steps = self._link_steps[links] = LinkSteps(self, links)
+        steps.compute(values)
+
+    @cached_property
+    def signatures(self) -> Signatures:
+        """What its terms and deterministic nodes are, to find like ones."""
+        return Signatures(self)
+
+    @cached_property
+    def states(self) -> Values | None:
+        """A few reachable values of all nodes, to compare functions on; None where they cannot be had.
+
+        Shape ``(states, *plates, *event)``.
+        """
+        model = self.model
+        values: Values = dict(self.known)
+        for name in self.chain:
+            shape = model[name].value_shape
+            full = np.broadcast_to(model.probe[name], model.probe_shape + shape)
+            values[name] = full.reshape(-1, *shape)[:_STATES]
+        try:
+            with marking_invalid(), np.errstate(all="ignore"):
+                for link in self.links:
+                    values[link], _ = model.evaluate(link, values)
+        except BayesmcError:
+            return None
+        return values
 
     def example(self, names: Iterable[str]) -> Values:
         """One reachable value of some chain nodes, and of what else is needed for what follows from them."""
-        wanted = list(names)
+        wanted = dict.fromkeys(names)
         for link in self.below(wanted):
-            wanted += [p for p in self._ancestors(link) if p not in wanted]
+            wanted |= dict.fromkeys(self._ancestors(link))
         state: Values = dict(self.known)
         for name in wanted:
             rows = np.asarray(self.model.probe[name])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import ChainMap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -71,7 +72,8 @@ def traced_term(target: Target, names: tuple[str, ...], term: Term) -> Traced:
 
 def _call(target: Target, names: tuple[str, ...], term: Term) -> tuple[Any, list[tuple[Any, ...]]]:
     model = target.model
-    values: dict[str, Any] = {**model.probe, **target.known}
+    # nothing is copied: there may be thousands of nodes, and as many calls
+    values: Any = ChainMap({}, target.known, model.probe)
     for name in names:
         node = model[name]
         if node.domain is not None:
@@ -81,7 +83,7 @@ def _call(target: Target, names: tuple[str, ...], term: Term) -> tuple[Any, list
         )
     keys: list[tuple[Any, ...]] = []
     with marking_invalid(), np.errstate(all="ignore"):
-        for link in target.below(names):
+        for link in target.between(names, term):
             node = model[link]
             if node.declaration.vectorize or node.declaration.function is None or node.domain:
                 raise Untraceable(f"node {link!r} cannot be followed")

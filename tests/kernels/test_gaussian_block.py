@@ -168,6 +168,39 @@ def labelled() -> tuple[bmc.BayesNet, dict[str, Any]]:
     return net, {"y": rng.normal(size=8), "z": rng.normal(size=8)}
 
 
+def through_nodes() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Deterministic nodes in every slice: before the next state, and before what is seen."""
+    rng = np.random.default_rng(6)
+    net = bmc.BayesNet(plates={"k": 2})
+    net.add("sd", bmc.LogNormal(0.0, 0.3))
+    net.add("level", bmc.Normal(1.0, 2.0))
+    net.add("x[0]", bmc.Normal(0.0, 1.0), plates="k")
+    evidence: dict[str, Any] = {}
+    for t in range(1, 8):
+        net.add(
+            f"drift[{t}]",
+            lambda x, level, t=t: level + (0.5 + t / 9) * (x - level),
+            parents=[f"x[{t - 1}]", "level"],
+            plates="k",
+        )
+        net.add(
+            f"x[{t}]",
+            lambda drift, sd: bmc.Normal(drift, sd),
+            parents=[f"drift[{t}]", "sd"],
+            plates="k",
+        )
+        net.add(f"twice[{t}]", lambda x: 2 * x - 1, parents=[f"x[{t}]"], plates="k")
+        net.add(
+            f"y[{t}]",
+            lambda twice, x, sd: bmc.Normal(twice + 0.3 * x, sd / 2),
+            parents=[f"twice[{t}]", f"x[{t}]", "sd"],
+            plates="k",
+        )
+        evidence[f"y[{t}]"] = np.where(rng.random(2) < 0.3, np.nan, rng.normal(size=2))
+    evidence["x[5]"] = np.array([np.nan, 0.5])
+    return net, evidence
+
+
 def sparse(seed: int) -> Callable[[], tuple[bmc.BayesNet, dict[str, Any]]]:
     def made() -> tuple[bmc.BayesNet, dict[str, Any]]:
         """Every node has some earlier ones as parents, near ones mostly; noise differs by chain."""
@@ -198,9 +231,12 @@ def linear(weights: np.ndarray, parents: list[str]) -> tuple[Any, ...]:
     return eval(source, {"function": function}), ["tau", *parents]
 
 
-NETS = {"lagged": lagged, "moving": moving, "labelled": labelled} | {
-    f"sparse {seed}": sparse(seed) for seed in range(3)
-}
+NETS = {
+    "lagged": lagged,
+    "moving": moving,
+    "labelled": labelled,
+    "through nodes": through_nodes,
+} | {f"sparse {seed}": sparse(seed) for seed in range(3)}
 
 
 def posed(make: Callable[[], tuple[bmc.BayesNet, dict[str, Any]]]) -> tuple[Target, Values]:
@@ -322,7 +358,7 @@ def test_every_order_gives_the_law_that_the_densities_give(
     np.testing.assert_allclose(integral - integral[0], whole - whole[0], atol=1e-8)
 
 
-@pytest.mark.parametrize("name", ["lagged", "moving", "sparse 0"])
+@pytest.mark.parametrize("name", ["lagged", "moving", "through nodes", "sparse 0"])
 def test_a_term_that_is_forgotten_shows(name: str) -> None:
     """The negative control of the test above."""
     target, values = posed(NETS[name])
@@ -333,7 +369,7 @@ def test_a_term_that_is_forgotten_shows(name: str) -> None:
     np.testing.assert_allclose(law_of(block, values)[1], cov, atol=1e-8)
     forgotten = next(part for part in block.parts if not part.own)
     block.parts = [part for part in block.parts if part is not forgotten]
-    block._standing = (None, [])
+    block._standing = None
     assert np.abs(law_of(block, values)[1] - cov).max() > 1e-3
 
 
@@ -436,6 +472,38 @@ def test_like_terms_are_one_part() -> None:
         tuple(f"x[{t}]" for t in range(2, 9)),  # x[4], of which one element is seen, among them
         tuple(f"y[{t}]" for t in range(9)),
     ]
+
+
+def test_like_terms_through_deterministic_nodes_are_one_part() -> None:
+    target, _ = posed(through_nodes)
+    parts = {part.like.names: part for part in the_block(target).parts if part.like is not None}
+    for what in "xy":
+        assert parts[tuple(f"{what}[{t}]" for t in range(1, 8))].linked
+
+
+def test_slopes_that_change_are_not_kept() -> None:
+    """Through deterministic nodes, and by a hidden number: terms stay apart, and the law is right."""
+
+    def made() -> tuple[bmc.BayesNet, dict[str, Any]]:
+        net = bmc.BayesNet()
+        net.add("slope", bmc.LogNormal(0.0, 1.0))
+        net.add("x[0]", bmc.Normal(0.0, 1.0))
+        for t in range(1, 6):
+            net.add(f"m[{t}]", lambda x, slope: slope * x, parents=[f"x[{t - 1}]", "slope"])
+            net.add(f"x[{t}]", lambda m: bmc.Normal(m, 0.5), parents=[f"m[{t}]"])
+        net.add("y", lambda x: bmc.Normal(x, 0.5), parents=["x[5]"])
+        return net, {"y": 1.0}
+
+    target, values = posed(made)
+    names = tuple(f"x[{t}]" for t in range(6))
+    block = GaussianBlock(target, {n: Blanket(target, n) for n in names})
+    assert all(part.like is None for part in block.parts)
+    precision, linear, _ = by_differences(target, block, values)
+    mean, cov, _ = law_of(block, values)
+    np.testing.assert_allclose(cov, np.linalg.inv(precision), atol=1e-8)
+    np.testing.assert_allclose(
+        mean, np.linalg.solve(precision, linear[..., None])[..., 0], atol=1e-8
+    )
 
 
 def test_what_all_slices_share_is_no_part_of_the_band() -> None:

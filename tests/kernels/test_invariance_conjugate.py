@@ -198,6 +198,34 @@ def test_pair_with_what_is_kept_of_the_evidence(key: tuple[str, str, str], fault
 # ---- jointly Normal blocks -------------------------------------------------------------------------
 
 
+def _series(prior: Any, child: Callable[..., Any], size: int = 8) -> Model:
+    """Many like children of one node, in the numbers of which the time is."""
+    net = bmc.BayesNet()
+    net.add("x", lambda: prior)
+    for t in range(size):
+        net.add(f"y{t}", lambda x, t=t: child(x, 1.0 + t / size), parents=["x"])
+    return Model(net, tuple(f"y{t}" for t in range(size)), ("x",))
+
+
+SERIES = {
+    "mean": _series(bmc.Normal(0.5, 1.0), lambda x, s: bmc.Normal(s * x - 1, s)),
+    "scale": _series(bmc.Gamma(3.0, 2.0), lambda x, s: bmc.Normal(s, s * x**-0.5)),
+    "share": _series(bmc.Beta(2.0, 3.0), lambda x, s: bmc.Binomial(5 + 0 * s, x)),
+}
+
+
+@pytest.mark.parametrize("fault", ["", "wrong"])
+@pytest.mark.parametrize(("name", "how"), [*((n, "moving") for n in SERIES), ("mean", "posed")])
+def test_like_children(name: str, how: str, fault: str) -> None:
+    """All children are one partner."""
+    wrong = _kernel([_wrong(p) for p in PAIRS])
+    sizes = {"replications": 300} if how == "posed" else {}
+    case = Case(SERIES[name], _kernel(), {"wrong": wrong}, how=how, sizes=sizes)
+    (partner,) = case.make(case.model.target("moving")).partners
+    assert len(partner.terms) == 8
+    case.check("ranks", fault)
+
+
 def _coupled() -> Model:
     """Three overlapping categories whose means have a mean; scales and labels are hidden, and stay."""
     net = bmc.BayesNet(plates={"k": 3, "i": 10})
