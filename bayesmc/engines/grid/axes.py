@@ -161,12 +161,8 @@ def _axes(node: CompiledNode, given: Any, rule: str) -> tuple[Axis, ...]:
 
 def _axis(node: CompiledNode, given: Any, rule: str) -> Axis:
     what = f"GridFilter(grid={{{node.name!r}: ...}})"
-    if isinstance(given, tuple) and len(given) == 3 and isinstance(given[2], (int, np.integer)):
-        low, high, cells = float(given[0]), float(given[1]), int(given[2])
-        if not (math.isfinite(low) and math.isfinite(high) and low < high and cells > 1):
-            raise ValueError(
-                f"{what}: {given!r} is no (low, high, cells) with low < high, cells > 1"
-            )
+    if isinstance(given, tuple):
+        low, high, cells = _bounds_and_cells(what, given)
         if node.is_discrete:
             raise ValueError(f"{what}: the node counts; give the values, such as np.arange(100)")
         return _interval(node.name, low, high, cells, rule)
@@ -186,6 +182,21 @@ def _axis(node: CompiledNode, given: Any, rule: str) -> Axis:
             raise ValueError(f"{what}: the node counts; give whole numbers")
         return Axis(owned(points, np.int64), owned(np.ones(len(points))))
     return Axis(owned(points), owned(_widths(what, points, rule)))
+
+
+def _bounds_and_cells(what: str, given: tuple[Any, ...]) -> tuple[float, float, int]:
+    """A tuple is an interval and how many cells it has; points come as a list or an array."""
+    try:
+        low, high, cells = map(float, given)
+    except (TypeError, ValueError):
+        low = high = cells = math.nan
+    fits = -math.inf < low < high < math.inf and cells >= 2
+    if not (fits and cells == math.floor(cells) < math.inf):
+        raise ValueError(
+            f"{what}: the tuple {given!r} is no (low, high, cells) with low < high and a whole number of "
+            "cells, 2 or more; for points give a list or an array"
+        )
+    return low, high, int(cells)
 
 
 def _interval(name: str, low: float, high: float, cells: int, rule: str) -> Axis:

@@ -38,9 +38,9 @@ class GridFilter(FilterEngine):
     Parameters
     ----------
     grid : dict
-        Node -> ``(low, high, cells)``, or an increasing array of points; for a vector one for all
-        components, or a list of one each; for counts the values. Finite nodes need none (their states are
-        their cells), nor do nodes on a bounded interval or circle.
+        Node -> the tuple ``(low, high, cells)``, or an increasing list or array of points; for a vector one
+        for all components, or a list of one each; for counts the values. Finite nodes need none (their
+        states are their cells), nor do nodes on a bounded interval or circle.
     cells : int
         Cells of bounded nodes without a grid.
     quadrature : str

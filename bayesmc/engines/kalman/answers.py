@@ -17,7 +17,7 @@ def filter_answers(
     engine: Any, problem: SeriesProblem, data: SeriesData, found: Filtered
 ) -> GaussianSeries:
     """Every slice given the rows up to it."""
-    spreads = Spreads(_stack(found.factors), found.which)
+    spreads = Spreads(found.factors, found.which)
     return _answers(engine, problem, data, "filter", found, found.means, spreads)
 
 
@@ -30,7 +30,7 @@ def smooth_answers(
     kind: str,
 ) -> GaussianSeries:
     """Every slice given later rows, too."""
-    layout, roots = data.layouts[0], _stack(found.factors)
+    layout, roots = data.layouts[0], found.factors
     left = roots[..., : layout.carried][found.which]
     if left.ndim == 3:  # the same in all elements of the plates apart
         left = left.reshape(len(left), *(1,) * len(layout.lead), *left.shape[1:])
@@ -40,12 +40,6 @@ def smooth_answers(
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _stack(factors: list[np.ndarray]) -> np.ndarray:
-    """Roots of all slices that differ, with the plates' axes where any has them."""
-    shape = np.broadcast_shapes(*(f.shape[:-2] for f in factors))
-    return np.stack([np.broadcast_to(f, shape + f.shape[-2:]) for f in factors])
 
 
 def _answers(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from bayesmc.progress import Progress
 class GaussianFilter(FilterEngine):
     """Base of ``KalmanFilter``, ``ExtendedKalmanFilter`` and ``UnscentedKalmanFilter``."""
 
+    takes_queries: ClassVar[bool] = False
+    belief: ClassVar[type] = GaussianBelief
+
     def refusal(self, problem: SeriesProblem) -> str | None:
         common = super().refusal(problem)
         if common is not None:
@@ -35,6 +38,10 @@ class GaussianFilter(FilterEngine):
         with quiet():
             why = self._own_refusal(problem, self._data(problem))
         return None if why is None else f"{type(self).__name__}: {why}"
+
+    def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
+        silent = {n for layout in self._data(problem).layouts for n in layout.silent}
+        return tuple(n for n in problem.slices.dynamic if n in silent)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         data, found = self._data(problem), {}
@@ -54,6 +61,8 @@ class GaussianFilter(FilterEngine):
                 found[name] = "Gaussian, observed in part"
             elif name in layout.drawn:
                 found[name] = "Gaussian"
+            elif name in layout.silent:
+                found[name] = "not answered for: takes no continuous values"
             else:
                 found[name] = "computed from Gaussian nodes"
         return found
@@ -69,7 +78,8 @@ class GaussianFilter(FilterEngine):
     ) -> GaussianSeries:
         if keep is not None:
             raise UnsupportedError(
-                f"keep={keep!r}: {type(self).__name__} has no particles; ask its result for mean, var and cov"
+                f"keep={keep!r}: {type(self).__name__} has no particles; ask its result for mean, var and "
+                "cov, or use a ParticleFilter"
             )
         self._check_queries(queries)
         data = self._data(problem)
@@ -168,7 +178,8 @@ class GaussianFilter(FilterEngine):
         if queries:
             raise UnsupportedError(
                 f"queries={list(queries)}: {type(self).__name__} answers mean, var, std and cov of nodes; "
-                "declare a deterministic node for an affine function of them, or use a ParticleFilter"
+                "declare a deterministic node for an affine function of them, or use a ParticleFilter, which "
+                "answers for any function"
             )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesmc.engines.kalman.levels import Level, Made
 from bayesmc.engines.kalman.nonlinear import NonlinearFilter
+from bayesmc.engines.kalman.slices import Moments
 
 #: balances the rounding of a central difference against its curvature
 _STEP = float(np.finfo(float).eps ** (1 / 3))
@@ -19,22 +20,31 @@ class ExtendedKalmanFilter(NonlinearFilter):
     """Approximate beliefs about nonlinear templates: means become their tangents at the belief's mean.
 
     Hidden nodes, and observed ones that depend on them, may have any smooth means and scales. Families other
-    than Normal and MvNormal are matched by their mean and variance. Nodes on a circle (``VonMises``,
-    ``WrappedNormal``) count angles the short way round: innovations and differences are wrapped to
+    than Normal and MvNormal are matched by their mean and variance, vectors of other families by ``mean`` and
+    ``cov_root``, any square root of their covariance. Numbers on a circle (``VonMises``, ``WrappedNormal``,
+    headings of poses) count angles the short way round: innovations and differences are wrapped to
     [-pi, pi), and their variance is ``-2 log R`` with R the mean resultant length.
 
-    Derivatives are central differences of the declared functions, all in one call. Where functions are affine
-    the results are those of ``KalmanFilter`` to about ten digits.
+    Counts that are missing in a row are answered by mean and variance where nothing with a density reads
+    them. What is computed from hidden nodes and takes no continuous values (truth values, whole numbers,
+    states) is not answered for; functions of the same slice read it as it is.
+
+    Derivatives are followed through the declared functions (forward mode), to rounding; central differences,
+    all in one call, where a function cannot be followed (``vectorize=True``, SciPy functions that are no
+    ufuncs, ...) or has a kink just there. Where functions are affine the results are those of
+    ``KalmanFilter``.
 
     Notes
     -----
     The log marginal likelihood is that of the linearised model. Where the belief is wide beside the curvature
     of a mean, the filter can be far off and sure of itself; hold it against a ``ParticleFilter``.
+    ``most_likely`` is answered for linear-Gaussian templates only, where smoothed means are the mode.
 
     References
     ----------
     Jazwinski (1970), Stochastic Processes and Filtering Theory, ch. 8; Särkkä and Svensson (2023), Bayesian
-    Filtering and Smoothing, 2nd ed., ch. 7.
+    Filtering and Smoothing, 2nd ed., ch. 7; Griewank and Walther (2008), Evaluating Derivatives, 2nd ed.,
+    sec. 3.1, for the forward mode.
 
     Examples
     --------
@@ -54,15 +64,25 @@ class ExtendedKalmanFilter(NonlinearFilter):
     label: ClassVar[str] = "extended Kalman filter"
 
     def made_linear(self, level: Level, mean: np.ndarray, rows: np.ndarray) -> Made:
-        """Central differences at the mean."""
+        """Derivatives at the mean."""
+        slopes = None
+        if not level.part.opaque:
+            found, moments = level(mean[None])
+            slopes = level.slopes(mean, found[0])
+        if slopes is None:
+            found, moments, slopes = self._differences(level, mean)
+        scales = [None if m.scale is None else m.scale[0] for m in moments]
+        return Made(found[0], slopes @ rows, level.noise(scales))
+
+    @staticmethod
+    def _differences(
+        level: Level, mean: np.ndarray
+    ) -> tuple[np.ndarray, list[Moments], np.ndarray]:
+        """What a level makes of the mean, first, and central differences there, shape (*lead, e, c)."""
         c = mean.shape[-1]
         share = 1.0 if level.part.affine else _STEP  # of what is affine a long step loses no digits
         steps = 2.0 ** np.round(np.log2(share * np.maximum(np.abs(mean), level.part.sizes)))
-        moves = steps[..., None, :] * np.eye(c)  # (*lead, c, c): one move per row
-        moves = np.moveaxis(moves, -2, 0)
-        points = np.concatenate([mean[None], mean + moves, mean - moves])
-        found, moments = level(points)
-        slopes = level.off(found[1 : 1 + c], found[1 + c :])
-        slopes = np.moveaxis(slopes, 0, -1) / (2 * steps[..., None, :])
-        scales = [None if m.scale is None else m.scale[0] for m in moments]
-        return Made(found[0], slopes @ rows, level.noise(scales))
+        moves = np.moveaxis(steps[..., None, :] * np.eye(c), -2, 0)  # (c, *lead, c): one move each
+        found, moments = level(np.concatenate([mean[None], mean + moves, mean - moves]))
+        off = level.off(found[1 : c + 1], found[c + 1 :])
+        return found, moments, np.moveaxis(off, 0, -1) / (2 * steps[..., None, :])

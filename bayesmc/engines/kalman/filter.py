@@ -10,15 +10,15 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.kalman.base import GaussianFilter
+from bayesmc.engines.kalman.covariances import rows_of
 from bayesmc.engines.kalman.data import Pattern, SeriesData
-from bayesmc.engines.kalman.passes import Filtered, State, forward, rows_of
+from bayesmc.engines.kalman.levels import why_not_matched
+from bayesmc.engines.kalman.passes import Filtered, State, forward
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
 from bayesmc.engines.kalman.rows import Memory
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.kalman import multiplied
-
-_OTHERS = "use ExtendedKalmanFilter, UnscentedKalmanFilter or ParticleFilter"
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,8 @@ class KalmanFilter(GaussianFilter):
     Covariances are carried as triangular roots (the array form): conditioning is one QR decomposition per
     slice, smoothing goes back through its orthogonal factors. No covariance is subtracted or inverted, so
     vague starts (``Normal(0, 1e7)``) and deterministic or exactly observed states keep full precision. Where
-    nothing but data varies with time, covariances are worked out until they repeat to rounding.
+    nothing but data varies with time, covariances are worked out until they repeat to rounding, also in turn
+    where missing rows come round.
 
     ``smooth`` is the Rauch–Tung–Striebel smoother, ``most_likely`` its means, which are the joint mode.
     Plates whose elements never meet are leading axes, not one joint state.
@@ -66,16 +67,16 @@ class KalmanFilter(GaussianFilter):
             layout = data.layouts[later]
             why = why_not_gaussian(layout, data.at(min(later, data.steps - 1)))
             if why is not None:
-                return f"{why}; {_OTHERS}"
+                return f"{why}; {_others(*data.layouts)}"
         try:
             self._matrices(problem, data)
         except UnsupportedError as error:
-            return f"{error}; {_OTHERS}"
+            return f"{error}; {_others(*data.layouts)}"
         return None
 
     def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
         why = why_not_gaussian(layout, values)
-        return None if why is None else f"{why}; {_OTHERS}"
+        return None if why is None else f"{why}; {_others(layout)}"
 
     def _forward(
         self,
@@ -103,15 +104,34 @@ class KalmanFilter(GaussianFilter):
         pattern: Pattern,
         memory: Memory,
     ) -> tuple[np.ndarray, np.ndarray]:
-        static = layout.slices.template.static
+        timeless = memory(("timeless", layout), lambda: not reads_time(layout))
 
         def read() -> Linear:
-            row = {n: v if n in static else np.asarray(v)[None] for n, v in values.items()}
-            return read_linear(layout, row, 1)
+            return _read_row(layout, values)
 
-        timeless = not reads_time(layout)
-        linear = memory(("matrices", layout), read) if timeless else read()
-        offset, moves, noise = (a[0][..., pattern.chosen, :] for a in
-                                (linear.offset[..., None], linear.moves, linear.noise))  # fmt: skip
-        mean = offset[..., 0] + multiplied(moves, state.mean)
-        return mean, rows_of(moves, noise, state.factor, pattern.absent)
+        def choose() -> Linear:
+            linear, at = memory(("matrices", layout), read) if timeless else read(), pattern.chosen
+            moves, noise = (a[0][..., at, :] for a in (linear.moves, linear.noise))
+            return Linear(linear.offset[0][..., at], moves, noise)
+
+        whole = timeless and pattern.given is None  # what is seen in part may differ in every row
+        found = memory(("chosen", layout), choose) if whole else choose()
+        mean = found.offset + multiplied(found.moves, state.mean)
+        return mean, rows_of(found.moves, found.noise, state.factor, pattern.absent)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _others(*layouts: Layout) -> str:
+    """Filters that take such slices."""
+    if any(layout.silent or why_not_matched(layout) is not None for layout in layouts):
+        return "use ParticleFilter"
+    return "use ExtendedKalmanFilter, UnscentedKalmanFilter or ParticleFilter"
+
+
+def _read_row(layout: Layout, values: Mapping[str, np.ndarray]) -> Linear:
+    """Coefficients of one slice."""
+    static = layout.slices.template.static
+    row = {n: v if n in static else np.asarray(v)[None] for n, v in values.items()}
+    return read_linear(layout, row, 1)

@@ -2,26 +2,30 @@
 
 The nodes of a slice are taken in levels: first those that read the slice before alone, then those that read
 them, and so on. A *rule* looks at the nodes of one level as one function of what they read and makes it
-linear, with whatever it takes for the error as noise of its own: by derivatives (``extended_kalman``) or by
-sigma points (``unscented_kalman``). What comes out are rows of coefficients of independent normals, as the
+linear, with whatever it takes for the error as noise of its own: by derivatives (``extended``) or by sigma
+points (``unscented``). What comes out are rows of coefficients of independent normals, as the
 Kalman filter has them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS
-from bayesmc.distributions import MvNormal
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.passes import State
 from bayesmc.engines.kalman.reading import is_affine, typical_sizes
-from bayesmc.engines.kalman.slices import Layout, Moments, put_noise
+from bayesmc.engines.kalman.slices import Layout, Moments, covariance_root, put_noise
+from bayesmc.engines.kalman.slopes import mean_slopes
 from bayesmc.errors import BayesmcError
+from bayesmc.tracing import Dual, NoTangent
+
+#: relative difference that rounding may explain between a function followed and called
+_SAME = 1e-9
 
 
 class Made(NamedTuple):
@@ -110,6 +114,8 @@ class Part(NamedTuple):
         Which of the numbers read are.
     affine : bool
         Whether all nodes are proved affine in what they read.
+    opaque : dict
+        Why derivatives cannot be followed through these nodes, as soon as that is known.
     """
 
     nodes: tuple[str, ...]
@@ -121,6 +127,7 @@ class Part(NamedTuple):
     turns: np.ndarray | None
     read_turns: np.ndarray | None
     affine: bool
+    opaque: dict[str, str]
 
 
 class Plan:
@@ -131,15 +138,16 @@ class Plan:
         self.before = {n + PREVIOUS: n for n in layout.before}
         self.sources: dict[str, tuple[str, ...]] = {}
         depth: dict[str, int] = {}
-        wanted = {*layout.rows, *layout.seen}
+        wanted = {*layout.rows, *layout.seen, *layout.silent}
         names = [n for n in layout.order if n in wanted]
         for name in names:
             self.sources[name] = self._sources(name)
             depth[name] = 1 + max(
                 (depth[s] for s in self.sources[name] if s in layout.rows), default=-1
             )
-        levels = sorted(set(depth.values()))
-        self.levels = [self._part([n for n in names if depth[n] == d], names) for d in levels]
+        placed = [n for n in names if n not in layout.silent]
+        levels = sorted({depth[n] for n in placed})
+        self.levels = [self._part([n for n in placed if depth[n] == d], names) for d in levels]
 
     def _sources(self, name: str) -> tuple[str, ...]:
         """Unknown numbers with a density, or of the slice before, that a function reads in the end."""
@@ -147,7 +155,7 @@ class Plan:
         for parent in self.layout.model[name].parents:
             if parent in self.before or parent in self.layout.drawn:
                 found[parent] = None
-            elif parent in self.layout.rows:
+            elif parent in self.layout.rows or parent in self.layout.silent:
                 found.update(dict.fromkeys(self.sources[parent]))
         return tuple(found)
 
@@ -162,21 +170,21 @@ class Plan:
             columns[source] = slice(at, at + size)
             reads.append(np.arange(start, start + size))
             sizes.append(typical_sizes(layout, stem))
-            angles.append(np.full(size, layout.is_angle(stem)))
+            angles.append(layout.angles_of(stem))
             at += size
         places, turns = [], []
         for name in nodes:
             place = layout.seen[name] if name in layout.seen else layout.rows[name]
             start = place.start + n + (0 if name in layout.seen else p)
             places.append(np.arange(start, start + place.stop - place.start))
-            turns.append(np.full(place.stop - place.start, layout.is_angle(name)))
+            turns.append(layout.angles_of(name))
         order = tuple(m for m in names if m in nodes or m in self._between(nodes))
         empty = np.zeros(0)
         return Part(
             tuple(nodes), order, columns,
             np.concatenate([empty, *reads]).astype(np.intp), np.concatenate(places),
             np.concatenate([empty, *sizes]), _some(turns), _some(angles),
-            all(is_affine(layout, n, self.values) for n in nodes),
+            all(is_affine(layout, n, self.values) for n in nodes), {},
         )  # fmt: skip
 
     def _between(self, nodes: list[str]) -> set[str]:
@@ -185,7 +193,7 @@ class Plan:
         todo = list(nodes)
         while todo:
             for parent in self.layout.model[todo.pop()].parents:
-                if parent in self.layout.rows and parent not in self.layout.drawn:
+                if parent in self.sources and not self.layout.model[parent].is_stochastic:
                     if parent not in found:
                         found.add(parent)
                         todo.append(parent)
@@ -201,15 +209,16 @@ class Level:
     def __call__(self, points: np.ndarray) -> tuple[np.ndarray, list[Moments]]:
         """Means at points, shape (points, *lead, c) -> (points, *lead, e), and the moments of each node."""
         layout, part = self.layout, self.part
-        if part.read_turns is not None:
-            points = np.where(part.read_turns, wrap_angle(points), points)
+        points = self._wrapped(points)
         values = dict(self.known)
         for name, place in part.columns.items():
-            node = layout.model[name]
-            values[name] = layout.unpacked(node, points[..., place])
+            values[name] = layout.unpacked(layout.model[name], points[..., place])
         batch = points.shape[:1]
         found = {}
         for name in part.order:
+            if name in layout.silent:
+                values[name] = layout.model.evaluate(name, values)[0]
+                continue
             made = layout.moments(name, values, batch)
             if name in part.nodes:
                 found[name] = made
@@ -217,6 +226,41 @@ class Level:
                 values[name] = layout.unpacked(layout.model[name], made.mean)
         ordered = [found[n] for n in part.nodes]
         return np.concatenate([m.mean for m in ordered], axis=-1), ordered
+
+    def slopes(self, mean: np.ndarray, expected: np.ndarray) -> np.ndarray | None:
+        """Derivatives of the means, followed through the functions, or None.
+
+        Parameters
+        ----------
+        mean : ndarray, shape (*lead, c)
+            Where they are wanted.
+        expected : ndarray, shape (*lead, e)
+            What the means are there.
+
+        Returns
+        -------
+        ndarray, shape (*lead, e, c), or None
+            None where a function cannot be followed, or has no derivative here.
+        """
+        layout, part = self.layout, self.part
+        if not part.columns:
+            return np.zeros((*expected.shape, 0))
+        if part.opaque:
+            return None
+        try:
+            found = mean_slopes(layout.model, part.order, {**self.known, **self._seeds(mean)})
+        except NoTangent as reason:
+            if reason.always:
+                part.opaque["why"] = str(reason)
+            return None
+        nodes = [(layout.model[n], found[n]) for n in part.nodes]
+        value = np.concatenate([layout.packed(n, d.value) for n, d in nodes], axis=-1)
+        if not (np.abs(self.off(value, expected)) <= _SAME * (1 + np.abs(expected))).all():
+            part.opaque["why"] = "a function or a family gives other values when it is followed"
+            return None
+        moved = [layout.packed(n, np.moveaxis(d.tangent, -1, 0)) for n, d in nodes]
+        slopes = np.moveaxis(np.concatenate(moved, axis=-1), 0, -1)
+        return slopes if np.isfinite(slopes).all() else None
 
     def off(self, found: np.ndarray, centre: np.ndarray) -> np.ndarray:
         """Differences between numbers made, those of angles the short way round."""
@@ -236,10 +280,33 @@ class Level:
             at = own.stop
         return rows
 
+    # ---- private -------------------------------------------------------------------------------
+
+    def _wrapped(self, points: np.ndarray) -> np.ndarray:
+        """Numbers as functions read them: angles in [-pi, pi)."""
+        turns = self.part.read_turns
+        return points if turns is None else np.where(turns, wrap_angle(points), points)
+
+    def _seeds(self, mean: np.ndarray) -> dict[str, Dual]:
+        """What is read, with a direction for each number; plates apart move together."""
+        layout, c = self.layout, mean.shape[-1]
+        points, found = self._wrapped(mean), {}
+        unit = np.broadcast_to(np.eye(c).reshape(c, *(1,) * len(layout.lead), c), (c, *mean.shape))
+        for name, place in self.part.columns.items():
+            node = layout.model[name]
+            tangent = np.moveaxis(layout.unpacked(node, unit[..., place]), 0, -1)
+            found[name] = Dual(layout.unpacked(node, points[..., place]), tangent)
+        return found
+
 
 def why_not_matched(layout: Layout) -> str | None:
     """Why a slice cannot be matched by means and variances, or None."""
     model = layout.model
+    for name in layout.silent:
+        if name in layout.slices.interface:
+            return (
+                f"node {name!r} is hidden, takes no continuous values, and the next slice reads it"
+            )
     for name in (n for n in layout.order if n in layout.rows or n in layout.seen):
         node = model[name]
         if node.domain is not None:
@@ -247,22 +314,39 @@ def why_not_matched(layout: Layout) -> str | None:
             return f"node {name!r} is {what} discrete"
         if not node.is_stochastic:
             continue
-        if name in layout.rows and node.is_discrete:
-            return f"node {name!r} is hidden and discrete"
+        if name in layout.rows and node.is_discrete and (reader := _reader(layout, name)):
+            return f"node {name!r} is hidden and discrete, and {reader} reads it"
         try:
-            result, _ = model.evaluate(name, model.probe)
-            if isinstance(result, MvNormal):
-                continue
-            if node.event_shape:
-                return f"node {name!r} is a vector of a family other than MvNormal"
-            if not (np.isfinite(result.mean) & np.isfinite(result.var)).all():
-                return f"node {name!r} has no finite variance"
+            why = _why_no_moments(model.evaluate(name, model.probe)[0])
         except BayesmcError as error:
-            return f"node {name!r} cannot be matched by its mean and variance ({error})"
+            why = f"cannot be matched by its mean and variance ({error})"
+        if why is not None:
+            return f"node {name!r} {why}"
     return None
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _why_no_moments(result: Any) -> str | None:
+    root = covariance_root(result)
+    if root is None and result.event_shape:
+        return "is a vector of a family other than MvNormal that has no cov_root"
+    spread = result.var if root is None else root
+    if not (np.isfinite(result.mean).all() and np.isfinite(spread).all()):
+        return "has no finite variance"
+    return None
+
+
+def _reader(layout: Layout, name: str) -> str | None:
+    """What with a density reads a node, through functions or not; None of one that is only answered for."""
+    below = {name}
+    for other in layout.order:
+        if below & set(layout.model[other].parents):
+            if layout.model[other].is_stochastic:
+                return f"node {other!r}"
+            below.add(other)
+    return "the next slice" if below & set(layout.slices.interface) else None
 
 
 def _some(flags: list[np.ndarray]) -> np.ndarray | None:

@@ -7,13 +7,16 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.filtering import Asked
 from bayesmc.engines.kalman.base import GaussianFilter
 from bayesmc.engines.kalman.data import Pattern, SeriesData
+from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.levels import Level, Made, Plan, expected_slice, why_not_matched
-from bayesmc.engines.kalman.passes import Filtered, State
+from bayesmc.engines.kalman.passes import Filtered, State, Turns
 from bayesmc.engines.kalman.rows import Memory, RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import Turned, turned
+from bayesmc.errors import UnsupportedError
+from bayesmc.kernels.kalman import multiplied, turned
 
 
 class NonlinearFilter(GaussianFilter):
@@ -22,6 +25,28 @@ class NonlinearFilter(GaussianFilter):
     def made_linear(self, level: Level, mean: np.ndarray, rows: np.ndarray) -> Made:
         """See ``levels.Rule``."""
         raise NotImplementedError
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        if asked.what == "most_likely" and (why := self._no_mode(problem)) is not None:
+            return why
+        return super().unable(problem, asked)
+
+    def most_likely(
+        self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
+    ) -> dict[str, np.ndarray]:
+        """Smoothed means, of templates proved linear-Gaussian only.
+
+        Elsewhere they are no mode: of y = x^2 + noise they lie between two of them.
+
+        Raises
+        ------
+        UnsupportedError
+            The template is not linear-Gaussian.
+        """
+        why = self._no_mode(problem)
+        if why is not None:
+            raise UnsupportedError(why)
+        return super().most_likely(problem, seed, progress)
 
     def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
         """See ``rows.Family``."""
@@ -40,6 +65,18 @@ class NonlinearFilter(GaussianFilter):
         plan = memory(("plan", layout), lambda: Plan(layout, values))
         return expected_slice(layout, values, state, pattern, self.made_linear, plan)
 
+    def _no_mode(self, problem: SeriesProblem) -> str | None:
+        """Why smoothed means are not the most likely trajectory, or None."""
+        refused = KalmanFilter().refusal(problem)
+        if refused is None:
+            return None
+        why = refused.removeprefix("KalmanFilter: ").partition("; use ")[0]
+        return (
+            f"most_likely: the smoothed means of {type(self).__name__} are the most likely trajectory of "
+            f"linear-Gaussian templates only, and {why}; use GridFilter(grid={{...}}), which finds the mode "
+            "over the points of a grid"
+        )
+
     def _own_refusal(self, problem: SeriesProblem, data: SeriesData) -> str | None:
         for layout in data.layouts:
             why = self.refused_row(layout, {})
@@ -56,19 +93,21 @@ class NonlinearFilter(GaussianFilter):
     ) -> Filtered:
         """Row by row; every row has its own layout, which is put into the one of the series."""
         steps, whole = data.steps, data.layouts[0]
+        n, c, shape = whole.n, whole.carried, (steps, *whole.lead)
+        turns = None
+        if smoothing:
+            square = (*shape, c, c)
+            turns = Turns(np.zeros(square), np.zeros(square), np.zeros((*shape, c)))
         found = Filtered(
-            np.empty((steps, *whole.lead, whole.n)), [], [], np.arange(steps),
-            np.empty((steps, *whole.lead)), [],
+            np.empty((*shape, n)), np.zeros((*shape, n, n)), np.arange(steps), np.empty(shape), turns
         )  # fmt: skip
         taker = RowTaker(self, problem.slices, data.static)
         before: Taken | None = None
         for k in range(steps):
             taken = taker.take(data.series.row(k), before, smoothing)
             _write(found, k, whole, taken)
-            if smoothing:
-                found.innovations.append(taken.eta)
-                turn = None if before is None else _turn(whole, before.layout, taken)
-                found.turns.append(turn)
+            if turns is not None and before is not None:
+                _write_turn(turns, k, whole, before.layout, taken)
             before = taken
             advance(1)
         return found
@@ -89,30 +128,23 @@ def _write(found: Filtered, k: int, whole: Layout, taken: Taken) -> None:
             value = np.broadcast_to(taken.known[name], node.value_shape).astype(float)
             found.means[k][..., place] = whole.packed(node, value)
     if own.n == whole.n:
-        found.factors.append(taken.factor)
+        found.factors[k] = taken.factor
         return
     rows = _placed(whole, tuple(own.rows))
     carried = rows[: own.carried]
     columns = np.concatenate([carried, whole.carried + np.arange(own.n - own.carried)])
-    factor = np.zeros((*taken.factor.shape[:-2], whole.n, whole.n))
-    factor[..., rows[:, None], columns] = taken.factor
-    found.factors.append(factor)
+    found.factors[k][..., rows[:, None], columns] = taken.factor
 
 
-def _turn(whole: Layout, before: Layout, taken: Taken) -> Turned:
+def _write_turn(turns: Turns, k: int, whole: Layout, before: Layout, taken: Taken) -> None:
     """What carries a smoother back, in the layout of the series."""
-    own, c = taken.layout, whole.carried
-    turn = turned(taken.made, own.carried)
-    if before.carried == own.carried == c:
-        return turn
+    own, made = taken.layout, taken.made
+    assert made.turn is not None
+    turn = turned(made.turn, made.root.shape[-1], own.carried)
     there, here = _placed(whole, before.after), _placed(whole, own.after)
-    lead = turn.link.shape[:-2]
-    shift = np.zeros((*lead, c, turn.shift.shape[-1]))
-    link, spread = np.zeros((*lead, c, c)), np.zeros((*lead, c, c))
-    shift[..., there, :] = turn.shift
-    link[..., there[:, None], here] = turn.link
-    spread[..., there[:, None], there] = turn.spread
-    return Turned(shift, link, spread)
+    turns.shifts[k][..., there] = multiplied(turn.shift, taken.eta)
+    turns.links[k][..., there[:, None], here] = turn.link
+    turns.spreads[k][..., there[:, None], there] = turn.spread
 
 
 def _placed(whole: Layout, names: tuple[str, ...]) -> np.ndarray:

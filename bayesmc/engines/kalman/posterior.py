@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.kalman.rows import RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.network import CompiledNode
 from bayesmc.results import SeriesPosterior
 
 
@@ -114,6 +116,11 @@ class GaussianSeries(SeriesPosterior):
         )  # fmt: skip
         found.layout, found.spreads = self.layout, self.spreads.last(steps)
         return found
+
+    def _node(self, name: str) -> CompiledNode:
+        if name in self.layout.silent:
+            raise _no_answer(name)
+        return super()._node(name)
 
     def _place(self, name: str) -> np.ndarray | int:
         """Places of a node's numbers among the unknown ones, or how many known ones it has."""
@@ -235,16 +242,24 @@ class GaussianBelief:
 
     def _place(self, name: str) -> np.ndarray | int:
         layout = self.layout
+        if name in layout.silent:
+            raise _no_answer(name)
         if name not in layout.rows and name not in self.known:
             raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
         return place_of(layout, name, layout.model[name].domain is not None)
 
 
+def _no_answer(name: str) -> UnsupportedError:
+    return UnsupportedError(
+        f"{name!r} takes no continuous values, and a Gaussian belief does not answer for it; use a "
+        "ParticleFilter"
+    )
+
+
 def on_circle(layout: Layout, name: str, value: np.ndarray) -> np.ndarray:
     """Angles in [-pi, pi); other numbers as they are."""
-    if not layout.is_angle(name):
-        return value
-    return np.remainder(value + np.pi, 2 * np.pi) - np.pi
+    angles = layout.angles_of(name)
+    return np.where(angles, wrap_angle(value), value) if angles.any() else value
 
 
 def place_of(layout: Layout, name: str, is_table: bool) -> np.ndarray | int:

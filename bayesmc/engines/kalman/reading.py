@@ -60,6 +60,8 @@ def why_not_gaussian(layout: Layout, values: Mapping[str, np.ndarray]) -> str | 
         node = layout.model[name]
         if node.domain is not None or node.is_discrete:
             return f"node {name!r} is hidden and discrete"
+    for name in layout.silent:
+        return f"node {name!r} is computed from hidden nodes and takes no continuous values"
     return why_not_linear(*_posed(layout, layout.order, values))
 
 

@@ -12,8 +12,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
+from bayesmc.engines.kalman.covariances import full_factor
 from bayesmc.engines.kalman.data import Pattern, certain_density, given_values, pattern_of, stacked
-from bayesmc.engines.kalman.passes import State, absorbed, full_factor, start_state
+from bayesmc.engines.kalman.means import absorbed
+from bayesmc.engines.kalman.passes import State, start_state
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError
@@ -96,15 +98,16 @@ class RowTaker:
         ------
         UnsupportedError, DegeneracyError, ParameterError
         """
-        layout, state = self._layout(row, before), None
+        layout = self._layout(row, before)
         values = self._values(row, before)
         for name in layout.computed:
             values[name] = layout.model.evaluate(name, values)[0]
         why = self.memory(("why", layout), lambda: self.family.refused_row(layout, values))
         if why is not None:
             raise UnsupportedError(f"{type(self.family).__name__}: {why}")
-        state = start_state(layout)
-        if before is not None:
+        if before is None:
+            state = start_state(layout)
+        else:
             c = before.layout.carried
             state = State(before.mean[..., :c], before.factor[..., :c, :c])
         given, pattern = self._pattern(layout, row)
@@ -123,7 +126,9 @@ class RowTaker:
             )
         known = {n: o.value for n, o in row.seen.items() if o.mask is None}
         known |= {n: values[n] for n in layout.computed}
-        return Taken(layout, after, full_factor(layout, pattern, made), made, eta, log, known)
+        return Taken(
+            layout, after, full_factor(layout, pattern, made.factor), made, eta, log, known
+        )
 
     # ---- private -------------------------------------------------------------------------------
 

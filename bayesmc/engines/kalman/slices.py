@@ -70,8 +70,8 @@ class Moments(NamedTuple):
     ----------
     mean : ndarray, shape (*batch, *lead, e)
     scale : ndarray or None
-        Standard deviations, shape like ``mean``, or lower roots, shape (*batch, *lead, elements, d, d), one
-        for each element of the stacked plates; None without noise.
+        Standard deviations, shape like ``mean``, or roots of covariances, shape (*batch, *lead, elements, d,
+        d), one for each element of the stacked plates; None without noise.
     """
 
     mean: np.ndarray
@@ -108,6 +108,9 @@ class Layout:
         Known nodes whose density does not.
     computed : tuple of str
         Deterministic nodes whose value is known.
+    silent : tuple of str
+        Deterministic nodes computed from unknown ones that jump from value to value: truth values, whole
+        numbers, states. They have no place in the vector and no answer; functions that read them do.
     """
 
     def __init__(
@@ -124,8 +127,10 @@ class Layout:
         self.unknown = unknown
         self.before = () if first else before
         self.order = _ordered(slices, first)
-        own = (*(n for n in slices.interface if n in unknown),
-               *(n for n in slices.dynamic if n in unknown and n not in slices.interface))  # fmt: skip
+        self.silent = tuple(n for n in self.order if n in unknown and _jumps(slices, n))
+        placed = unknown.difference(self.silent)
+        own = (*(n for n in slices.interface if n in placed),
+               *(n for n in slices.dynamic if n in placed and n not in slices.interface))  # fmt: skip
         self.after = tuple(n for n in own if n in slices.interface)
         self.prev, self.n_prev = self._places(self.before)
         self.rows, self.n = self._places(own)
@@ -141,6 +146,10 @@ class Layout:
         self.drawn = tuple(n for n in self.order if n in unknown and self.model[n].is_stochastic)
         self.depends = depends
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        return {**self.__dict__, "model": self.model.without_functions()}
+
     def size(self, name: str) -> int:
         """How many numbers a node has, plates apart not counted."""
         node = self.slices.first[name]
@@ -148,19 +157,22 @@ class Layout:
             math.prod(n for p, n in zip(node.plates, node.plate_shape, strict=True) if p in self.apart), 1
         )  # fmt: skip
 
-    def is_angle(self, name: str) -> bool:
-        """Whether a node lies on a circle."""
-        support = self.slices.first[name].support
-        return support is not None and support.kind == "circle"
+    def angles_of(self, name: str) -> np.ndarray:
+        """Which of a node's numbers are angles, shape (size,): as in later slices, which all but one are."""
+        node = self.slices.later[name]
+        if node.angles is None:
+            return np.zeros(self.size(name), dtype=bool)
+        full = self.packed(node, np.broadcast_to(node.angles, node.value_shape))
+        return full.reshape(-1, self.size(name))[0]
 
     @cached_property
     def angles(self) -> np.ndarray | None:
         """Which of the seen and the unknown numbers are angles, shape (p + n,); None where none is."""
         found = np.zeros(self.p + self.n, dtype=bool)
         for name, place in self.seen.items():
-            found[place] = self.is_angle(name)
+            found[place] = self.angles_of(name)
         for name, place in self.rows.items():
-            found[self.p + place.start : self.p + place.stop] = self.is_angle(name)
+            found[self.p + place.start : self.p + place.stop] = self.angles_of(name)
         return found if found.any() else None
 
     def packed(self, node: CompiledNode, value: np.ndarray) -> np.ndarray:
@@ -200,12 +212,12 @@ class Layout:
             error = invalid_error(node, result, np.ones(own, dtype=bool), own)
             if error is not None:
                 raise error
-        if isinstance(result, MvNormal):
-            mean = self.packed(node, np.broadcast_to(result.loc, full))
-            d = full[-1]
-            tril = np.broadcast_to(result.scale_tril, batch + node.plate_shape + (d, d))
-            return Moments(mean, self._blocks(node, tril, d))
         mean = self.packed(node, np.broadcast_to(result.mean, full))
+        root = covariance_root(result)
+        if root is not None:
+            d = full[-1]
+            root = np.broadcast_to(root, batch + node.plate_shape + (d, d))
+            return Moments(mean, self._blocks(node, root, d))
         return Moments(mean, self.packed(node, np.broadcast_to(np.sqrt(_variance(result)), full)))
 
     # ---- private -------------------------------------------------------------------------------
@@ -233,6 +245,17 @@ class Layout:
         return tril.reshape((*tril.shape[:count], *self.lead, -1, d, d))
 
 
+def covariance_root(result: Any) -> np.ndarray | None:
+    """A root of the covariance of a vector, shape (*batch, d, d), which may be singular; or None.
+
+    ``MvNormal`` has one; any other family is matched by its moments if it has ``mean`` and ``cov_root``, such
+    that ``cov_root @ cov_root.T`` is its covariance. That of an angle is of its deviation from the mean.
+    """
+    if isinstance(result, MvNormal):
+        return result.scale_tril
+    return getattr(result, "cov_root", None)
+
+
 def put_noise(rows: np.ndarray, scale: np.ndarray) -> None:
     """Write a node's own noise into its rows, ``(..., e, e)``, where there are zeros."""
     e = rows.shape[-1]
@@ -254,6 +277,12 @@ def _ordered(slices: Slices, first: bool) -> tuple[str, ...]:
     model = slices.first if first else slices.later
     wanted = set(slices.dynamic)
     return tuple(n for n in model.nodes if n in wanted)
+
+
+def _jumps(slices: Slices, name: str) -> bool:
+    """Whether a node is computed and takes no continuous values."""
+    nodes = (slices.first[name], slices.later[name])
+    return any(not n.is_stochastic and (n.is_discrete or n.domain is not None) for n in nodes)
 
 
 def _variance(result: Any) -> np.ndarray:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.engines.kalman.levels import Level, Made
 from bayesmc.engines.kalman.nonlinear import NonlinearFilter
 from bayesmc.errors import ParameterError
-from bayesmc.gaussian import try_cholesky
 
 
 @dataclass(frozen=True)
@@ -35,10 +34,10 @@ class UnscentedKalmanFilter(NonlinearFilter):
     -----
     The additive form: noise is not among the numbers that points are laid for; its covariance is
     averaged over the points. Points are laid anew for every level of a slice: for the slice before, then
-    around what is predicted. Families other than Normal and MvNormal are matched by mean and variance, and
-    angles are wrapped, as in ``ExtendedKalmanFilter``. What the points tell beyond a regression line is
-    noise, so a slice is a linear model again and the smoother that of ``KalmanFilter``, with
-    cross-covariances by points.
+    around what is predicted. Other families than Normal and MvNormal, angles, counts and what takes no
+    continuous values are treated as in ``ExtendedKalmanFilter``. What the points tell beyond a regression
+    line is noise, so a slice is a linear model again and the smoother that of ``KalmanFilter``, with
+    cross-covariances by points. ``most_likely`` is answered for linear-Gaussian templates only.
 
     References
     ----------
@@ -117,15 +116,16 @@ class UnscentedKalmanFilter(NonlinearFilter):
         """A node's noise, its covariance averaged over the points."""
         if scale is None or (scale == scale[:1]).all():
             return None if scale is None else scale[0]
-        matrices = scale.ndim > 2 + lead
-        squared = scale @ np.matrix_transpose(scale) if matrices else scale**2
-        found = squared[0] + weight * (squared[1:] - squared[0]).sum(axis=0)
-        if not matrices and (found > 0).all():
-            return np.sqrt(found)
-        root, bad = try_cholesky(found) if matrices else (found, True)
-        if bad is None:
-            return root
-        raise _not_positive("noise averaged over sigma points is not positive")
+        if scale.ndim == 2 + lead:
+            squared = scale**2
+            found = squared[0] + weight * (squared[1:] - squared[0]).sum(axis=0)
+            root = np.sqrt(found) if (found > 0).all() else None
+        else:
+            middle = 1.0 - weight * (len(scale) - 1)
+            root = _joint_root(scale[0], middle, scale[1:], weight)
+        if root is None:
+            raise _not_positive("noise averaged over sigma points is not positive")
+        return root
 
     @staticmethod
     def _with_middle(
@@ -135,16 +135,33 @@ class UnscentedKalmanFilter(NonlinearFilter):
         if middle >= 0:
             return np.concatenate([bent, np.sqrt(middle) * centre[..., None], noise], axis=-1)
         whole = sum(a @ np.matrix_transpose(a) for a in (bent, noise))
-        whole = whole + middle * centre[..., None] * centre[..., None, :]
-        values, vectors = np.linalg.eigh(whole)  # nodes without noise make it singular
-        if (values >= -1e-9 * np.abs(values).max(axis=-1, keepdims=True)).all():
-            return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-        raise _not_positive(
-            f"the middle point weighs {middle:.3g}, and the covariance is not positive"
-        )
+        root = _root_of(whole + middle * centre[..., None] * centre[..., None, :])
+        if root is None:
+            raise _not_positive(
+                f"the middle point weighs {middle:.3g}, and the covariance is not positive"
+            )
+        return root
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _joint_root(first: np.ndarray, middle: float, others: np.ndarray, weight: float) -> Any:
+    """A root of a weighted sum of covariances, given roots of them, or None where it has none."""
+    if middle < 0:
+        squared = others @ np.matrix_transpose(others)
+        return _root_of(middle * first @ np.matrix_transpose(first) + weight * squared.sum(axis=0))
+    roots = np.concatenate([np.sqrt(middle) * first[None], np.sqrt(weight) * others])
+    beside = np.matrix_transpose(np.concatenate(tuple(roots), axis=-1))
+    return np.matrix_transpose(np.linalg.qr(beside, mode="r"))
+
+
+def _root_of(covariance: np.ndarray) -> np.ndarray | None:
+    """A root of a covariance, which may be singular; None of what is no covariance."""
+    values, vectors = np.linalg.eigh(covariance)
+    if (values >= -1e-9 * np.abs(values).max(axis=-1, keepdims=True)).all():
+        return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return None
 
 
 def _not_positive(what: str) -> ParameterError:

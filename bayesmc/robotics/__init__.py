@@ -1,0 +1,77 @@
+"""Robots: poses, motion, sensors, maps and logs, each piece a conditional density for any dynamic Bayes net.
+
+Nothing here filters: a robot's belief is that of a ``DynamicBayesNet`` whose transition is one of ``motion`` and
+whose sensors are ``landmarks``, ``beams`` or ``field``, and every engine over time runs on it. Lengths are
+metres, angles radians, times seconds.
+"""
+
+from __future__ import annotations
+
+from bayesmc.robotics.beams import BeamFit, BeamModel, Beams, clean_ranges, fit_beams
+from bayesmc.robotics.brightness import Ceiling
+from bayesmc.robotics.field import FieldScan, LikelihoodField
+from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
+from bayesmc.robotics.landmarks import (
+    bearing,
+    bearing_to,
+    cone_range,
+    range_and_bearing,
+    range_only,
+    range_to,
+    sonar,
+)
+from bayesmc.robotics.mapfile import read_map, write_map
+from bayesmc.robotics.motion import OdometryMotion, VelocityMotion, euler_step, unicycle
+from bayesmc.robotics.poses import (
+    AndAngle,
+    PoseNormal,
+    angle_between,
+    between,
+    compass,
+    compose,
+    inverse,
+    mean_pose,
+    pose_errors,
+    transform,
+    wrap,
+)
+from bayesmc.robotics.raycast import RayTable, ray_cast
+
+__all__ = [
+    "AndAngle",
+    "BeamFit",
+    "BeamModel",
+    "Beams",
+    "Ceiling",
+    "FieldScan",
+    "FreeSpace",
+    "LikelihoodField",
+    "OccupancyGrid",
+    "OdometryMotion",
+    "PoseNormal",
+    "RayTable",
+    "VelocityMotion",
+    "angle_between",
+    "bearing",
+    "bearing_to",
+    "between",
+    "clean_ranges",
+    "compass",
+    "compose",
+    "cone_range",
+    "euler_step",
+    "fit_beams",
+    "inverse",
+    "mean_pose",
+    "pose_errors",
+    "range_and_bearing",
+    "range_only",
+    "range_to",
+    "ray_cast",
+    "read_map",
+    "sonar",
+    "transform",
+    "unicycle",
+    "wrap",
+    "write_map",
+]

@@ -1,0 +1,383 @@
+"""The likelihood field: how well the end points of a laser scan fall on obstacles.
+
+The log density of an end point is looked up by the cell it falls into, so that a scan costs one
+pass of gathers however many obstacles there are. Rays are not followed: a wall between robot and
+end point counts for nothing (``beams`` on cast rays counts it), and the density is not normalised
+over ranges.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.distributions.base import as_float
+from bayesmc.distributions.support import Support, nonnegative, product
+from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.robotics.grid import OccupancyGrid
+from bayesmc.shapes import Shape, broadcast_shapes, read_only
+
+#: end points worked on at a time: more leave the cache, fewer cost calls
+_BLOCK = 1 << 16
+#: cells up to which the table has a margin that no end point can leave, so that none needs clipping
+_ROOMY = 1 << 24
+#: radians that float32 still holds to a thousandth of a degree
+_LARGE_ANGLE = 50.0
+
+
+@dataclass(frozen=True, eq=False)
+class LikelihoodField:
+    """The end points of a scan as a density given the pose, by the distance to the nearest obstacle.
+
+    The density of one range is ``z_hit * N(d; 0, sigma) + z_rand / max_range``, where d is the
+    distance of its end point from the nearest obstacle; a scan's is the product over its beams, to
+    the power ``tempering``.
+
+    Parameters
+    ----------
+    grid : OccupancyGrid
+        Its ``threshold`` decides what is an obstacle; unknown cells are none.
+    sigma : float
+        Standard deviation (m) of an end point about its obstacle.
+    z_hit, z_rand : float
+        Shares of beams that hit an obstacle of the map and that end anywhere; at most 1 together.
+        The rest are no returns.
+    max_range : float
+        Range (m) from which on a reading is no return.
+    mount : (float, float, float)
+        Pose of the laser in the robot's frame (m, m, rad).
+    tempering : float
+        Exponent of the density of a scan: beams are less independent than the product makes them.
+        Positive; 1 leaves it as it is.
+
+    Raises
+    ------
+    ParameterError
+        A parameter is out of range.
+
+    Notes
+    -----
+    - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
+    - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
+      all have.
+    - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
+      end point within 0.001 cells of a border may count for the cell next to it.
+    - The density is not normalised over ranges (Thrun et al., section 6.4); evidence computed with
+      it compares maps or parameters with each other only roughly.
+
+    References
+    ----------
+    Thrun, Burgard and Fox, Probabilistic Robotics, 2005, table 6.3.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.field import LikelihoodField
+    >>> from bayesmc.robotics.grid import OccupancyGrid
+    >>> room = OccupancyGrid(np.pad(np.zeros((40, 20)), 1, constant_values=1.0), 0.1)
+    >>> field = LikelihoodField(room, sigma=0.2, max_range=10.0)
+    >>> particles = np.array([[1.05, 1.05, 0.0], [2.05, 1.05, 0.0]])
+    >>> scan = field.given(particles, np.deg2rad([-90.0, 0.0, 90.0]))
+    >>> scan.log_prob([1.0, 3.1, 1.0]).round(2).tolist()  # as the first one would see it
+    [1.32, -3.08]
+    """
+
+    grid: OccupancyGrid
+    sigma: float = 0.2
+    z_hit: float = 0.8
+    z_rand: float = 0.2
+    max_range: float = 80.0
+    mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tempering: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("sigma", "max_range", "tempering"):
+            _require(0 < getattr(self, name) < math.inf, self, name, "positive and finite")
+        for name in ("z_hit", "z_rand"):
+            _require(0 <= getattr(self, name) <= 1, self, name, "between 0 and 1")
+        total = self.z_hit + self.z_rand
+        _require(0 < total <= 1 + 1e-9, self, "z_rand", "such that 0 < z_hit + z_rand <= 1")
+        mount = np.asarray(self.mount, dtype=float)
+        _require(
+            mount.shape == (3,) and np.isfinite(mount).all(), self, "mount", "three finite numbers"
+        )
+
+    def given(self, pose: Any, angles: Any) -> FieldScan:
+        """The scan of a laser with beams at ``angles``, from ``pose``.
+
+        Parameters
+        ----------
+        pose : array_like, shape (..., 3)
+            Of the robot: x, y (m) and heading (rad).
+        angles : array_like, shape (beams,)
+            Of the beams against the laser's heading (rad).
+
+        Returns
+        -------
+        FieldScan
+            ``batch_shape`` is that of the poses, ``event_shape`` is ``(beams,)``.
+        """
+        return FieldScan(self, pose, angles)
+
+    @property
+    def log_random(self) -> float:
+        """Log density (tempered) of an end point that no obstacle explains."""
+        if not self.z_rand:
+            return -math.inf
+        return self.tempering * math.log(self.z_rand / self.max_range)
+
+    def log_density(self) -> np.ndarray:
+        """Log density (tempered) of an end point in each cell of the map, shape (nx, ny)."""
+        scaled = self.grid.distances / self.sigma
+        with np.errstate(divide="ignore", over="ignore"):
+            density = self.z_hit * np.exp(-0.5 * scaled**2) / (math.sqrt(2 * math.pi) * self.sigma)
+            return self.tempering * np.log(density + self.z_rand / self.max_range)
+
+    @cached_property
+    def _table(self) -> _Table:
+        """What end points are looked up in; laid out once."""
+        return _Table.of(self)
+
+    def __repr__(self) -> str:
+        return f"LikelihoodField({self.grid!r}, sigma={self.sigma:g}, max_range={self.max_range:g})"
+
+
+class FieldScan(Distribution):
+    """Ranges (m) of a laser's beams from a pose, by a likelihood field: see ``LikelihoodField.given``.
+
+    Draws come from the density of each beam normalised along its ray up to ``max_range`` (in steps
+    of half a cell), without the tempering exponent and without no returns.
+
+    Parameters
+    ----------
+    field : LikelihoodField
+    pose : array_like, shape (..., 3)
+    angles : array_like, shape (beams,)
+
+    Raises
+    ------
+    ParameterError
+        A pose or an angle is not finite.
+    ShapeError
+        Poses do not have three components, or angles more than one axis.
+    """
+
+    parameter_ndim = {"pose": 1, "angles": 1}
+
+    def __init__(self, field: LikelihoodField, pose: Any, angles: Any) -> None:
+        pose, angles = as_float(pose), as_float(angles)
+        if pose.shape[-1:] != (3,):
+            raise ShapeError(
+                f"FieldScan: poses have shape {pose.shape}; give (..., 3): x, y, heading"
+            )
+        if angles.ndim != 1:
+            raise ShapeError(f"FieldScan: angles have shape {angles.shape}; give (beams,)")
+        self.field, self.pose, self.angles = field, pose, angles
+        self.batch_shape, self.event_shape = pose.shape[:-1], angles.shape
+        if not math.isfinite(np.add.reduce(pose, axis=None)):  # cheaper than every element
+            self.pose = self._check("pose", pose, np.isfinite(pose).all(axis=-1), 0.0, "finite")
+        if not math.isfinite(np.add.reduce(angles)):
+            raise ParameterError("FieldScan: angles must be finite")
+
+    @property
+    def support(self) -> Support:
+        return product([(nonnegative, self.event_shape[0])])
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        if x.shape[-1:] != self.event_shape:
+            raise ShapeError(f"ranges have shape {x.shape}, not (..., {self.event_shape[0]})")
+        if x.ndim == 1:
+            return self._of_scan(x, self.pose)
+        lead = broadcast_shapes(x.shape[:-1], self.batch_shape)
+        pose = np.broadcast_to(self.pose, (*lead, 3))
+        own = x.shape[:-1]
+        log = np.empty(lead)
+        if math.prod(own) * 16 <= math.prod(lead):  # a few scans, such as one per robot of a plate
+            x = x.reshape((1,) * (len(lead) - len(own)) + x.shape)
+            for index in np.ndindex(*x.shape[:-1]):
+                at = tuple(
+                    slice(None) if n == 1 else i for i, n in zip(index, x.shape[:-1], strict=True)
+                )
+                log[at] = self._of_scan(x[index], pose[at])
+            return log
+        scans = np.broadcast_to(x, (*lead, x.shape[-1])).reshape(-1, x.shape[-1])
+        return self._of_pairs(scans, pose.reshape(-1, 3)).reshape(lead)
+
+    def _of_scan(self, ranges: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Log densities of one scan from poses, shape ``pose.shape[:-1]``: the hot path."""
+        used = (ranges >= 0) & (ranges < self.field.max_range)
+        if not used.all():
+            ranges, angles = ranges[used], self.angles[used]
+        else:
+            angles = self.angles
+        if not len(ranges):
+            return np.zeros(pose.shape[:-1])
+        table = self.field._table
+        log = table.scores(ranges, angles, *table.place(pose.reshape(-1, 3)))
+        return log.reshape(pose.shape[:-1])
+
+    def _of_pairs(self, scans: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Log densities of scans ``(n, beams)``, each from its own pose ``(n, 3)``."""
+        table, log = self.field._table, np.empty(len(scans))
+        step = max(1, _BLOCK // max(scans.shape[1], 1))
+        for start in range(0, len(scans), step):
+            part = slice(start, start + step)
+            used = (scans[part] >= 0) & (scans[part] < self.field.max_range)
+            ranges = np.where(used, scans[part], 0.0)
+            density = table.along(pose[part], self.angles, ranges[..., None])[..., 0]
+            log[part] = np.where(used, density, 0.0).sum(axis=-1)
+        return log
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        field, beams = self.field, len(self.angles)
+        pose = np.broadcast_to(self.pose, (*shape, 3)).reshape(-1, 3)
+        count = math.ceil(2 * field.max_range / field.grid.resolution)
+        width = field.max_range / count
+        middles = (np.arange(count) + 0.5) * width
+        draws = np.empty((len(pose), beams))
+        step = max(1, (1 << 20) // max(beams * count, 1))
+        for start in range(0, len(pose), step):
+            log = field._table.along(pose[start : start + step], self.angles, middles)
+            density = np.exp(log / field.tempering, dtype=float)
+            density = np.where(density.sum(axis=-1, keepdims=True) > 0, density, 1.0)
+            sums = density.cumsum(axis=-1)
+            level = rng.random(sums.shape[:-1]) * sums[..., -1]
+            chosen = (sums <= level[..., None]).sum(axis=-1)
+            draws[start : start + step] = (chosen + rng.random(chosen.shape)) * width
+        return draws.reshape(*shape, beams)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Table:
+    """Log densities by cell, with a margin, flat and in single precision.
+
+    End points are worked out in cells of this table; those of robots on the map stay inside the
+    margin where it is wide enough, and are clipped where it is not.
+    """
+
+    def __init__(self, field: LikelihoodField, margin: int, clips: bool) -> None:
+        self.field, self.margin, self.clips = field, margin, clips
+        cells = np.pad(
+            field.log_density().astype(np.float32), margin, constant_values=field.log_random
+        )
+        self.shape = cells.shape
+        self._corner = np.array(field.grid.origin)[:, None]
+        self._size = np.array(field.grid.shape)[:, None]
+        self._top = np.array(self.shape, dtype=np.float32)[:, None, None] - 1
+        self.flat = read_only(cells.ravel())
+
+    @classmethod
+    def of(cls, field: LikelihoodField) -> _Table:
+        reach = field.max_range + math.hypot(*field.mount[:2])
+        margin = math.ceil(reach / field.grid.resolution) + 2
+        nx, ny = field.grid.shape
+        if (nx + 2 * margin) * (ny + 2 * margin) <= _ROOMY:
+            return cls(field, margin, clips=False)
+        return cls(field, 1, clips=True)
+
+    def place(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """Cosine, sine, x and y (cells), shape (4, poses), and which are beyond the map, if any."""
+        grid = self.field.grid
+        cells = pose.T[:2] - self._corner
+        cells *= 1 / grid.resolution
+        inside = (cells >= 0) & (cells < self._size)
+        outside = None
+        if not inside.all():
+            outside = ~inside.all(axis=0)
+            np.clip(cells, 0, self._size, out=cells)
+        rows = np.empty((4, len(pose)), dtype=np.float32)
+        np.add(cells, self.margin, out=rows[2:], casting="same_kind")
+        heading = pose[:, 2]
+        if len(heading) and np.abs(heading).max() > _LARGE_ANGLE:
+            heading = np.remainder(heading, 2 * np.pi)
+        rows[1] = heading
+        np.cos(rows[1], out=rows[0])
+        np.sin(rows[1], out=rows[1])
+        return rows, outside
+
+    def scores(
+        self, ranges: np.ndarray, angles: np.ndarray, rows: np.ndarray, outside: np.ndarray | None
+    ) -> np.ndarray:
+        """Log densities of one scan from placed poses, summed over its beams, shape (poses,)."""
+        count, beams = rows.shape[1], len(ranges)
+        # Turning and shifting the end points by each pose is one product of matrices, inner axis four.
+        turn = np.zeros((2, beams, 4), dtype=np.float32)
+        ex, ey = self._ends(ranges, angles)
+        turn[0, :, 0] = turn[1, :, 1] = ex
+        turn[1, :, 0] = ey
+        np.negative(ey, out=turn[0, :, 1], casting="same_kind")
+        turn[0, :, 2] = turn[1, :, 3] = 1.0
+        log = np.empty(count)
+        step = max(1, min(count, _BLOCK // beams))
+        rooms = _Rooms(beams, step)
+        for start in range(0, count, step):
+            part = slice(start, min(start + step, count))
+            found = self._gather(turn.reshape(-1, 4), rows[:, part], rooms)
+            np.add.reduce(found, axis=0, out=log[part], dtype=np.float32)
+        if outside is not None:
+            log[outside] = beams * self.field.log_random
+        return log
+
+    def along(self, pose: np.ndarray, angles: np.ndarray, ranges: np.ndarray) -> np.ndarray:
+        """Log densities at ``ranges`` (..., points) along each beam, shape (poses, beams, points)."""
+        (c, s, px, py), outside = self.place(pose)
+        c, s, px, py = (row[:, None, None] for row in (c, s, px, py))
+        ex, ey = (part.astype(np.float32) for part in self._ends(ranges, angles[:, None]))
+        ix = (c * ex - s * ey + px).astype(np.int64)
+        iy = (s * ex + c * ey + py).astype(np.int64)
+        np.clip(ix, 0, self.shape[0] - 1, out=ix)
+        np.clip(iy, 0, self.shape[1] - 1, out=iy)
+        found = self.flat[ix * self.shape[1] + iy]
+        if outside is not None:
+            found[outside] = self.field.log_random
+        return found
+
+    def _ends(self, ranges: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """End points in the robot's frame, in cells."""
+        mx, my, turn = self.field.mount
+        size = self.field.grid.resolution
+        beam = angles + turn
+        return (mx + ranges * np.cos(beam)) / size, (my + ranges * np.sin(beam)) / size
+
+    def _gather(self, turn: np.ndarray, rows: np.ndarray, rooms: _Rooms) -> np.ndarray:
+        """Log densities (beams, poses) of a block, in one of ``rooms``."""
+        place, cells, flat, found = rooms.cut(rows.shape[1])
+        np.matmul(turn, rows, out=place.reshape(-1, rows.shape[1]))
+        if self.clips:
+            np.clip(place, 0, self._top, out=place)
+        np.copyto(cells, place, casting="unsafe")  # nothing is negative: this is the floor
+        ix, iy = cells
+        ix *= np.int32(self.shape[1])
+        ix += iy
+        np.copyto(flat, ix)
+        # "clip" checks no bounds; the margin (or clipping) keeps every index inside
+        return np.take(self.flat, flat, out=found, mode="clip")
+
+
+class _Rooms:
+    """Scratch arrays (..., beams, poses) of one call, the last block's cut from the same memory."""
+
+    def __init__(self, beams: int, poses: int) -> None:
+        self.beams, size = beams, beams * poses
+        self.place, self.cells = np.empty(2 * size, np.float32), np.empty(2 * size, np.int32)
+        self.flat, self.found = np.empty(size, np.intp), np.empty(size, np.float32)
+
+    def cut(self, poses: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        one, count = (self.beams, poses), self.beams * poses
+        place, cells = self.place[: 2 * count], self.cells[: 2 * count]
+        flat, found = self.flat[:count], self.found[:count]
+        return place.reshape(2, *one), cells.reshape(2, *one), flat.reshape(one), found.reshape(one)
+
+
+def _require(ok: Any, field: LikelihoodField, name: str, requirement: str) -> None:
+    if not ok:
+        raise ParameterError(
+            f"LikelihoodField: {name} must be {requirement}; got {getattr(field, name)!r}"
+        )

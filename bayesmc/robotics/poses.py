@@ -1,0 +1,535 @@
+"""Poses in the plane, and distributions of them.
+
+A pose is an array ``(..., 3)``: x and y in metres, and the heading in radians, 0 along +x and
+counterclockwise. All functions take arrays with any leading axes (particles, plates) that
+broadcast. Headings that come out lie in ``[-pi, pi)``, and differences of headings go the short way
+round.
+
+How a robot moves is in ``motion``, what it senses in ``landmarks`` and its neighbours; nothing here
+knows of either.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution, Joint, MvNormal, WrappedNormal
+from bayesmc.distributions.adapt import as_distribution
+from bayesmc.distributions.base import as_float
+from bayesmc.distributions.circular import wrap_angle
+from bayesmc.distributions.support import Support, circle, product, real_vector
+from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.shapes import Shape, broadcast_shapes
+
+#: two numbers and an angle
+POSES: Support = product([(real_vector, 2), (circle, 0)])
+
+
+def compose(a: Any, b: Any) -> np.ndarray:
+    """The pose ``b``, given in the frame of ``a``, in the frame that ``a`` is given in.
+
+    Parameters
+    ----------
+    a, b : array_like, shape (..., 3)
+        Poses in m, m, rad; their leading axes broadcast.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+
+    Raises
+    ------
+    ShapeError
+        A pose has not three components.
+
+    References
+    ----------
+    Smith, Self and Cheeseman (1990), Estimating uncertain spatial relationships in robotics, equation 3 (the
+    compounding ``a + b``).
+
+    Examples
+    --------
+    One metre ahead, then a quarter turn to the left; twice:
+
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import compose
+    >>> step = [1.0, 0.0, np.pi / 2]
+    >>> compose(step, step).round(3).tolist()
+    [1.0, 1.0, -3.142]
+    """
+    a, b = as_poses("compose", a), as_poses("compose", b)
+    sine, cosine = sin_cos(a[..., 2])
+    x = a[..., 0] + (cosine * b[..., 0] - sine * b[..., 1])
+    y = a[..., 1] + (sine * b[..., 0] + cosine * b[..., 1])
+    return joined_pose(x, y, turned_back(a[..., 2] + b[..., 2]))
+
+
+def inverse(a: Any) -> np.ndarray:
+    """The pose that undoes ``a``: ``compose(a, inverse(a))`` is the origin.
+
+    Parameters
+    ----------
+    a : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+
+    References
+    ----------
+    Smith, Self and Cheeseman (1990), equation 6 (the inverse relationship).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import inverse
+    >>> inverse([1.0, 2.0, np.pi / 2]).round(3).tolist()
+    [-2.0, 1.0, -1.571]
+    """
+    a = as_poses("inverse", a)
+    sine, cosine = sin_cos(a[..., 2])
+    x = -(cosine * a[..., 0] + sine * a[..., 1])
+    y = sine * a[..., 0] - cosine * a[..., 1]
+    return joined_pose(x, y, turned_back(-a[..., 2]))
+
+
+def between(a: Any, b: Any) -> np.ndarray:
+    """The pose ``b`` seen from ``a``: ``compose(a, between(a, b))`` is ``b``.
+
+    Parameters
+    ----------
+    a, b : array_like, shape (..., 3)
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import between
+    >>> between([1.0, 1.0, np.pi / 2], [1.0, 3.0, np.pi]).round(3).tolist()
+    [2.0, 0.0, 1.571]
+    """
+    a, b = as_poses("between", a), as_poses("between", b)
+    sine, cosine = sin_cos(a[..., 2])
+    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
+    ahead, left = cosine * dx + sine * dy, cosine * dy - sine * dx
+    return joined_pose(ahead, left, turned_back(b[..., 2] - a[..., 2]))
+
+
+def transform(pose: Any, points: Any) -> np.ndarray:
+    """Points of the robot's frame in the world.
+
+    Parameters
+    ----------
+    pose : array_like, shape (..., 3)
+    points : array_like, shape (..., 2)
+        In m; their leading axes broadcast with the pose's. For many points of every pose give the
+        pose an axis for them: ``transform(pose[..., None, :], points)``.
+
+    Returns
+    -------
+    ndarray, shape (..., 2)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import transform
+    >>> transform([1.0, 1.0, np.pi / 2], [[1.0, 0.0], [0.0, 1.0]]).round(3).tolist()
+    [[1.0, 2.0], [0.0, 1.0]]
+    """
+    pose, points = as_poses("transform", pose), as_points("transform", points)
+    sine, cosine = sin_cos(pose[..., 2])
+    px, py = points[..., 0], points[..., 1]
+    x, y = pose[..., 0] + (cosine * px - sine * py), pose[..., 1] + (sine * px + cosine * py)
+    return np.stack(np.broadcast_arrays(x, y), axis=-1)
+
+
+def wrap(angle: Any) -> np.ndarray:
+    """The same angle in ``[-pi, pi)``.
+
+    Parameters
+    ----------
+    angle : array_like
+        In rad, of any size; angles in ``[-pi, pi)`` keep every digit.
+
+    Returns
+    -------
+    ndarray
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import wrap
+    >>> wrap([3 * np.pi, 0.5, 7.0]).round(3).tolist()
+    [-3.142, 0.5, 0.717]
+    """
+    return wrap_angle(angle)
+
+
+def angle_between(a: Any, b: Any) -> np.ndarray:
+    """The turn from heading ``a`` to heading ``b`` the short way round, in ``[-pi, pi)``.
+
+    Parameters
+    ----------
+    a, b : array_like
+        Angles in rad, which broadcast.
+
+    Returns
+    -------
+    ndarray
+
+    Examples
+    --------
+    >>> from bayesmc.robotics.poses import angle_between
+    >>> angle_between([3.1, 0.0], [-3.1, 0.25]).round(3).tolist()
+    [0.083, 0.25]
+    """
+    return wrap_angle(np.asarray(b, dtype=float) - np.asarray(a, dtype=float))
+
+
+def compass(heading: Any) -> np.ndarray:
+    """Headings of one convention in the other: ``pi / 2 - heading``, which is its own inverse.
+
+    One convention is this package's, 0 along +x and counterclockwise; the other that of a compass, 0 along +y
+    and clockwise, which the lecture notes' motion model implies (see ``motion.euler_step``).
+
+    Parameters
+    ----------
+    heading : array_like
+        In rad.
+
+    Returns
+    -------
+    ndarray
+        In ``[-pi, pi)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import compass
+    >>> compass([0.0, np.pi / 2, -np.pi]).round(3).tolist()
+    [1.571, 0.0, -1.571]
+    """
+    return angle_between(heading, 0.5 * np.pi)
+
+
+def mean_pose(poses: Any, weights: Any = None, axis: int = 0) -> np.ndarray:
+    """Weighted mean of poses, the heading's on the circle.
+
+    Parameters
+    ----------
+    poses : array_like, shape (..., 3)
+    weights : array_like, optional
+        Nonnegative, not necessarily normalised; of the shape of ``poses`` without its last axis, or
+        one for each entry along ``axis``.
+    axis : int
+        What is averaged over, counted among the leading axes: the particles, usually the first.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Without ``axis``. The heading is the direction of the mean of ``(cos, sin)``; where that
+        mean is zero no direction is better than another.
+
+    Raises
+    ------
+    ParameterError
+        No weight is positive, or one is negative or not finite.
+    ShapeError
+
+    References
+    ----------
+    Mardia and Jupp (2000), Directional Statistics, section 2.2.1.
+
+    Examples
+    --------
+    Headings on both sides of pi, whose plain mean would point the other way:
+
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import mean_pose
+    >>> mean_pose([[0.0, 0.0, 3.0], [1.0, 2.0, -3.1]]).round(3).tolist()
+    [0.5, 1.0, 3.092]
+    """
+    poses = as_poses("mean_pose", poses)
+    if poses.ndim < 2:
+        raise ShapeError("mean_pose: one pose alone has no axis to average over; give (n, 3)")
+    lead = poses.shape[:-1]
+    axis = range(len(lead))[axis]
+    share = _shares(lead, weights, axis)[..., None]
+    sine, cosine = sin_cos(poses[..., 2])
+    parts = np.stack([poses[..., 0], poses[..., 1], sine, cosine], axis=-1)
+    total = (share * parts).sum(axis=axis)
+    return joined_pose(total[..., 0], total[..., 1], wrap(np.arctan2(total[..., 2], total[..., 3])))
+
+
+def pose_errors(estimate: Any, truth: Any) -> tuple[np.ndarray, np.ndarray]:
+    """How far an estimate is from the truth.
+
+    Parameters
+    ----------
+    estimate, truth : array_like, shape (..., 3)
+
+    Returns
+    -------
+    distance : ndarray, shape (...)
+        Between the positions, in m.
+    heading : ndarray, shape (...)
+        From the true heading to the estimated one, in rad, in ``[-pi, pi)``.
+
+    Examples
+    --------
+    >>> from bayesmc.robotics.poses import pose_errors
+    >>> distance, heading = pose_errors([3.0, 4.0, 3.1], [0.0, 0.0, -3.1])
+    >>> float(distance), float(heading.round(3))
+    (5.0, -0.083)
+    """
+    estimate, truth = as_poses("pose_errors", estimate), as_poses("pose_errors", truth)
+    off = estimate - truth
+    return np.hypot(off[..., 0], off[..., 1]), wrap_angle(off[..., 2])
+
+
+class PoseDistribution(Distribution):
+    """Base of distributions of poses: two numbers and an angle.
+
+    Attributes
+    ----------
+    cov_root : ndarray, shape (..., 3, 3)
+        A root of the covariance, ``cov_root @ cov_root.T``, of (x, y, heading's deviation from its
+        mean). It is what filters with Gaussian beliefs need beside ``mean``, and may be singular.
+    """
+
+    event_shape: Shape = (3,)
+
+    @property
+    def support(self) -> Support:
+        return POSES
+
+    @property
+    def cov_root(self) -> np.ndarray:
+        raise NotImplementedError
+
+    @property
+    def cov(self) -> np.ndarray:
+        """Covariance, shape ``(*batch_shape, 3, 3)``."""
+        root = self.cov_root
+        return np.broadcast_to(root @ np.matrix_transpose(root), (*self.batch_shape, 3, 3))
+
+    @property
+    def var(self) -> np.ndarray:
+        return np.linalg.diagonal(self.cov)
+
+    def _finite_pose(self, name: str, pose: np.ndarray) -> np.ndarray:
+        if np.isfinite(np.add.reduce(pose, axis=None)):  # cheaper than looking at every element
+            return pose
+        return self._check(name, pose, np.isfinite(pose).all(axis=-1), 0.0, "finite")
+
+
+class PoseNormal(PoseDistribution):
+    """Normal distribution of a pose: Gaussian noise is added, and the heading taken as an angle.
+
+    Give exactly one of ``cov``, ``scale_tril`` and ``scale_diag``.
+
+    Parameters
+    ----------
+    loc : array_like, shape (..., 3)
+        x, y in m, heading in rad (any finite angle).
+    cov : array_like, shape (..., 3, 3)
+        Covariance of the noise in m and rad.
+    scale_tril : array_like, shape (..., 3, 3)
+        Its lower Cholesky factor.
+    scale_diag : array_like, shape (..., 3)
+        Standard deviations of independent components.
+
+    Raises
+    ------
+    ParameterError, ShapeError
+        As ``MvNormal``.
+
+    Notes
+    -----
+    The density is the sum over all headings that differ by full turns: the normal density of the
+    position times the wrapped normal density of the heading given the position, so no term of the
+    sum is dropped.
+
+    References
+    ----------
+    Mardia and Jupp (2000), Directional Statistics, section 3.5.7 (wrapping).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.poses import PoseNormal
+    >>> pose = PoseNormal([0.0, 0.0, 3.1], scale_diag=[0.1, 0.1, 0.05])
+    >>> pose.log_prob([[0.0, 0.0, 3.1], [0.0, 0.0, 3.1 - 2 * np.pi]]).round(4).tolist()
+    [4.8441, 4.8441]
+    """
+
+    parameter_ndim = {"loc": 1, "cov": 2}
+
+    def __init__(
+        self, loc: Any, cov: Any = None, *, scale_tril: Any = None, scale_diag: Any = None
+    ) -> None:
+        self._flat = MvNormal(loc, cov, scale_tril=scale_tril, scale_diag=scale_diag)
+        if self._flat.event_shape != (3,):
+            raise ShapeError(f"PoseNormal: loc must have shape (..., 3); got {np.shape(loc)}")
+        self._set_batch(self._flat.batch_shape)
+        self._adopt(self._flat)
+        self.loc = self._flat.loc
+
+    @property
+    def mean(self) -> np.ndarray:
+        """Mean, the heading's in ``[-pi, pi)``."""
+        loc = self.loc
+        wrapped = joined_pose(loc[..., 0], loc[..., 1], wrap_angle(loc[..., 2]))
+        return np.broadcast_to(wrapped, (*self.batch_shape, 3))
+
+    @property
+    def cov(self) -> np.ndarray:
+        return np.broadcast_to(self._flat.cov, (*self.batch_shape, 3, 3))
+
+    @property
+    def cov_root(self) -> np.ndarray:
+        return np.broadcast_to(self._flat.scale_tril, (*self.batch_shape, 3, 3))
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        draws = self._flat.sample_to(rng, shape)
+        draws[..., 2] = turned_back(draws[..., 2])
+        return draws
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        root = self._flat.scale_tril
+        off = x - self.loc
+        first = off[..., 0] / root[..., 0, 0]
+        second = (off[..., 1] - root[..., 1, 0] * first) / root[..., 1, 1]
+        area = 2 * np.pi * root[..., 0, 0] * root[..., 1, 1]
+        expected = root[..., 2, 0] * first + root[..., 2, 1] * second
+        heading = WrappedNormal(0.0, root[..., 2, 2]).log_prob(off[..., 2] - expected)
+        return -0.5 * (first * first + second * second) - np.log(area) + heading
+
+
+class AndAngle(Joint):
+    """A number or a vector, and an angle independent of it, side by side: the last component is the angle.
+
+    It is a pose from a position and a heading, or a range and a bearing.
+
+    Parameters
+    ----------
+    part : Distribution or frozen scipy.stats distribution
+        Continuous, of numbers or vectors.
+    angle : Distribution
+        On the circle: ``VonMises``, ``WrappedNormal`` or a ``Mixture`` of such. Batch shapes broadcast.
+
+    Raises
+    ------
+    ParameterError
+        ``angle`` does not lie on the circle.
+    UnsupportedError
+        ``part`` is no part of a ``Joint``.
+
+    References
+    ----------
+    Koller and Friedman, Probabilistic Graphical Models, 2009, section 2.1.4 (independence).
+
+    Examples
+    --------
+    Somewhere in a room of 6 by 4 metres, in any direction:
+
+    >>> from bayesmc.distributions import Joint, Uniform, VonMises
+    >>> from bayesmc.robotics.poses import AndAngle
+    >>> room = AndAngle(Joint(Uniform(0.0, 6.0), Uniform(0.0, 4.0)), VonMises(0.0, 0.0))
+    >>> room.sample(rng=0, sample_shape=5).shape, float(room.log_prob([1.0, 1.0, 9.0]).round(4))
+    ((5, 3), -5.0159)
+    """
+
+    def __init__(self, part: Any, angle: Any) -> None:
+        super().__init__(part)
+        last = as_distribution(angle)
+        if last is None or last.event_shape or last.support.kind != "circle":
+            raise ParameterError(
+                "AndAngle: the second part must be an angle, such as WrappedNormal(0.0, 0.1); got "
+                f"{angle!r:.80}"
+            )
+        self.parts = (*self.parts, last)
+        self._sizes = (*self._sizes, 0)
+        self.event_shape = (self.event_shape[0] + 1,)
+        self._set_batch(*(p.batch_shape for p in self.parts))
+        self._adopt(last)
+
+    @property
+    def cov_root(self) -> np.ndarray:
+        """A root of the covariance, shape ``(*batch_shape, d, d)``; that of the angle is circular."""
+        cov = np.asarray(self.cov)
+        try:
+            return np.linalg.cholesky(cov)
+        except np.linalg.LinAlgError:
+            raise ParameterError(
+                "AndAngle: the parts' covariance is not positive definite"
+            ) from None
+
+
+def as_poses(call: str, pose: Any) -> np.ndarray:
+    """Poses as floats, or an error that names the call."""
+    pose = as_float(pose)
+    if not pose.ndim or pose.shape[-1] != 3:
+        raise ShapeError(
+            f"{call}: a pose has the components x, y, heading on its last axis; got shape {pose.shape}"
+        )
+    return pose
+
+
+def as_points(call: str, points: Any) -> np.ndarray:
+    """Points of the plane as floats, or an error that names the call."""
+    points = as_float(points)
+    if not points.ndim or points.shape[-1] != 2:
+        raise ShapeError(
+            f"{call}: a point has the components x, y on its last axis; got shape {points.shape}"
+        )
+    return points
+
+
+def joined_pose(x: Any, y: Any, heading: Any) -> np.ndarray:
+    """Poses from their components, which broadcast."""
+    shape = broadcast_shapes(np.shape(x), np.shape(y), np.shape(heading))
+    pose = np.empty((*shape, 3))
+    pose[..., 0], pose[..., 1], pose[..., 2] = x, y, heading
+    return pose
+
+
+def sin_cos(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sine and cosine."""
+    return np.sin(angle), np.cos(angle)
+
+
+def turned_back(heading: np.ndarray) -> np.ndarray:
+    """The same as ``wrap`` to rounding, and several times faster: for headings of some turns at most."""
+    turned = heading - (2 * np.pi) * np.rint(heading * (0.5 / np.pi))
+    beyond = np.abs(turned) >= np.pi
+    return np.where(beyond, -np.pi, turned) if beyond.any() else turned
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _shares(lead: Shape, weights: Any, axis: int) -> np.ndarray:
+    """Weights that sum to one along an axis."""
+    if weights is None:
+        return np.full(lead, 1.0 / max(lead[axis], 1))
+    weights = as_float(weights)
+    if weights.shape == (lead[axis],):
+        weights = weights.reshape([-1 if k == axis else 1 for k in range(len(lead))])
+    elif weights.shape != lead:
+        raise ShapeError(
+            f"mean_pose: weights have shape {weights.shape}; give ({lead[axis]},), one for each "
+            f"entry along axis {axis}, or {lead}"
+        )
+    total = weights.sum(axis=axis, keepdims=True)
+    if not ((weights >= 0).all() and np.isfinite(total).all() and (total > 0).all()):
+        raise ParameterError(
+            "mean_pose: weights must be nonnegative and finite, and some positive; of log weights "
+            "give np.exp(log_weights - log_weights.max())"
+        )
+    return weights / total
