@@ -24,7 +24,7 @@ help:
 demo: .venv/.extras-plot
 	$(PY) -m examples.demo
 
-test: .venv/.extras-plot,arviz,test
+test: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m pytest -q -n auto --dist worksteal
 
 lint: .venv/.extras-dev
@@ -36,16 +36,16 @@ format: .venv/.extras-dev
 	$(PY) -m ruff check --fix-only -q .
 	$(PY) -m ruff format .
 
-docs: .venv/.extras-plot,arviz,test
+docs: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py
 
-bench: .venv/.extras-plot,arviz,test
+bench: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m benchmarks
 
 peers: .venv-peers/.installed
 
 # BAYESMC_DATA says where the published posteriors are
-references: .venv/.extras-plot,arviz,test
+references: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m references
 
 clean:
