@@ -1,8 +1,8 @@
-"""Robots: poses, motion, sensors, maps and logs, each piece a conditional density for any dynamic Bayes net.
+"""Robots: poses, motion, sensors, maps and logs; each piece a conditional density for any dynamic Bayes net.
 
 Nothing here filters: a robot's belief is that of a ``DynamicBayesNet`` whose transition is one of ``motion``
-and whose sensors are ``landmarks``, ``beams`` or ``field``, and every engine over time runs on it. Lengths are
-metres, angles radians, times seconds.
+and whose sensors are ``landmarks``, ``beams`` or ``field``, and every engine over time runs on it. Lengths
+are metres, angles radians, times seconds.
 """
 
 from __future__ import annotations
