@@ -9,8 +9,10 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 import venv
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -23,22 +25,51 @@ UNREACHABLE = ("connection", "timed out", "temporary failure", "name resolution"
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("wheel")
-    _pip(sys.executable, "wheel", "--no-deps", "-w", str(folder), str(REPOSITORY))
-    (built,) = folder.glob("*.whl")
+    def build(folder: Path) -> None:
+        _pip(sys.executable, "wheel", "--no-deps", "-w", str(folder), str(REPOSITORY))
+
+    (built,) = _once(tmp_path_factory, "wheel", build).glob("*.whl")
     return built
 
 
 @pytest.fixture(scope="module")
 def stranger(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Python of an environment that holds the wheel and what it requires, nothing else."""
-    folder = tmp_path_factory.mktemp("stranger") / "env"
-    venv.create(folder, with_pip=True)
-    python = folder / "bin" / "python"
-    if not python.exists():
-        python = folder / "Scripts" / "python.exe"
-    _pip(str(python), "install", str(wheel))
-    return python
+
+    def python(folder: Path) -> Path:
+        found = folder / "env" / "bin" / "python"
+        return found if found.exists() else folder / "env" / "Scripts" / "python.exe"
+
+    def install(folder: Path) -> None:
+        venv.create(folder / "env", with_pip=True)
+        _pip(str(python(folder)), "install", str(wheel))
+
+    return python(_once(tmp_path_factory, "stranger", install))
+
+
+def _once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder that the first of all workers fills; the others wait for it."""
+    base = factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / f"once-{name}"
+    done, failed = folder / "done", folder / "failed"
+    try:
+        folder.mkdir()
+    except FileExistsError:
+        for _ in range(3000):
+            if done.exists() or failed.exists():
+                break
+            time.sleep(0.2)
+        if not done.exists():  # the other could not; see why
+            folder = factory.mktemp(name)
+            make(folder)
+        return folder
+    try:
+        make(folder)
+    except BaseException:
+        failed.touch()
+        raise
+    done.touch()
+    return folder
 
 
 def test_wheel_holds_the_package_only(wheel: Path) -> None:

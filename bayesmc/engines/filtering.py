@@ -130,7 +130,7 @@ class FilterEngine:
         >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
         >>> engine = bmc.KalmanFilter()
         >>> belief = engine.step(engine.start(dbn), {"y": 1.0})
-        >>> belief.t, float(belief.mean("x"))
+        >>> belief.t, round(float(belief.mean("x")), 6)
         (0, 0.5)
         """
         if not isinstance(dbn, DynamicBayesNet):
