@@ -17,7 +17,7 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 ABSENT = "reference data absent"
 
 hypothesis.settings.register_profile(
-    "bayesmc", derandomize=True, deadline=None, print_blob=True, database=None
+    "bayesmc", max_examples=60, derandomize=True, deadline=None, print_blob=True, database=None
 )
 hypothesis.settings.load_profile("bayesmc")
 

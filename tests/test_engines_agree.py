@@ -224,7 +224,7 @@ def rejected(answer: Answer, kind: str, seed: int, draw: int, observed: bool = T
 
 
 #: chains take longer for an answer than independent draws: nets of each kind that they are asked
-CHAIN_NETS = 8
+CHAIN_NETS = 10
 
 
 def check_all(
