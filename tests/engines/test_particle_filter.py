@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles import cloud as particle
-from bayesmc.engines.particles.cloud import Mover, Selection
+from bayesmc.engines.particles import mover as particle
+from bayesmc.engines.particles.mover import Mover, Selection
 from bayesmc.errors import (
     DegeneracyError,
     EvidenceError,

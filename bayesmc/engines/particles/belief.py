@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
-from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
+from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.mover import Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import circular_variance, table_variance

@@ -18,8 +18,9 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries
 from bayesmc.engines.particles.anew import Lost, Rejuvenation
 from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.cloud import Cloud, Layout, Mover
+from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.engines.particles.counts import KLD
+from bayesmc.engines.particles.mover import Mover
 from bayesmc.engines.particles.optimal import OptimalPlan, why_not_optimal
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery

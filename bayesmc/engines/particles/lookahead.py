@@ -168,7 +168,7 @@ class LookAhead:
         size = self._numbers(node)
         centre, slopes, noise = self._linear(state, name, size, point, cov, self.total)
         off = self._flat(node, np.asarray(state.values[name], dtype=float)) - centre
-        off = wrap_angle(off) if _is_angle(node) else off
+        off = wrap_angle(off) if node.angles is not None else off
         off = off - _applied(slopes, mean - point)
         inner = _times(_times(slopes, cov), np.swapaxes(slopes, -1, -2)) + noise
         var = np.diagonal(inner, axis1=-2, axis2=-1)
@@ -176,7 +176,7 @@ class LookAhead:
         blind = ~(np.isfinite(off) & np.isfinite(var) & (var > 0))
         if name in self.masks:
             blind |= ~self.masks[name]
-        if _is_angle(node):
+        if node.angles is not None:
             wide = (var > _TURNED) & ~blind
             spread, at = np.sqrt(np.where(wide, var, 1.0)), np.where(wide, off, 0.0)
             alone = np.where(wide, WrappedNormal(0.0, spread).log_prob(at), 0.0).sum(axis=-1)
@@ -227,7 +227,7 @@ class LookAhead:
         slopes = np.zeros((*mean.shape[:-1], size, count))
         for k in range(count):
             rise = loc[1 + k] - loc[1 + count + k]
-            rise = wrap_angle(rise) if _is_angle(node) else rise
+            rise = wrap_angle(rise) if node.angles is not None else rise
             slopes[..., k] = rise / (2 * steps[..., k, None])
         return loc[0], slopes, self._noise(node, dist, lead, size)
 
@@ -366,10 +366,6 @@ def _applied(a: np.ndarray, x: np.ndarray) -> np.ndarray:
 
 def _over_events(mask: np.ndarray, node: CompiledNode) -> np.ndarray:
     return mask.reshape(mask.shape + (1,) * len(node.event_shape))
-
-
-def _is_angle(node: CompiledNode) -> bool:
-    return node.support is not None and node.support.kind == "circle"
 
 
 def _root(cov: np.ndarray) -> np.ndarray:
