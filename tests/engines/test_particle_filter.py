@@ -266,10 +266,14 @@ def test_answers_are_those_of_the_unrolled_net(variant: str) -> None:
 
 def test_blocks_change_nothing_but_the_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many small blocks give answers as good as one."""
+    monkeypatch.setattr(particle, "WHOLE", 10**6)
     whole = bmc.filter(switching(), {"y": ROWS}, engine=bmc.ParticleFilter(20_000), rng=0)
+    monkeypatch.setattr(particle, "WHOLE", 0)
     monkeypatch.setattr(particle, "BLOCK", 1000)
     cut = bmc.filter(switching(), {"y": ROWS}, engine=bmc.ParticleFilter(20_000), rng=0)
     np.testing.assert_allclose(whole.mean("x"), cut.mean("x"), atol=0.05)
+    np.testing.assert_allclose(whole.std("x"), cut.std("x"), rtol=0.05)
+    np.testing.assert_allclose(whole.weight_ess, cut.weight_ess, rtol=0.05)
     assert abs(whole.log_marginal_likelihood - cut.log_marginal_likelihood) < 0.1
 
 
