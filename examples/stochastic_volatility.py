@@ -135,7 +135,8 @@ def draw(found: dict[str, Any], series: Returns) -> Any:
         ax.plot(days, middle, color=picture.OTHER, lw=1.4, label="particles")
         exact = np.exp(found[f"{how} exactly"].mean("x") / 2)
         ax.plot(days, exact, color=picture.EXACT, lw=0.8, ls="--", label="grid")
-        ax.set(ylabel="volatility, %", title=called, ylim=(0, 1.25), xlim=(0, days[-1]))
+        ceiling = 1.25 * float(np.quantile(high, 0.995))  # room for the legend
+        ax.set(ylabel="volatility, %", title=called, ylim=(0, ceiling), xlim=(0, days[-1]))
     panels["smoothed"].set(xlabel="day")
     panels["filtered"].legend(frameon=False, loc="upper right", ncols=3)
     return figure
