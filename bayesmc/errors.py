@@ -198,6 +198,10 @@ class GridWarning(BayesmcWarning):
     """A grid that is too small or too coarse for the densities on it."""
 
 
+class LogWarning(BayesmcWarning):
+    """Lines of a log were skipped, since they do not read."""
+
+
 def missing_extra(package: str, extra: str) -> MissingExtraError:
     """The error for an absent optional ``package`` that ``bayesmc[extra]`` installs."""
     return MissingExtraError(

@@ -23,6 +23,9 @@ _LOG_TURN = np.log(2 * np.pi)
 _SERIES_UP_TO = 30.0  # concentration from which on erf and its corrections beat the Fourier series
 _SMOOTH = 1.25  # scale from which on the Fourier series needs fewer terms than the wrapped sum
 _UNIFORM = 20.0  # a normal of this scale, wrapped, is uniform to exp(-200)
+_ALONE = 41.0  # exp(-41) is lost beside one
+_FAR = 100.0  # angles beyond are wrapped exactly, which takes longer
+_TINY = 1e-300  # what is divided by is at least this
 _REACH = 40.0  # standard deviations that hold all mass that a double can tell from none
 
 
@@ -220,7 +223,7 @@ class WrappedNormal(_Circular):
         return wrap_angle(draws)
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        distance = np.abs(wrap_angle(x - self.loc))
+        distance = _short_way(x - self.loc)
         value = self._by_scale(_log_wrapped_sum, _log_fourier, distance)
         return _only_angles(x, value)
 
@@ -303,23 +306,71 @@ def _von_mises_tail(distance: np.ndarray, k: np.ndarray) -> np.ndarray:
     return total / (width * _TURN * special.i0e(k))
 
 
+def _short_way(off: np.ndarray) -> np.ndarray:
+    """Size of an angle taken the short way, in ``[0, pi]``; NaN where it is no angle."""
+    if (np.abs(off) > _FAR).any():
+        return np.abs(wrap_angle(off))
+    turns = np.asarray(np.rint(off * (1 / _TURN)))  # up to two, their product is exact
+    turns *= _TURN
+    np.subtract(off, turns, out=turns)
+    np.abs(turns, out=turns)
+    return np.minimum(turns, _PI, out=turns)
+
+
 def _log_wrapped_sum(distance: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Log density at ``distance`` in [0, pi]: the nearest normal, times what the others add."""
-    z = distance / scale
-    others = np.exp(-_TURN / scale * ((_PI - distance) / scale))
-    others = others + np.exp(-_TURN / scale * ((_PI + distance) / scale))
-    others = others + np.exp(-2 * _TURN / scale * ((_TURN - distance) / scale))
-    return np.log1p(others) - 0.5 * z * z - 0.5 * _LOG_TURN - np.log(scale)
+    """Log density at ``distance`` in [0, pi]: the nearest normal, times what the others add.
+
+    They add something where the distance is close to half a turn, for narrow scales almost nowhere.
+    """
+    value = np.asarray(distance / scale)
+    value *= value
+    value *= -0.5
+    value -= np.log(scale) + 0.5 * _LOG_TURN
+    shared = np.asarray(distance >= _PI - _ALONE / _TURN * (scale * scale))
+    count = np.count_nonzero(shared)
+    if 4 * count > shared.size:
+        value += np.log1p(_others(distance, scale))
+    elif count:
+        distance, scale = (np.broadcast_to(a, shared.shape)[shared] for a in (distance, scale))
+        value[shared] += np.log1p(_others(distance, scale))
+    return value
+
+
+def _others(distance: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """Densities of the next three normals, beside the nearest's."""
+    inverse = np.minimum(1 / scale, 1 / _TINY)
+    total = np.exp(-_TURN * inverse * ((_PI - distance) * inverse))  # the square would overflow
+    if not scale.size or scale.max() ** 2 * _ALONE < _TURN * _PI:
+        return total
+    # the second is q / first and the third q * first**2, with q as below
+    q = np.exp(-((_TURN * inverse) ** 2))
+    return total + q * (1 / np.maximum(total, _TINY) + total * total)
 
 
 def _log_fourier(distance: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Log density by the Fourier series, whose coefficients are ``exp(-(n scale)**2 / 2)``."""
-    cosine = np.cos(distance)
-    before, current, total = 1.0, cosine, 0.0
-    for n in range(1, 8):
-        total = total + np.exp(-0.5 * (n * scale) ** 2) * current
-        before, current = current, 2 * cosine * current - before
-    return np.log1p(2 * total) - _LOG_TURN
+    """Log density by the Fourier series, whose coefficients are ``exp(-(n scale)**2 / 2)``; by Clenshaw."""
+    terms = int(np.clip(np.sqrt(2 * _ALONE) / scale.min(), 1, 7))
+    first = np.exp(-0.5 * scale * scale)
+    coefficient, ratio = [first], first
+    for _ in range(1, terms):  # powers 1, 4, 9 ... of the first
+        ratio = ratio * first * first
+        coefficient.append(coefficient[-1] * ratio)
+    cosine = np.asarray(np.cos(distance))
+    current = np.array(
+        np.broadcast_to(coefficient[-1], np.broadcast_shapes(cosine.shape, scale.shape))
+    )
+    before, spare = np.zeros_like(current), np.empty_like(current)
+    twice = 2 * cosine
+    for a in coefficient[-2::-1]:
+        np.multiply(twice, current, out=spare)
+        spare -= before
+        spare += a
+        before, current, spare = current, spare, before
+    current *= twice
+    before *= 2
+    current -= before  # twice the sum
+    current += 1.0
+    return np.log(current, out=current) - _LOG_TURN
 
 
 def _wrapped_tail(distance: np.ndarray, scale: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Set
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -135,38 +136,35 @@ class SliceProposals:
     """Proposals of a filter, read against both models of a template.
 
     A proposal that names the slice before does not apply in slice 0, nor does one that names a node below its
-    targets where that is missing: the nodes' own densities are drawn from there.
+    targets where that is missing: the nodes' own densities are drawn from there. Slice 0 may have proposals
+    of its own, which come before the others.
 
     Parameters
     ----------
     slices : Slices
-    given : dict
-        As ``check_specification`` leaves it.
+    given, initial : dict
+        As ``check_specification`` leaves it; of all slices, and of slice 0 alone.
     engine : str
         For messages.
     """
 
-    def __init__(self, slices: Slices, given: Mapping[Key, Any], engine: str) -> None:
-        self.engine = engine
-        self.first: list[Proposal] = []
-        self.later: list[Proposal] = []
+    def __init__(
+        self,
+        slices: Slices,
+        given: Mapping[Key, Any],
+        engine: str,
+        initial: Mapping[Key, Any] = MappingProxyType({}),
+    ) -> None:
+        self.engine, self._slices = engine, slices
         #: for each proposal what it reads and can only know by having seen it
-        self._looks: dict[Key, frozenset[str]] = {}
-        for key, spec in given.items():
-            for name in names_of(key):
-                check_target(slices, name, f"{engine}: proposal for {key!r}")
-            function = as_function(engine, key, spec, FUNCTION)
-            later = bound(engine, slices.later, key, function)
-            if not later.is_independent:
-                own = next(p for p in later.parents if p in later.names)
-                raise ModelError(
-                    f"{later.what}: it names {own!r}, which it is to draw; name observed nodes, inputs, the "
-                    f"slice before ({own + PREVIOUS!r}) or nodes drawn before"
-                )
-            self.later.append(later)
-            self._looks[key] = frozenset(later.parents) & _below(slices, later.names)
-            if not any(p.endswith(PREVIOUS) for p in later.parents):
-                self.first.append(bound(engine, slices.first, key, function))
+        self._looks: dict[tuple[bool, Key], frozenset[str]] = {}
+        self.first = [self._bound(slices.first, True, k, spec) for k, spec in initial.items()]
+        own = {name for proposal in self.first for name in proposal.names}
+        self.later = [self._bound(slices.later, False, k, spec) for k, spec in given.items()]
+        for later in self.later:
+            if own & set(later.names) or any(p.endswith(PREVIOUS) for p in later.parents):
+                continue
+            self.first.append(self._bound(slices.first, True, later.key, given[later.key]))
 
     def check(self, observed: Set[str], throughout: Set[str]) -> None:
         """Refuse proposals that look at nodes which a series never observes, or draw what it always does.
@@ -175,14 +173,14 @@ class SliceProposals:
         ------
         ModelError
         """
-        for proposal in self.later:
+        for first, proposal in [(True, p) for p in self.first] + [(False, p) for p in self.later]:
             always = [n for n in proposal.names if n in throughout]
             if always:
                 raise ModelError(
                     f"{proposal.what}: {always[0]!r} is observed in every slice, so nothing is drawn; "
                     "propose hidden nodes"
                 )
-            never = sorted(self._looks[proposal.key] - observed)
+            never = sorted(self._looks[first, proposal.key] - observed)
             if never:
                 raise ModelError(
                     f"{proposal.what}: it names {never[0]!r}, which depends on what is to be drawn and is "
@@ -192,8 +190,24 @@ class SliceProposals:
     def of(self, row: Row) -> list[Proposal]:
         """Those that apply in a row's slice."""
         seen = {n for n, o in row.seen.items() if o.mask is None}
-        asked = self.first if row.t == 0 else self.later
-        return [p for p in asked if self._looks[p.key] <= seen and not seen & set(p.names)]
+        first = row.t == 0
+        asked = self.first if first else self.later
+        return [p for p in asked if self._looks[first, p.key] <= seen and not seen & set(p.names)]
+
+    def _bound(self, model: Model, first: bool, key: Key, spec: Any) -> Proposal:
+        """A proposal read against one of the models."""
+        for name in names_of(key):
+            check_target(self._slices, name, f"{self.engine}: proposal for {key!r}")
+        found = bound(self.engine, model, key, as_function(self.engine, key, spec, FUNCTION))
+        if not found.is_independent:
+            own = next(p for p in found.parents if p in found.names)
+            raise ModelError(
+                f"{found.what}: it names {own!r}, which it is to draw; name observed nodes, inputs, "
+                + ("" if first else f"the slice before ({own + PREVIOUS!r}) ")
+                + "or nodes drawn before"
+            )
+        self._looks[first, key] = frozenset(found.parents) & _below(self._slices, found.names)
+        return found
 
 
 def static_values(slices: Slices, given: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -232,11 +232,12 @@ class ChainsSums(_Chains, SumsPosterior):
             return None
         node = self._node(name)
         shape = series.shape[:2] + node.value_shape
-        if self._is_circular(name):
-            cosine, sine = np.moveaxis(series, 2, 0)
+        if node.angles is not None:
+            first, sine = np.moveaxis(series, 2, 0)
             mean, turns = self.mean(name), self._sums.turns(name)[0, :2] / self._sums.weight[0]
-            cosine, sine = cosine.reshape(shape), sine.reshape(shape)
-            return (sine * np.cos(mean) - cosine * np.sin(mean)) / np.hypot(*turns)
+            with np.errstate(divide="ignore", invalid="ignore"):  # where numbers are no angles
+                turned = (sine * np.cos(mean) - first * np.sin(mean)) / np.hypot(*turns)
+            return np.where(node.angles, turned, first)
         labelled = node.domain is not None and node.domain.labels is not None
         return series.reshape((*shape, -1) if labelled else shape)
 
@@ -376,11 +377,16 @@ class _BatchMeans:
 
 
 def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
-    """What the answers about a node are means of, shape ``(draw, chain, ...)``."""
+    """What the answers about a node are means of, shape ``(draw, chain, ...)``.
+
+    With angles there are two: cosines and sines, for numbers that are none themselves and zero.
+    """
     if node.domain is None:
-        if node.support is not None and node.support.kind == "circle":
-            return np.stack([np.cos(draws), np.sin(draws)], axis=2)
-        return draws
+        if node.angles is None:
+            return draws
+        cosine, sine = np.cos(draws), np.sin(draws)
+        pair = np.where(node.angles, cosine, draws), np.where(node.angles, sine, 0.0)
+        return np.stack(pair, axis=2)
     if node.domain.labels is None:
         return np.take(np.asarray(node.domain.numbers, dtype=float), draws)
     return (draws[..., None] == np.arange(node.domain.size)).astype(float)

@@ -253,11 +253,6 @@ class Posterior:
             )
         return node
 
-    def _is_circular(self, name: str) -> bool:
-        """Whether the node's values are angles, whose mean and deviation are circular."""
-        support = self.model.nodes[name].support
-        return support is not None and support.kind == "circle"
-
     def _is_free(self, name: str) -> bool:
         return self.model.nodes[name].kind != "fixed" and name not in self._observed
 

@@ -130,18 +130,27 @@ class ScalarMoments(Moments):
 
 
 class Turns:
-    """Sums of cos, sin, cos^2, cos sin, sin^2 of angles, shape ``(2, 5, size)``."""
+    """Sums of cos, sin, cos^2, cos sin, sin^2 of angles, shape ``(2, 5, angles)``.
 
-    def __init__(self, size: int) -> None:
-        self.sums = np.zeros((2, 5, size))
+    Parameters
+    ----------
+    angles : ndarray of bool
+        Which of a value's numbers are angles, shape (size,).
+    """
+
+    def __init__(self, angles: np.ndarray) -> None:
+        self.places = np.flatnonzero(angles)
+        self._all = len(self.places) == len(angles)
+        self.sums = np.zeros((2, 5, len(self.places)))
 
     def rescale(self, scale: np.ndarray) -> None:
         """See ``JointCounts.rescale``."""
         self.sums *= scale[:, None, None]
 
     def add(self, value: np.ndarray, weights: np.ndarray) -> None:
-        """Take in angles of shape ``(draws, ...)``."""
-        for k, figure in enumerate(turns(value.reshape(len(value), -1))):
+        """Take in values of shape ``(draws, ...)``."""
+        value = value.reshape(len(value), -1)
+        for k, figure in enumerate(turns(value if self._all else value[:, self.places])):
             self.sums[:, k] += weights @ figure
 
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
-from bayesmc.network import Model, Problem
+from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results.posterior import Posterior, circular_variance, table_variance
 from bayesmc.results.running import (
     JointCounts,
@@ -35,7 +35,8 @@ class Sums:
     """Running weighted sums over chunks of draws, of constant size.
 
     Scalar finite nodes are counted jointly in groups, one histogram for several nodes; plated ones
-    state by state; angles by their turns; all others by the first two powers of their centred values.
+    state by state; angles by their turns, also those among a vector's numbers; all other numbers by
+    the first two powers of their centred values.
     """
 
     def __init__(self, model: Model, names: tuple[str, ...]) -> None:
@@ -46,7 +47,8 @@ class Sums:
         self.weight = np.zeros(2)
         self.tail = Tail()
         self._groups: list[JointCounts] | None = None
-        self._single: dict[str, PlateCounts | Moments | Turns] = {}
+        self._single: dict[str, PlateCounts | Moments] = {}
+        self._turned: dict[str, Turns] = {}
         self._constant: dict[str, np.ndarray] = {}
 
     def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
@@ -70,6 +72,8 @@ class Sums:
                 if heavier and isinstance(kept, Moments):
                     kept.move(values[name], weights[0], self.weight)
                 kept.add(values[name], weights)
+            for name, turned in self._turned.items():
+                turned.add(values[name], weights)
         self.weight += weights[0].sum(), weights[0] @ weights[0]
 
     def counts(self, name: str) -> np.ndarray:
@@ -96,14 +100,17 @@ class Sums:
         return kept.centre.reshape(shape), first, second
 
     def turns(self, name: str) -> np.ndarray:
-        """Sums of cos, sin, cos^2, cos sin, sin^2 of an angle, shape ``(2, 5, *plates, *event)``."""
+        """Sums of cos, sin, cos^2, cos sin, sin^2 of angles, shape ``(2, 5, *plates, *event)``; zero
+        where a vector's numbers are none.
+        """
         shape = self.model[name].value_shape
         if name in self._constant:
             figures = np.stack(turns(self._constant[name]))
             return self.weight.reshape((2,) + (1,) * figures.ndim) * figures
-        kept = self._single[name]
-        assert isinstance(kept, Turns)
-        return kept.sums.reshape((2, 5, *shape))
+        kept = self._turned[name]
+        full = np.zeros((2, 5, math.prod(shape)))
+        full[..., kept.places] = kept.sums
+        return full.reshape((2, 5, *shape))
 
     def _sort(self, values: Mapping[str, np.ndarray]) -> list[JointCounts]:
         """Decide from the first chunk how each node is summed."""
@@ -113,10 +120,12 @@ class Sums:
             size = math.prod(node.value_shape)
             if value.ndim == len(node.value_shape):
                 self._constant[name] = value
-            elif node.domain is None and node.support is not None and node.support.kind == "circle":
-                self._single[name] = Turns(size)
             elif node.domain is None:
-                self._single[name] = Moments(size) if node.value_shape else ScalarMoments()
+                angles = node.angles
+                if angles is None or not angles.all():
+                    self._single[name] = Moments(size) if node.value_shape else ScalarMoments()
+                if angles is not None:
+                    self._turned[name] = Turns(np.broadcast_to(angles, node.value_shape).ravel())
             elif node.plates:
                 self._single[name] = PlateCounts(size, node.domain.size)
             elif groups and groups[-1].size * node.domain.size <= _GROUP_STATES:
@@ -130,7 +139,7 @@ class Sums:
         if self.weight[0]:
             scale = np.exp(np.array([1.0, 2.0]) * (self.top - highest))
             self.weight *= scale
-            for kept in [*(self._groups or ()), *self._single.values()]:
+            for kept in [*(self._groups or ()), *self._single.values(), *self._turned.values()]:
                 kept.rescale(scale)
         self.top = highest
 
@@ -159,11 +168,7 @@ class SumsPosterior(Posterior):
         if node.domain is not None:
             return self.probabilities(name) @ np.asarray(node.domain.numbers, dtype=float)
         self._kept(name)
-        if self._is_circular(name):
-            cosine, sine = self._sums.turns(name)[0, :2]
-            return np.arctan2(sine, cosine)
-        centre, first, _ = self._sums.powers(name)
-        return centre + first[0] / self._sums.weight[0]
+        return _by_kind(node, lambda: self._plain_mean(name), lambda: self._direction(name))
 
     def var(self, name: str) -> np.ndarray:
         node = self._numeric(name, "var")
@@ -171,11 +176,7 @@ class SumsPosterior(Posterior):
             numbers = np.asarray(node.domain.numbers, dtype=float)
             return table_variance(self.probabilities(name), numbers)
         self._kept(name)
-        if self._is_circular(name):
-            return circular_variance(*(self._sums.turns(name)[0, :2] / self._sums.weight[0]))
-        _, first, second = self._sums.powers(name)
-        total = self._sums.weight[0]
-        return np.maximum(second[0] / total - (first[0] / total) ** 2, 0.0)
+        return _by_kind(node, lambda: self._plain_var(name), lambda: self._spread(name))
 
     def probabilities(self, *names: str) -> np.ndarray:
         if len(names) != 1:
@@ -189,17 +190,9 @@ class SumsPosterior(Posterior):
             raise self._cannot("mcse of a function")
         node = self._node(what)
         self._kept(what)
-        total, squares = self._sums.weight
-        if self._is_circular(what):
-            turns, mean = self._sums.turns(what), self.mean(what)
-            c, s = np.cos(mean), np.sin(mean)
-            spread = turns[1, 4] * c * c - 2 * turns[1, 3] * c * s + turns[1, 2] * s * s
-            return np.sqrt(np.maximum(spread, 0.0)) / np.hypot(turns[0, 0], turns[0, 1])
         if node.domain is None:
-            _, first, second = self._sums.powers(what)
-            mean = first[0] / total
-            spread = second[1] - 2 * mean * first[1] + mean**2 * squares
-            return np.sqrt(np.maximum(spread, 0.0)) / total
+            return _by_kind(node, lambda: self._plain_error(what), lambda: self._turn_error(what))
+        total, squares = self._sums.weight
         counts, heavy = self._sums.counts(what)
         p = counts / total
         if node.domain.labels is not None:
@@ -224,6 +217,38 @@ class SumsPosterior(Posterior):
     def rhat(self, what: Any) -> np.ndarray:
         return np.full(np.shape(self.mcse(what)), np.nan)
 
+    def _plain_mean(self, name: str) -> np.ndarray:
+        centre, first, _ = self._sums.powers(name)
+        return centre + first[0] / self._sums.weight[0]
+
+    def _direction(self, name: str) -> np.ndarray:
+        cosine, sine = self._sums.turns(name)[0, :2]
+        return np.arctan2(sine, cosine)
+
+    def _plain_var(self, name: str) -> np.ndarray:
+        _, first, second = self._sums.powers(name)
+        total = self._sums.weight[0]
+        return np.maximum(second[0] / total - (first[0] / total) ** 2, 0.0)
+
+    def _spread(self, name: str) -> np.ndarray:
+        return circular_variance(*(self._sums.turns(name)[0, :2] / self._sums.weight[0]))
+
+    def _plain_error(self, name: str) -> np.ndarray:
+        total, squares = self._sums.weight
+        _, first, second = self._sums.powers(name)
+        mean = first[0] / total
+        spread = second[1] - 2 * mean * first[1] + mean**2 * squares
+        return np.sqrt(np.maximum(spread, 0.0)) / total
+
+    def _turn_error(self, name: str) -> np.ndarray:
+        """Error of the mean direction to first order (delta method)."""
+        turns, mean = self._sums.turns(name), self._direction(name)
+        c, s = np.cos(mean), np.sin(mean)
+        spread = turns[1, 4] * c * c - 2 * turns[1, 3] * c * s + turns[1, 2] * s * s
+        length = np.hypot(turns[0, 0], turns[0, 1])
+        with np.errstate(divide="ignore", invalid="ignore"):  # numbers that are no angles have none
+            return np.sqrt(np.maximum(spread, 0.0)) / length
+
     def _quantile_columns(self, name: str) -> dict[str, np.ndarray]:
         return {}
 
@@ -243,3 +268,15 @@ class SumsPosterior(Posterior):
 
     def _remedy(self) -> str:
         return 'call infer with keep="draws"'
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _by_kind(
+    node: CompiledNode, plain: Callable[[], np.ndarray], turned: Callable[[], np.ndarray]
+) -> np.ndarray:
+    """Figures of a node of numbers: ``turned`` ones of its angles, ``plain`` ones of the others."""
+    if node.angles is None:
+        return plain()
+    return turned() if node.angles.all() else np.where(node.angles, turned(), plain())

@@ -7,6 +7,7 @@ are metres, angles radians, times seconds.
 
 from __future__ import annotations
 
+from bayesmc.robotics.aimed import AimedPoses, SensorPoses
 from bayesmc.robotics.beams import BeamFit, BeamModel, Beams, clean_ranges, fit_beams
 from bayesmc.robotics.brightness import Ceiling
 from bayesmc.robotics.field import FieldScan, LikelihoodField
@@ -21,10 +22,9 @@ from bayesmc.robotics.landmarks import (
     sonar,
 )
 from bayesmc.robotics.mapfile import read_map, write_map
-from bayesmc.robotics.motion import OdometryMotion, VelocityMotion, euler_step, unicycle
+from bayesmc.robotics.motion import OdometryMotion, VelocityMotion
+from bayesmc.robotics.pose_distributions import AndAngle, PoseNormal
 from bayesmc.robotics.poses import (
-    AndAngle,
-    PoseNormal,
     angle_between,
     between,
     compass,
@@ -36,8 +36,10 @@ from bayesmc.robotics.poses import (
     wrap,
 )
 from bayesmc.robotics.raycast import RayTable, ray_cast
+from bayesmc.robotics.steps import euler_step, unicycle
 
 __all__ = [
+    "AimedPoses",
     "AndAngle",
     "BeamFit",
     "BeamModel",
@@ -50,6 +52,7 @@ __all__ = [
     "OdometryMotion",
     "PoseNormal",
     "RayTable",
+    "SensorPoses",
     "VelocityMotion",
     "angle_between",
     "bearing",

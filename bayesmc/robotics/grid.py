@@ -244,6 +244,9 @@ class FreeSpace(Distribution):
     grid : OccupancyGrid
     clearance : float
         Only cells whose centre is at least this far (m) from the nearest obstacle's.
+    threshold : float, optional
+        Only cells with an occupancy below this; by default the grid's, below which nothing is an obstacle.
+        Maps that shade what was hardly seen want a lower one here, such as 0.2.
 
     Attributes
     ----------
@@ -255,7 +258,7 @@ class FreeSpace(Distribution):
     ModelError
         The map has no such cell.
     ParameterError
-        ``clearance`` is negative or not finite.
+        ``clearance`` is negative or not finite, ``threshold`` not in (0, 1].
 
     References
     ----------
@@ -274,24 +277,48 @@ class FreeSpace(Distribution):
 
     event_shape = (3,)
 
-    def __init__(self, grid: OccupancyGrid, clearance: float = 0.0) -> None:
+    def __init__(
+        self, grid: OccupancyGrid, clearance: float = 0.0, threshold: float | None = None
+    ) -> None:
+        level = grid.threshold if threshold is None else threshold
+        if not (np.ndim(level) == 0 and 0 < level <= 1):
+            raise ParameterError(f"FreeSpace: threshold must be in (0, 1]; got {threshold!r}")
         if not (np.ndim(clearance) == 0 and 0 <= clearance < math.inf):
             raise ParameterError(
                 f"FreeSpace: clearance must be nonnegative and finite; got {clearance}"
             )
-        inside = grid.free()
+        inside = grid.free(level)
         if clearance:
             inside &= grid.distances >= clearance
         if not inside.any():
             wanted = f" at least {clearance} m from an obstacle" if clearance else ""
             raise ModelError(
                 f"FreeSpace: no cell of {grid!r} is free{wanted} (known, with an occupancy below "
-                f"{grid.threshold}); is the map inverted, or all of it unknown?"
+                f"{level:g}); is the map inverted, or all of it unknown?"
             )
         self.grid, self.clearance = grid, float(clearance)
         self._inside = inside
         self._cells = np.flatnonzero(inside)
         self.area = len(self._cells) * grid.resolution**2
+
+    @cached_property
+    def centers(self) -> np.ndarray:
+        """World coordinates (m) of the middles of its cells, shape (cells, 2)."""
+        cells = np.stack(np.divmod(self._cells, self.grid.shape[1]), axis=-1)
+        return read_only(self.grid.center_of(cells))
+
+    def cell_of(self, poses: Any) -> np.ndarray:
+        """Which of its cells (their number in ``centers``) poses lie in, shape (...): -1 for none."""
+        cells = self.grid.cell_of(poses)
+        within = self.grid._within(cells) & np.isfinite(np.asarray(poses)).all(axis=-1)
+        ix, iy = np.moveaxis(np.where(within[..., None], cells, 0), -1, 0)
+        return np.where(within, self._lookup[ix, iy], -1)
+
+    @cached_property
+    def _lookup(self) -> np.ndarray:
+        found = np.full(self.grid.shape, -1, dtype=np.intp)
+        found[self._inside] = np.arange(len(self._cells))
+        return found
 
     @property
     def support(self) -> Support:
@@ -313,10 +340,7 @@ class FreeSpace(Distribution):
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         if x.shape[-1:] != (3,):
             raise ShapeError(f"FreeSpace.log_prob: values have shape {x.shape}, not (..., 3)")
-        cells = self.grid.cell_of(x)
-        within = self.grid._within(cells) & np.isfinite(x[..., 2])
-        ix, iy = np.moveaxis(np.where(within[..., None], cells, 0), -1, 0)
-        return np.where(within & self._inside[ix, iy], -math.log(self.area) - _LOG_TURN, -np.inf)
+        return np.where(self.cell_of(x) >= 0, -math.log(self.area) - _LOG_TURN, -np.inf)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -27,7 +27,8 @@ from bayesmc.distributions import (
 from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.plates import PlateArray
-from bayesmc.robotics.poses import AndAngle, as_points, as_poses, turned_back
+from bayesmc.robotics.pose_distributions import AndAngle
+from bayesmc.robotics.poses import as_points, as_poses, turned_back
 
 
 def range_to(pose: Any, landmark: Any) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 Reads what ``map_server`` reads and writes what it reads. It needs Pillow and PyYAML, which the
 extra ``robotics`` brings and which are loaded when a file is read or written. Maps turned against
-the world are refused.
+the world are refused, since grids are not turned, and so are maps without a free cell.
 """
 
 from __future__ import annotations
@@ -43,17 +43,19 @@ def read_map(path: Any, *, threshold: float = 0.5) -> OccupancyGrid:
     Raises
     ------
     FileFormatError
-        The YAML file or the image does not read, or a value is missing or out of range; the message
-        names file and key.
+        The YAML file or the image does not read, a value is missing or out of range (the message
+        names file and key), or no cell is free, so that a robot could be nowhere.
     UnsupportedError
-        The map is turned against the world (a yaw that is not 0).
+        The map is turned against the world (a yaw that is not 0); the message says how to work in
+        its own frame.
     MissingExtraError
         Pillow or PyYAML is not installed.
     FileNotFoundError
         There is no YAML file of this name.
 
-    Notes ----- With darkness ``p = (255 - grey) / 255`` (``grey / 255`` where ``negate``; colours
-    are averaged):
+    Notes
+    -----
+    With darkness ``p = (255 - grey) / 255`` (``grey / 255`` where ``negate``; colours are averaged):
 
     - ``trinary``: 1 above ``occupied_thresh``, 0 below ``free_thresh``, unknown in between;
     - ``scale``: 1 and 0 likewise, in between linear from one to the other; unknown where fully
@@ -79,14 +81,25 @@ def read_map(path: Any, *, threshold: float = 0.5) -> OccupancyGrid:
     path = Path(path)
     keys = _Keys.of(path)
     if keys.yaw:
+        turned = f"[{keys.x:g}, {keys.y:g}, {keys.yaw:g}]"
         raise UnsupportedError(
-            f"read_map: {path}: key 'origin': the map is turned by {keys.yaw:g} rad against "
-            "the world; give poses in the map's frame and set the yaw to 0, or turn the image"
+            f"read_map: {path}: key 'origin': the map is turned by {keys.yaw:g} rad against the world, "
+            "and grids are not turned; set 'origin' to [0, 0, 0] and work in the map's own frame, where "
+            f"robotics.between({turned}, pose) takes poses of the world and robotics.compose({turned}, "
+            "pose) takes them back"
         )
     grey, alpha = _read_image(keys.image, path)
     occupancy = _occupancy(grey, alpha, keys)
     # rows run from the top down, columns along x
-    return OccupancyGrid(occupancy[::-1].T, keys.resolution, (keys.x, keys.y), threshold)
+    grid = OccupancyGrid(occupancy[::-1].T, keys.resolution, (keys.x, keys.y), threshold)
+    if not grid.free().any():
+        raise FileFormatError(
+            f"no cell is free: of {grey.size} pixels of {keys.image.name} {int(grid.occupied().sum())} "
+            "are obstacles, the others unknown; is the image inverted (key 'negate', here "
+            f"{int(keys.negate)}), or written for a mode other than {keys.mode!r}?",
+            path,
+        )
+    return grid
 
 
 def write_map(grid: OccupancyGrid, path: Any, *, mode: str = "trinary") -> Path:

@@ -1,9 +1,9 @@
 """How a robot in the plane moves: conditional densities of its next pose, given the last and a control.
 
-Three models, each with draws and an exact density: Gaussian noise about any motion (``PoseNormal``
-about ``euler_step`` or ``unicycle``), a robot that drives an arc with noise on its two velocities
-(``VelocityMotion``), and one whose odometry is trusted up to noise on a rotation, a translation and
-a rotation (``OdometryMotion``).
+Two models, each with draws and an exact density: a robot that drives an arc with noise on its two
+velocities (``VelocityMotion``), and one whose odometry is trusted up to noise on a rotation, a
+translation and a rotation (``OdometryMotion``). The third way is Gaussian noise about any step:
+``PoseNormal`` about one of ``steps``.
 
 Poses are as in ``poses``: m, m, rad, heading 0 along +x and counterclockwise. Everything broadcasts
 over leading axes, so a parent's particles and plates come through as they are. Estimating the noise
@@ -12,7 +12,6 @@ is left to whoever declares ``alphas`` as a node.
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -20,139 +19,17 @@ import numpy as np
 from bayesmc.distributions import WrappedNormal
 from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
-from bayesmc.robotics.poses import (
-    PoseDistribution,
-    as_poses,
-    compose,
-    joined_pose,
-    sin_cos,
-    turned_back,
-    wrap,
-)
+from bayesmc.robotics.pose_distributions import PoseDistribution
+from bayesmc.robotics.poses import as_poses, compose, joined_pose, sin_cos, turned_back, wrap
+from bayesmc.robotics.steps import sinc
 from bayesmc.shapes import Shape
 
 #: metres below which the density of a displacement, which may have a pole at none, is taken as constant
 _LEAST = 1e-9
 _LOG_2PI = float(np.log(2 * np.pi))
-#: of ``sin(a) / a`` in powers of the square, highest first and without the first; to rounding up to a = 0.5
-_SERIES = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6, 0, -1))
 #: nodes for moments over the noise of a turn: to rounding while that has a deviation of a radian or less
 _NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(21)
 _WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
-
-
-def euler_step(pose: Any, v: Any, omega: Any, dt: Any, heading_zero: str = "x") -> np.ndarray:
-    """A step straight ahead along the old heading, then a turn: the mean of the lecture notes' motion model.
-
-    Parameters
-    ----------
-    pose : array_like, shape (..., 3)
-    v : array_like, shape (...)
-        Forward velocity, m/s.
-    omega : array_like, shape (...)
-        Rate at which the heading grows, rad/s.
-    dt : array_like, shape (...)
-        Duration in s.
-    heading_zero : "x" or "y"
-        The axis along which heading 0 points. ``"x"`` is this package's convention, with headings
-        counterclockwise: ``(x + v cos(h) dt, y + v sin(h) dt, h + omega dt)``. ``"y"`` is the
-        notes': ``(x + v sin(h) dt, y + v cos(h) dt, h + omega dt)``, with headings clockwise as on
-        a compass.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-
-    Raises
-    ------
-    ShapeError
-        ``pose`` has not three components.
-    ValueError
-        ``heading_zero`` is another word.
-
-    Notes
-    -----
-    The notes print the second component as ``y + v * theta(h) dt``, a misprint of ``cos``: the
-    first component is ``x + v sin(h) dt``, and the step must have length ``v dt``. So with h = 0
-    the robot drives along +y, and with h = pi / 2 along +x. ``poses.compass`` turns headings of one
-    convention into the other (``omega`` changes its sign), and sensors that read headings expect
-    this package's: the notes' own bearing, ``atan2(dy, dx) - h``, does.
-
-    References
-    ----------
-    Dellaert, Monte Carlo Inference (lecture notes), section 2.1.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesmc.robotics.motion import euler_step
-    >>> euler_step([0.0, 0.0, 0.0], 2.0, 0.5, 1.0).tolist()
-    [2.0, 0.0, 0.5]
-    >>> euler_step([0.0, 0.0, 0.0], 2.0, 0.5, 1.0, heading_zero="y").tolist()
-    [0.0, 2.0, 0.5]
-    """
-    if heading_zero not in ("x", "y"):
-        raise ValueError(
-            f'euler_step(heading_zero={heading_zero!r}): give "x" (counterclockwise) or "y" (as on a compass)'
-        )
-    pose = as_poses("euler_step", pose)
-    v, omega, dt = as_float(v), as_float(omega), as_float(dt)
-    sine, cosine = sin_cos(pose[..., 2])
-    if heading_zero == "y":
-        sine, cosine = cosine, sine
-    step = v * dt
-    return joined_pose(
-        pose[..., 0] + step * cosine,
-        pose[..., 1] + step * sine,
-        turned_back(pose[..., 2] + omega * dt),
-    )
-
-
-def unicycle(pose: Any, v: Any, omega: Any, dt: Any) -> np.ndarray:
-    """Where an arc of constant velocities ends: exact, and smooth where the turn goes to zero.
-
-    Parameters
-    ----------
-    pose : array_like, shape (..., 3)
-    v : array_like, shape (...)
-        Forward velocity, m/s; negative backwards.
-    omega : array_like, shape (...)
-        Angular velocity, rad/s, counterclockwise.
-    dt : array_like, shape (...)
-        Duration in s.
-
-    Returns
-    -------
-    ndarray, shape (..., 3)
-
-    Notes
-    -----
-    An arc of length s that turns by 2 a has a chord of length ``s sin(a) / a`` in the direction
-    ``heading + a``. Unlike the usual ``v / omega (sin(h + omega dt) - sin(h))`` nothing cancels or
-    is divided by zero when a is small.
-
-    References
-    ----------
-    Thrun, Burgard and Fox (2005), Probabilistic Robotics, equation 5.9.
-
-    Examples
-    --------
-    Half of a circle of radius one, and a straight line:
-
-    >>> import numpy as np
-    >>> from bayesmc.robotics.motion import unicycle
-    >>> unicycle([0.0, 0.0, 0.0], np.pi, np.pi, 1.0).round(3).tolist()
-    [0.0, 2.0, -3.142]
-    >>> unicycle([0.0, 0.0, 0.0], 1.0, 0.0, 2.0).tolist()
-    [2.0, 0.0, 0.0]
-    """
-    pose = as_poses("unicycle", pose)
-    v, omega, dt = as_float(v), as_float(omega), as_float(dt)
-    half = 0.5 * omega * dt
-    chord = v * dt * _sinc(half)
-    sine, cosine = sin_cos(pose[..., 2] + half)
-    x, y = pose[..., 0] + chord * cosine, pose[..., 1] + chord * sine
-    return joined_pose(x, y, turned_back(pose[..., 2] + 2 * half))
 
 
 class VelocityMotion(PoseDistribution):
@@ -262,7 +139,7 @@ class VelocityMotion(PoseDistribution):
         last += turn
         last += self.pose_prev[..., 2]
         turn *= 0.5  # in place from here on: new arrays cost more than what is done with them
-        length *= _sinc(turn)
+        length *= sinc(turn)
         turn += self.pose_prev[..., 2]
         return _gone(self.pose_prev, length, turn, last)
 
@@ -299,7 +176,7 @@ class VelocityMotion(PoseDistribution):
         off = self.scales[1][..., None] * _NODES
         half = 0.5 * (self.turn[..., None] + off)
         sine, cosine = sin_cos(half)
-        return _sinc(half)[..., None] * np.stack([cosine, sine], axis=-1), off
+        return sinc(half)[..., None] * np.stack([cosine, sine], axis=-1), off
 
 
 class OdometryMotion(PoseDistribution):
@@ -446,19 +323,6 @@ def _gone(pose: np.ndarray, distance: Any, direction: Any, heading: Any) -> np.n
     cosine += pose[..., 0]
     sine += pose[..., 1]
     return joined_pose(cosine, sine, turned_back(heading))
-
-
-def _sinc(a: np.ndarray) -> np.ndarray:
-    """``sin(a) / a``; by its series where all angles are small, which is several times faster."""
-    if not np.size(a) or max(np.max(a), -np.min(a)) > 0.5:
-        return np.sinc(a / np.pi)
-    square = a * a
-    value = square * _SERIES[0]
-    for coefficient in _SERIES[1:]:
-        value += coefficient
-        value *= square
-    value += 1.0
-    return value
 
 
 def _polar(

@@ -61,6 +61,73 @@ def test_wrapped_normal_is_right_around_the_change_of_formula() -> None:
     assert np.abs(narrow - brute_wrapped_normal(x, 1.2)).max() > 1e-3
 
 
+def wrapped_normal_errors(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """How far log densities are off, relative to their size or to one."""
+    expected = brute_wrapped_normal(x, scale)
+    off = d.WrappedNormal(0.0, scale).log_prob(x) - expected
+    return np.abs(off) / np.maximum(np.abs(expected), 1.0)
+
+
+@settings(FIXED, max_examples=300)
+@given(
+    st.lists(st.floats(-np.pi, np.pi), min_size=1, max_size=6),
+    st.lists(SCALE, min_size=1, max_size=3),
+)
+def test_wrapped_normal_keeps_its_digits(x: list[float], scales: list[float]) -> None:
+    # one scale with all angles, several, and each angle with scales of both formulas
+    far = np.pi - 6.5 * np.minimum(np.square(scales), 0.48)  # where the others begin to count
+    angles = np.array([*x, *far, *-far, np.pi, -np.pi, 0.0])
+    for scale in (np.array(scales[0]), np.array(scales)[:, None]):
+        assert wrapped_normal_errors(angles, scale).max() < 1e-14
+        for angle in angles[-4:]:  # numbers take no mask
+            assert wrapped_normal_errors(angle, scale).max() < 1e-14
+
+
+@pytest.mark.parametrize("scale", [0.2, 0.5, 0.9, 1.2, 3.5])
+def test_wrapped_normal_keeps_its_digits_where_some_angles_have_company(scale: float) -> None:
+    for share in (0.02, 0.6):  # the others are added to few elements, and to many
+        x = np.linspace(-share * np.pi, share * np.pi, 500)
+        x[::50] = np.linspace(0.9 * np.pi, np.pi, 10)
+        assert wrapped_normal_errors(x, np.array(scale)).max() < 1e-14
+        assert wrapped_normal_errors(x[:, None], scale * np.array([0.5, 1.0])).max() < 1e-14
+
+
+def test_others_left_out_too_early_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = np.linspace(0.0, np.pi, 400)
+    assert wrapped_normal_errors(x, np.array(0.4)).max() < 1e-14
+    monkeypatch.setattr("bayesmc.distributions.circular._ALONE", 20.0)
+    assert wrapped_normal_errors(x, np.array(0.4)).max() > 1e-12
+
+
+@pytest.mark.parametrize("scale", [5e-324, 1e-160, 0.05, 1.2, 1.3, 9.0, 1e200])
+def test_wrapped_normal_of_what_is_no_angle_and_of_far_ones(scale: float) -> None:
+    dist = d.WrappedNormal(0.5, scale)
+    found = dist.log_prob([np.nan, np.inf, -np.inf, 0.5, np.pi + 0.5, 0.5 + 2.0**70, 0.6])
+    assert np.isnan(found[0])
+    assert found[1:3].tolist() == [-np.inf, -np.inf]
+    assert not np.isnan(found[3:]).any()
+    assert (found[3:] <= found[3]).all()
+    assert found[6] == dist.log_prob(0.6)  # whatever stands beside it
+    assert dist.log_prob(np.full((0, 3), 0.1)).shape == (0, 3)
+
+
+def test_wrapped_normal_broadcasts_and_changes_no_argument() -> None:
+    x, loc = np.linspace(-40.0, 40.0, 7), np.array([[0.1], [3.0]])
+    kept = x.copy()
+    for scale in (0.3, np.array([[[0.3]], [[2.0]], [[0.9]]])):
+        found = d.WrappedNormal(loc, scale).log_prob(x)
+        assert found.shape == (*np.shape(scale)[:1], 2, 7)
+        np.testing.assert_array_equal(x, kept)
+        one_by_one = [d.WrappedNormal(lo, scale).log_prob(x) for lo in loc[:, 0]]
+        for k, alone in enumerate(one_by_one):
+            wide = np.broadcast_to(alone.reshape(*found.shape[:-2], 7), (*found.shape[:-2], 7))
+            np.testing.assert_allclose(found[..., k, :], wide, rtol=1e-13)
+    whole = np.array([1, 2, 3])  # integers are angles, too
+    np.testing.assert_array_equal(
+        d.WrappedNormal(0, 1).log_prob(whole), d.WrappedNormal(0.0, 1.0).log_prob(whole + 0.0)
+    )
+
+
 #: values computed with 50 digits from the definitions: x, expected
 GOLDEN = [
     (d.VonMises(0.0, 0.0), 1.0, -1.8378770664093453),

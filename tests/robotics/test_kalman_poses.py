@@ -11,8 +11,10 @@ import bayesmc as bmc
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.kalman.unscented import _joint_root
 from bayesmc.robotics.landmarks import bearing, range_and_bearing, range_only
-from bayesmc.robotics.motion import OdometryMotion, VelocityMotion, euler_step, unicycle
-from bayesmc.robotics.poses import PoseDistribution, PoseNormal, pose_errors
+from bayesmc.robotics.motion import OdometryMotion, VelocityMotion
+from bayesmc.robotics.pose_distributions import PoseDistribution, PoseNormal
+from bayesmc.robotics.poses import pose_errors
+from bayesmc.robotics.steps import euler_step, unicycle
 
 MARKS = np.array([[0.0, 0.0], [8.0, 0.0], [8.0, 6.0], [0.0, 6.0], [-3.0, 9.0]])
 STEPS = 100

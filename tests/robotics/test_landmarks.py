@@ -22,8 +22,10 @@ from bayesmc.robotics.landmarks import (
     range_to,
     sonar,
 )
-from bayesmc.robotics.motion import VelocityMotion, unicycle
-from bayesmc.robotics.poses import AndAngle, PoseNormal, compose, pose_errors, transform, wrap
+from bayesmc.robotics.motion import VelocityMotion
+from bayesmc.robotics.pose_distributions import AndAngle, PoseNormal
+from bayesmc.robotics.poses import compose, pose_errors, transform, wrap
+from bayesmc.robotics.steps import unicycle
 
 TURN = 2 * np.pi
 #: rate of false alarms of each goodness-of-fit test below, were its seed fresh

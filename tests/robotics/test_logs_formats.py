@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from bayesmc.errors import BayesmcWarning, FileFormatError, ShapeError
+from bayesmc.errors import FileFormatError, LogWarning, ShapeError
 from bayesmc.robotics.logs import (
     MAX_RANGE,
     UNKNOWN_SUBJECT,
@@ -281,7 +281,7 @@ class TestMrclam:
             FileFormatError, match=r"Robot1_Odometry\.dat:2: a line of odometry has 2"
         ):
             read_mrclam(folder)
-        with pytest.warns(BayesmcWarning, match="1 of 3 lines"):
+        with pytest.warns(LogWarning, match="1 of 3 lines"):
             data = read_mrclam(folder, on_error="skip")
         assert [f.line for f in data.faults["Robot1_Odometry.dat"]] == [2]
         assert len(data.robots[1].velocities) == 2
@@ -362,7 +362,7 @@ class TestPlaza:
         folder = self.folder(tmp_path)
         with open(folder / "P_TD.txt", "a") as file:
             file.write("1.6 2 5")
-        with pytest.warns(BayesmcWarning):
+        with pytest.warns(LogWarning):
             drive = read_plaza(folder, "P", on_error="skip")
         assert [f.line for f in drive.faults["P_TD.txt"]] == [3] and len(drive.ranges) == 2
 
@@ -377,7 +377,7 @@ def test_freiburg():
     ]
     lines[1] = "ODOMETRY 0.1 1.0 -0."[:14]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", BayesmcWarning)
+        warnings.simplefilter("ignore", LogWarning)
         assert [r.t for r in read_freiburg(lines, on_error="skip")] == [0.0, 1.0, 2.0]
     assert "neither ODOMETRY nor SENSOR" in fault_of(read_freiburg, "SENSO 1 2 3")
     assert "field 2 is not a whole number" in fault_of(read_freiburg, "SENSOR 1.5 2 3")

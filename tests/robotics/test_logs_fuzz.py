@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bayesmc.errors import BayesmcWarning, FileFormatError
+from bayesmc.errors import FileFormatError, LogWarning
 from bayesmc.robotics.logs import (
     read_carmen,
     read_freiburg,
@@ -111,7 +111,7 @@ def read_all(log):
 
 def quiet(log):
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", BayesmcWarning)
+        warnings.simplefilter("ignore", LogWarning)
         return list(log)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bayesmc.errors import BayesmcWarning, FileFormatError
+from bayesmc.errors import FileFormatError, LogWarning
 from bayesmc.robotics.logs import (
     Odometry,
     read_carmen,
@@ -34,7 +34,7 @@ def skipped(source, read=read_wean, **options):
         records = list(log)
     assert log.lines == len(records) + len(log.faults) + sum(log.ignored.values())
     assert log.records == len(records)
-    assert [w.category for w in caught] == [BayesmcWarning] * bool(log.faults)
+    assert [w.category for w in caught] == [LogWarning] * bool(log.faults)
     return records, log
 
 
@@ -86,7 +86,7 @@ def test_the_warning_comes_once_at_the_end_and_points_to_the_caller():
     for _ in range(6):
         next(log)  # warnings are errors in these tests
     with pytest.warns(
-        BayesmcWarning, match=r"2 of 8 lines were skipped, the first at line 1: O has 2"
+        LogWarning, match=r"2 of 8 lines were skipped, the first at line 1: O has 2"
     ) as w:
         assert list(log) == []
     assert [v.filename for v in w] == [__file__]

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from bayesmc.errors import BayesmcWarning, FileFormatError
+from bayesmc.errors import FileFormatError, LogWarning
 from bayesmc.robotics.logs import (
     UNKNOWN_SUBJECT,
     Laser,
@@ -85,7 +85,7 @@ def test_wean_cut_off(robot, tmp_path):
     (tmp_path / "cut.log.gz").write_bytes(data[: len(data) // 2])
     whole = list(read_wean(robot / "wean" / "robotdata1.log.gz"))
     log = read_wean(tmp_path / "cut.log.gz", on_error="skip")
-    with pytest.warns(BayesmcWarning, match="the gzip stream is cut off"):
+    with pytest.warns(LogWarning, match="the gzip stream is cut off"):
         records = list(log)
     assert 1000 < len(records) < 1250 and records == whole[: len(records)]
 
@@ -152,5 +152,5 @@ def test_a_line_of_a_real_log_garbled(robot):
     for k in range(3, 300, 37):
         garbled = [*lines[:k], lines[k][: len(lines[k]) // 2], *lines[k + 1 :]]
         log = read_wean(garbled, on_error="skip")
-        with pytest.warns(BayesmcWarning, match=f"the first at line {k + 1}:"):
+        with pytest.warns(LogWarning, match=f"the first at line {k + 1}:"):
             assert list(log) == [*whole[:k], *whole[k + 1 :]]

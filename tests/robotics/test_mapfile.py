@@ -16,6 +16,7 @@ from bayesmc.errors import (
 )
 from bayesmc.robotics.grid import OccupancyGrid
 from bayesmc.robotics.mapfile import read_map, write_map
+from bayesmc.robotics.poses import between, compose
 
 yaml = pytest.importorskip("yaml", reason="PyYAML (extra robotics) is not installed")
 Image = pytest.importorskip("PIL.Image", reason="Pillow (extra robotics) is not installed")
@@ -94,10 +95,10 @@ def test_kinds_of_image(tmp_path: Path, kind: str):
 
 
 def test_pgm_as_map_saver_writes_it(tmp_path: Path):
-    header = b"P5\n# CREATOR: map_saver.cpp 0.050 m/pix\n2 1\n255\n"
-    (tmp_path / "map.pgm").write_bytes(header + bytes([0, 205]))
+    header = b"P5\n# CREATOR: map_saver.cpp 0.050 m/pix\n3 1\n255\n"
+    (tmp_path / "map.pgm").write_bytes(header + bytes([0, 205, 254]))
     grid = read_map(folder_with(tmp_path, None, image="map.pgm"))
-    np.testing.assert_array_equal(grid.occupancy, [[1], [NAN]])
+    np.testing.assert_array_equal(grid.occupancy, [[1], [NAN], [0]])
 
 
 # ---- there and back -----------------------------------------------------------------------------
@@ -148,6 +149,7 @@ def test_writing_refuses(tmp_path: Path):
         ({"resolution": None}, "key 'resolution' is missing"),
         ({"resolution": "fine"}, "key 'resolution' must be a finite number; got 'fine'"),
         ({"resolution": NAN}, "key 'resolution' must be a finite number"),
+        ({"resolution": 0}, "key 'resolution' must be positive; got 0"),
         ({"resolution": -0.05}, "key 'resolution' must be positive; got -0.05"),
         ({"origin": None}, "key 'origin' is missing"),
         ({"origin": 3.0}, r"key 'origin' must be \[x, y, yaw\]; got 3.0"),
@@ -155,25 +157,60 @@ def test_writing_refuses(tmp_path: Path):
         ({"origin": [1.0, "a", 0.0]}, "key 'origin' must be a finite number; got 'a'"),
         ({"negate": 2}, "key 'negate' must be 0 or 1"),
         ({"free_thresh": 1.5}, "key 'free_thresh' must be between 0 and 1"),
+        (
+            {"free_thresh": 0.65, "occupied_thresh": 0.196},
+            "'free_thresh' must be below .* 0.65 and 0.196",
+        ),
         ({"free_thresh": 0.7}, "'free_thresh' must be below 'occupied_thresh'"),
         ({"mode": "sepia"}, "key 'mode' must be one of .*; got 'sepia'"),
     ],
 )
 def test_bad_keys(tmp_path: Path, keys: dict, message: str):
-    path = folder_with(tmp_path, [[0]], **keys)
+    path = folder_with(tmp_path, [[254]], **keys)
     with pytest.raises(FileFormatError, match=message) as caught:
         read_map(path)
     assert str(path) in str(caught.value) and caught.value.path == path
 
 
 def test_numbers_that_yaml_takes_for_text(tmp_path: Path):
-    path = folder_with(tmp_path, [[0]], resolution="5e-2", origin=[0, "1e1", 0])
+    path = folder_with(tmp_path, [[254]], resolution="5e-2", origin=[0, "1e1", 0])
     assert read_map(path).resolution == 0.05
 
 
-def test_turned_maps_are_refused(tmp_path: Path):
-    with pytest.raises(UnsupportedError, match="map.yaml: key 'origin': the map is turned by 0.5"):
-        read_map(folder_with(tmp_path, [[0]], origin=[0, 0, 0.5]))
+def test_turned_maps_are_refused_and_the_way_out_is_right(tmp_path: Path):
+    turn, pixels = np.pi / 2, [[254, 254, 254], [254, 254, 0]]
+    with pytest.raises(
+        UnsupportedError, match="map.yaml: key 'origin': .* turned by 0.5"
+    ) as caught:
+        read_map(folder_with(tmp_path, pixels, origin=[1, 2, 0.5]))
+    assert "robotics.between([1, 2, 0.5], pose)" in str(caught.value)
+    # what it advises: the third pixel of the lowest row lies 2.5 cells from the corner, along +y here
+    grid = read_map(folder_with(tmp_path, pixels, origin=[0, 0, 0]))
+    there = [1.0 - 0.5 * 0.05, 2.0 + 2.5 * 0.05, 0.0]
+    assert grid.at(between([1.0, 2.0, turn], there)) == 1.0
+    np.testing.assert_allclose(
+        compose([1.0, 2.0, turn], between([1.0, 2.0, turn], there)), there, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(
+    ("pixels", "keys", "message"),
+    [
+        ([[0, 0], [0, 0]], {}, "of 4 pixels of map.png 4 are obstacles"),
+        ([[205, 205, 205]], {}, "of 3 pixels of map.png 0 are obstacles, the others unknown"),
+        ([[0, 205, 50]], {}, "of 3 pixels of map.png 2 are obstacles"),
+        ([[254, 254]], {"negate": 1}, "is the image inverted .key 'negate', here 1"),
+        ([[254, 254]], {"mode": "raw"}, "0 are obstacles, .* a mode other than 'raw'"),
+    ],
+)
+def test_maps_without_a_free_cell(tmp_path: Path, pixels: list, keys: dict, message: str):
+    path = folder_with(tmp_path, pixels, **keys)
+    with pytest.raises(FileFormatError, match=f"no cell is free: .*{message}") as caught:
+        read_map(path)
+    assert str(caught.value).startswith(str(path)) and caught.value.path == path
+    one_free = np.array(pixels)
+    one_free[0, 0] = 0 if keys else 254
+    assert read_map(folder_with(tmp_path, one_free, **keys)).free().sum() == 1
 
 
 @pytest.mark.parametrize(

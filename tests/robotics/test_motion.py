@@ -13,8 +13,10 @@ from scipy import stats
 import bayesmc as bmc
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
 from bayesmc.robotics import motion as motion_module
-from bayesmc.robotics.motion import OdometryMotion, VelocityMotion, euler_step, unicycle
-from bayesmc.robotics.poses import PoseNormal, between, compass, compose, pose_errors, wrap
+from bayesmc.robotics.motion import OdometryMotion, VelocityMotion
+from bayesmc.robotics.pose_distributions import PoseNormal
+from bayesmc.robotics.poses import between, compass, compose, pose_errors, wrap
+from bayesmc.robotics.steps import euler_step, unicycle
 
 TURN = 2 * np.pi
 #: rate of false alarms of each goodness-of-fit test below, were its seed fresh

@@ -10,9 +10,8 @@ from scipy import stats
 
 import bayesmc.distributions as d
 from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.robotics.pose_distributions import AndAngle, PoseNormal
 from bayesmc.robotics.poses import (
-    AndAngle,
-    PoseNormal,
     angle_between,
     between,
     compass,

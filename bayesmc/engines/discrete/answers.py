@@ -104,7 +104,7 @@ class SliceAnswers:
 
     def _tell(self, name: str, node: CompiledNode, found: Answers) -> None:
         """Answers of a node that is no variable: averages over what it reads."""
-        circle = node.support is not None and node.support.kind == "circle"
+        angles = node.angles
         size = (self.reader.card(name),) if self._is_tabular(name) else ()
         rest = len(node.event_shape) + len(size)
         first = np.empty((self.run.steps, *node.value_shape, *size))
@@ -126,22 +126,24 @@ class SliceAnswers:
                 if parts[1] is None:
                     continue
                 other = self.reader.at_element(parts[1], node, cards, element, rest)
-                if not circle:
-                    centre = one.reshape(*one.shape[:2], *(1,) * cards, *one.shape[2:])
-                    other = other + (own - centre) ** 2
+                centre = one.reshape(*one.shape[:2], *(1,) * cards, *one.shape[2:])
+                off = (own - centre) ** 2
+                other = other + (off if angles is None else np.where(angles, 0.0, off))
                 self._place(second, start, stop, node, element, _averaged(weights, other, rest))
-        self._put_seen(name, node, circle, first, second)
+        self._put_seen(name, node, first, second)
         if size:
             found.tables[name] = first
-        elif circle:
-            found.means[name] = np.arctan2(second, first)
-            found.variances[name] = circular_variance(first, second)
-        else:
+        elif angles is None:
             found.means[name] = first
             found.variances[name] = second
+        else:
+            with np.errstate(over="ignore"):  # of numbers that are no angles
+                turns = circular_variance(first, second)
+            found.means[name] = np.where(angles, np.arctan2(second, first), first)
+            found.variances[name] = np.where(angles, turns, second)
 
     def _moments(self, term: Term, rows: Rows) -> tuple[Any, ...]:
-        """What is averaged of a node: probabilities, or mean and variance, or mean cosine and sine."""
+        """What is averaged of a node: probabilities, or mean and variance (cosine and sine of angles)."""
         node = self.model[term.name]
         with marking_invalid(), np.errstate(all="ignore"):
             result, _ = self.reader.evaluate(term, rows)
@@ -159,10 +161,11 @@ class SliceAnswers:
                 return _padded(np.asarray(result.probs_table), lead + 1), None
             ndim = lead + len(node.event_shape)
             mean, var = _padded(result.mean, ndim), _padded(result.var, ndim)
-            if node.support is not None and node.support.kind == "circle":
-                length = np.exp(-0.5 * var)
-                return length * np.cos(mean), length * np.sin(mean)
-            return mean, var
+            if node.angles is None:
+                return mean, var
+            length = np.exp(-0.5 * var)
+            cosine, sine = length * np.cos(mean), length * np.sin(mean)
+            return np.where(node.angles, cosine, mean), np.where(node.angles, sine, var)
 
     def _is_tabular(self, name: str) -> bool:
         """Whether a node has the same states in all slices; computed nodes may not, and are numbers then."""
@@ -170,7 +173,7 @@ class SliceAnswers:
         return now is not None and later is not None and now.states == later.states
 
     def _put_seen(
-        self, name: str, node: CompiledNode, circle: bool, first: np.ndarray, second: np.ndarray
+        self, name: str, node: CompiledNode, first: np.ndarray, second: np.ndarray
     ) -> None:
         """Elements that were seen have the value that was seen."""
         seen = self.run.series.observed.get(name)
@@ -182,10 +185,12 @@ class SliceAnswers:
             mask = seen.mask[-self.run.steps :]
         if node.domain is not None:
             first[mask] = np.eye(node.domain.size)[value[mask].astype(np.intp)]
-        elif circle:
-            first[mask], second[mask] = np.cos(value[mask]), np.sin(value[mask])
-        else:
+        elif node.angles is None:
             first[mask], second[mask] = value[mask], 0.0
+        else:
+            here = value[mask]
+            first[mask] = np.where(node.angles, np.cos(here), here)
+            second[mask] = np.where(node.angles, np.sin(here), 0.0)
 
     def _place(
         self,

@@ -72,11 +72,8 @@ class Answers:
             if node.domain.labels is not None:
                 return None
             value = node.decode(value)
-        angle = node.support is not None and node.support.kind == "circle"
         if value is not None:
-            return self._turns(node, value) if angle else self._moments(node, value, None)
-        if angle:
-            return None
+            return self._moments(node, value, None)
         try:
             dist = self.model.evaluate(self.first, name, self.base)
             mean, var = self._moments(node, dist.mean, dist.var)
@@ -251,12 +248,16 @@ class Answers:
         return weights.reshape(shape + [1] * tail)
 
     def _moments(self, node: CompiledNode, value: Any, var: Any) -> Moments:
+        """Of values over the grid, or of distributions' means and variances; circular for angles."""
         value = np.asarray(value, dtype=float)
         mean = self._average(node, value)
         spread = self._average(node, (value - mean) ** 2)
-        return mean, spread if var is None else spread + self._average(node, var)
-
-    def _turns(self, node: CompiledNode, value: np.ndarray) -> Moments:
-        sine = self._average(node, np.sin(value))
-        cosine = self._average(node, np.cos(value))
-        return np.arctan2(sine, cosine), circular_variance(cosine, sine)
+        if var is not None:
+            spread = spread + self._average(node, var)
+        if node.angles is None:
+            return mean, spread
+        length = 1.0 if var is None else np.exp(-0.5 * np.asarray(var))
+        sine = self._average(node, length * np.sin(value))
+        cosine = self._average(node, length * np.cos(value))
+        turned, turns = np.arctan2(sine, cosine), circular_variance(cosine, sine)
+        return np.where(node.angles, turned, mean), np.where(node.angles, turns, spread)

@@ -34,6 +34,8 @@ from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
 
+#: options that hold functions by node
+_FUNCTIONS = ("proposal", "initial_proposal", "rejuvenation")
 #: equally weighted particles below which a slice rests on a single one
 _COLLAPSED = 2.0
 #: share of such slices from which on a warning says so
@@ -64,6 +66,8 @@ class ParticleFilter(FilterEngine):
         derives one from the declared densities: p(x_t | x_{t-1}, y_t) where hidden nodes are Normal and what
         is seen is affine in them; else it is made linear a few times at each particle, and a tenth of the
         particles is drawn from their own densities.
+    initial_proposal : dict, optional
+        As ``proposal``, for slice 0 alone: where the first observations say the start could be.
     auxiliary : bool or callable
         Resample with a look at the next row: particles are chosen by their weight times a first-stage
         factor, by default the density of the row given the slice before: exact where means are affine, else
@@ -124,6 +128,7 @@ class ParticleFilter(FilterEngine):
     resampling: str | Callable[..., np.ndarray] = "systematic"
     ess_threshold: float = 0.5
     proposal: Mapping[Any, Any] | str | None = field(default=None, hash=False)
+    initial_proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
     auxiliary: bool | Callable[..., Any] = False
     on_degeneracy: str = "raise"
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
@@ -154,7 +159,7 @@ class ParticleFilter(FilterEngine):
             )
         scheme_of(self.resampling)
         accepted = FUNCTION
-        for option in ("proposal", "rejuvenation"):
+        for option in _FUNCTIONS:
             given = getattr(self, option)
             if option == "proposal" and isinstance(given, str):
                 if given != "optimal":
@@ -167,6 +172,10 @@ class ParticleFilter(FilterEngine):
                 for key, spec in checked.items():
                     as_function("ParticleFilter", key, spec, accepted)
                 object.__setattr__(self, option, MappingProxyType(checked))
+        if isinstance(self.proposal, str) and self.initial_proposal is not None:
+            raise ValueError(
+                'ParticleFilter: proposal="optimal" proposes for slice 0 too; leave initial_proposal= out'
+            )
         for option, kind in (("adapt", KLD), ("recovery", Recovery)):
             given = getattr(self, option)
             if given is not None and not isinstance(given, kind):
@@ -205,7 +214,7 @@ class ParticleFilter(FilterEngine):
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
         state = dict(self.__dict__)
-        for option in ("proposal", "rejuvenation"):
+        for option in _FUNCTIONS:
             if isinstance(state[option], Mapping):
                 state[option] = dict.fromkeys(state[option])
         for option in ("resampling", "auxiliary"):
@@ -219,9 +228,10 @@ class ParticleFilter(FilterEngine):
         return self
 
     def _require_functions(self) -> None:
-        given = [*(self.rejuvenation or {}).values(), self.resampling, self.auxiliary]
-        if isinstance(self.proposal, Mapping):
-            given += self.proposal.values()
+        given = [self.resampling, self.auxiliary]
+        for option in _FUNCTIONS:
+            functions = getattr(self, option)
+            given += functions.values() if isinstance(functions, Mapping) else ()
         whole = self.recovery is None or self.recovery.is_whole
         if not whole or any(value is None for value in given):
             raise UnsupportedError(
@@ -248,7 +258,7 @@ class ParticleFilter(FilterEngine):
             if why is not None:
                 return why
         else:
-            proposals = SliceProposals(problem.slices, self.proposal or {}, "ParticleFilter")
+            proposals = self._proposals(problem.slices)
             seen = problem.series.observed
             proposals.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
         for model in (problem.slices.first, problem.slices.later):
@@ -431,6 +441,11 @@ class ParticleFilter(FilterEngine):
                 stacklevel=4,
             )
 
+    def _proposals(self, slices: Slices) -> SliceProposals:
+        assert not isinstance(self.proposal, str)
+        first = self.initial_proposal or {}
+        return SliceProposals(slices, self.proposal or {}, "ParticleFilter", first)
+
     def _mover(
         self,
         slices: Slices,
@@ -447,9 +462,7 @@ class ParticleFilter(FilterEngine):
         if isinstance(self.proposal, str):
             plan: SlicePlan = OptimalPlan(slices, apart, static)
         else:
-            asked = self.proposal or {}
-            proposals = SliceProposals(slices, asked, "ParticleFilter") if asked else None
-            plan = SlicePlan(slices, apart, static, proposals)
+            plan = SlicePlan(slices, apart, static, self._proposals(slices))
         stage: Any = None
         if callable(self.auxiliary):
             stage = GivenStage(plan, self.auxiliary, self.particles)

@@ -158,8 +158,12 @@ class Mover:
         recovery, n = self.recovery, selection.particles
         assert recovery is not None
         lost = np.zeros(0, dtype=np.intp)
-        if before:
-            lost = np.flatnonzero(rng.random(n) < recovery.options.share_of(averages))
+        share = recovery.options.share_of(averages) if before else 0.0
+        drawn = recovery.options.drawn(share)
+        if drawn > 0.0:
+            lost = np.flatnonzero(rng.random(n) < drawn)
+        if drawn > share:
+            log = log + (math.log1p(-share) - math.log1p(-drawn) if drawn < 1.0 else 0.0)
         if lost.size:
             own = lost if selection.ancestors is None else selection.ancestors[lost]
             known = self.plan.known(row)
@@ -169,7 +173,7 @@ class Mover:
                 step(state)
             values = {k: self._placed(k, v, state.values[k], lost, n) for k, v in values.items()}
             log = np.array(np.broadcast_to(log, (n,)), dtype=float)
-            log[lost] = state.log_weight
+            log[lost] = state.log_weight + math.log(share / drawn)
         cloud = self._weighted(row, values, log, selection)
         if not _has_weight(cloud):
             raise self._degenerate(row, before, cloud.values, selection)

@@ -37,6 +37,10 @@ class Recovery:
         ``t`` and nodes drawn before. All nodes that the next slice reads are named.
     share : float
         Probability that a slice begins anew, between 0 and 1.
+    draws : float
+        Share of the particles that are drawn anew, where that is more than ``share``; weights make up for
+        it. With a ``proposal`` that knows where to look, a robot that is hardly ever carried away (a
+        ``share`` of 1e-6, say) is still looked for elsewhere in every slice.
     slow, fast : float
         Rates at which two running averages of the density of the rows forget, ``0 < slow < fast <= 1``; the
         share is then at least one minus their ratio, fast over slow. Both 0 leave the share as it is.
@@ -70,6 +74,7 @@ class Recovery:
     share: float = 0.0
     slow: float = 0.0
     fast: float = 0.0
+    draws: float = 0.0
     proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
 
     def __post_init__(self) -> None:
@@ -86,8 +91,11 @@ class Recovery:
                     )
                 as_function("Recovery", key, spec, FUNCTION)
             object.__setattr__(self, option, MappingProxyType(checked))
-        if not 0.0 <= self.share <= 1.0:
-            raise ValueError(f"Recovery(share={self.share!r}): give a probability, 0 to 1")
+        for option in ("share", "draws"):
+            if not 0.0 <= getattr(self, option) <= 1.0:
+                raise ValueError(
+                    f"Recovery({option}={getattr(self, option)!r}): give a probability, 0 to 1"
+                )
         off = self.slow == 0.0 and self.fast == 0.0
         if not off and not 0.0 < self.slow < self.fast <= 1.0:
             raise ValueError(
@@ -118,6 +126,10 @@ class Recovery:
         if averages is None or not self.slow:
             return self.share
         return max(self.share, 1.0 - math.exp(min(averages.fast - averages.slow, 0.0)))
+
+    def drawn(self, share: float) -> float:
+        """The share of the particles that are drawn anew."""
+        return max(share, self.draws) if share > 0.0 else 0.0
 
     def averaged(self, averages: Averages | None, increment: Any) -> Averages | None:
         """The averages after one more row, whose log density this is."""

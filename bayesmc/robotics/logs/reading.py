@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Generic, Literal, NamedTuple, TypeVar, cast
 
-from bayesmc.errors import BayesmcWarning, FileFormatError
+from bayesmc.errors import FileFormatError, LogWarning
 from bayesmc.robotics.logs.records import Record, Timed
 from bayesmc.robotics.logs.sources import Line, Source, checked, lines_of, name_of
 
@@ -90,7 +90,7 @@ class Reading(Iterator[R], Generic[R]):
 
     Warns
     -----
-    BayesmcWarning
+    LogWarning
         When the log is exhausted and lines were skipped as faults.
 
     Examples
@@ -145,7 +145,7 @@ class Reading(Iterator[R], Generic[R]):
                 )
         if self._faults and self._skips and not self._has_warned:
             self._has_warned = True
-            warnings.warn(self._summary(), BayesmcWarning, stacklevel=2)
+            warnings.warn(self._summary(), LogWarning, stacklevel=2)
         raise StopIteration
 
     @property
