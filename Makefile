@@ -21,7 +21,7 @@ help:
 	@echo "make references  hold Gibbs against BUGS and posteriordb, and write docs/accuracy.md (long)"
 	@echo "make clean   remove what the other targets made"
 
-demo: .venv/.extras-plot
+demo: .venv/.extras-plot,robotics
 	$(PY) -m examples.demo
 
 test: .venv/.extras-plot,arviz,robotics,test

@@ -1,7 +1,8 @@
 """The demonstration behind ``make demo``: all examples, one after the other.
 
-Two nets are asked with every engine that can answer about them, then come the figures, those of models
-over time last. Each script also runs by itself; pictures go to ``out/``. ``--fast`` takes few draws.
+Two nets are asked with every engine that can answer about them, then come the figures: of static models, of
+models over time, of robots. Each script also runs by itself; pictures go to ``out/``. ``--fast`` takes few
+draws.
 """
 
 from __future__ import annotations
@@ -9,21 +10,29 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from examples import (
+    banana,
     bimodal_mixture,
+    ceiling_robot,
     central_limit,
+    corridor_doors,
     diagnosis,
     expectation_and_marginal,
     faithful_gibbs,
     growth_benchmark,
     ising_denoising,
     kernels_as_chains,
+    kidnapped_robot,
+    landmark_localization,
+    laser_localization,
     markov_chains,
     nile,
     old_faithful,
     parzen,
     picture,
     pushforward,
+    range_only,
     rejection_and_importance,
+    sonar_localization,
     stochastic_volatility,
     three_views,
     van_der_merwe,
@@ -35,6 +44,8 @@ FIGURES = (
     parzen, central_limit, pushforward, rejection_and_importance, expectation_and_marginal,
     markov_chains, bimodal_mixture, ising_denoising, faithful_gibbs, kernels_as_chains,
     weight_collapse, growth_benchmark, three_views, van_der_merwe, stochastic_volatility, nile,
+    banana, corridor_doors, ceiling_robot, laser_localization, sonar_localization, kidnapped_robot,
+    landmark_localization, range_only,
 )  # fmt: skip
 
 

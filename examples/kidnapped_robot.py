@@ -10,13 +10,17 @@ space:
     when surprised   as many as two running averages of the rows' densities ask for, one minus fast over slow:
                      none while the robot sees what it expects, many when it does not (augmented Monte Carlo
                      localization); some, too, where it comes to a place that the map explains less well
+    where it looks   one in twenty is drawn from where the scan says the robot could be, though only one scan
+                     in a hundred is thought to follow on a carriage: weights make up for both (the dual of
+                     Monte Carlo localization)
 
-The picture shows the error over time of all three, the share that begins anew, and where the particles are
+The picture shows the error over time of all, the share that begins anew, and where the particles are
 before and after. A robot has found itself when its error is below half a metre and stays so for twenty
 scans.
 
 Thrun, Burgard and Fox (2005), Probabilistic Robotics, section 8.3.5 and table 8.3; Gutmann and Fox (2002),
-An experimental comparison of localization methods continued, IROS.
+An experimental comparison of localization methods continued, IROS; Thrun, Fox, Burgard and Dellaert (2001),
+Robust Monte Carlo localization for mobile robots, Artificial Intelligence 128.
 """
 
 from __future__ import annotations
@@ -27,7 +31,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import FreeSpace
 from examples import picture, robot_logs
 from examples.robot_logs import Log
 
@@ -35,6 +38,7 @@ SEED, PARTICLES = 1, 10_000
 AT, TO = 70, 150  # of the made-up log: cut after the first so many scans, on from this one
 RATES = (0.1, 0.8)  # slow and fast
 DOTS = 2_000
+GOLD = "#e0a030"
 LATER = (-1, 10, 40)  # scans after the robot was carried off, at which particles are drawn
 
 
@@ -58,12 +62,13 @@ class Run(NamedTuple):
 
 def recoveries(log: Log) -> dict[str, bmc.Recovery | None]:
     """What is compared."""
-    anywhere = {"pose": FreeSpace(log.grid)}
+    anywhere = {"pose": log.floor}
     slow, fast = RATES
     return {
         "never": None,
         "always 5 %": bmc.Recovery(anywhere, share=0.05),
         "when surprised": bmc.Recovery(anywhere, slow=slow, fast=fast),
+        "where it looks": robot_logs.looking(log),
     }
 
 
@@ -93,12 +98,12 @@ def report(found: dict[str, Run], at: int) -> None:
 
 
 def draw(log: Log, found: dict[str, Run], at: int) -> Any:
-    """Error and share over time; the particles of the one that is surprised, before and after."""
+    """Error and share over time; the particles of the last one, before and after."""
     clouds = [f"cloud {k}" for k in LATER]
     figure, panels = picture.axes(
         [["error"] * 3, ["share"] * 3, clouds], (13, 10.5), height_ratios=[1.5, 0.8, 1.5]
     )
-    colours = dict(zip(found, (picture.FAINT, picture.DRAWS, picture.EXACT), strict=True))
+    colours = dict(zip(found, (picture.FAINT, picture.DRAWS, GOLD, picture.EXACT), strict=True))
     ax, share = panels["error"], panels["share"]
     for name, each in found.items():
         back = robot_logs.recovery_time(each.error, at)

@@ -27,7 +27,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import FreeSpace
 from examples import picture, robot_logs
 from examples.robot_logs import Log
 
@@ -78,7 +77,7 @@ def run(dbn: bmc.DynamicBayesNet, log: Log, engine: Any, rng: int, slices: Seque
 
 def located(log: Log, particles: int = PARTICLES, rng: int = SEED) -> Run:
     """Global localisation of a log from a laser, for the pictures."""
-    dbn = robot_logs.model(log, FreeSpace(log.grid), log.caution)
+    dbn = robot_logs.model(log, log.floor, log.caution)
     return run(dbn, log, robot_logs.adaptive(particles, LEAST), rng, frames(log))
 
 

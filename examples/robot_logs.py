@@ -7,6 +7,7 @@ Lab, and two logs of Wean Hall. Whatever the log, the net is the same one, and s
 measure how well it localises:
 
     pose given pose_prev and motion   OdometryMotion with noise on two rotations and a translation
+    on_floor given pose               always seen as True: no robot stands in a wall
     scan given pose                   LikelihoodField: end points of beams lie near obstacles
 
 Beams of one scan share their errors (a map that is a little off, people), so that their product is far too
@@ -36,6 +37,7 @@ from bayesmc.robotics import (
     OccupancyGrid,
     OdometryMotion,
     PoseNormal,
+    SensorPoses,
     between,
     clean_ranges,
     compose,
@@ -73,6 +75,12 @@ class Log(NamedTuple):
         Range of the sensor in m.
     caution : float
         Tempering for a robot that may be anywhere.
+    noise : tuple of float
+        Of the wheels: four variances, see ``OdometryMotion``.
+    hits : float
+        Share of beams that end at what is on the map: fewer where people walk about.
+    free : float, optional
+        Occupancy below which a cell is floor, where that is less than the map's threshold.
     """
 
     name: str
@@ -84,6 +92,14 @@ class Log(NamedTuple):
     mount: tuple[float, float, float] = (0.0, 0.0, 0.0)
     reach: float = REACH
     caution: float = GLOBAL
+    noise: tuple[float, float, float, float] = ALPHAS
+    hits: float = 0.8
+    free: float | None = None
+
+    @property
+    def floor(self) -> FreeSpace:
+        """Where the robot can be."""
+        return FreeSpace(self.grid, threshold=self.free)
 
     @property
     def dead_reckoning(self) -> np.ndarray:
@@ -132,14 +148,18 @@ def intel(data: Path, every: int = 3) -> Log:
     return Log("Intel Research Lab", grid, np.deg2rad(beams - 90.0), scans, motion, truth)
 
 
-def wean(data: Path, number: int, every: int = 5) -> Log:
-    """Wean Hall, log 1 or 4; nobody knows the true poses."""
+def wean(data: Path, number: int, every: int = 3) -> Log:
+    """Wean Hall, log 1 or 4; nobody knows the true poses.
+
+    The map is a picture that shades what was hardly seen, people walk along, and the wheels slip.
+    """
     folder = data / "robot" / "wean"
     with np.load(folder / "wean_map_from_gif.npz") as m:
         cells = m["occupancy_xy"].astype(float)
     grid = OccupancyGrid(np.where(cells < 0.0, np.nan, cells), 0.1)
     found = list(keyframes(read_wean(folder / f"robotdata{number}.log.gz")))
-    return _log(f"Wean Hall, log {number}", grid, found, None, REACH, every)
+    log = _log(f"Wean Hall, log {number}", grid, found, None, REACH, every)
+    return log._replace(caution=0.1, noise=(0.04, 0.02, 0.04, 0.02), hits=0.5, free=0.1)
 
 
 def data_root() -> Path | None:
@@ -183,13 +203,17 @@ def carried_off(log: Log, rng: np.random.Generator, far: float = 10.0) -> tuple[
 
 
 def net(log: Log, start: Any, scan: Callable[[Any], bmc.Distribution]) -> bmc.DynamicBayesNet:
-    """A robot that moves as its wheels say, up to noise, and has a sensor."""
-    dbn = bmc.DynamicBayesNet(log.name)
+    """A robot that moves as its wheels say, up to noise, stays out of walls, and has a sensor."""
+    dbn, floor = bmc.DynamicBayesNet(log.name), log.floor
     dbn.input("motion", event_shape=(3,))
 
     @dbn.node(initial=start)
     def pose(pose_prev, motion):
-        return OdometryMotion(pose_prev, motion, ALPHAS)
+        return OdometryMotion(pose_prev, motion, log.noise)
+
+    @dbn.node
+    def on_floor(pose):  # a map may be wrong in one of a hundred places
+        return bmc.Bernoulli(np.where(floor.cell_of(pose) >= 0, 0.99, 0.01))
 
     dbn.add("scan", lambda pose: scan(pose))
     return dbn
@@ -199,10 +223,31 @@ def model(
     log: Log, start: Any, tempering: float = TRACKING, sigma: float = 0.2
 ) -> bmc.DynamicBayesNet:
     """The net with the likelihood field of the log's map for a sensor; ``sigma`` in m."""
-    field = LikelihoodField(
-        log.grid, sigma, max_range=log.reach, mount=log.mount, tempering=tempering
+    seen = field(log, sigma, tempering)
+    return net(log, start, lambda pose: seen.given(pose, log.angles))
+
+
+def field(log: Log, sigma: float, tempering: float) -> LikelihoodField:
+    """The likelihood field of the log's map."""
+    return LikelihoodField(
+        log.grid, sigma, log.hits, 1.0 - log.hits, log.reach, log.mount, tempering
     )
-    return net(log, start, lambda pose: field.given(pose, log.angles))
+
+
+def aimed(log: Log, spacing: float = 0.5, headings: int = 36) -> SensorPoses:
+    """Where a scan says the robot could be: bins of half a metre and ten degrees, and a field to match."""
+    coarse = field(log, 0.3, 2.0 * log.caution)
+    return SensorPoses(
+        log.floor, lambda pose: coarse.given(pose, log.angles), spacing, headings, even=0.1
+    )
+
+
+def looking(log: Log, share: float = 0.01, draws: float = 0.05) -> bmc.Recovery:
+    """Recovery that draws from where the scan says the robot could be."""
+    aim = aimed(log)
+    return bmc.Recovery(
+        {"pose": log.floor}, share, draws=draws, proposal={"pose": lambda scan: aim.given(scan)}
+    )
 
 
 def near(log: Log) -> PoseNormal:
@@ -214,15 +259,15 @@ def localized(
     dbn: bmc.DynamicBayesNet, log: Log, engine: Any, rng: Any, keep: str | None = None
 ) -> Any:
     """Beliefs about all slices of a log."""
-    seen, done = {"scan": log.scans}, {"motion": log.motion}
-    return bmc.filter(dbn, seen, inputs=done, engine=engine, rng=rng, keep=keep)
+    seen = {"scan": log.scans, "on_floor": np.ones(len(log.scans), dtype=bool)}
+    return bmc.filter(dbn, seen, inputs={"motion": log.motion}, engine=engine, rng=rng, keep=keep)
 
 
 def beliefs(dbn: bmc.DynamicBayesNet, log: Log, engine: Any, rng: Any) -> Iterator[Any]:
     """The same slice by slice, as on a robot: particles of one slice at a time, not of all."""
     belief = engine.start(dbn, rng=rng)
     for scan, motion in zip(log.scans, log.motion, strict=True):
-        belief = engine.step(belief, {"scan": scan}, inputs={"motion": motion})
+        belief = engine.step(belief, {"scan": scan, "on_floor": True}, inputs={"motion": motion})
         yield belief
 
 
@@ -250,10 +295,15 @@ def tracking(log: Log, particles: int, rng: Any, **options: Any) -> np.ndarray:
 def anywhere(log: Log, particles: int | bmc.ParticleFilter, rng: Any, **options: Any) -> np.ndarray:
     """Estimated poses of a robot that starts anywhere on the map, shape (time, 3).
 
-    ``particles`` is their number, or a filter with options of its own; ``options`` are those of ``model``.
+    ``particles`` is their number, drawn from where the first scan says it could be, or a filter with options
+    of its own; ``options`` are those of ``model``.
     """
-    engine = bmc.ParticleFilter(particles) if isinstance(particles, int) else particles
-    dbn = model(log, FreeSpace(log.grid), **{"tempering": log.caution, **options})
+    engine = particles
+    if isinstance(engine, int):
+        aim = aimed(log)
+        first_look = {"pose": lambda scan: aim.given(scan)}
+        engine = bmc.ParticleFilter(engine, initial_proposal=first_look)
+    dbn = model(log, log.floor, **{"tempering": log.caution, **options})
     return localized(dbn, log, engine, rng).mean("pose")
 
 

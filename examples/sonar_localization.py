@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import BeamFit, BeamModel, Beams, FreeSpace, RayTable, fit_beams
+from bayesmc.robotics import BeamFit, BeamModel, Beams, RayTable, fit_beams
 from examples import laser_localization, picture, robot_logs
 from examples.laser_localization import Run
 from examples.robot_logs import Log
@@ -57,7 +57,7 @@ def model(log: Log, start: Any, tempering: float = TEMPERING) -> bmc.DynamicBaye
 
 def located(log: Log, particles: int = PARTICLES, rng: int = SEED) -> Run:
     """Global localisation by sonar, for the pictures."""
-    dbn = model(log, FreeSpace(log.grid))
+    dbn = model(log, log.floor)
     engine = robot_logs.adaptive(particles, LEAST)
     return laser_localization.run(dbn, log, engine, rng, laser_localization.SHOWN)
 

@@ -108,7 +108,7 @@ class SensorPoses:
         Raises
         ------
         ShapeError
-            The sensor's density has not one number for each pose: several readings at once, for instance.
+            The sensor has not one density for each pose, or there are several readings at once.
         """
         reading = np.asarray(reading, dtype=float)
         key = reading.tobytes()
@@ -121,12 +121,18 @@ class SensorPoses:
 
     def _weighed(self, reading: np.ndarray) -> np.ndarray:
         """Log weights of the bins."""
-        log = np.asarray(self.sensor(self.poses).log_prob(reading), dtype=float)
-        if log.shape != (len(self.poses),):
+        dist, count = self.sensor(self.poses), len(self.poses)
+        if dist.batch_shape != (count,):
             raise ShapeError(
-                f"SensorPoses: the density of a reading of shape {reading.shape} has shape {log.shape} at "
-                f"{len(self.poses)} poses; give one reading at a time, and a sensor with one density per pose"
+                f"SensorPoses: the sensor's densities at {count} poses have batch shape {dist.batch_shape}; "
+                "return one for each pose"
             )
+        if reading.shape != dist.event_shape:
+            raise ShapeError(
+                f"SensorPoses: the reading has shape {reading.shape}, and the sensor's are of shape "
+                f"{dist.event_shape}; give one reading at a time"
+            )
+        log = dist.log_prob(reading)
         return np.where(np.isnan(log), -np.inf, log)
 
     @cached_property

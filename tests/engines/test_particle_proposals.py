@@ -655,3 +655,69 @@ def test_the_optimal_proposal_is_refused_for_other_families() -> None:
     dbn = linear()
     dbn.add("never", lambda x: bmc.StudentT(1.0, x, 1.0))  # drawn from its own density
     bmc.filter(dbn, {"y": [0.0]}, engine=bmc.ParticleFilter(9, proposal="optimal"), rng=0)
+
+
+# ---- slice 0 ------------------------------------------------------------------------------------
+
+
+def wide(runs: int = 0) -> bmc.DynamicBayesNet:
+    """A start that the first row narrows a great deal."""
+    dbn, own = template(runs)
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 0.5), initial=bmc.Normal(0.0, 20.0), plates=own)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5), plates=own)
+    return dbn
+
+
+LOOKED: dict[str, Any] = {"x": lambda y: bmc.Normal(y, 0.7)}
+GIVEN: dict[str, Any] = {"x": lambda x_prev, y: bmc.Normal(0.5 * (x_prev + y), 0.6)}
+
+
+@pytest.mark.parametrize("proposal", [None, GIVEN], ids=["later ones as they are", "both"])
+def test_a_proposal_for_the_start_is_weighed_and_finds_more(proposal: Any) -> None:
+    rows = {"y": np.array([30.0, 30.4, 29.8])}
+    exact = bmc.filter(wide(), rows, engine=bmc.KalmanFilter()).log_marginal_likelihood
+    together = {"y": np.repeat(rows["y"][:, None], 2_000, axis=1)}
+    engine = bmc.ParticleFilter(50, initial_proposal=LOOKED, proposal=proposal)
+    found = bmc.filter(wide(2_000), together, engine=engine, rng=0)
+    ratio = np.exp(found.log_marginal_likelihood - exact)
+    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each)
+    assert abs(ratio.mean() - 1.0) < 4 * ratio.std(ddof=1) / np.sqrt(len(ratio))
+    plain = bmc.filter(wide(), rows, engine=bmc.ParticleFilter(50), rng=0)
+    assert np.mean(found.weight_ess[0]) > 5 * plain.weight_ess[0]
+
+
+def test_a_proposal_for_the_start_stays_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def looked(y: Any, t: Any) -> bmc.Distribution:
+        asked.append(int(t))
+        return bmc.Normal(y, 0.7)
+
+    rows = {"y": np.array([30.0, 30.4, 29.8])}
+    engine = bmc.ParticleFilter(100, initial_proposal={"x": looked})
+    bmc.filter(wide(), rows, engine=engine, rng=0)
+    assert set(asked) == {0}
+    # it comes before one for all slices
+    both = bmc.ParticleFilter(100, initial_proposal={"x": looked}, proposal=LOOKED)
+    bmc.filter(wide(), rows, engine=both, rng=0)
+    assert set(asked) == {0}
+    # and is not used where what it looks at is missing
+    asked.clear()
+    missing = {"y": np.ma.masked_invalid([np.nan, 30.4, 29.8])}
+    bmc.filter(wide(), missing, engine=engine, rng=0)
+    assert not asked
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"proposal": "optimal", "initial_proposal": LOOKED}, ValueError, "slice 0 too"),
+        ({"initial_proposal": "optimal"}, TypeError, "dict from node name"),
+        ({"initial_proposal": {"q": bmc.Normal(0.0, 1.0)}}, Exception, "'q'"),
+        ({"initial_proposal": GIVEN}, ModelError, "x_prev"),
+        ({"initial_proposal": {"y": bmc.Normal(0.0, 1.0)}}, ModelError, "observed in every slice"),
+    ],
+)
+def test_wrong_proposals_for_the_start_are_named(options: Any, error: Any, message: str) -> None:
+    with pytest.raises(error, match=message):
+        bmc.filter(wide(), {"y": [1.0]}, engine=bmc.ParticleFilter(10, **options), rng=0)

@@ -58,11 +58,21 @@ def deviation(found: np.ndarray) -> float:
 AIMED: dict[str, Any] = {"x": lambda y: bmc.Truncated(bmc.Normal(y, 0.8), 0.0, 10.0)}
 
 
+@pytest.mark.parametrize("draws", [0.0, 0.3, 1.0])
 @pytest.mark.parametrize("proposal", [None, AIMED], ids=["from the density", "aimed"])
-def test_the_evidence_is_that_of_the_declared_jump(proposal: Any) -> None:
-    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each)
-    found = ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, proposal=proposal))
-    assert deviation(found) < 4
+def test_the_evidence_is_that_of_the_declared_jump(proposal: Any, draws: float) -> None:
+    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each); where all are drawn
+    # anew, the other part of the mixture is left out
+    found = ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=draws, proposal=proposal))
+    assert (deviation(found) < 4) == (draws < 1.0)
+
+
+def test_draws_beyond_the_share_are_weighed_down(monkeypatch: pytest.MonkeyPatch) -> None:
+    recovery = bmc.Recovery({"x": ANYWHERE}, share=1e-3, draws=0.2, proposal=AIMED)
+    found = bmc.filter(walk(), ROWS, engine=bmc.ParticleFilter(5000, recovery=recovery), rng=0)
+    assert (abs(found.anew[1:] - 1000) < 6 * np.sqrt(1000)).all()
+    monkeypatch.setattr(bmc.Recovery, "share_of", lambda self, averages: self.draws)
+    assert deviation(ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=0.4))) > 8
 
 
 def test_a_proposal_that_is_not_weighed_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,6 +164,7 @@ def test_options_travel_without_functions() -> None:
 WRONG: dict[str, tuple[Any, type[Exception], str]] = {
     "no share": (lambda: bmc.Recovery({"x": ANYWHERE}), ValueError, "nothing would begin anew"),
     "large share": (lambda: bmc.Recovery({"x": ANYWHERE}, share=1.5), ValueError, "0 to 1"),
+    "draws": (lambda: bmc.Recovery({"x": ANYWHERE}, share=0.1, draws=-1.0), ValueError, "draws=-1"),
     "rates": (lambda: bmc.Recovery({"x": ANYWHERE}, slow=0.5, fast=0.1), ValueError, "slow < fast"),
     "tuple": (lambda: bmc.Recovery({("x", "y"): ANYWHERE}, share=0.1), TypeError, "name one node"),
     "no dict": (lambda: bmc.Recovery(ANYWHERE, share=0.1), TypeError, "dict from node name"),
