@@ -16,6 +16,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results import ChainsPosterior, ChainsSums
+from bayesmc.results.draws import near
 
 #: R-hat above which chains disagree (Vehtari et al. 2021, sec. 5)
 MAX_RHAT = 1.01
@@ -131,7 +132,7 @@ def _figures(posterior: ChainsPosterior, forward: frozenset[str]) -> _Judged:
         values = posterior._stored[name][at]
         if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
             names.append(_scalar(posterior.model, name, index))
-            columns.append(_thinned(values, block))
+            columns.append(_uncut(posterior.model[name], index, _thinned(values, block)))
     if not names:
         return _Judged(0, {}, {})
     share = len(columns[0]) / chains
@@ -243,6 +244,13 @@ def _thinned(values: np.ndarray, block: int) -> np.ndarray:
     step = max(1, min(draws // _DRAWS, -(-chains * draws // _ONE)))
     whole = draws // block * block
     return values[:, :whole].reshape(chains, -1, block)[:, ::step].reshape(chains, -1)
+
+
+def _uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.ndarray:
+    """The draws of a scalar, those of an angle near their mean: cut in two they would look faster mixed."""
+    if node.angles is None or not node.angles[index[len(node.plates) :]]:
+        return values
+    return near(values, np.angle(np.exp(1j * values).mean()))
 
 
 def _scalar(model: Model, name: str, index: tuple[int, ...]) -> str:

@@ -2,7 +2,8 @@
 
 One covariance for every element that moves by itself, learnt from all chains together, and a scale for
 every chain, which finds the mass from far away; at the end of the warmup the scales become one. The
-numbers are those of an unconstrained space or of the node itself: nothing is known of nodes here.
+numbers are those of an unconstrained space or of the node itself: nothing is known of nodes here, but
+which numbers are angles, whose deviations from their mean go the short way round.
 
 References
 ----------
@@ -17,12 +18,19 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.circular import wrap_angle
+from bayesmc.distributions.support import Support
+from bayesmc.distributions.transforms import transform_of
+from bayesmc.shapes import Shape
+
 #: adaptation slows down with these powers of the number of sweeps: covariances need longer memories
 _DECAY, SCALE_DECAY = 0.6, 0.5
 #: share of its diagonal that is added to a covariance, which chains that hardly move leave singular
 _LOADING = 1e-4
 #: sweeps between two factorisations of a covariance
 _EVERY = 5
+#: standard deviation at which a step round a circle goes anywhere, to exp(-20): longer ones are no better
+_ANYWHERE = 2 * math.pi
 
 
 def best_rate(size: int) -> float:
@@ -33,6 +41,24 @@ def best_rate(size: int) -> float:
     Roberts and Rosenthal (2001), Statistical Science 16.
     """
     return 0.234 + 0.206 / max(size, 1)
+
+
+def turning(support: Support, event_shape: Shape, unconstrained: bool = True) -> np.ndarray:
+    """Which of the numbers that walk for one value of a support are angles, flat.
+
+    Examples
+    --------
+    >>> from bayesmc.distributions.support import circle, product, simplex
+    >>> from bayesmc.kernels.adaptation import turning
+    >>> turning(product([(simplex, 3), (circle, 0)]), (4,)).tolist()  # a simplex walks by two numbers
+    [False, False, True]
+    """
+    if not unconstrained:
+        return support.angles(math.prod(event_shape))
+    if support.kind == "product":
+        parts = [turning(part, (count,) if count else ()) for part, count in support.parts]
+        return np.concatenate(parts)
+    return support.angles(math.prod(transform_of(support, event_shape).unconstrained_shape))
 
 
 class Steps:
@@ -51,20 +77,33 @@ class Steps:
         starting points.
     adaptive : bool
         Whether anything is learnt.
+    angles : ndarray of bool, shape (size,), optional
+        Which numbers are angles: their means are circular, so that a cut of the circle through the mass
+        does not pass for spread.
     """
 
-    def __init__(self, size: int, scale: Any = None, adaptive: bool = True) -> None:
+    def __init__(
+        self,
+        size: int,
+        scale: Any = None,
+        adaptive: bool = True,
+        angles: np.ndarray | None = None,
+    ) -> None:
         self.size = size
         self.scale = scale
         self.adaptive = adaptive
+        self.angles = angles if angles is not None and angles.any() else None
+        #: nothing but angles has a longest step: where all are accepted, the scale would grow for good
+        self._longest = math.log(_ANYWHERE) if angles is not None and angles.all() else math.inf
         self.rate = best_rate(size)
         self.base = 2.38 / math.sqrt(max(size, 1))
 
     def start(self, u: np.ndarray) -> dict[str, Any]:
         """The memory before the first step from points ``u``, shape (chains, elements, size)."""
         chains, elements, size = u.shape
+        mean = self._mean(np.where(np.isfinite(u), u, 0.0))
         if self.scale is None:
-            var = u.var(axis=0)
+            var = np.square(self.wrapped(u - mean)).mean(axis=0)
             var = np.where((var > 0) & np.isfinite(var), var, 1.0)
             log_scale = math.log(self.base) + 0.5 * np.log(var).sum(axis=1) / max(size, 1)
         else:
@@ -73,7 +112,7 @@ class Steps:
         cov = np.zeros((elements, size, size))
         cov[:, np.arange(size), np.arange(size)] = var
         return {
-            "mean": np.where(np.isfinite(u), u, 0.0).mean(axis=0),
+            "mean": mean,
             "cov": cov,
             "factor": _unit(np.sqrt(cov)),
             "log_scale": np.tile(log_scale, (chains, 1)),
@@ -122,8 +161,8 @@ class Steps:
         mean, cov = memory["mean"], memory["cov"]
         kept = u if typical is None else u[typical]
         if np.isfinite(kept).all() and len(kept):
-            mean = mean + gain * (kept.mean(axis=0) - mean)
-            away = kept - mean
+            mean = mean + gain * self.wrapped(self._mean(kept) - mean)
+            away = self.wrapped(kept - mean)
             if self.size == 1:
                 square = np.square(away).mean(axis=0)[..., None]
             else:
@@ -132,6 +171,7 @@ class Steps:
             cov = np.where(fine, cov + gain * (square - cov), cov)
         error = np.where(np.isnan(rates), 0.0, rates / self.rate - 1.0)
         log_scale = memory["log_scale"] + (count + 1.0) ** -SCALE_DECAY * error
+        log_scale = np.minimum(log_scale, self._longest)
         average = memory["average"] + gain * (log_scale.mean(axis=0) - memory["average"])
         factor = memory["factor"]
         if count % _EVERY == 0:
@@ -152,6 +192,20 @@ class Steps:
         log_scale = np.broadcast_to(memory["average"], memory["log_scale"].shape).copy()
         factor = self._factor(memory["cov"], memory["factor"])
         return {**memory, "log_scale": log_scale, "factor": factor}
+
+    def wrapped(self, difference: np.ndarray) -> np.ndarray:
+        """The same numbers ``(..., size)`` with angles, or their differences, in [-pi, pi)."""
+        if self.angles is None:
+            return difference
+        return np.where(self.angles, wrap_angle(difference), difference)
+
+    def _mean(self, u: np.ndarray) -> np.ndarray:
+        """Mean over chains, circular for angles, shape (elements, size)."""
+        mean = u.mean(axis=0)
+        if self.angles is None:
+            return mean
+        turned = np.arctan2(np.sin(u).mean(axis=0), np.cos(u).mean(axis=0))
+        return np.where(self.angles, turned, mean)
 
     def _factor(self, cov: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
         """Cholesky factors of covariances, made positive definite, of determinant one."""

@@ -2,7 +2,8 @@
 
 All numbers of the block, on the unconstrained scale, make one vector per chain. Where chains come in
 ensembles, half the members of each move given the other half, whose differences show the directions and
-sizes that matter; ensembles never look at each other once the warmup is over.
+sizes that matter; ensembles never look at each other once the warmup is over. Angles are kept within one
+turn, and their differences taken the short way round.
 
 References
 ----------
@@ -21,7 +22,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped
-from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance
+from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance, turning
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import Block, accepted, instead
 from bayesmc.kernels.random_walk import counted, finite, some_support, walked
@@ -113,7 +114,8 @@ class BlockWalk(Kernel):
         self.alone = alone
         self.parts = parts_of(target, self.names, unconstrained)
         size = self.parts[-1].stop
-        self.steps = Steps(size, scale, adaptive)
+        angles = [_angles(target, part, unconstrained) for part in self.parts]
+        self.steps = Steps(size, scale, adaptive, np.concatenate(angles))
         if ensemble > 1:
             self.label = "adaptive random walk and differential evolution"
             self.match = f"ensembles of {ensemble}"
@@ -196,21 +198,31 @@ class BlockWalk(Kernel):
         memory: Memory,
         rng: np.random.Generator,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Where some rows might go, and by which kind of move."""
+        """Where some rows might go, and by which kind of move.
+
+        Every move is symmetric, on a circle, too. A step d is drawn without a look at where the row stands,
+        and -d is as likely: for a difference the two members are as likely the other way round, and the short
+        way between angles then changes its sign, unless they stand opposite each other, which has
+        probability zero. What is added to an angle is wrapped, and wrapping commutes with adding steps, so
+        that the chance to get from one point of the circle to another, summed over turns, is that of the way
+        back. Were angles not wrapped, the target would repeat itself along a line for good and have no
+        total: nothing holds members in one turn, their differences grow by ever more turns, and the angles
+        run off to where doubles tell none apart.
+        """
         steps = self.steps.draw(memory["steps"], rng, rows)[:, 0]
         if others is None:
-            return u[rows] + steps, np.full(len(rows), _GAUSSIAN)
+            return self.steps.wrapped(u[rows] + steps), np.full(len(rows), _GAUSSIAN)
         kind, jumps, one, other = rng.random((4, len(rows)))
         along, jump = kind < _DIFFERENCES, jumps < _JUMPS
         count, at = others.shape[1], np.arange(len(rows))
         first = (one * count).astype(np.intp)
         second = (first + 1 + (other * (count - 1)).astype(np.intp)) % count
         factor = 2.38 / math.sqrt(2 * max(self.size, 1)) * math.exp(memory["log_factor"])
-        difference = u[others[at, first]] - u[others[at, second]]
+        difference = self.steps.wrapped(u[others[at, first]] - u[others[at, second]])
         # a little noise: differences of few members span less than the space
         difference = np.where(jump, 1.0, factor)[:, None] * difference + _NOISE * steps
         moves = np.where(along, np.where(jump, _JUMP, _DIFFERENCE), _GAUSSIAN)
-        return u[rows] + np.where(along[:, None], difference, steps), moves
+        return self.steps.wrapped(u[rows] + np.where(along[:, None], difference, steps)), moves
 
     def _placed(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
         """The vectors behind current values, and the log densities of these vectors."""
@@ -336,3 +348,13 @@ def parts_of(target: Target, names: Sequence[str], unconstrained: bool = True) -
         parts.append(Part(name, free, shape, start, stop))
         start = stop
     return parts
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _angles(target: Target, part: Part, unconstrained: bool) -> np.ndarray:
+    """Which numbers of a part are angles, shape (stop - start,)."""
+    support = some_support(target.model, part.name)
+    one = turning(support, target.model[part.name].event_shape, unconstrained)
+    return np.tile(one, (part.stop - part.start) // max(len(one), 1))

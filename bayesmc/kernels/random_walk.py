@@ -14,7 +14,7 @@ import numpy as np
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped, transform_of
 from bayesmc.errors import ShapeError
-from bayesmc.kernels.adaptation import Steps, chance
+from bayesmc.kernels.adaptation import Steps, chance, turning
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import accepted, compare, instead
 from bayesmc.network import Model
@@ -97,7 +97,8 @@ class AdaptiveWalk(Kernel):
                 )
             full = np.broadcast_to(scale, wanted)
             scale = full.reshape(blanket.size, size)
-        self.steps = Steps(size, scale, adaptive)
+        angles = turning(support, node.event_shape, unconstrained)
+        self.steps = Steps(size, scale, adaptive, angles)
         if not adaptive:
             self.label = "random walk"
 
@@ -112,7 +113,7 @@ class AdaptiveWalk(Kernel):
         now = values[name]
         transform = self._transform(values)
         free = self._free(transform, now)
-        tried = free + self.steps.draw(memory["steps"], rng)
+        tried = self.steps.wrapped(free + self.steps.draw(memory["steps"], rng))
         shape = (len(now), *blanket.node.plate_shape)
         proposal = transform.constrain(tried.reshape(shape + self.free_shape))
         volume = self._volume(transform, tried, shape) - self._volume(transform, free, shape)

@@ -178,7 +178,8 @@ class Slice(Kernel):
         support = self._support(values, component)
         low, high = self._bounds(support, members)
         growth = _GROWTH
-        if support.kind == "circle":  # one turn holds everything
+        circle = transform_of(support) if support.kind == "circle" else None
+        if circle is not None:  # one turn holds everything
             width, growth = np.full(width.shape, 2 * np.pi), 0
         if self.is_integer:  # a number uniform in the cell of each integer
             x = x + rng.random(x.shape)
@@ -192,6 +193,8 @@ class Slice(Kernel):
         def log_density(tried: np.ndarray) -> np.ndarray:
             if self.is_integer:
                 tried = np.floor(tried).astype(now.dtype)
+            if circle is not None:  # what depends on an angle need not repeat itself beyond the cut
+                tried = circle.constrain(tried)
             logs = tried
             inside: Any = True
             if self.on_logs:
@@ -223,8 +226,8 @@ class Slice(Kernel):
             moved = np.floor(moved)
         if self.on_logs:
             moved = start + np.exp(moved)
-        if support.kind == "circle":
-            moved = transform_of(support).constrain(moved)
+        if circle is not None:
+            moved = circle.constrain(moved)
         if not component:
             return moved.astype(now.dtype, copy=False)
         new = now.copy()

@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import UnknownNodeError, UnsupportedError, missing_extra
 from bayesmc.network import Model, Observed, Problem, forward, read_inputs
 from bayesmc.randomness import Purpose, seed_sequence, stream
@@ -103,9 +104,14 @@ class DrawsPosterior(Posterior):
         return np.where(angles, turned, spread)
 
     def cov(self, *names: str) -> np.ndarray:
+        """Covariance matrix of all scalars of the named nodes, in order; of one scalar, its variance.
+
+        Angles count by how far they lie from their circular mean, the short way round. ``var`` says
+        ``-2 log R`` of them, about as much where they are concentrated.
+        """
         if not names:
             raise UnknownNodeError("cov(): name at least one node")
-        blocks = [self._full(name, "cov").reshape(*self._shape, -1) for name in names]
+        blocks = [self._uncut(name, "cov").reshape(*self._shape, -1) for name in names]
         flat = np.concatenate(blocks, axis=-1)
         flat = (flat - self._average(flat)).reshape(-1, flat.shape[-1])
         weights = (
@@ -115,12 +121,7 @@ class DrawsPosterior(Posterior):
         return matrix[0, 0] if matrix.size == 1 else matrix
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
-        values = self._full(name, "quantile")
-        angles = self.model.nodes[name].angles
-        if angles is not None:  # an order needs a cut: opposite the mean
-            mean = self.mean(name)
-            near = mean + np.remainder(values - mean + np.pi, 2 * np.pi) - np.pi
-            values = np.where(angles, near, values)
+        values = self._uncut(name, "quantile")
         flat = values.reshape((math.prod(self._shape), *values.shape[2:]))
         levels = np.asarray(q, dtype=float)
         if not ((levels >= 0) & (levels <= 1)).all():
@@ -379,6 +380,12 @@ class DrawsPosterior(Posterior):
         values = self._values(name, what)
         return np.broadcast_to(values, self._shape + values.shape[2:])
 
+    def _uncut(self, name: str, what: str) -> np.ndarray:
+        """The same with angles within half a turn of their mean."""
+        values = self._full(name, what)
+        angles = self.model.nodes[name].angles
+        return values if angles is None else np.where(angles, near(values, self.mean(name)), values)
+
     def _average(self, values: np.ndarray) -> np.ndarray:
         if values.shape[:2] == (1, 1):
             return np.asarray(values[0, 0], dtype=float)
@@ -403,11 +410,17 @@ class DrawsPosterior(Posterior):
             codes = np.broadcast_to(self._of(what), self._shape + node.value_shape)
             return (codes[..., None] == np.arange(node.domain.size)).astype(float)
         values = self._full(what, "mean").astype(float)
-        if not self._is_circular(what):
+        if node.angles is None:
             return values
         # to first order the circular mean errs as the mean of these does (delta method)
         length = np.sqrt(self._average(np.cos(values)) ** 2 + self._average(np.sin(values)) ** 2)
-        return np.sin(values - self.mean(what)) / np.maximum(length, 1e-300)
+        turned = np.sin(values - self.mean(what)) / np.maximum(length, 1e-300)
+        return np.where(node.angles, turned, values)
+
+
+def near(angles: np.ndarray, mean: Any) -> np.ndarray:
+    """Angles within half a turn of their mean: what needs an order needs a cut, best opposite the mean."""
+    return mean + wrap_angle(angles - mean)
 
 
 def _chained(values: np.ndarray, trailing: int) -> np.ndarray:

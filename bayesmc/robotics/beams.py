@@ -117,7 +117,9 @@ class Beams(Distribution):
     - With ``tempering`` other than 1, ``log_prob`` is the tempered log density, which is not
       normalised; draws come from the density without the exponent.
 
-    References ---------- Thrun, Burgard and Fox, Probabilistic Robotics, 2005, equations 6.4 to
+    References
+    ----------
+    Thrun, Burgard and Fox, Probabilistic Robotics, 2005, equations 6.4 to
     6.13. There, the random and the max reading share no common measure; the mass at ``max_range``
     is made explicit here.
 
@@ -229,7 +231,9 @@ def fit_beams(
     ShapeError
         The two arrays differ in shape, or there is no usable reading.
 
-    Notes ----- The scale of hits and the rate of short ones are maximised with the truncation that
+    Notes
+    -----
+    The scale of hits and the rate of short ones are maximised with the truncation that
     the density has (the closed forms of the table ignore it and can lower the likelihood), one
     number at a time.
 

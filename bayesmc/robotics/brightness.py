@@ -40,10 +40,14 @@ class Ceiling:
         A brightness is not finite, the resolution is not positive, the origin not two finite
         numbers.
 
-    Notes ----- Between the centres of cells brightness is interpolated bilinearly; beyond the image
+    Notes
+    -----
+    Between the centres of cells brightness is interpolated bilinearly; beyond the image
     the ceiling goes on as it is at the edge.
 
-    References ---------- Dellaert, Burgard, Fox and Thrun (1999), Using the condensation algorithm
+    References
+    ----------
+    Dellaert, Burgard, Fox and Thrun (1999), Using the condensation algorithm
     for robust, vision-based mobile robot localization, CVPR.
 
     Examples

@@ -205,7 +205,9 @@ class OccupancyGrid:
 
         Shape (nx, ny), computed once; infinite everywhere on a map without obstacles.
 
-        References ---------- Maurer, Qi and Raghavan (2003), A linear time algorithm for computing
+        References
+        ----------
+        Maurer, Qi and Raghavan (2003), A linear time algorithm for computing
         exact Euclidean distance transforms, IEEE PAMI 25(2): what
         ``scipy.ndimage.distance_transform_edt`` runs.
         """

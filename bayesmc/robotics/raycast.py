@@ -54,11 +54,15 @@ def ray_cast(grid: OccupancyGrid, poses: Any, angles: Any, max_range: float) -> 
     ShapeError
         Poses without three components, or angles that do not fit them.
 
-    Notes ----- A ray jumps from cell to cell as in Amanatides and Woo's traversal, but over the
+    Notes
+    -----
+    A ray jumps from cell to cell as in Amanatides and Woo's traversal, but over the
     largest empty square that begins at its cell and extends in its direction; these are worked out
     once per map and direction.
 
-    References ---------- Amanatides and Woo (1987), A fast voxel traversal algorithm for ray
+    References
+    ----------
+    Amanatides and Woo (1987), A fast voxel traversal algorithm for ray
     tracing, Eurographics. Leaping over empty squares: Cohen and Sheffer (1994), Proximity clouds,
     The Visual Computer 11.
 
@@ -105,10 +109,14 @@ class RayTable:
     ParameterError
         ``max_range`` is not positive and finite, or ``headings`` is not a positive whole number.
 
-    Notes ----- Memory: two bytes per cell and heading, in steps of ``max_range / 65535``. A ray
+    Notes
+    -----
+    Memory: two bytes per cell and heading, in steps of ``max_range / 65535``. A ray
     from beyond the map is given ``max_range``.
 
-    References ---------- Walsh and Karaman (2018), CDDT: Fast approximate 2D ray casting for
+    References
+    ----------
+    Walsh and Karaman (2018), CDDT: Fast approximate 2D ray casting for
     accelerated localization, ICRA: its lookup table.
 
     Examples

@@ -20,12 +20,14 @@ from arviz_stats.base import array_stats
 
 import bayesmc as bmc
 from bayesmc import diagnostics
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.chains import ChainEngine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
 from bayesmc.errors import ConvergenceWarning, DensityError, InterruptWarning, UnsupportedError
 from bayesmc.network import Problem, pose
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results import ChainsPosterior
+from bayesmc.robotics import AndAngle
 
 KEEPS = ["draws", ["x", "s"], "summaries"]
 
@@ -522,6 +524,39 @@ def test_the_one_bad_scalar_of_many_is_found(fault: str) -> None:
             figure = float(array_stats.ess(x[..., 77], chain_axis=0, draw_axis=1, **options))
             expected = f"worth {figure:.0f} independent ones ({word}"
     assert expected in message
+
+
+HEADINGS = {
+    "sound": (lambda rng, x: x, False),
+    "a slow one": (lambda rng, x: slow(rng, 0.9), True),
+    "a chain apart": (lambda rng, x: x + 0.6 * LAST, True),
+}
+
+
+@pytest.mark.parametrize("case", HEADINGS)
+@pytest.mark.parametrize("turn", [1.0, np.pi - 0.3, -np.pi])
+def test_headings_are_judged_alike_wherever_they_point(case: str, turn: float) -> None:
+    """A cut through draws of an angle would make slow chains look fast: signs forget sooner than numbers."""
+    change, bad = HEADINGS[case]
+    rng = np.random.default_rng(3)
+    here = 0.3 * change(rng, rng.normal(size=(4, 1000)))
+
+    def judged(heading: np.ndarray, last: bmc.Distribution) -> list[str]:
+        net = bmc.BayesNet(plates={"p": 1})
+        net.add("x", last if last.event_shape else bmc.Normal(0.0, 1.0), plates="p")
+        x = np.stack([rng.normal(size=heading.shape), heading], axis=-1)[:, :, None]
+        drawn = {"x": x if last.event_shape else x[..., 1]}
+        posterior = ChainsPosterior(pose(net, {}), Autoregression(), drawn, heading.shape)
+        return [m.replace("x[0, 1]", "x[0]") for m in poor_mixing(posterior, frozenset())]
+
+    there = wrap_angle(here + turn)
+    of_pose = AndAngle(bmc.Normal(0.0, 1.0), bmc.VonMises(0.0, 1.0))
+    on_the_line = judged(here, bmc.Normal(0.0, 1.0))
+    assert bool(on_the_line) == bad
+    assert judged(there, of_pose) == on_the_line
+    if case == "a slow one" and turn > 2:  # negative control: what numbers of the line hide
+        assert "independent ones" in on_the_line[-1]
+        assert not any("independent ones" in m for m in judged(there, bmc.Normal(0.0, 1.0)))
 
 
 def test_members_apart_do_not_hide_an_ensemble_apart() -> None:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc.robotics import PoseNormal
 from tests.kernels.invariance import Model, mixture
 
 SHARES = [0.2, 0.3, 0.5]
@@ -118,6 +119,36 @@ def two() -> Model:
     net.add("label", bmc.Categorical(SHARES), plates="i")
     net.add("y", lambda a, s, label: bmc.Normal(a + CENTRES[label], s), plates="i")
     return Model(net, ("y",), ("a", "s"))
+
+
+def heading(prior: Any) -> Model:
+    """A number and an angle that share their data."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("h", prior)
+    net.add("label", bmc.Categorical(SHARES), plates="i")
+    net.add(
+        "y",
+        lambda a, h, label: bmc.Normal(a + np.sin(h) + CENTRES[label] * np.cos(h), 1.0),
+        plates="i",
+    )
+    return Model(net, ("y",), ("a", "h"))
+
+
+def robot() -> Model:
+    """A pose whose heading lies near the cut of the circle, and goes with its position."""
+    cov = [[0.5, 0.1, 0.2], [0.1, 0.4, -0.1], [0.2, -0.1, 0.5]]
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("x", PoseNormal([0.0, 1.0, np.pi - 0.2], cov))
+    net.add("label", bmc.Categorical(SHARES), plates="i")
+    net.add(
+        "y",
+        lambda x, label: bmc.Normal(
+            x[..., 0] + np.sin(x[..., 2]) + CENTRES[label] * x[..., 1] * np.cos(x[..., 2]), 1.0
+        ),
+        plates="i",
+    )
+    return Model(net, ("y",), ("x",))
 
 
 def labels() -> Model:

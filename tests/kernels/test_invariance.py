@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.kernels import slice
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate
@@ -33,6 +34,14 @@ class Tilted(Blanket):
 
     def log_density(self, values: Any, candidate: Any, members: Any = None) -> np.ndarray:
         return super().log_density(values, candidate, members) - np.log(candidate)
+
+
+class Unwound(Blanket):
+    """A density of angles beyond the cut, where they are not what its children read."""
+
+    def log_density(self, values: Any, candidate: Any, members: Any = None) -> np.ndarray:
+        now = self.current(values, members)
+        return super().log_density(values, now + wrap_angle(candidate - now), members)
 
 
 class Careless(Slice):
@@ -99,6 +108,11 @@ ONE_NODE = {
         models.moving_bounds("top"), sliced("top"), {"no Jacobian": sliced("top", of=Tilted)}, **WARM
     ),
     "circle": Case(models.circle(), sliced(), CARELESS, **WARM),
+    "angles read as numbers": Case(
+        models.of_x(bmc.VonMises(np.pi, 1.0), lambda x: bmc.Normal(np.exp(x) / 4, 1.0)),
+        sliced(), {**CARELESS, "beyond the cut": sliced(of=Unwound)}, **WARM,
+    ),
+    "pose": Case(models.robot(), sliced(), CARELESS, last_first),
     "integers": Case(models.integers(), sliced(), CARELESS, **WARM),
     "integers with bounds of parents": Case(models.moving_integers(), sliced(), CARELESS, **WARM),
     "components": Case(models.pairs(), sliced(), CARELESS, last_first),

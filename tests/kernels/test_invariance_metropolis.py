@@ -114,12 +114,28 @@ class OwnHalf(BlockWalk):
                 for moving, _ in super()._halves(rows, rng)]  # fmt: skip
 
 
+class OneWayRound(BlockWalk):
+    """Differences of angles all go the same way round, and are not as likely backwards."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        angles = self.steps.angles
+        self.steps.wrapped = lambda u: np.where(angles, np.remainder(u, 2 * np.pi), u)  # type: ignore[method-assign]
+
+
 def together(kind: type[BlockWalk] = BlockWalk, **options: Any) -> Make:
     return lambda target: kind(target, ("a", "x"), **options)
 
 
-def ensembles(kind: type[BlockWalk] = BlockWalk) -> Make:
-    return lambda target: kind(target, ("a", "s"), 4)
+def ensembles(kind: type[BlockWalk] = BlockWalk, names: tuple[str, ...] = ("a", "s")) -> Make:
+    return lambda target: kind(target, names, 4)
+
+
+def of_angles(model: Model, *names: str) -> Case:
+    """Ensembles on a model with an angle, whose mass lies on both sides of the cut at pi."""
+    fault = {"one way round": ensembles(OneWayRound, names)}
+    sizes = {"draws": 100, "replications": 8000}
+    return Case(model, ensembles(names=names), fault, members=4, warmup=30, sizes=sizes)
 
 
 SCALES = {"scale": [0.8, 0.4, 0.4, 0.4], "unconstrained": False, "adaptive": False}
@@ -134,6 +150,9 @@ SEVERAL = {
         models.two(), ensembles(), {"own half": ensembles(OwnHalf), "no volume": ensembles(NoBlockVolume)},
         members=4, warmup=30, sizes={"draws": 100, "replications": 8000},
     ),
+    "von Mises": of_angles(models.heading(bmc.VonMises(3.0, 3.0)), "a", "h"),
+    "wrapped normal": of_angles(models.heading(bmc.WrappedNormal(-3.0, 0.6)), "a", "h"),
+    "pose": of_angles(models.robot(), "x"),
 }  # fmt: skip
 
 

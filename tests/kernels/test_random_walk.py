@@ -16,12 +16,14 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.starting import start_states
 from bayesmc.kernels.adaptation import Steps, best_rate
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.network import pose
+from bayesmc.robotics import PoseNormal
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import target_of
 from bayesmc.testing import rank_test
@@ -362,6 +364,33 @@ def test_covariances_are_learnt() -> None:
     )
 
 
+@pytest.mark.parametrize("turn", [0.3, np.pi, 31 * np.pi - 0.1])
+def test_covariances_of_angles_do_not_see_the_cut(turn: float) -> None:
+    """What is learnt of positions and headings is the same once all headings are turned."""
+    rng = np.random.default_rng(0)
+    root = np.array([[1.0, 0.0, 0.0], [0.3, 0.5, 0.0], [0.2, -0.2, 0.3]])
+    drawn = [rng.normal(size=(8, 2, 3)) @ root.T for _ in range(400)]
+    drawn[0][..., 2] += 4.0  # the mean is found from far away, too
+
+    def learnt(turn: float, angles: bool) -> Any:
+        steps = Steps(3, angles=np.array([False, False, angles]))
+        wrapped = [
+            np.where([False, False, True], wrap_angle(u + [0.0, 0.0, turn]), u) for u in drawn
+        ]
+        memory = steps.start(wrapped[0])
+        for u in wrapped[1:]:
+            memory = steps.learnt(memory, u, np.full((8, 2), 0.3))
+        return steps.frozen(memory)
+
+    here, there, linear = learnt(0.0, True), learnt(turn, True), learnt(turn, False)
+    for what in ("cov", "factor", "log_scale"):
+        np.testing.assert_allclose(there[what], here[what], atol=1e-9)
+    assert np.abs(wrap_angle(there["mean"][:, 2] - here["mean"][:, 2] - turn)).max() < 1e-9
+    np.testing.assert_allclose(there["cov"], np.stack([root @ root.T] * 2), atol=0.15)
+    if turn > 3:  # negative control: numbers of the line have a deviation of half a turn
+        assert (linear["cov"][:, 2, 2] > 10 * here["cov"][:, 2, 2]).all()
+
+
 def test_arguments_are_left_alone() -> None:
     target = target_of(pose(simplex_net(), {"n": [2, 9, 1]}))
     kernel = AdaptiveWalk(Blanket(target, "w"))
@@ -372,3 +401,36 @@ def test_arguments_are_left_alone() -> None:
     kernel.step(values, memory, np.random.default_rng(1), True)
     assert all((values[k] == v).all() for k, v in before.items())
     assert memory["steps"]["count"] == count
+
+
+# ---- angles -------------------------------------------------------------------------------------
+
+
+def test_a_heading_of_which_nothing_is_known_walks_all_round() -> None:
+    net = bmc.BayesNet()
+    net.add("h", bmc.VonMises(0.0, 0.0))
+    net.add("y", lambda h: bmc.Normal(0.0 * h, 1.0))
+    draws, _ = chains_of(AdaptiveWalk, net, {"y": 0.0}, "h", warmup=2000)
+    turned = np.stack([np.cos(draws), np.sin(draws), np.cos(3 * draws)], axis=-1)
+    assert np.abs(z_scores(turned, 0.0)).max() < LIMIT
+    assert len(np.unique(draws)) > 0.3 * draws.size
+
+
+@pytest.mark.parametrize("unconstrained", [True, False])
+def test_a_pose_near_the_cut_is_walked_in_its_shape(unconstrained: bool) -> None:
+    """Deviations .1, 2 and .28 about a heading of pi."""
+    net = bmc.BayesNet()
+    net.add("pose", PoseNormal([1.0, 2.0, 3.0], scale_diag=[0.1, 2.0, 0.4]))
+    net.add("read", lambda pose: bmc.WrappedNormal(pose[..., 2], 0.4))
+
+    def walk(blanket: Blanket) -> AdaptiveWalk:
+        return AdaptiveWalk(blanket, unconstrained=unconstrained)
+
+    draws, rate = chains_of(walk, net, {"read": -3.0}, "pose", warmup=600)
+    heading = draws[..., 2]
+    assert (-np.pi <= heading).all() and (heading < np.pi).all()
+    figures = np.stack(
+        [draws[..., 0], (draws[..., 1] - 2.0) ** 2, np.cos(heading), np.sin(heading)], axis=-1
+    )
+    assert np.abs(z_scores(figures, [1.0, 4.0, -np.exp(-0.5 * 0.08), 0.0])).max() < LIMIT
+    assert 0.15 < rate.mean() < 0.5

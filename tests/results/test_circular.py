@@ -8,6 +8,8 @@ import pytest
 import bayesmc as bmc
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.metropolis_proposals import RandomWalk
+from bayesmc.network import pose
+from bayesmc.results import DrawsPosterior
 from bayesmc.robotics.pose_distributions import AndAngle, PoseNormal
 
 CENTRE = np.pi - 0.1  # draws fall on both sides of the cut at pi
@@ -215,6 +217,28 @@ def test_quantiles_of_an_angle_are_cut_opposite_its_mean() -> None:
     low, middle, high = posterior.quantile("heading", [0.05, 0.5, 0.95])
     assert low < middle < high
     assert high - low == pytest.approx(2 * 1.645 * 0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.5, np.pi, -2.0])
+@pytest.mark.parametrize("weighted", [False, True])
+def test_covariances_of_headings_do_not_see_the_cut(turn: float, weighted: bool) -> None:
+    """However draws of two poses are turned, they covary as they do on a line that is not cut."""
+    rng = np.random.default_rng(0)
+    line = rng.normal(size=(2, 500, 2, 3)) @ rng.normal(size=(3, 3)) * [1.0, 1.0, 0.2]
+    log_weights = rng.normal(size=(2, 500)) if weighted else None
+    turned = line + [0.0, 0.0, turn]
+    turned[..., 2] = wrap_angle(turned[..., 2])
+    problem = pose(robots(), READ)
+    posterior = DrawsPosterior(
+        problem, bmc.LikelihoodWeighting(1000), {"pose": turned}, (2, 500), log_weights
+    )
+    weights = None if log_weights is None else np.exp(log_weights).ravel()
+    expected = np.cov(line.reshape(1000, 6).T, aweights=weights, ddof=0)
+    np.testing.assert_allclose(posterior.cov("pose"), expected, atol=1e-12)
+    np.testing.assert_allclose(np.diag(expected)[[2, 5]], posterior.var("pose")[:, 2], rtol=0.3)
+    if abs(turn) == np.pi:  # negative control: as numbers of a line they are half a turn off
+        linear = np.cov(turned.reshape(1000, 6).T, aweights=weights, ddof=0)
+        assert linear[2, 2] > 5 * expected[2, 2]
 
 
 def test_labels_have_no_expectation() -> None:
