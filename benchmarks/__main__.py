@@ -8,6 +8,8 @@ from benchmarks import (
     bench_exact,
     bench_gaussian,
     bench_gibbs,
+    bench_robot_logs,
+    bench_robots,
     bench_scale,
     bench_time,
     bench_weighting,
@@ -29,3 +31,8 @@ if __name__ == "__main__":
     bench_gibbs.main(sys.argv[1:])
     print()
     bench_time.main(sys.argv[1:])
+    print()
+    bench_robots.main(sys.argv[1:])
+    print()
+    if "--short" not in sys.argv[1:]:  # many minutes
+        bench_robot_logs.main()

@@ -5,12 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bayesmc.robotics import FreeSpace, wrap
+import bayesmc as bmc
+from bayesmc.robotics import FreeSpace, PoseNormal, range_and_bearing, wrap
 from benchmarks import bench_robot_logs, bench_robots
 from benchmarks.floors import localization
 from examples.robot_logs import Log, first
 
 STEPS, PARTICLES, RUNS, LIMIT = 12, 400, 30, 5.0
+NEAR, START = (0.1, 0.1, 0.3), PoseNormal([0.0, 0.0, 3.0], scale_diag=[0.5, 0.5, 0.3])
+MARKS, RATES = np.array([[-4.0, -2.0], [3.0, 4.0], [-5.0, 0.0]]), np.array([1.0, 2.0, 3.0])
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +62,7 @@ def test_blocks_of_end_points_change_nothing(log: Log, monkeypatch: pytest.Monke
 def test_comparison_of_laws_sees_a_fault(
     log: Log, fault: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Negative controls: wheels that turn by 10 mrad a step, ranges off by 3 cm, noise of half as much variance again."""
+    """Negative controls: wheels that turn 10 mrad more, ranges 3 cm longer, half as much variance again."""
     other = log
     if fault == "turned":
         other = log._replace(motion=log.motion + [0.0, 0.0, 0.01])
@@ -83,6 +86,32 @@ def test_row_by_row_is_the_whole_log(log: Log) -> None:
     means = bench_robots.step_by_step(dbn, log, 300, 7)
     whole = bench_robots.run(dbn, log, 300, 7).mean("pose")
     np.testing.assert_allclose(np.array(means), whole, atol=1e-9)
+
+
+def test_answers_of_a_run_are_those_of_its_particles() -> None:
+    """Poses, bearings that are missing, counts in a plate: in several blocks, and in one."""
+    dbn = bmc.DynamicBayesNet(plates={"mark": 3})
+    dbn.add("pose", lambda pose_prev: PoseNormal(pose_prev, scale_diag=NEAR), initial=START)
+    dbn.add("seen", lambda pose: range_and_bearing(pose, MARKS, 0.5, 0.2), plates="mark")
+    dbn.add("count", lambda pose: bmc.Poisson(1.0 + np.abs(pose[..., 0]) * RATES), plates="mark")
+    seen = np.full((3, 3, 2), np.nan)
+    seen[:, 0] = [5.0, 0.5]
+    for particles in (700, 9_000):
+        engine = bmc.ParticleFilter(particles)
+        found = bmc.filter(dbn, {"seen": seen}, engine=engine, rng=0, keep="particles")
+        for name, angle in (("pose", 2), ("seen", 1), ("count", None)):
+            values, weights = found.particles(name).astype(float), found.weights
+            weights = weights.reshape(weights.shape + (1,) * (values.ndim - 2))
+            mean = (weights * values).sum(axis=1)
+            variance = (weights * (values - mean[:, None]) ** 2).sum(axis=1)
+            if angle is not None:
+                turned = (weights * np.exp(1j * values)).sum(axis=1)[..., angle]
+                mean[..., angle] = np.angle(turned)
+                variance[..., angle] = -2 * np.log(np.minimum(np.abs(turned), 1.0))
+            np.testing.assert_allclose(found.mean(name), mean, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(found.var(name), variance, rtol=1e-9, atol=1e-12)
+            plain = (weights * values).sum(axis=1)
+            assert angle is None or np.abs(found.mean(name) - plain).max() > 1e-4
 
 
 def test_figures_without_data_are_named(

@@ -311,15 +311,23 @@ class FreeSpace(Distribution):
 
     def cell_of(self, poses: Any) -> np.ndarray:
         """Which of its cells (their number in ``centers``) poses lie in, shape (...): -1 for none."""
-        cells = self.grid.cell_of(poses)
-        within = self.grid._within(cells) & np.isfinite(np.asarray(poses)).all(axis=-1)
-        ix, iy = np.moveaxis(np.where(within[..., None], cells, 0), -1, 0)
-        return np.where(within, self._lookup[ix, iy], -1)
+        poses = np.asarray(poses, dtype=float)
+        if poses.shape[-1:] != (3,):
+            raise ShapeError(f"FreeSpace: poses have shape {poses.shape}; give (..., 3)")
+        grid, (nx, ny) = self.grid, self.grid.shape
+        with np.errstate(invalid="ignore"):  # one axis after the other: in every filter's inner loop
+            x = (poses[..., 0] - grid.origin[0]) * (1 / grid.resolution)
+            y = (poses[..., 1] - grid.origin[1]) * (1 / grid.resolution)
+            within = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & np.isfinite(poses[..., 2])
+            if not within.all():
+                x, y = np.where(within, x, nx), np.where(within, y, ny)
+            return self._lookup[x.astype(np.intp), y.astype(np.intp)]
 
     @cached_property
     def _lookup(self) -> np.ndarray:
-        found = np.full(self.grid.shape, -1, dtype=np.intp)
-        found[self._inside] = np.arange(len(self._cells))
+        """Numbers of the cells, -1 for others; a last row and column stand for what is beyond the map."""
+        found = np.pad(np.full(self.grid.shape, -1, dtype=np.intp), (0, 1), constant_values=-1)
+        found[:-1, :-1][self._inside] = np.arange(len(self._cells))
         return found
 
     @property

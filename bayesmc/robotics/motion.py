@@ -104,9 +104,7 @@ class VelocityMotion(PoseDistribution):
         self.length, self.turn = self.v * self.dt, self.omega * self.dt
         squares = self.length**2, self.turn**2
         #: standard deviations of the arc's length, its turn and the last turn
-        self.scales = tuple(
-            _root_of(self.alphas[..., [2 * k, 2 * k + 1]], squares, self.floor[k]) for k in range(3)
-        )
+        self.scales = tuple(_root_of(self.alphas, 2 * k, squares, self.floor[k]) for k in range(3))
 
     @property
     def mean(self) -> np.ndarray:
@@ -253,14 +251,14 @@ class OdometryMotion(PoseDistribution):
     def _scales(self, least: float) -> tuple[np.ndarray, ...]:
         """Standard deviations of the first rotation, the translation and the last rotation."""
         clear = np.abs(self.translation) >= least
-        first = np.where(clear, self.rotation, 0.0)
-        last = wrap(self.turn - first)
-        distance, both = self.translation**2, first**2 + last**2
-        turning, moving = self.alphas[..., [0, 1]], self.alphas[..., [2, 3]]
+        first = _number(np.where(clear, self.rotation, 0.0))
+        last = _number(wrap(self.turn - first))
+        turned, distance = first * first, self.translation * self.translation
+        after, alphas, floor = last * last, self.alphas, self.floor
         return (
-            _root_of(turning, (first**2, distance), self.floor[0]),
-            _root_of(moving, (distance, both), self.floor[1]),
-            _root_of(turning, (last**2, distance), self.floor[2]),
+            _root_of(alphas, 0, (turned, distance), floor[0]),
+            _root_of(alphas, 2, (distance, turned + after), floor[1]),
+            _root_of(alphas, 0, (after, distance), floor[2]),
         )
 
     @property
@@ -341,9 +339,9 @@ def _polar(
 
 def _folded(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """First rotation within a quarter turn, translation with its sign, and the whole turn."""
-    dx, dy = motion[..., 0], motion[..., 1]
-    back = np.where(dx < 0, -1.0, 1.0)
-    return np.arctan2(back * dy, back * dx), back * np.hypot(dx, dy), wrap(motion[..., 2])
+    dx, dy, turn = (_number(motion[..., k]) for k in range(3))
+    back = _number(np.where(dx < 0, -1.0, 1.0))
+    return np.arctan2(back * dy, back * dx), back * np.hypot(dx, dy), _number(wrap(turn))
 
 
 def _noise(call: str, alphas: Any, count: int, floor: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -360,17 +358,25 @@ def _noise(call: str, alphas: Any, count: int, floor: Any) -> tuple[np.ndarray, 
 def _checked_noise(
     dist: Any, alphas: np.ndarray, floor: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    fine = ((alphas >= 0) & (alphas < np.inf)).all(axis=-1)
-    if not ((floor > 0) & (floor < np.inf)).all():
+    if not (floor.min() > 0 and floor.max() < np.inf):
         raise ParameterError(
             f"{type(dist).__name__}: floor must be positive and finite; got {floor.tolist()}"
         )
+    if alphas.size and alphas.min() >= 0 and alphas.max() < np.inf:
+        return alphas, floor
+    fine = ((alphas >= 0) & (alphas < np.inf)).all(axis=-1)
     return dist._check("alphas", alphas, fine, 0.0, "nonnegative and finite"), floor
 
 
-def _root_of(alphas: np.ndarray, squares: tuple[Any, Any], floor: Any) -> np.ndarray:
-    """Standard deviation: the root of ``a[0] squares[0] + a[1] squares[1]`` and the floor's square."""
-    return np.sqrt(alphas[..., 0] * squares[0] + alphas[..., 1] * squares[1] + floor**2)
+def _root_of(alphas: np.ndarray, at: int, squares: tuple[Any, Any], floor: Any) -> np.ndarray:
+    """Standard deviation: the root of ``a[at] squares[0] + a[at + 1] squares[1]`` and the floor's square."""
+    one, other = _number(alphas[..., at]), _number(alphas[..., at + 1])
+    return np.sqrt(one * squares[0] + other * squares[1] + floor * floor)
+
+
+def _number(value: np.ndarray) -> Any:
+    """The number that an array without axes holds, whose arithmetic is several times faster."""
+    return value[()]
 
 
 def _columns(position: Any, heading: Any) -> np.ndarray:

@@ -15,9 +15,6 @@ from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import circular_variance, table_variance
 
-#: columns up to which sums over particles are taken column by column
-_COLUMNS = 32
-
 
 class ParticleBelief:
     """Particles of one slice, as ``ParticleFilter.start`` and ``step`` give them.
@@ -290,6 +287,23 @@ def table_of_states(
     return _average(layout, cloud, node, hits.astype(float), 1)
 
 
+def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
+    """Mean and variance of a node that is not finite, circular ones of angles, in blocks of particles."""
+    if value.ndim == len(node.value_shape):
+        return value, np.zeros(node.value_shape)
+    if layout.apart:
+        return _moments_apart(layout, cloud, node, value)
+    if value.ndim == 1 and node.angles is None:
+        return _of_numbers(layout, cloud, value)
+    shape = value.shape[1:]
+    flat = value.reshape(len(value), -1)
+    angular = None
+    if node.angles is not None:
+        angular = np.broadcast_to(node.angles, shape).reshape(-1)
+    mean, variance = _of_columns(layout, cloud, flat, angular)
+    return mean.reshape(shape), variance.reshape(shape)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -300,57 +314,104 @@ def _mean(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -
         return value
     if node.angles is None:
         return _average(layout, cloud, node, value)
-    turned = np.arctan2(*_turn(layout, cloud, node, value))
-    return np.where(node.angles, turned, _average(layout, cloud, node, value))
+    return moments(layout, cloud, node, value)[0]
 
 
 def _variance(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> Any:
     if node.domain is not None:
         return table_variance(table_of_states(layout, cloud, node, value), _numbers(node))
-    if value.ndim == len(node.value_shape):
-        return np.zeros(node.value_shape)
-    off = value - _average(layout, cloud, node, value)
-    spread = _average(layout, cloud, node, off * off)
-    if node.angles is None:
-        return spread
-    return np.where(node.angles, circular_variance(*_turn(layout, cloud, node, value)), spread)
+    return moments(layout, cloud, node, value)[1]
 
 
-def moments(layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray) -> tuple[Any, Any]:
-    """Mean and variance of a node that is not finite, in blocks of particles."""
-    if layout.apart or value.ndim == len(node.value_shape) or node.angles is not None:
-        return _mean(layout, cloud, node, value), _variance(layout, cloud, node, value)
-    flat = value if value.ndim == 1 else value.reshape(len(value), -1)
-    first: Any = 0.0
-    second: Any = 0.0
-    centre: Any = None
-    for low in range(0, len(flat), layout.block):
-        part, weights = flat[low : low + layout.block], cloud.weights[low : low + layout.block]
+def _moments_apart(
+    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The same where plate elements have weights of their own."""
+    mean = _average(layout, cloud, node, value)
+    off = value - mean
+    off *= off
+    variance = _average(layout, cloud, node, off)
+    if node.angles is not None:
+        # angles of an event lie side by side on one axis, whatever its shape
+        turning, more = value[..., node.angles], 1 - len(node.event_shape)
+        cosine = _average(layout, cloud, node, np.cos(turning), more)
+        sine = _average(layout, cloud, node, np.sin(turning, out=turning), more)
+        mean[..., node.angles] = np.arctan2(sine, cosine)
+        variance[..., node.angles] = circular_variance(cosine, sine)
+    return mean, variance
+
+
+def _of_numbers(layout: Layout, cloud: Cloud, value: np.ndarray) -> tuple[Any, Any]:
+    """Of one number per particle."""
+    first = second = centre = 0.0
+    for low in range(0, len(value), layout.block):
+        part, weights = value[low : low + layout.block], cloud.weights[low : low + layout.block]
         here = weights.dot(part)
-        if centre is None:  # near the mean, so that the squares do not cancel
-            share = cloud.total if len(part) == len(flat) else weights.sum()
-            centre = here / share if share > 0 else part[0]
-        first = first + here
-        second = second + _squares_about(part, centre, weights)
-    mean, variance = first / cloud.total, second / cloud.total
-    if len(flat) > layout.block:
-        variance = np.maximum(variance - (mean - centre) ** 2, 0.0)
-    if value.ndim == 1:
-        return mean, variance
-    return mean.reshape(value.shape[1:]), variance.reshape(value.shape[1:])
-
-
-def _squares_about(part: np.ndarray, centre: Any, weights: np.ndarray) -> Any:
-    """Weighted sums of the squared distances of numbers, or of each of some columns, from a centre."""
-    if part.ndim == 1:
+        if low == 0:
+            centre = _near_the_mean(cloud, here, part, weights)
         off = part - centre
         off *= off
-        return weights.dot(off)
-    if part.shape[1] > _COLUMNS:
-        return weights.dot((part - centre) ** 2)
-    # column by column: broadcasting along a short last axis is ten times slower
-    columns = range(part.shape[1])
-    return np.array([_squares_about(part[:, j], centre[j], weights) for j in columns])
+        first, second = first + here, second + weights.dot(off)
+    return _settled(layout, cloud, len(value), first, second, centre)
+
+
+def _of_columns(
+    layout: Layout, cloud: Cloud, flat: np.ndarray, angular: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each column; ``angular`` says which are angles."""
+    first, second = np.zeros(flat.shape[1]), np.zeros(flat.shape[1])
+    centre = np.zeros((flat.shape[1], 1))
+    sine: Any = 0.0
+    cosine: Any = 0.0
+    for low in range(0, len(flat), layout.block):
+        part, weights = flat[low : low + layout.block], cloud.weights[low : low + layout.block]
+        # whatever goes along a short last axis is ten times slower
+        rows = np.array(part.T, dtype=float, order="C" if len(part) > part.shape[1] else "F")
+        here = rows.dot(weights)
+        if low == 0:
+            centre = _near_the_mean(cloud, here, part, weights)[:, None]
+        first += here
+        if angular is not None:
+            up, along = _turned(rows[angular], weights)
+            sine, cosine = sine + up, cosine + along
+        rows -= centre
+        rows *= rows
+        second += rows.dot(weights)
+    mean, variance = _settled(layout, cloud, len(flat), first, second, centre[:, 0])
+    if angular is not None:
+        sine, cosine = sine / cloud.total, cosine / cloud.total
+        mean[angular] = np.arctan2(sine, cosine)
+        variance[angular] = circular_variance(cosine, sine)
+    return mean, variance
+
+
+def _near_the_mean(cloud: Cloud, here: Any, part: np.ndarray, weights: np.ndarray) -> Any:
+    """The mean of the first block, about which squares do not cancel."""
+    share = cloud.total if len(part) == len(cloud.weights) else weights.sum()
+    return here / share if share > 0 else part[0]
+
+
+def _settled(
+    layout: Layout, cloud: Cloud, n: int, first: Any, second: Any, centre: Any
+) -> tuple[Any, Any]:
+    """Mean and variance of sums of values and of squares about a centre."""
+    mean, variance = first / cloud.total, second / cloud.total
+    if n > layout.block:
+        variance = np.maximum(variance - (mean - centre) ** 2, 0.0)
+    return mean, variance
+
+
+def _turned(angles: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted sums of the sines and cosines of rows of angles.
+
+    Both from the tangent of the half angle, since what costs is calling such functions.
+    """
+    tangent = np.tan(0.5 * angles)
+    square = tangent * tangent
+    weighted = weights / (1.0 + square)  # cos = (1 - t^2) / (1 + t^2), sin = 2 t / (1 + t^2)
+    tangent *= weighted
+    square *= weighted
+    return 2.0 * tangent.sum(axis=-1), weighted.sum(axis=-1) - square.sum(axis=-1)
 
 
 def _average(
@@ -371,13 +432,6 @@ def _average(
     weights = cloud.weights.transpose(0, *(1 + a for a in axes)).reshape(len(value), *shape, *tail)
     total = cloud.total.transpose(axes).reshape(*shape, *tail)
     return (weights * value).sum(axis=0) / total
-
-
-def _turn(
-    layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    sine = _average(layout, cloud, node, np.sin(value))
-    return sine, _average(layout, cloud, node, np.cos(value))
 
 
 def _values(node: CompiledNode, value: np.ndarray) -> np.ndarray:
