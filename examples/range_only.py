@@ -194,7 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Print errors and biases, and draw them."""
     options = picture.options(__doc__, arguments)
     name, drive = log(options.fast)
-    found = beliefs(drive, 500 if options.fast else 1000)
+    found = beliefs(drive, 500 if options.fast else 4000)
     readings = int((~np.isnan(drive.seen)).sum())
     print(f"Range only: {name}, {drive.times[-1]:.0f} s, {readings} ranges")
     print(f"  {'':28}{'RMSE, m':>8}   bias at {MIDDLE:.0f} m, m    growth, m/m")

@@ -21,7 +21,7 @@ from bayesmc.network.evidence import observe
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
 from bayesmc.network.store import unknown
-from bayesmc.shapes import first_index, owned
+from bayesmc.shapes import Shape, first_index, owned
 
 
 class Compiled(Protocol):
@@ -333,6 +333,7 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
                 f"inputs= gives {name!r}, which is not a declared input; the inputs are "
                 f"{list(template.inputs)}"
             )
+        _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
         if np.ndim(inputs[name]) == 0:
             raise EvidenceError(
                 f"inputs of {name!r}: {inputs[name]!r} has no axis for time; give one row per slice"
@@ -346,11 +347,35 @@ def _rows(name: str, value: Any) -> Any:
         shapes = {np.shape(v) for v in value if v is not None}
         if len(shapes) == 1 and (shape := shapes.pop()):
             return [np.full(shape, np.nan) if v is None else v for v in value]
+    _check_even(f"observations of {name!r}", value, "a missing row is None")
     if np.ndim(value) == 0:
         raise EvidenceError(
             f"observations of {name!r}: {value!r} has no axis for time; give one row per slice"
         )
     return value
+
+
+def _check_even(what: str, value: Any, hint: str) -> None:
+    """Refuse lists whose rows differ in shape, with the first row that does."""
+    if not isinstance(value, (list, tuple)) or not value:
+        return
+    shapes = [_shape_of(row) for row in value]
+    usual = max(set(shapes) - {None}, key=shapes.count, default=None)
+    for k, shape in enumerate(shapes):
+        if value[k] is None and usual in ((), None) and "missing" in hint:
+            continue  # numbers, some of them missing
+        if shape != usual:
+            got = "None" if value[k] is None else "ragged" if shape is None else f"of shape {shape}"
+            raise EvidenceError(
+                f"{what}: row {k} is {got}, others are of shape {usual}; rows are alike, and {hint}"
+            )
+
+
+def _shape_of(row: Any) -> Shape | None:
+    try:
+        return None if row is None else np.shape(row)
+    except ValueError:
+        return None
 
 
 def _count(

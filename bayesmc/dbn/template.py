@@ -14,7 +14,8 @@ import numpy as np
 from bayesmc.dbn.series import Series, read_series, unrolled
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
 from bayesmc.dbn.unroll import sampled, unroll
-from bayesmc.errors import DuplicateNodeError, ModelError, UnknownNodeError
+from bayesmc.distributions import Distribution
+from bayesmc.errors import DuplicateNodeError, ModelError, ParameterError, UnknownNodeError
 from bayesmc.network import BayesNet, Node
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import Parents
@@ -396,13 +397,27 @@ class DynamicBayesNet:
         later = self._read(name, add)
         first = None
         if isinstance(initial, (list, tuple, np.ndarray)):
-            first = self._read(
-                name, lambda net: net.table(name, (), initial, states, plates=plates)
-            )
+            try:
+                first = self._read(
+                    name, lambda net: net.table(name, (), initial, states, plates=plates)
+                )
+            except ParameterError as error:
+                error.add_note(
+                    "initial= is the density of slice 0: a list holds the probabilities of a finite node; "
+                    "for others give a distribution, such as Normal(0.0, 1.0)"
+                )
+                raise
         elif isinstance(initial, (int, float, np.number)):
             raise ModelError(
                 f"node {name!r}: initial={initial!r} is a number; give the distribution of slice 0, such as "
                 "Normal(0.0, 1.0), a function that returns one, or a list of probabilities"
+            )
+        elif (
+            initial is not None and not isinstance(initial, Distribution) and not callable(initial)
+        ):
+            raise ModelError(
+                f"node {name!r}: initial= is of type {type(initial).__name__}; give the distribution of slice "
+                "0, such as Normal(0.0, 1.0), a function that returns one, or a list of probabilities"
             )
         elif initial is not None:
             options: dict[str, Any] = {"vectorize": vectorize and callable(initial)}

@@ -75,9 +75,11 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     some = missing.any(axis=event) if event else missing
     every = missing.all(axis=event) if event else missing
     if (some & ~every).any():
+        at = first_index(missing & np.expand_dims(some & ~every, event))
         raise EvidenceError(
-            f"evidence on {node.name!r}: some components of one vector are missing, which is not "
-            "supported; split the vector into nodes of its parts, or leave the whole vector out"
+            f"evidence on {node.name!r}: of one vector the entry at {_index(at)} is missing and others are not, "
+            "which is not supported; split the vector into nodes of its parts, leave all of it out, or put in "
+            "what stands for no reading (of ranges: robotics.clean_ranges)"
         )
     if every.all() and array.size:
         return None
@@ -224,27 +226,38 @@ def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:
 def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray) -> None:
     event = tuple(range(len(node.plate_shape), stored.ndim))
     if stored.dtype.kind == "f":
-        finite = np.isfinite(stored)
-        bad = ~(finite.all(axis=event) if event else finite) & observed
+        bad = ~np.isfinite(stored) & np.expand_dims(observed, event)
         if bad.any():
             at = first_index(bad)
             raise EvidenceError(
-                f"evidence on {node.name!r} is {stored[at]}{_at(at)}; it must be finite"
+                f"evidence on {node.name!r} is {stored[at]:g}{_at(at)}; it must be finite"
             )
     if node.domain is not None or node.support is None:
         return
     if node.support.event_ndim not in (0, len(node.event_shape)):
         return
     inside = np.asarray(node.support.contains(stored))
-    if event and node.support.event_ndim == 0:  # an interval, for every component of a vector
-        inside = np.asarray(inside.all(axis=event))
-    outside = ~inside & observed
+    alone = (
+        bool(event) and node.support.event_ndim == 0
+    )  # an interval, for every component of a vector
+    outside = ~inside & (np.expand_dims(observed, event) if alone else observed)
     if outside.any():
         at = first_index(outside)
         raise EvidenceError(
-            f"evidence on {node.name!r} is {stored[at]}{_at(at)}, outside its support "
+            f"evidence on {node.name!r} is {_short(stored[at])}{_at(at)}, outside its support "
             f"({node.support.describe()})"
         )
+
+
+def _short(value: np.ndarray) -> str:
+    """A value in a line: of a long vector its least and largest number."""
+    if value.size <= 6:
+        return str(value)
+    return f"a vector of {value.size} numbers from {value.min():g} to {value.max():g}"
+
+
+def _index(at: Shape) -> str:
+    return str(at if len(at) > 1 else at[0])
 
 
 def _allowed(node: CompiledNode) -> str:

@@ -19,7 +19,7 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import as_float
 from bayesmc.distributions.support import Support, nonnegative, product
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ModelError, ParameterError, ShapeError
 from bayesmc.robotics.grid import OccupancyGrid
 from bayesmc.shapes import Shape, broadcast_shapes, read_only
 
@@ -65,7 +65,7 @@ class LikelihoodField:
     -----
     - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
     - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
-      all have.
+      all have. Where none of several poses is on the map, that is an error.
     - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
       end point within 0.001 cells of a border may count for the cell next to it.
     - The density is not normalised over ranges (Thrun et al., section 6.4); evidence computed with
@@ -166,6 +166,8 @@ class FieldScan(Distribution):
         A pose or an angle is not finite.
     ShapeError
         Poses do not have three components, or angles more than one axis.
+    ModelError
+        From ``log_prob``: none of several poses lies on the map.
     """
 
     parameter_ndim = {"pose": 1, "angles": 1}
@@ -322,8 +324,19 @@ class _Table:
             found = self._gather(turn.reshape(-1, 4), rows[:, part], rooms)
             np.add.reduce(found, axis=0, out=log[part], dtype=np.float32)
         if outside is not None:
+            if count > 1 and outside.all():
+                raise self._nowhere(rows)
             log[outside] = beams * self.field.log_random
         return log
+
+    def _nowhere(self, rows: np.ndarray) -> ModelError:
+        """None of several poses is on the map: lost beyond help, or never on it."""
+        left, right, bottom, top = self.field.grid.extent
+        return ModelError(
+            f"LikelihoodField: none of {rows.shape[1]} poses lies on the map, which spans x {left:g} to "
+            f"{right:g} and y {bottom:g} to {top:g} m; is the start given in the map's frame and in metres, "
+            "or has the motion led off the map?"
+        )
 
     def along(self, pose: np.ndarray, angles: np.ndarray, ranges: np.ndarray) -> np.ndarray:
         """Log densities at ``ranges`` (..., points) along each beam, shape (poses, beams, points)."""

@@ -14,6 +14,7 @@ from bayesmc.errors import (
     DuplicateNodeError,
     EvidenceError,
     ModelError,
+    ParameterError,
     PlateError,
     UnknownNodeError,
 )
@@ -277,6 +278,21 @@ def test_faults_name_the_node_and_the_remedy(fault: str) -> None:
         dbn.validate()
 
 
+@pytest.mark.parametrize(
+    ("initial", "error", "message"),
+    [
+        (np.array([1.0, 1.0, 0.0]), ParameterError, "the probabilities of a finite node"),
+        ({"mean": 0.0}, ModelError, "initial= is of type dict; give the distribution of slice 0"),
+    ],
+)
+def test_starts_that_are_no_densities(initial: Any, error: type[Exception], message: str) -> None:
+    dbn = bmc.DynamicBayesNet()
+    with pytest.raises(error) as caught:
+        dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=initial)
+    told = [str(caught.value), *getattr(caught.value, "__notes__", [])]
+    assert message in " ".join(told)
+
+
 BAD_DATA: dict[str, tuple[Callable[[bmc.DynamicBayesNet], Any], type[Exception], str]] = {
     "an input observed": (
         lambda d: bmc.filter(d, {"u": [1.0]}, inputs={"u": [1.0]}), EvidenceError,
@@ -286,6 +302,14 @@ BAD_DATA: dict[str, tuple[Callable[[bmc.DynamicBayesNet], Any], type[Exception],
     "no time": (
         lambda d: bmc.filter(d, {"x": 1.0}, inputs={"u": [0.0]}), EvidenceError,
         "'x': 1.0 has no axis for time",
+    ),
+    "ragged rows": (
+        lambda d: bmc.filter(d, {"x": [1.0, 2.0, [3.0, 4.0]]}, inputs={"u": [0.0] * 3}), EvidenceError,
+        r"observations of 'x': row 2 is of shape \(2,\), others are of shape \(\); .*a missing row is None",
+    ),
+    "an input that is None": (
+        lambda d: bmc.filter(d, {"x": [1.0, None]}, inputs={"u": [0.0, None]}), EvidenceError,
+        "inputs of 'u': row 1 is None, .*an input is known in every slice",
     ),
     "other lengths": (
         lambda d: bmc.filter(d, {"x": [1.0, 2.0]}, inputs={"u": [0.0]}), EvidenceError,

@@ -163,7 +163,7 @@ REFUSED = {
     ),
     "part of a vector": (
         {"v": [[1.0, np.nan], [0, 0], [0, 0]]},
-        r"evidence on 'v': some components of one vector are missing.*split the vector",
+        r"evidence on 'v': of one vector the entry at \(0, 1\) is missing.*split the vector",
     ),
 }
 

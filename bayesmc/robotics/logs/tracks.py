@@ -60,7 +60,7 @@ def keyframes(
     Raises
     ------
     ValueError
-        For a negative threshold or NaN.
+        For a negative threshold or NaN; at the end, where there were records and none was a scan.
 
     Examples
     --------
