@@ -19,7 +19,8 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support
 from bayesmc.errors import ParameterError, ShapeError
-from bayesmc.robotics.grid import FreeSpace
+from bayesmc.robotics.grid import FreeSpace, as_number
+from bayesmc.robotics.pose_distributions import POSES
 from bayesmc.shapes import Shape, read_only
 
 #: readings whose histogram is kept: the blocks of a cloud ask for the same one, one after the other
@@ -45,13 +46,15 @@ class SensorPoses:
     headings : int
         Parts of the circle.
     even : float
-        Probability that a pose is drawn from ``space`` instead, whatever the reading says: 0 to 1, and above
-        0 so that no pose is left out.
+        Probability that a pose is drawn from ``space`` instead, whatever the reading says: above 0, at most
+        1. Without it, poses in bins of no weight could never be drawn, and no weight would make up for that.
 
     Raises
     ------
     ParameterError
-        A spacing that is not positive, no heading, a probability outside 0..1.
+        A spacing that is not positive, no heading, a probability that is 0 or outside 0..1.
+    TypeError
+        ``space`` is no FreeSpace, or ``sensor`` cannot be called.
 
     References
     ----------
@@ -77,20 +80,32 @@ class SensorPoses:
     spacing: float = 0.5
     headings: int = 36
     even: float = 0.05
-    _kept: OrderedDict[bytes, AimedPoses] = field(
+    _kept: OrderedDict[tuple[Shape, bytes], AimedPoses] = field(
         default_factory=OrderedDict, init=False, repr=False
     )
 
     def __post_init__(self) -> None:
-        if not 0 < self.spacing < math.inf:
+        if not isinstance(self.space, FreeSpace):
+            raise TypeError(
+                f"SensorPoses: space must be a FreeSpace, such as FreeSpace(grid); got {self.space!r:.80}"
+            )
+        if not callable(self.sensor):
+            raise TypeError(
+                "SensorPoses: sensor must be a function of poses that returns a distribution, such as "
+                f"lambda pose: field.given(pose, angles); got {self.sensor!r:.80}"
+            )
+        if not 0 < as_number(self.spacing) < math.inf:
             raise ParameterError(
-                f"SensorPoses: spacing must be positive and finite; got {self.spacing}"
+                f"SensorPoses: spacing must be positive and finite; got {self.spacing!r:.80}"
             )
         whole = isinstance(self.headings, (int, np.integer)) and not isinstance(self.headings, bool)
         if not whole or self.headings < 1:
             raise ParameterError(f"SensorPoses: headings must be 1 or more; got {self.headings!r}")
-        if not 0 <= self.even <= 1:
-            raise ParameterError(f"SensorPoses: even must be between 0 and 1; got {self.even}")
+        if not 0 < as_number(self.even) <= 1:
+            raise ParameterError(
+                "SensorPoses: even must be above 0 (a proposal that leaves poses out gives wrong weights) "
+                f"and at most 1; got {self.even!r:.80}"
+            )
 
     @property
     def poses(self) -> np.ndarray:
@@ -111,7 +126,7 @@ class SensorPoses:
             The sensor has not one density for each pose, or there are several readings at once.
         """
         reading = np.asarray(reading, dtype=float)
-        key = reading.tobytes()
+        key = reading.shape, reading.tobytes()
         found = self._kept.get(key)
         if found is None:
             found = self._kept[key] = AimedPoses(self, self._weighed(reading))
@@ -162,7 +177,7 @@ class AimedPoses(Distribution):
 
     @property
     def support(self) -> Support:
-        return self.aim.space.support
+        return POSES
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         poses = self.aim.space._sample(rng, shape)

@@ -8,6 +8,7 @@ rays cast on a map or anything else, is not decided here.
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -18,7 +19,8 @@ from scipy import special
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import as_float
 from bayesmc.distributions.support import Support, nonnegative, product
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ConvergenceWarning, ParameterError, ShapeError
+from bayesmc.robotics.grid import as_number
 from bayesmc.shapes import Shape
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
@@ -70,14 +72,15 @@ class BeamModel:
 
     def __post_init__(self) -> None:
         for name in _PARTS:
-            _require(0 <= getattr(self, name) <= 1, self, name, "between 0 and 1")
+            _require(0 <= as_number(getattr(self, name)) <= 1, self, name, "between 0 and 1")
         total = sum(self.shares)
         if abs(total - 1) > 1e-6:
             raise ParameterError(
                 f"BeamModel: z_hit, z_short, z_max and z_rand must sum to 1; they sum to {total:.6g}"
             )
         for name in ("sigma_hit", "lambda_short", "max_range", "tempering"):
-            _require(0 < getattr(self, name) < math.inf, self, name, "positive and finite")
+            ok = 0 < as_number(getattr(self, name)) < math.inf
+            _require(ok, self, name, "positive and finite")
 
     @property
     def shares(self) -> tuple[float, float, float, float]:
@@ -109,11 +112,14 @@ class Beams(Distribution):
     ------
     ParameterError
         An expected range is negative or NaN.
+    TypeError
+        ``model`` is no BeamModel.
 
     Notes
     -----
     - A reading of ``max_range`` or above (infinite included) is the max reading, a negative one is
-      impossible, NaN is a beam that is left out (its factor is 1).
+      impossible, NaN is a beam that is left out (its factor is 1). Evidence of a net is finite, so put
+      scans through ``clean_ranges`` before they become a net's rows: it makes max readings of all these.
     - With ``tempering`` other than 1, ``log_prob`` is the tempered log density, which is not
       normalised; draws come from the density without the exponent.
 
@@ -136,7 +142,7 @@ class Beams(Distribution):
     parameter_ndim = {"expected": 1}
 
     def __init__(self, expected: Any, model: BeamModel) -> None:
-        expected = as_float(expected)
+        expected, model = as_float(expected), _as_model("Beams", model)
         if expected.ndim == 0:
             raise ShapeError("Beams: expected ranges are one number; give (..., beams)")
         self.batch_shape, self.event_shape = expected.shape[:-1], expected.shape[-1:]
@@ -191,12 +197,15 @@ class BeamFit(NamedTuple):
         Of the data (not tempered) under the model before each iteration and after the last; it
         never falls.
     converged : bool
-        Whether the last iteration gained less than the tolerance.
+        Whether the last iteration gained less than the tolerance, and no parameter ended at a bound.
+    at_bound : tuple of str
+        Parameters that the data would have smaller than they may be: ``"sigma_hit"``, ``"lambda_short"``.
     """
 
     model: BeamModel
     log_likelihood: np.ndarray
     converged: bool
+    at_bound: tuple[str, ...] = ()
 
 
 def fit_beams(
@@ -206,6 +215,7 @@ def fit_beams(
     *,
     iterations: int = 200,
     tolerance: float = 1e-7,
+    least_sigma: float = 1e-3,
 ) -> BeamFit:
     """The intrinsic parameters of greatest likelihood, learned from ranges by EM.
 
@@ -219,6 +229,9 @@ def fit_beams(
         At most so many.
     tolerance : float
         Gain in mean log likelihood per beam below which it has converged.
+    least_sigma : float
+        The least ``sigma_hit`` in m. Readings that equal what is expected, such as simulated ones without
+        noise, have no greatest likelihood: it grows without end as ``sigma_hit`` shrinks.
 
     Returns
     -------
@@ -227,12 +240,23 @@ def fit_beams(
     Raises
     ------
     ParameterError
-        An expected range is NaN or negative, or ``start`` gives some reading probability zero.
+        An expected range is NaN or negative, ``start`` gives some reading probability zero or has a
+        ``sigma_hit`` below ``least_sigma``, or that is not positive and finite.
     ShapeError
         The two arrays differ in shape, or there is no usable reading.
+    TypeError
+        ``start`` is no BeamModel.
+
+    Warns
+    -----
+    ConvergenceWarning
+        A parameter ended at its bound: see ``BeamFit.at_bound``.
 
     Notes
     -----
+    Short readings that are spread evenly, or are more the nearer to what is expected, have no rate above 0
+    that is best; ``lambda_short`` is kept at ``0.001 / max_range`` or more, which is even to a thousandth.
+
     The scale of hits and the rate of short ones are maximised with the truncation that
     the density has (the closed forms of the table ignore it and can lower the likelihood), one
     number at a time.
@@ -251,7 +275,8 @@ def fit_beams(
     >>> [round(share, 2) for share in fit.model.shares], round(fit.model.sigma_hit, 2)
     ([0.61, 0.19, 0.1, 0.1], 0.1)
     """
-    model = BeamModel() if start is None else start
+    model = BeamModel() if start is None else _as_model("fit_beams", start)
+    least = _least(model, least_sigma)
     z, expected = _pairs(ranges, expected, model)
     history: list[float] = []
     converged = False
@@ -271,8 +296,9 @@ def fit_beams(
         history.append(log)
         if converged or len(history) > iterations:
             break
-        model = _maximised(model, z, expected, share)
-    return BeamFit(model, np.array(history), converged)
+        model = _maximised(model, z, expected, share, least)
+    stuck = _at_bound(model, least, len(z))
+    return BeamFit(model, np.array(history), converged and not stuck, stuck)
 
 
 def clean_ranges(ranges: Any, max_range: float) -> np.ndarray:
@@ -283,11 +309,17 @@ def clean_ranges(ranges: Any, max_range: float) -> np.ndarray:
     ranges : array_like
         As logged, m; NaN, infinite, negative or beyond ``max_range`` where nothing was seen.
     max_range : float
+        In m, positive and finite.
 
     Returns
     -------
     ndarray
         In ``[0, max_range]``.
+
+    Raises
+    ------
+    ParameterError
+        ``max_range`` is not positive and finite.
 
     Examples
     --------
@@ -296,6 +328,10 @@ def clean_ranges(ranges: Any, max_range: float) -> np.ndarray:
     >>> clean_ranges([1.5, np.nan, 81.8, -1.0], 80.0).tolist()
     [1.5, 80.0, 80.0, 80.0]
     """
+    if not 0 < as_number(max_range) < math.inf:
+        raise ParameterError(
+            f"clean_ranges: max_range must be positive and finite; got {max_range!r:.80}"
+        )
     ranges = np.asarray(ranges, dtype=float)
     return np.where((ranges >= 0) & (ranges < max_range), ranges, max_range)
 
@@ -342,8 +378,47 @@ def _log(share: float) -> float:
     return math.log(share) if share > 0 else -math.inf
 
 
+class _Least(NamedTuple):
+    """What the scale and the rate may not fall below."""
+
+    sigma_hit: float
+    lambda_short: float
+
+
+def _least(start: BeamModel, sigma: float) -> _Least:
+    if not 0 < as_number(sigma) < math.inf:
+        raise ParameterError(
+            f"fit_beams: least_sigma must be positive and finite; got {sigma!r:.80}"
+        )
+    if start.sigma_hit < sigma:
+        raise ParameterError(
+            f"fit_beams: start has sigma_hit={start.sigma_hit:g}, below least_sigma={sigma:g}; give a "
+            "smaller least_sigma"
+        )
+    return _Least(float(sigma), min(1e-3 / start.max_range, start.lambda_short))
+
+
+def _at_bound(model: BeamModel, least: _Least, count: int) -> tuple[str, ...]:
+    """Parameters that ended at their bounds, and a warning about them."""
+    why = []
+    if model.sigma_hit <= least.sigma_hit * (1 + 1e-4):
+        why.append(
+            f"sigma_hit ended at least_sigma={least.sigma_hit:g} m: hits hardly differ from what is "
+            "expected; are these real readings, and is expected not made of them?"
+        )
+    # a rate of short readings that there are none of says nothing
+    if model.lambda_short <= least.lambda_short * (1 + 1e-4) and model.z_short * count > 1:
+        why.append(
+            f"lambda_short ended at {least.lambda_short:g} per m: short readings do not thin out along "
+            "the beam"
+        )
+    if why:
+        warnings.warn("fit_beams: " + "; ".join(why), ConvergenceWarning, stacklevel=3)
+    return tuple(part.split()[0] for part in why)
+
+
 def _maximised(
-    model: BeamModel, z: np.ndarray, expected: np.ndarray, share: np.ndarray
+    model: BeamModel, z: np.ndarray, expected: np.ndarray, share: np.ndarray, least: _Least
 ) -> BeamModel:
     """The M step: shares in closed form, scale and rate one at a time."""
     hit, short = share[0], share[1]
@@ -357,6 +432,7 @@ def _maximised(
     sigma = _improved(
         lambda s: float(hit[bells] @ _log_bell(z[bells], expected[bells], s, model.max_range)),
         model.sigma_hit,
+        least.sigma_hit,
     )
     exponentials = short > 0
     rate = _improved(
@@ -364,23 +440,28 @@ def _maximised(
             short[exponentials] @ _log_short(z[exponentials], expected[exponentials], r)
         ),
         model.lambda_short,
+        least.lambda_short,
     )
     return replace(model, **parts, sigma_hit=sigma, lambda_short=rate)
 
 
-def _improved(gain: Callable[[float], float], now: float) -> float:
-    """A positive number near ``now`` at which ``gain`` is greatest; ``now`` where none is greater."""
+def _improved(gain: Callable[[float], float], now: float, least: float) -> float:
+    """A number near ``now``, at least ``least``, of the greatest ``gain``; ``now`` where none is greater."""
     from scipy.optimize import minimize_scalar
 
+    low = max(-1.5, math.log(least / now))
     with np.errstate(all="ignore"):
         found = minimize_scalar(
             lambda log: -gain(now * math.exp(log)),
-            bounds=(-1.5, 1.5),
+            bounds=(low, 1.5),
             method="bounded",
             options={"xatol": 1e-6},
         )
-        other = now * math.exp(found.x)
-        return other if gain(other) > gain(now) else now
+        others = [now, max(now * math.exp(found.x), least)]
+        if low > -1.5:  # the search comes close to its ends and never there
+            others.append(least)
+        gains = [gain(other) for other in others]
+        return others[int(np.argmax(gains))]
 
 
 def _pairs(ranges: Any, expected: Any, model: BeamModel) -> tuple[np.ndarray, np.ndarray]:
@@ -402,6 +483,14 @@ def _pairs(ranges: Any, expected: Any, model: BeamModel) -> tuple[np.ndarray, np
             f"fit_beams: expected ranges must be nonnegative; got {expected[at]} at usable reading {at}"
         )
     return np.minimum(z, model.max_range), np.minimum(expected, model.max_range)
+
+
+def _as_model(call: str, model: Any) -> BeamModel:
+    if not isinstance(model, BeamModel):
+        raise TypeError(
+            f"{call}: give a BeamModel, such as BeamModel(max_range=8.0); got {model!r:.80}"
+        )
+    return model
 
 
 def _require(ok: Any, model: BeamModel, name: str, requirement: str) -> None:

@@ -20,7 +20,8 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import as_float
 from bayesmc.distributions.support import Support, nonnegative, product
 from bayesmc.errors import ModelError, ParameterError, ShapeError
-from bayesmc.robotics.grid import OccupancyGrid
+from bayesmc.robotics.grid import OccupancyGrid, as_grid, as_number
+from bayesmc.robotics.poses import check_radians
 from bayesmc.shapes import Shape, broadcast_shapes, read_only
 
 #: end points worked on at a time: more leave the cache, fewer cost calls
@@ -59,11 +60,14 @@ class LikelihoodField:
     Raises
     ------
     ParameterError
-        A parameter is out of range.
+        A parameter is out of range, or the mount's heading beyond a full turn (in degrees, most likely).
+    TypeError
+        ``grid`` is no OccupancyGrid.
 
     Notes
     -----
     - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
+      Evidence of a net is finite, so put scans through ``clean_ranges`` before they become a net's rows.
     - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
       all have. Where none of several poses is on the map, that is an error.
     - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
@@ -97,16 +101,19 @@ class LikelihoodField:
     tempering: float = 1.0
 
     def __post_init__(self) -> None:
+        as_grid("LikelihoodField", self.grid)
         for name in ("sigma", "max_range", "tempering"):
-            _require(0 < getattr(self, name) < math.inf, self, name, "positive and finite")
+            ok = 0 < as_number(getattr(self, name)) < math.inf
+            _require(ok, self, name, "positive and finite")
         for name in ("z_hit", "z_rand"):
-            _require(0 <= getattr(self, name) <= 1, self, name, "between 0 and 1")
+            _require(0 <= as_number(getattr(self, name)) <= 1, self, name, "between 0 and 1")
         total = self.z_hit + self.z_rand
         _require(0 < total <= 1 + 1e-9, self, "z_rand", "such that 0 < z_hit + z_rand <= 1")
-        mount = np.asarray(self.mount, dtype=float)
+        mount = [as_number(part) for part in self.mount] if np.ndim(self.mount) == 1 else []
         _require(
-            mount.shape == (3,) and np.isfinite(mount).all(), self, "mount", "three finite numbers"
+            len(mount) == 3 and np.isfinite(mount).all(), self, "mount", "three finite numbers"
         )
+        check_radians("LikelihoodField", "headings of a mount", np.array(mount[2:]))
 
     def given(self, pose: Any, angles: Any) -> FieldScan:
         """The scan of a laser with beams at ``angles``, from ``pose``.
@@ -122,6 +129,11 @@ class LikelihoodField:
         -------
         FieldScan
             ``batch_shape`` is that of the poses, ``event_shape`` is ``(beams,)``.
+
+        Raises
+        ------
+        ParameterError, ShapeError
+            As ``FieldScan``.
         """
         return FieldScan(self, pose, angles)
 
@@ -163,9 +175,9 @@ class FieldScan(Distribution):
     Raises
     ------
     ParameterError
-        A pose or an angle is not finite.
+        A pose or an angle is not finite, or an angle beyond a full turn (in degrees, most likely).
     ShapeError
-        Poses do not have three components, or angles more than one axis.
+        Poses do not have three components, angles more than one axis, or there is no beam.
     ModelError
         From ``log_prob``: none of several poses lies on the map.
     """
@@ -178,14 +190,15 @@ class FieldScan(Distribution):
             raise ShapeError(
                 f"FieldScan: poses have shape {pose.shape}; give (..., 3): x, y, heading"
             )
-        if angles.ndim != 1:
-            raise ShapeError(f"FieldScan: angles have shape {angles.shape}; give (beams,)")
+        if angles.ndim != 1 or not angles.size:
+            raise ShapeError(
+                f"FieldScan: angles have shape {angles.shape}; give (beams,), one beam or more"
+            )
         self.field, self.pose, self.angles = field, pose, angles
         self.batch_shape, self.event_shape = pose.shape[:-1], angles.shape
         if not math.isfinite(np.add.reduce(pose, axis=None)):  # cheaper than every element
             self.pose = self._check("pose", pose, np.isfinite(pose).all(axis=-1), 0.0, "finite")
-        if not math.isfinite(np.add.reduce(angles)):
-            raise ParameterError("FieldScan: angles must be finite")
+        check_radians("FieldScan", "angles", angles)
 
     @property
     def support(self) -> Support:

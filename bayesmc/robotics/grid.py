@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.support import Support, circle, interval, product
+from bayesmc.distributions.support import Support
 from bayesmc.errors import ModelError, ParameterError, ShapeError
+from bayesmc.robotics.pose_distributions import POSES
 from bayesmc.shapes import Shape, first_index, read_only
 
 _LOG_TURN = math.log(2 * math.pi)
@@ -261,6 +262,13 @@ class FreeSpace(Distribution):
         The map has no such cell.
     ParameterError
         ``clearance`` is negative or not finite, ``threshold`` not in (0, 1].
+    TypeError
+        ``grid`` is no OccupancyGrid.
+
+    Notes
+    -----
+    Its support is that of every distribution of poses, so that it mixes with motion models (a robot that may
+    have been carried away); beyond free space the density is zero.
 
     References
     ----------
@@ -282,12 +290,13 @@ class FreeSpace(Distribution):
     def __init__(
         self, grid: OccupancyGrid, clearance: float = 0.0, threshold: float | None = None
     ) -> None:
+        grid = as_grid("FreeSpace", grid)
         level = grid.threshold if threshold is None else threshold
-        if not (np.ndim(level) == 0 and 0 < level <= 1):
-            raise ParameterError(f"FreeSpace: threshold must be in (0, 1]; got {threshold!r}")
-        if not (np.ndim(clearance) == 0 and 0 <= clearance < math.inf):
+        if not 0 < as_number(level) <= 1:
+            raise ParameterError(f"FreeSpace: threshold must be in (0, 1]; got {threshold!r:.80}")
+        if not 0 <= as_number(clearance) < math.inf:
             raise ParameterError(
-                f"FreeSpace: clearance must be nonnegative and finite; got {clearance}"
+                f"FreeSpace: clearance must be nonnegative and finite; got {clearance!r:.80}"
             )
         inside = grid.free(level)
         if clearance:
@@ -315,7 +324,9 @@ class FreeSpace(Distribution):
         if poses.shape[-1:] != (3,):
             raise ShapeError(f"FreeSpace: poses have shape {poses.shape}; give (..., 3)")
         grid, (nx, ny) = self.grid, self.grid.shape
-        with np.errstate(invalid="ignore"):  # one axis after the other: in every filter's inner loop
+        with np.errstate(
+            invalid="ignore"
+        ):  # one axis after the other: in every filter's inner loop
             x = (poses[..., 0] - grid.origin[0]) * (1 / grid.resolution)
             y = (poses[..., 1] - grid.origin[1]) * (1 / grid.resolution)
             within = (x >= 0) & (x < nx) & (y >= 0) & (y < ny) & np.isfinite(poses[..., 2])
@@ -332,8 +343,7 @@ class FreeSpace(Distribution):
 
     @property
     def support(self) -> Support:
-        left, right, bottom, top = self.grid.extent
-        return product([(interval(left, right), 0), (interval(bottom, top), 0), (circle, 0)])
+        return POSES
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         cells = self._cells[rng.integers(len(self._cells), size=shape)]
@@ -351,6 +361,27 @@ class FreeSpace(Distribution):
         if x.shape[-1:] != (3,):
             raise ShapeError(f"FreeSpace.log_prob: values have shape {x.shape}, not (..., 3)")
         return np.where(self.cell_of(x) >= 0, -math.log(self.area) - _LOG_TURN, -np.inf)
+
+
+def as_grid(call: str, grid: Any) -> OccupancyGrid:
+    """The grid, or an error that names the call."""
+    if not isinstance(grid, OccupancyGrid):
+        found = (
+            f"an array of shape {grid.shape}" if isinstance(grid, np.ndarray) else f"{grid!r:.80}"
+        )
+        raise TypeError(
+            f"{call}: give an OccupancyGrid, such as OccupancyGrid(array, 0.05) or read_map(path); got "
+            f"{found}"
+        )
+    return grid
+
+
+def as_number(value: Any) -> float:
+    """A single number as a float; NaN for anything else, text included."""
+    try:
+        return math.nan if isinstance(value, (str, bytes)) or np.ndim(value) else float(value)
+    except (TypeError, ValueError):
+        return math.nan
 
 
 # ---- private ------------------------------------------------------------------------------------

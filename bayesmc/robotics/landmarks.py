@@ -28,7 +28,7 @@ from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.plates import PlateArray
 from bayesmc.robotics.pose_distributions import AndAngle
-from bayesmc.robotics.poses import as_points, as_poses, turned_back
+from bayesmc.robotics.poses import as_points, as_poses, check_leading, turned_back
 
 
 def range_to(pose: Any, landmark: Any) -> np.ndarray:
@@ -49,7 +49,7 @@ def range_to(pose: Any, landmark: Any) -> np.ndarray:
     Raises
     ------
     ShapeError
-        The last axes are not those of poses and points.
+        The last axes are not those of poses and points, or the others do not broadcast.
 
     References
     ----------
@@ -84,7 +84,7 @@ def bearing_to(pose: Any, landmark: Any) -> np.ndarray:
     Raises
     ------
     ShapeError
-        The last axes are not those of poses and points.
+        The last axes are not those of poses and points, or the others do not broadcast.
 
     References
     ----------
@@ -370,6 +370,7 @@ def _offset(call: str, pose: Any, landmark: Any) -> tuple[np.ndarray, np.ndarray
             f"{call}: a pose has the components x, y, heading on its last axis, a position x, y; got shape "
             f"{pose.shape}"
         )
+    check_leading(call, pose, landmark)
     return landmark[..., 0] - pose[..., 0], landmark[..., 1] - pose[..., 1]
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.errors import FileFormatError, ParameterError, UnsupportedError, missing_extra
-from bayesmc.robotics.grid import OccupancyGrid
+from bayesmc.robotics.grid import OccupancyGrid, as_grid
 
 _MODES = ("trinary", "scale", "raw")
 _FREE, _UNKNOWN, _OCCUPIED = 254, 205, 0  # grey of trinary maps, as map_saver writes them
@@ -123,9 +123,12 @@ def write_map(grid: OccupancyGrid, path: Any, *, mode: str = "trinary") -> Path:
     ------
     ParameterError
         The mode is not known, or ``path`` is that of an image.
+    TypeError
+        ``grid`` is no OccupancyGrid.
     MissingExtraError
         Pillow or PyYAML is not installed.
     """
+    grid = as_grid("write_map", grid)
     yaml, image = _yaml(), _pillow()
     path = Path(path)
     if mode not in _MODES:

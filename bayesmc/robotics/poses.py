@@ -20,6 +20,9 @@ from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.shapes import Shape, broadcast_shapes
 
+#: radians, with some for rounding
+_FULL_TURN = 2 * np.pi + 1e-3
+
 
 def compose(a: Any, b: Any) -> np.ndarray:
     """The pose ``b``, given in the frame of ``a``, in the frame that ``a`` is given in.
@@ -36,7 +39,7 @@ def compose(a: Any, b: Any) -> np.ndarray:
     Raises
     ------
     ShapeError
-        A pose has not three components.
+        A pose has not three components, or leading axes do not broadcast.
 
     References
     ----------
@@ -54,6 +57,7 @@ def compose(a: Any, b: Any) -> np.ndarray:
     [1.0, 1.0, -3.142]
     """
     a, b = as_poses("compose", a), as_poses("compose", b)
+    check_leading("compose", a, b)
     sine, cosine = sin_cos(a[..., 2])
     x = a[..., 0] + (cosine * b[..., 0] - sine * b[..., 1])
     y = a[..., 1] + (sine * b[..., 0] + cosine * b[..., 1])
@@ -108,6 +112,7 @@ def between(a: Any, b: Any) -> np.ndarray:
     [2.0, 0.0, 1.571]
     """
     a, b = as_poses("between", a), as_poses("between", b)
+    check_leading("between", a, b)
     sine, cosine = sin_cos(a[..., 2])
     dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
     ahead, left = cosine * dx + sine * dy, cosine * dy - sine * dx
@@ -136,6 +141,7 @@ def transform(pose: Any, points: Any) -> np.ndarray:
     [[1.0, 2.0], [0.0, 1.0]]
     """
     pose, points = as_poses("transform", pose), as_points("transform", points)
+    check_leading("transform", pose, points)
     sine, cosine = sin_cos(pose[..., 2])
     px, py = points[..., 0], points[..., 1]
     x, y = pose[..., 0] + (cosine * px - sine * py), pose[..., 1] + (sine * px + cosine * py)
@@ -234,6 +240,7 @@ def mean_pose(poses: Any, weights: Any = None, axis: int = 0) -> np.ndarray:
     ParameterError
         No weight is positive, or one is negative or not finite.
     ShapeError
+        There are no poses along ``axis``, they have not three components, or weights do not fit them.
 
     References
     ----------
@@ -253,6 +260,8 @@ def mean_pose(poses: Any, weights: Any = None, axis: int = 0) -> np.ndarray:
         raise ShapeError("mean_pose: one pose alone has no axis to average over; give (n, 3)")
     lead = poses.shape[:-1]
     axis = range(len(lead))[axis]
+    if not lead[axis]:
+        raise ShapeError(f"mean_pose: poses of shape {poses.shape} have no entry along axis {axis}")
     share = _shares(lead, weights, axis)[..., None]
     sine, cosine = sin_cos(poses[..., 2])
     parts = np.stack([poses[..., 0], poses[..., 1], sine, cosine], axis=-1)
@@ -274,6 +283,11 @@ def pose_errors(estimate: Any, truth: Any) -> tuple[np.ndarray, np.ndarray]:
     heading : ndarray, shape (...)
         From the true heading to the estimated one, in rad, in ``[-pi, pi)``.
 
+    Raises
+    ------
+    ShapeError
+        A pose has not three components, or leading axes do not broadcast.
+
     Examples
     --------
     >>> from bayesmc.robotics.poses import pose_errors
@@ -282,6 +296,7 @@ def pose_errors(estimate: Any, truth: Any) -> tuple[np.ndarray, np.ndarray]:
     (5.0, -0.083)
     """
     estimate, truth = as_poses("pose_errors", estimate), as_poses("pose_errors", truth)
+    check_leading("pose_errors", estimate, truth)
     off = estimate - truth
     return np.hypot(off[..., 0], off[..., 1]), wrap_angle(off[..., 2])
 
@@ -304,6 +319,43 @@ def as_points(call: str, points: Any) -> np.ndarray:
             f"{call}: a point has the components x, y on its last axis; got shape {points.shape}"
         )
     return points
+
+
+def check_leading(call: str, a: np.ndarray, b: np.ndarray) -> None:
+    """Nothing, where all axes but the last broadcast.
+
+    Raises
+    ------
+    ShapeError
+        Where they do not; it names the call.
+    """
+    if a.ndim > 1 and b.ndim > 1 and a.shape[:-1] != b.shape[:-1]:
+        try:
+            broadcast_shapes(a.shape[:-1], b.shape[:-1])
+        except ValueError:
+            raise ShapeError(
+                f"{call}: arrays of shape {a.shape} and {b.shape} do not fit; their leading axes must "
+                "broadcast"
+            ) from None
+
+
+def check_radians(call: str, name: str, angles: np.ndarray) -> None:
+    """Nothing, where angles are finite and none is beyond a full turn: a sensor's are not.
+
+    Raises
+    ------
+    ParameterError
+        Degrees, most likely; it names the call.
+    """
+    reach = float(max(angles.max(), -angles.min())) if angles.size else 0.0
+    if not reach <= _FULL_TURN:  # NaN fails as well
+        at = int(np.argmax(~(np.abs(angles) <= _FULL_TURN)))
+        if not np.isfinite(angles.flat[at]):
+            raise ParameterError(f"{call}: {name} must be finite; got {angles.flat[at]}")
+        raise ParameterError(
+            f"{call}: {name} are in radians; got {angles.flat[at]:g}, more than a full turn; of degrees give "
+            "np.deg2rad(...)"
+        )
 
 
 def joined_pose(x: Any, y: Any, heading: Any) -> np.ndarray:
@@ -332,7 +384,7 @@ def turned_back(heading: np.ndarray) -> np.ndarray:
 def _shares(lead: Shape, weights: Any, axis: int) -> np.ndarray:
     """Weights that sum to one along an axis."""
     if weights is None:
-        return np.full(lead, 1.0 / max(lead[axis], 1))
+        return np.full(lead, 1.0 / lead[axis])
     weights = as_float(weights)
     if weights.shape == (lead[axis],):
         weights = weights.reshape([-1 if k == axis else 1 for k in range(len(lead))])

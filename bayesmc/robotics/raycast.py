@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
-from bayesmc.robotics.grid import OccupancyGrid
+from bayesmc.robotics.grid import OccupancyGrid, as_grid, as_number
 from bayesmc.shapes import Shape, broadcast_shapes, first_index
 
 #: rays that are begun at a time: many enough for few calls, few enough for their arrays to stay in cache
@@ -53,6 +53,8 @@ def ray_cast(grid: OccupancyGrid, poses: Any, angles: Any, max_range: float) -> 
         A pose or an angle is not finite, or ``max_range`` is not positive and finite.
     ShapeError
         Poses without three components, or angles that do not fit them.
+    TypeError
+        ``grid`` is no OccupancyGrid.
 
     Notes
     -----
@@ -75,7 +77,7 @@ def ray_cast(grid: OccupancyGrid, poses: Any, angles: Any, max_range: float) -> 
     >>> ray_cast(room, [1.1, 1.1, 0.0], np.deg2rad([-90.0, 0.0, 45.0]), 10.0).round(4).tolist()
     [1.0, 3.0, 1.4142]
     """
-    max_range = _reach(max_range)
+    grid, max_range = as_grid("ray_cast", grid), _reach(max_range)
     poses, angles = _checked(poses, angles)
     heading = poses[..., 2:] + angles
     shape = heading.shape
@@ -108,6 +110,8 @@ class RayTable:
     ------
     ParameterError
         ``max_range`` is not positive and finite, or ``headings`` is not a positive whole number.
+    TypeError
+        ``grid`` is no OccupancyGrid.
 
     Notes
     -----
@@ -136,6 +140,7 @@ class RayTable:
     _known: np.ndarray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
+        as_grid("RayTable", self.grid)
         _reach(self.max_range)
         if not (isinstance(self.headings, (int, np.integer)) and self.headings > 0):
             raise ParameterError(
@@ -295,10 +300,7 @@ def _arrive(rays: _Rays, shape: Shape, found: np.ndarray) -> None:
 
 
 def _reach(max_range: Any) -> float:
-    try:
-        reach = float(max_range)
-    except (TypeError, ValueError):
-        reach = math.nan
+    reach = as_number(max_range)
     if not 0 < reach < math.inf:
         raise ParameterError(
             f"ray casting: max_range must be positive and finite; got {max_range!r:.80}"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ConvergenceWarning, ParameterError, ShapeError
 from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges, fit_beams
 
 END = 8.0
@@ -240,6 +240,55 @@ def test_shares_of_zero_stay():
     ranges, expected = planted(2_000, 4)
     start = BeamModel(0.5, 0.0, 0.2, 0.3, max_range=END)
     assert fit_beams(ranges, expected, start).model.z_short == 0.0
+
+
+def test_readings_that_are_what_is_expected_have_a_least_scale():
+    expected = np.random.default_rng(0).uniform(1.0, 7.0, 300)
+    for options, least in (({}, 1e-3), ({"least_sigma": 0.02}, 0.02)):
+        with pytest.warns(ConvergenceWarning, match=f"sigma_hit ended at least_sigma={least:g} m"):
+            fit = fit_beams(expected, expected, BeamModel(max_range=END), **options)
+        assert fit.model.sigma_hit == least and fit.at_bound == ("sigma_hit",)
+        assert not fit.converged and (np.diff(fit.log_likelihood) >= 0).all()
+    noisy = Beams(expected, BeamModel(sigma_hit=0.05, max_range=END)).sample(1)
+    found = fit_beams(noisy, expected, BeamModel(max_range=END), least_sigma=0.01)
+    assert found.model == fit_beams(noisy, expected, BeamModel(max_range=END)).model
+    assert found.at_bound == () and found.converged
+
+
+def test_short_readings_that_do_not_thin_out_are_reported():
+    rng = np.random.default_rng(0)
+    expected = rng.uniform(1.0, 7.0, 2000)
+    hit = np.clip(expected + 0.1 * rng.normal(size=2000), 0.0, END)
+    ranges = np.where(rng.random(2000) < 0.4, expected * rng.random(2000) ** 0.7, hit)
+    with pytest.warns(ConvergenceWarning, match="lambda_short ended at 0.000125 per m"):
+        fit = fit_beams(ranges, expected, BeamModel(max_range=END))
+    assert fit.at_bound == ("lambda_short",) and not fit.converged
+    assert fit.model.z_short == pytest.approx(0.4, abs=0.05)
+
+
+def test_least_scales_that_make_no_sense():
+    for least in (0.0, NAN, "a"):
+        with pytest.raises(ParameterError, match="least_sigma must be positive"):
+            fit_beams([1.0], [1.0], least_sigma=least)
+    with pytest.raises(ParameterError, match="sigma_hit=0.2, below least_sigma=0.5"):
+        fit_beams([1.0], [1.0], least_sigma=0.5)
+
+
+def test_wrong_objects_are_named():
+    with pytest.raises(TypeError, match=r"Beams: give a BeamModel, such as .*; got 8.0"):
+        Beams([1.0], 8.0)
+    with pytest.raises(TypeError, match="fit_beams: give a BeamModel"):
+        fit_beams([1.0], [1.0], 8.0)
+    with pytest.raises(ParameterError, match="sigma_hit must be positive and finite; got 'a'"):
+        BeamModel(sigma_hit="a")
+    with pytest.raises(ParameterError, match="z_hit must be between 0 and 1; got '1'"):
+        BeamModel(z_hit="1")
+
+
+@pytest.mark.parametrize("reach", [0.0, -1.0, NAN, np.inf, "a", None])
+def test_clean_ranges_of_no_reach(reach: Any):
+    with pytest.raises(ParameterError, match="clean_ranges: max_range must be positive and finite"):
+        clean_ranges([1.0, 2.0], reach)
 
 
 def test_bad_data():

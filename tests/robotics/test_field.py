@@ -14,7 +14,7 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.errors import ModelError, ParameterError, ShapeError
 from bayesmc.robotics import field as field_module
 from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.robotics.field import LikelihoodField
@@ -128,11 +128,56 @@ def test_no_returns_say_nothing():
 def test_robots_beyond_the_map():
     field = standard()
     beyond = np.array([[-1.2, 0.0, 0.0], [1e12, 0.0, 1.0], [0.0, -1e300, 0.0]])
-    log = field.given(beyond, ANGLES).log_prob(np.ones(11))
-    np.testing.assert_allclose(log, 11 * np.log(0.2 / REACH))
+    one_on_it = np.array([*beyond, [1.0, 0.0, 0.0]])
+    log = field.given(one_on_it, ANGLES).log_prob(np.ones(11))
+    np.testing.assert_allclose(log[:3], 11 * np.log(0.2 / REACH))
+    assert log[3] == field.given(one_on_it[3], ANGLES).log_prob(np.ones(11)) != log[0]
     assert field.log_random == pytest.approx(np.log(0.2 / REACH))
     sure = standard(z_rand=0.0, z_hit=1.0)
-    assert (sure.given(beyond, ANGLES).log_prob(np.ones(11)) == -np.inf).all()
+    assert (sure.given(one_on_it, ANGLES).log_prob(np.ones(11))[:3] == -np.inf).all()
+    for alone in beyond:
+        log = field.given(alone, ANGLES).log_prob(np.ones(11))
+        assert log == pytest.approx(11 * np.log(0.2 / REACH))
+
+
+def test_clouds_beyond_the_map():
+    beyond = np.array([[-1.2, 0.0, 0.0], [1e12, 0.0, 1.0], [0.0, -1e300, 0.0]])
+    with pytest.raises(
+        ModelError, match="none of 3 poses lies on the map, which spans x -1 to 7 and"
+    ):
+        standard().given(beyond, ANGLES).log_prob(np.ones(11))
+
+
+@pytest.mark.parametrize("angles", [[-90.0, 0.0, 90.0], [0.0, 359.0], [0.0, 7.0]])
+def test_angles_in_degrees(angles: list):
+    with pytest.raises(ParameterError, match=r"angles are in radians; got .*np\.deg2rad"):
+        standard().given([1.0, 0.0, 0.0], angles)
+    around = np.linspace(0.0, 2 * np.pi, 9)
+    assert standard().given([1.0, 0.0, 0.0], around).event_shape == (9,)
+
+
+def test_mounts_turned_in_degrees():
+    with pytest.raises(ParameterError, match=r"headings of a mount are in radians; got 180"):
+        standard(mount=(0.1, 0.0, 180.0))
+    assert standard(mount=(90.0, 0.0, -np.pi)).mount[0] == 90.0
+
+
+def test_a_scan_has_beams():
+    with pytest.raises(
+        ShapeError, match=r"angles have shape \(0,\); give \(beams,\), one beam or more"
+    ):
+        standard().given([1.0, 0.0, 0.0], [])
+
+
+def test_wrong_objects_are_named():
+    with pytest.raises(
+        TypeError, match=r"LikelihoodField: give an OccupancyGrid.* of shape \(3, 3\)"
+    ):
+        LikelihoodField(np.zeros((3, 3)))
+    for options in ({"sigma": "a"}, {"z_hit": "a"}, {"mount": "abc"}, {"mount": ("a", 0.0, 0.0)}):
+        ((name, _),) = options.items()
+        with pytest.raises(ParameterError, match=f"LikelihoodField: {name} must be"):
+            standard(**options)
 
 
 def test_maps_without_obstacles():

@@ -253,7 +253,7 @@ def test_unseen_rows_cost_nothing() -> None:
     assert found.log_marginal_likelihood == 0.0
     half = nothing.copy()
     half[0, 2, 0] = 1.0
-    with pytest.raises(bmc.errors.EvidenceError, match="some components"):
+    with pytest.raises(bmc.errors.EvidenceError, match="is missing and others are not"):
         bmc.filter(dbn, {"z": half}, engine=bmc.ParticleFilter(500), rng=0)
 
 
@@ -360,3 +360,11 @@ def test_one_declaration_runs_by_extended_kalman_and_particle_filter(kind: str) 
         assert kalman.log_marginal_likelihood == pytest.approx(
             particles.log_marginal_likelihood, abs=2.0
         )
+
+
+@pytest.mark.parametrize("call", [range_to, bearing_to])
+def test_landmarks_that_do_not_broadcast_are_named(call: Any) -> None:
+    with pytest.raises(
+        ShapeError, match=rf"{call.__name__}: arrays of shape \(4, 3\) and \(5, 2\)"
+    ):
+        call(np.zeros((4, 3)), np.zeros((5, 2)))

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from bayesmc.errors import FileFormatError, LogWarning, ShapeError
+from bayesmc.errors import FileFormatError, LogWarning, ParameterError, ShapeError
 from bayesmc.robotics.logs import (
     MAX_RANGE,
     UNKNOWN_SUBJECT,
@@ -227,6 +227,59 @@ class TestWriting:
         with pytest.raises(ValueError, match="without blanks"):
             write_carmen(path, [good], host="my robot")
         assert path.read_text() == "precious"
+
+    @pytest.mark.parametrize(
+        ("times", "why"),
+        [
+            ([0.0, 2.0, 1.0, 3.0], "record 2 .*: time runs backwards by 1 s"),
+            ([0.0, 1e6, 1.0], "record 1 .*: time leaps ahead by 999999 s"),
+            ([1e6, 1.0, 2.0], "record 0 .*: time leaps ahead"),
+            ([], "there are no records"),
+        ],
+    )
+    def test_what_the_reader_would_refuse_is_not_written(self, tmp_path, times, why):
+        path = tmp_path / "a.log"
+        records = [Odometry(t, [0.0, 0.0, 0.0]) for t in times]
+        with pytest.raises(FileFormatError, match=why):
+            write_carmen(path, records)
+        assert not path.exists()
+
+    def test_times_run_back_where_the_reader_is_told(self, tmp_path):
+        path = tmp_path / "a.log"
+        records = [Odometry(t, [0.0, 0.0, 0.0]) for t in (0.0, 2.0, 1.5, 3.0)]
+        for tolerance in (0.5, math.inf):
+            write_carmen(path, records, tolerance=tolerance)
+            assert list(read_carmen(path, tolerance=tolerance)) == records
+        with pytest.raises(FileFormatError, match="runs backwards"):
+            write_carmen(path, records, tolerance=0.4)
+        with pytest.raises(ValueError, match="tolerance=nan"):
+            write_carmen(path, records, tolerance=math.nan)
+
+    def test_a_silence_is_no_leap(self, tmp_path):
+        records = [Odometry(t, [0.0, 0.0, 0.0]) for t in (0.0, 1e6, 1e6 + 1.0)]
+        write_carmen(tmp_path / "a.log", iter(records))
+        assert list(read_carmen(tmp_path / "a.log")) == records
+
+
+def test_angles_of_a_flaser_in_degrees_are_refused():
+    with pytest.raises(
+        ValueError, match=r"read_carmen: angles are in radians; got -90.*np\.deg2rad"
+    ):
+        read_carmen([FLASER], angles=[-90.0, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("time", "reach", "message"),
+    [
+        (math.nan, 80.0, "t must be finite; got nan"),
+        (math.inf, 80.0, "t must be finite"),
+        (0.0, -1.0, "max_range must be positive; got -1"),
+        (0.0, math.nan, "max_range must be positive; got nan"),
+    ],
+)
+def test_scans_at_no_time_or_of_no_reach(time, reach, message):
+    with pytest.raises(ParameterError, match=f"Laser: {message}"):
+        Laser(time, [1.0], [0.0], [0.0, 0.0, 0.0], max_range=reach)
 
 
 def test_wean():

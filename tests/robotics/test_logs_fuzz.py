@@ -110,9 +110,14 @@ def read_all(log):
 
 
 def quiet(log):
+    """All records; none where no line reads, which is an error also where faults are skipped."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LogWarning)
-        return list(log)
+        try:
+            return list(log)
+        except FileFormatError as error:
+            assert "no line reads" in str(error) and log.faults and not log.records
+            return []
 
 
 @pytest.mark.parametrize("name", FORMATS)

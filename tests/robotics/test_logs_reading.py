@@ -27,11 +27,16 @@ GOOD = [f"O {100 * k} 0 0 {0.1 * k:.1f}" for k in range(6)]
 
 
 def skipped(source, read=read_wean, **options):
-    """Records and the exhausted reader, with its one warning if there were faults."""
+    """Records and the exhausted reader, with its one warning of faults, or its error where no line read."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         log = read(source, on_error="skip", **options)
-        records = list(log)
+        try:
+            records = list(log)
+        except FileFormatError as error:
+            assert "no line reads" in str(error) and not log.records and not caught
+            assert list(log) == [], "no second error"
+            return [], log
     assert log.lines == len(records) + len(log.faults) + sum(log.ignored.values())
     assert log.records == len(records)
     assert [w.category for w in caught] == [LogWarning] * bool(log.faults)
@@ -91,6 +96,44 @@ def test_the_warning_comes_once_at_the_end_and_points_to_the_caller():
         assert list(log) == []
     assert [v.filename for v in w] == [__file__]
     assert list(log) == [], "and no second warning"
+
+
+@pytest.mark.parametrize(
+    ("lines", "read", "kind"),
+    [
+        (["O x y", "", "# comment", "P 1 2"], read_wean, "a Wean Hall log"),
+        (GOOD, read_carmen, "a CARMEN log"),
+        (["\x00\x01\x02"] * 300, read_carmen, "a CARMEN log"),
+        (GOOD, read_mrclam_velocities, "a table of MRCLAM"),
+    ],
+)
+def test_a_log_of_another_kind_is_an_error_in_both_modes(lines, read, kind):
+    log = read(lines, on_error="skip")
+    with pytest.raises(FileFormatError, match=f"no line reads.*is this {kind}\\?"):
+        list(log)
+    assert log.lines == len(lines) and log.records == 0 and list(log) == []
+    with pytest.raises(FileFormatError, match=f"<lines>:1: .*is this {kind}\\?") as caught:
+        list(read(lines))
+    assert "on_error" not in str(caught.value)
+
+
+def test_skipping_is_advised_where_lines_after_the_fault_read():
+    with pytest.raises(FileFormatError, match="on_error='skip' leaves such lines out") as caught:
+        list(read_wean(["garbage", *GOOD]))
+    assert "is this" not in str(caught.value)
+    log = read_wean(["garbage", *GOOD])
+    with pytest.raises(FileFormatError):
+        next(log)
+    assert len(list(log)) == 6, "nothing that was looked at is lost"
+
+
+def test_a_log_of_wean_hall_names_its_reader():
+    scan = "L 1 2 0 1 2 0 " + "5 " * 180 + "0.5"
+    for line in (GOOD[1], scan):
+        with pytest.raises(FileFormatError, match="Wean Hall log, which read_wean reads"):
+            list(read_carmen([line]))
+    with pytest.raises(FileFormatError, match=r"cut off \('O'\)"):
+        list(read_carmen(["O"]))
 
 
 def test_records_before_the_error_are_all_handed_out():
@@ -249,8 +292,12 @@ class TestSources:
         path = tmp_path / "empty.log"
         for data in (b"", gzip.compress(b"")):
             path.write_bytes(data)
-            with pytest.raises(FileFormatError, match=r"empty\.log:1: the file is empty"):
+            with pytest.raises(FileFormatError, match=r"empty\.log:1: the file is empty") as caught:
                 list(read_wean(path))
+            assert "is this a Wean Hall log?" in str(caught.value)
+            assert "on_error='skip'" not in str(caught.value), "which would not help"
+            with pytest.raises(FileFormatError, match="no line reads, .* is this a Wean Hall log"):
+                list(read_wean(path, on_error="skip"))
             assert skipped(path)[0] == []
         assert skipped([])[1].faults[0].why == "there is no line"
 

@@ -63,6 +63,22 @@ class TestKeyframes:
         assert [key.laser.t for key in keyframes(records)] == [1.0]
         assert list(keyframes([])) == []
 
+    def test_records_without_a_scan(self):
+        found = keyframes(iter([Odometry(0.0, [5.0, 0.0, 0.0]), Velocity(1.0, 0.0, 0.0)]))
+        with pytest.raises(
+            ValueError, match="no record is a Laser, the last one is of type Velocity"
+        ):
+            list(found)
+
+    @pytest.mark.parametrize("wrong", ["drive.log", b"drive.log", 3, None])
+    def test_no_records_are_refused_at_once(self, wrong):
+        with pytest.raises(TypeError, match="keyframes: give records, such as"):
+            keyframes(wrong)
+
+    def test_things_that_are_no_records(self):
+        with pytest.raises(TypeError, match="one is of type ndarray"):
+            list(keyframes([scan(0.0, 0, 0, 0), np.zeros(3)]))
+
     def test_thresholds(self):
         scans = [scan(k, 0.0, 0.0, 0.0) for k in range(3)]
         assert len(list(keyframes(scans, 0.0, 0.0))) == 3

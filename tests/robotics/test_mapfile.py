@@ -254,3 +254,11 @@ def test_missing_extras(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module:
     for call in (lambda: read_map(path), lambda: write_map(some_grid(), tmp_path / "m.yaml")):
         with pytest.raises(MissingExtraError, match=rf"{package}.*bayesmc\[robotics\]"):
             call()
+
+
+def test_what_is_no_grid_is_not_written(tmp_path):
+    with pytest.raises(
+        TypeError, match=r"write_map: give an OccupancyGrid.*array of shape \(3, 3\)"
+    ):
+        write_map(np.zeros((3, 3)), tmp_path / "room.yaml")
+    assert not list(tmp_path.iterdir())

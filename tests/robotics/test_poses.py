@@ -240,3 +240,24 @@ def test_and_angle_is_its_parts() -> None:
     assert AndAngle(d.Normal(0.0, 1.0), heading).event_shape == (2,)
     with pytest.raises(ParameterError, match="second part must be an angle"):
         AndAngle(position, d.Normal(0.0, 1.0))
+
+
+@pytest.mark.parametrize("call", [compose, between, pose_errors])
+def test_poses_that_do_not_broadcast_are_named(call):
+    with pytest.raises(
+        ShapeError, match=rf"{call.__name__}: arrays of shape \(4, 3\) and \(5, 3\)"
+    ):
+        call(np.zeros((4, 3)), np.zeros((5, 3)))
+    call(np.zeros((4, 1, 3)), np.zeros((5, 3)))
+
+
+def test_points_that_do_not_broadcast_are_named():
+    with pytest.raises(ShapeError, match=r"transform: arrays of shape \(4, 3\) and \(5, 2\)"):
+        transform(np.zeros((4, 3)), np.zeros((5, 2)))
+
+
+def test_no_poses_have_no_mean():
+    for shape, axis in (((0, 3), 0), ((4, 0, 3), 1)):
+        with pytest.raises(ShapeError, match=f"mean_pose: .* have no entry along axis {axis}"):
+            mean_pose(np.zeros(shape), axis=axis)
+    assert mean_pose(np.zeros((4, 0, 3))).shape == (0, 3)

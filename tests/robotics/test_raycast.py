@@ -198,3 +198,12 @@ def test_table_rounds_to_cell_and_heading():
 def test_bad_tables(headings: object):
     with pytest.raises(ParameterError, match="headings must be a positive whole number"):
         RayTable(scattered((5, 5), 0.1, 0), 1.0, headings)  # type: ignore[arg-type]
+
+
+def test_wrong_objects_are_named():
+    with pytest.raises(
+        TypeError, match=r"ray_cast: give an OccupancyGrid.*array of shape \(3, 3\)"
+    ):
+        ray_cast(np.zeros((3, 3)), [1.0, 1.0, 0.0], [0.0], 5.0)
+    with pytest.raises(TypeError, match="RayTable: give an OccupancyGrid"):
+        RayTable(np.zeros((3, 3)), 5.0)

@@ -33,12 +33,14 @@ from bayesmc.robotics.logs.reading import (
     Reading,
     check_ranges,
     counted,
+    in_order,
     numbers,
     ranges,
     whole,
 )
 from bayesmc.robotics.logs.records import MAX_RANGE, Laser, Odometry, read_only
 from bayesmc.robotics.logs.sources import Source
+from bayesmc.robotics.poses import check_radians
 
 MESSAGES = ("ODOM", "FLASER", "ROBOTLASER1")
 """The messages that are read."""
@@ -115,11 +117,15 @@ def read_carmen(
     if isinstance(messages, str) or unknown:
         raise ValueError(f"read_carmen(messages={messages!r}): give some of {MESSAGES}")
     parse = _format(frozenset(messages), max_range, angles, bad_ranges)
-    return Reading(source, parse, on_error=on_error, tolerance=tolerance)
+    return Reading(source, parse, on_error=on_error, tolerance=tolerance, kind="a CARMEN log")
 
 
 def write_carmen(
-    path: str | os.PathLike[str], records: Iterable[Odometry | Laser], host: str = "bayesmc"
+    path: str | os.PathLike[str],
+    records: Iterable[Odometry | Laser],
+    host: str = "bayesmc",
+    *,
+    tolerance: float = 0.0,
 ) -> None:
     """Write odometry and scans as a CARMEN log that `read_carmen` reads back the same.
 
@@ -135,12 +141,15 @@ def write_carmen(
     records : iterable of Odometry and Laser
     host : str
         The name of the computer, which each line has.
+    tolerance : float
+        How far, in s, time may run backwards, as of `read_carmen`, which will need the same.
 
     Raises
     ------
     FileFormatError
         For a record that would not read back: NaN or negative ranges, beams that are not evenly
-        spaced; the message says which.
+        spaced, a time before the last one's or that leaps ahead and comes back; the message says which.
+        For no records at all.
     TypeError
         For any other kind of record.
 
@@ -157,7 +166,15 @@ def write_carmen(
     if len(host.split()) != 1 or not host.isprintable():
         raise ValueError(f"write_carmen(host={host!r}): give a name without blanks")
     parse = _format(frozenset(MESSAGES), MAX_RANGE, None, "fault")
+    if not tolerance >= 0.0:
+        raise ValueError(f"write_carmen(tolerance={tolerance!r}): give seconds, 0 or more")
+    records = tuple(records)
+    if not records:
+        raise FileFormatError(
+            "write_carmen: there are no records, and a log without lines does not read"
+        )
     lines = [_checked_line(k, record, host, parse) for k, record in enumerate(records)]
+    _check_order(records, tolerance)
     data = "".join(line + "\n" for line in lines).encode("utf-8")
     # no time stamp in the gzip, so that the same records give the same file
     Path(path).write_bytes(gzip.compress(data, mtime=0) if str(path).endswith(".gz") else data)
@@ -199,6 +216,7 @@ def _format(
             raise ValueError(
                 "read_carmen(angles=...): give a vector of finite angles, one per beam"
             )
+        check_radians("read_carmen", "angles", mounted)
 
     def parse(line: str) -> Odometry | Laser | Ignored:
         fields = line.split()
@@ -208,7 +226,7 @@ def _format(
         if name[0] == "#":
             return Ignored("comment")
         if name not in messages:
-            return _other(name)
+            return _other(name, fields)
         if name == "ODOM":
             return _odom(fields)
         if name == "FLASER":
@@ -218,9 +236,13 @@ def _format(
     return parse
 
 
-def _other(name: str) -> Ignored:
+def _other(name: str, fields: list[str]) -> Ignored:
     """What is no message to be read, unless it is none at all or the stump of one."""
     if name not in MESSAGES:
+        if name in ("O", "L") and len(fields) > 4:
+            raise FileFormatError(
+                f"a line that begins with {name} looks like one of a Wean Hall log, which read_wean reads"
+            )
         if not _NAME.fullmatch(name):
             raise FileFormatError("the line does not begin with the name of a message")
         if any(message.startswith(name) for message in MESSAGES):
@@ -297,6 +319,18 @@ def _checked_line(
                 f"write_carmen: record {k} has beams that are not evenly spaced, which no message states"
             )
     return line
+
+
+def _check_order(records: Sequence[Odometry | Laser], tolerance: float) -> None:
+    """Refuse times that the reader would."""
+    if tolerance == math.inf:
+        return
+    for k, _, result in in_order(((k, "", r) for k, r in enumerate(records)), tolerance):
+        if isinstance(result, str):
+            raise FileFormatError(
+                f"write_carmen: record {k} is not fit to be written: {result}; sort with merge(records), or "
+                "give tolerance= here and to read_carmen"
+            )
 
 
 def _odom_line(record: Odometry, host: str) -> str:

@@ -62,7 +62,7 @@ def read_freiburg(
             return RotTransRot(float(step), first, second, third)
         return Measurement(float(step), whole(fields[1], 2), second, third)
 
-    return Reading(source, parse, on_error=on_error)
+    return Reading(source, parse, on_error=on_error, kind="a log of Freiburg")
 
 
 def read_freiburg_world(source: Source, *, on_error: OnError = "raise") -> Mapping[int, np.ndarray]:
@@ -93,5 +93,5 @@ def read_freiburg_world(source: Source, *, on_error: OnError = "raise") -> Mappi
         counted(fields, 3, "a landmark")
         return Landmark(whole(fields[0], 1), np.array(numbers(fields[1:], 2)))
 
-    landmarks = Reading(source, parse, on_error=on_error)
+    landmarks = Reading(source, parse, on_error=on_error, kind="a list of Freiburg's landmarks")
     return MappingProxyType({landmark.subject: landmark.position for landmark in landmarks})

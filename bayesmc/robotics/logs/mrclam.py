@@ -164,7 +164,7 @@ def read_mrclam_velocities(
         fields = line.split()
         return _passed(fields) or Velocity(*_row(fields, 3, "a line of odometry"))
 
-    return Reading(source, parse, on_error=on_error, tolerance=tolerance)
+    return Reading(source, parse, on_error=on_error, tolerance=tolerance, kind="a table of MRCLAM")
 
 
 def read_mrclam_measurements(
@@ -203,7 +203,7 @@ def read_mrclam_measurements(
         subject = subjects.get(whole(fields[1], 2), UNKNOWN_SUBJECT)
         return Measurement(t, subject, distance, bearing)
 
-    return Reading(source, parse, on_error=on_error, tolerance=tolerance)
+    return Reading(source, parse, on_error=on_error, tolerance=tolerance, kind="a table of MRCLAM")
 
 
 def read_mrclam_truth(
@@ -231,7 +231,7 @@ def read_mrclam_truth(
         t, *pose = _row(fields, 4, "a line of truth")
         return GroundTruth(t, read_only(pose))
 
-    return Reading(source, parse, on_error=on_error, tolerance=tolerance)
+    return Reading(source, parse, on_error=on_error, tolerance=tolerance, kind="a table of MRCLAM")
 
 
 def read_mrclam_landmarks(source: Source, *, on_error: OnError = "raise") -> Reading[Landmark]:
@@ -258,7 +258,7 @@ def read_mrclam_landmarks(source: Source, *, on_error: OnError = "raise") -> Rea
         _, x, y, sd_x, sd_y = _row(fields, 5, "a landmark")
         return Landmark(whole(fields[0], 1), read_only((x, y)), read_only((sd_x, sd_y)))
 
-    return Reading(source, parse, on_error=on_error)
+    return Reading(source, parse, on_error=on_error, kind="a table of MRCLAM")
 
 
 def read_mrclam_barcodes(source: Source, *, on_error: OnError = "raise") -> Reading[Barcode]:
@@ -284,7 +284,7 @@ def read_mrclam_barcodes(source: Source, *, on_error: OnError = "raise") -> Read
         counted(fields, 2, "a barcode")
         return Barcode(whole(fields[0], 1), whole(fields[1], 2))
 
-    return Reading(source, parse, on_error=on_error)
+    return Reading(source, parse, on_error=on_error, kind="a table of MRCLAM")
 
 
 def _passed(fields: list[str]) -> Ignored | None:

@@ -104,7 +104,9 @@ def read_plaza_increments(
     >>> list(read_plaza_increments(["3.8570e+003 2.0e-001 -5.2e-002"]))
     [Increment(t=3857.0, distance=0.2, turn=-0.052)]
     """
-    return Reading(source, _increment, on_error=on_error, tolerance=tolerance)
+    return Reading(
+        source, _increment, on_error=on_error, tolerance=tolerance, kind="a table of Plaza"
+    )
 
 
 def read_plaza_ranges(
@@ -127,7 +129,7 @@ def read_plaza_ranges(
     >>> list(read_plaza_ranges(["3.8580e+003 2.0e+000 5.0e+000 6.5466e+001"]))
     [RangeOnly(t=3858.0, beacon=5, range=65.466)]
     """
-    return Reading(source, _range, on_error=on_error, tolerance=tolerance)
+    return Reading(source, _range, on_error=on_error, tolerance=tolerance, kind="a table of Plaza")
 
 
 def _increment(line: str) -> Increment | Ignored:

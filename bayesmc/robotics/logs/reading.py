@@ -7,6 +7,7 @@ else, from a damaged file to times that run backwards, is dealt with here, and t
 
 from __future__ import annotations
 
+import itertools
 import math
 import warnings
 from collections import Counter
@@ -23,6 +24,12 @@ R = TypeVar("R", bound=Record)
 
 OnError = Literal["raise", "skip"]
 BadRanges = Literal["fault", "max"]
+
+_AHEAD = 100
+"""Lines after a fault in which anything that reads shows that the log is of its kind."""
+
+_NOTHING = ("blank", "comment")
+"""Kinds of ignored lines that files of any kind have."""
 
 MAX_GAP = 60.0
 """A time further ahead than this (s) counts only if the next record does not come back from it."""
@@ -52,6 +59,11 @@ class Ignored(NamedTuple):
     kind: str
 
 
+_Result = Record | Ignored | str  # the last is why the line is a fault
+_Outcome = tuple[
+    int, str, _Result
+]  # with the line's number and text; a plain tuple is quick to make
+
 Format = Callable[[str], R | Ignored]
 """From a line to what it says; raises ``FileFormatError`` with the reason where it does not read."""
 
@@ -77,6 +89,8 @@ class Reading(Iterator[R], Generic[R]):
         Whether a fault is raised, or collected in ``faults`` and warned about once at the end.
     tolerance : float
         How far, in s, time may run backwards; ``math.inf`` for times in any order.
+    kind : str
+        What the log should be, for the message about one of which no line reads.
 
     Raises
     ------
@@ -86,7 +100,7 @@ class Reading(Iterator[R], Generic[R]):
         At once, for an unknown ``on_error`` or a negative ``tolerance``.
     FileFormatError
         At once for a file in UTF-16; in the mode ``"raise"`` at the first fault, with ``path`` and
-        ``line``.
+        ``line``; in both modes at the end of a log of which no line reads: it is of another kind.
 
     Warns
     -----
@@ -114,15 +128,18 @@ class Reading(Iterator[R], Generic[R]):
         *,
         on_error: OnError = "raise",
         tolerance: float = 0.0,
+        kind: str = "a log of this kind",
     ) -> None:
         if on_error not in ("raise", "skip"):
             raise ValueError(f"on_error={on_error!r}: give 'raise' or 'skip'")
         if not tolerance >= 0.0:
             raise ValueError(f"tolerance={tolerance!r}: give seconds, 0 or more")
         self.name = name_of(source)
-        self._skips = on_error == "skip"
+        self._skips, self._kind = on_error == "skip", kind
         parsed = _parsed(lines_of(checked(source)), parse)
-        self._outcomes = parsed if tolerance == math.inf else _in_order(parsed, tolerance)
+        self._outcomes: Iterator[_Outcome] = (
+            parsed if tolerance == math.inf else in_order(parsed, tolerance)
+        )
         self._faults: list[LogFault] = []
         self._ignored: Counter[str] = Counter()
         self._records = 0
@@ -138,13 +155,20 @@ class Reading(Iterator[R], Generic[R]):
                 continue
             self._faults.append(LogFault(number, text[:200], result))
             if not self._skips:
-                raise FileFormatError(
-                    f"{result}: {_excerpt(text)}; on_error='skip' leaves such lines out",
-                    self.name,
-                    number,
-                )
+                advice = "on_error='skip' leaves such lines out"
+                if not self._reads() and not self._will_read():
+                    advice = f"is this {self._kind}?"
+                raise FileFormatError(f"{result}: {_excerpt(text)}; {advice}", self.name, number)
         if self._faults and self._skips and not self._has_warned:
             self._has_warned = True
+            if not self._reads():
+                first = self._faults[0]
+                raise FileFormatError(
+                    f"no line reads, this one since {first.why}: {_excerpt(first.text)}; is this "
+                    f"{self._kind}?",
+                    self.name,
+                    first.line,
+                )
             warnings.warn(self._summary(), LogWarning, stacklevel=2)
         raise StopIteration
 
@@ -172,6 +196,21 @@ class Reading(Iterator[R], Generic[R]):
         return (
             f"<Reading of {self.name}: {self.records} records, {len(self._faults)} faults and "
             f"{self._ignored.total()} ignored in {self.lines} lines>"
+        )
+
+    def _reads(self) -> bool:
+        """Whether any line has shown that the log is of its kind."""
+        return bool(self._records) or any(kind not in _NOTHING for kind in self._ignored)
+
+    def _will_read(self) -> bool:
+        """Whether one of the next lines does."""
+        ahead = list(itertools.islice(self._outcomes, _AHEAD))
+        self._outcomes = itertools.chain(ahead, self._outcomes)
+        results = (result for _, _, result in ahead)
+        return any(
+            isinstance(result, Record)
+            or (isinstance(result, Ignored) and result.kind not in _NOTHING)
+            for result in results
         )
 
     def _summary(self) -> str:
@@ -286,12 +325,6 @@ def check_ranges(who: str, max_range: float, bad: str) -> None:
         raise ValueError(f"{who}(bad_ranges={bad!r}): give 'fault' or 'max'")
 
 
-_Result = Record | Ignored | str  # the last is why the line is a fault
-_Outcome = tuple[
-    int, str, _Result
-]  # with the line's number and text; a plain tuple is quick to make
-
-
 def _parsed(lines: Iterator[Line], parse: Callable[[str], Record | Ignored]) -> Iterator[_Outcome]:
     for number, text, fault in lines:
         result: _Result
@@ -302,8 +335,11 @@ def _parsed(lines: Iterator[Line], parse: Callable[[str], Record | Ignored]) -> 
         yield number, text, result
 
 
-def _in_order(outcomes: Iterator[_Outcome], tolerance: float) -> Iterator[_Outcome]:
-    """The outcomes, with faults for the records whose time does not fit the others'."""
+def in_order(outcomes: Iterator[_Outcome], tolerance: float) -> Iterator[_Outcome]:
+    """The outcomes, with faults for the records whose time does not fit the others'.
+
+    An outcome is a number, a text that is passed on, and a record or why there is none.
+    """
     latest = -math.inf
     waiting: list[_Outcome] = []  # a record far ahead, and what came after it that has no say
     ahead = -math.inf  # its time

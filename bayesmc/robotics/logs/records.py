@@ -7,11 +7,12 @@ file says it how is the business of the readers; nothing here opens a file.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
 
-from bayesmc.errors import ShapeError
+from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.robotics.poses import between
 
 MAX_RANGE = 80.0
@@ -96,11 +97,14 @@ class Laser(Timed):
     laser_pose : ndarray, shape (3,), optional
         Of the laser, in the same frame; the robot's if left out.
     max_range : float
+        In m, positive.
 
     Raises
     ------
     ShapeError
         Where angles and ranges do not match, or a pose is not three numbers.
+    ParameterError
+        For a time that is not finite, or a ``max_range`` that is not positive.
 
     Examples
     --------
@@ -119,6 +123,10 @@ class Laser(Timed):
     max_range: float = MAX_RANGE
 
     def __post_init__(self) -> None:
+        if not math.isfinite(self.t):
+            raise ParameterError(f"Laser: t must be finite; got {self.t}")
+        if not self.max_range > 0.0:
+            raise ParameterError(f"Laser: max_range must be positive; got {self.max_range}")
         if self.laser_pose is None:
             object.__setattr__(self, "laser_pose", self.pose)
         for name, size in (("ranges", None), ("angles", None), ("pose", 3), ("laser_pose", 3)):

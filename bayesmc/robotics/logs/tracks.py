@@ -47,7 +47,7 @@ def keyframes(
     Parameters
     ----------
     records : iterable of records
-        In order of time; those that are no `Laser` are passed over.
+        In order of time, from whatever reader; those that are no `Laser` are passed over.
     distance : float
         In m.
     angle : float
@@ -61,6 +61,8 @@ def keyframes(
     ------
     ValueError
         For a negative threshold or NaN; at the end, where there were records and none was a scan.
+    TypeError
+        For what is no iterable of records.
 
     Examples
     --------
@@ -72,6 +74,10 @@ def keyframes(
     if not (distance >= 0.0 and angle >= 0.0):
         raise ValueError(
             f"keyframes(distance={distance!r}, angle={angle!r}): give 0 or more of both"
+        )
+    if isinstance(records, (str, bytes)) or not isinstance(records, Iterable):
+        raise TypeError(
+            f"keyframes: give records, such as those of read_carmen(path); got {records!r:.80}"
         )
     return _keyframes(records, distance, angle)
 
@@ -187,8 +193,14 @@ def stack(records: Iterable[Record]) -> dict[str, np.ndarray]:
 
 def _keyframes(records: Iterable[Record], distance: float, angle: float) -> Iterator[Keyframe]:
     last: Laser | None = None
+    record: Any = None
     for record in records:
         if not isinstance(record, Laser):
+            if not isinstance(record, Record):
+                raise TypeError(
+                    "keyframes: give records, such as those of read_carmen(path); one is of type "
+                    f"{type(record).__name__}"
+                )
             continue
         if last is None:
             motion = np.zeros(3)
@@ -199,3 +211,8 @@ def _keyframes(records: Iterable[Record], distance: float, angle: float) -> Iter
         last = record
         motion.flags.writeable = False
         yield Keyframe(record, motion)
+    if last is None and record is not None:
+        raise ValueError(
+            f"keyframes: no record is a Laser, the last one is of type {type(record).__name__}; did the "
+            "reader take the log's scans?"
+        )

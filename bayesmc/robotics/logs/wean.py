@@ -91,7 +91,7 @@ def read_wean(
             return _laser(fields, beams, max_range, bad_ranges)
         raise FileFormatError("the line begins with neither O nor L")
 
-    return Reading(source, parse, on_error=on_error, tolerance=tolerance)
+    return Reading(source, parse, on_error=on_error, tolerance=tolerance, kind="a Wean Hall log")
 
 
 def _odometry(fields: list[str]) -> Odometry:
