@@ -12,7 +12,17 @@ from typing import Any
 
 
 class BayesmcError(Exception):
-    """Base of every error raised on purpose by bayesmc."""
+    """Base of every error raised on purpose by bayesmc.
+
+    Attributes
+    ----------
+    filtered : SeriesPosterior or None
+        Where a filter that goes slice by slice fails: its answer about the slices before the one that failed.
+        None where there is none, or where the error comes from elsewhere. Exceptions of other kinds that such
+        a filter passes on (a function of the model that breaks, ``KeyboardInterrupt``) have it, too.
+    """
+
+    filtered: Any = None
 
 
 class ModelError(BayesmcError, ValueError):
@@ -183,7 +193,7 @@ class ConvergenceWarning(BayesmcWarning):
 
 
 class InterruptWarning(BayesmcWarning):
-    """A run was interrupted; its answer rests on the draws made before."""
+    """A run was interrupted; its answer rests on the draws made, or is of the slices done, before."""
 
 
 class ReducibleWarning(BayesmcWarning):

@@ -8,8 +8,8 @@ space:
     never            the filter as it is
     always 5 %       in every slice one particle in twenty begins anew: a mixture of two transitions
     when surprised   as many as two running averages of the rows' densities ask for, one minus fast over slow:
-                     none while the robot sees what it expects, many when it does not (augmented Monte Carlo
-                     localization); some, too, where it comes to a place that the map explains less well
+                     many when the robot does not see what it expects (augmented Monte Carlo localization),
+                     and some wherever it comes to a place that the map explains less well than the last
     where it looks   one in twenty is drawn from where the scan says the robot could be, though only one scan
                      in a hundred is thought to follow on a carriage: weights make up for both (the dual of
                      Monte Carlo localization)

@@ -15,7 +15,7 @@ The picture shows the map, both errors over time (grey where no landmark was in 
 and what becomes of the gains. Filters are told the first true pose and the landmarks, and no more of the
 truth; the scales of noise, one set for all five robots, were chosen by hand on these logs.
 
-Where ``BAYESMC_DATA`` names the reference data, the log is of the UTIAS MRCLAM set 6 (Leung, Halpern, Barfoot
+Where the reference data is at hand, the log is of the UTIAS MRCLAM set 6 (Leung, Halpern, Barfoot
 and Liu 2011, International Journal of Robotics Research 30), else a generated one in the same files, which is
 read by the same reader. Thrun, Burgard and Fox (2005), Probabilistic Robotics, chapters 7 and 8.
 """
@@ -23,7 +23,6 @@ read by the same reader. Thrun, Burgard and Fox (2005), Probabilistic Robotics, 
 from __future__ import annotations
 
 import json
-import os
 import tempfile
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -33,7 +32,7 @@ import numpy as np
 
 import bayesmc as bmc
 from bayesmc.robotics import PoseNormal, compose, range_and_bearing
-from examples import picture
+from examples import picture, reference
 from examples.robot_landmarks import Drive, ellipse, marks_seen, write_mrclam
 
 SPREAD, LASTING = 0.07, 200.0  # of the gains: standard deviation, and seconds until they are others
@@ -187,9 +186,8 @@ def _unseen(drive: Drive, least: float = 5.0) -> list[tuple[float, float]]:
 
 def log(fast: bool) -> tuple[str, Drive]:
     """A robot of MRCLAM 6 where the data is, else (or for a smoke test) a generated one."""
-    named = os.environ.get("BAYESMC_DATA")
-    folder = Path(named) / "robot" / "mrclam6" if named else None
-    if folder is not None and folder.is_dir() and not fast:
+    folder = reference.folder("robot", "mrclam6")
+    if folder is not None and not fast:
         return "MRCLAM 6, robot 1", marks_seen(folder, 1)
     with tempfile.TemporaryDirectory() as made:
         return "a generated robot", marks_seen(write_mrclam(Path(made), 60.0 if fast else 300.0), 1)

@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import bayesmc as bmc
-from examples import picture, robot_logs
+from examples import picture, reference, robot_logs
 from examples.robot_logs import Log
 
 SEED, PARTICLES, LEAST = 1, 20_000, 1_000
@@ -176,7 +176,7 @@ def report(log: Log, found: Run) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Localise on the made-up floor, and in the Intel Research Lab where its log is at hand."""
     options = picture.options(__doc__, arguments)
-    data = robot_logs.data_root()
+    data = reference.folder()
     logs = {"laser_localization": robot_logs.generated()}
     if data is not None and not options.fast:
         logs["laser_localization_intel"] = robot_logs.intel(data)

@@ -11,14 +11,13 @@ declared in two ways.
 Both are parameters; but a particle filter that never moves a parameter is left with few of its values, so the
 nodes wander, the bias by 15 cm in a minute; the extended Kalman filter is given the same template.
 
-Where ``BAYESMC_DATA`` names the reference data, the log is Plaza 1 (Djugash, Hamner and Roth 2009, Journal of
+Where the reference data is at hand, the log is Plaza 1 (Djugash, Hamner and Roth 2009, Journal of
 Field Robotics 26), else a generated one in the same files, whose bias is 2.5 m and constant. Filters are told
 the first true pose, with 0.3 rad of doubt about the heading, and where the beacons are.
 """
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,7 +27,7 @@ import numpy as np
 
 import bayesmc as bmc
 from bayesmc.robotics import PoseNormal, compose, range_only, range_to
-from examples import picture
+from examples import picture, reference
 from examples.robot_landmarks import Drive, ellipse, ranges_heard, write_plaza
 
 DOUBT, GROWTH, MIDDLE = 5.0, 0.1, 40.0  # m, m per m, and the range in m that the bias is stated for
@@ -181,9 +180,8 @@ def _draw_bias(ax: Any, drive: Drive, found: dict[str, Any]) -> None:
 
 def log(fast: bool) -> tuple[str, Drive]:
     """Plaza 1 where the data is, else (or for a smoke test) a generated drive."""
-    named = os.environ.get("BAYESMC_DATA")
-    folder = Path(named) / "robot" / "plaza" if named else None
-    if folder is not None and folder.is_dir() and not fast:
+    folder = reference.folder("robot", "plaza")
+    if folder is not None and not fast:
         return "Plaza 1", ranges_heard(folder)
     with tempfile.TemporaryDirectory() as made:
         folder = write_plaza(Path(made), 100.0 if fast else 600.0)

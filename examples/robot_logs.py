@@ -22,7 +22,6 @@ Carnegie Mellon.
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -160,14 +159,6 @@ def wean(data: Path, number: int, every: int = 3) -> Log:
     found = list(keyframes(read_wean(folder / f"robotdata{number}.log.gz")))
     log = _log(f"Wean Hall, log {number}", grid, found, None, REACH, every)
     return log._replace(caution=0.1, noise=(0.04, 0.02, 0.04, 0.02), hits=0.5, free=0.1)
-
-
-def data_root() -> Path | None:
-    """Where the reference data is, if it is."""
-    named = os.environ.get("BAYESMC_DATA")
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    root = Path(named) if named else beside
-    return root if (root / "robot").is_dir() else None
 
 
 def first(log: Log, scans: int) -> Log:

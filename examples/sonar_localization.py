@@ -8,7 +8,7 @@ causes. Its shares and its width are not taken from the script that made the wor
 short drive at known poses (``fit_beams``).
 
 Neighbouring cones share walls and errors, so that the product over 24 beams is tempered, by an exponent of
-.1. A ring looks all round, which makes up for how little each sonar sees; what takes long is to tell places
+.05. A ring looks all round, which makes up for how little each sonar sees; what takes long is to tell places
 apart that look alike within four metres.
 
 Thrun, Burgard and Fox (2005), Probabilistic Robotics, section 6.3 (beam model; table 6.2: learning it) and
@@ -19,6 +19,7 @@ Thrun, Burgard and Fox (2005), Probabilistic Robotics, section 6.3 (beam model; 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +52,7 @@ def learned(table: RayTable, log: Log, scans: slice = LESSON) -> BeamFit:
 def model(log: Log, start: Any, tempering: float = TEMPERING) -> bmc.DynamicBayesNet:
     """The net of ``robot_logs`` with beams on cast rays for a sensor."""
     table = RayTable(log.grid, log.reach, HEADINGS)
-    beams = _tempered(learned(table, log).model, tempering)
+    beams = replace(learned(table, log).model, tempering=tempering)
     return robot_logs.net(log, start, lambda pose: Beams(expected(table, log, pose), beams))
 
 
@@ -84,10 +85,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     found = located(log, PARTICLES // 4 if options.fast else PARTICLES)
     report(log, learned(RayTable(log.grid, log.reach, HEADINGS), log), found)
     picture.save(laser_localization.draw(log, found), options.out, "sonar_localization")
-
-
-def _tempered(model: BeamModel, tempering: float) -> BeamModel:
-    return BeamModel(*model.shares, model.sigma_hit, model.lambda_short, model.max_range, tempering)
 
 
 if __name__ == "__main__":

@@ -180,9 +180,10 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
     ),
     "Importance": (by_importance(bmc.Importance, 10_000), dict.fromkeys(KINDS, 0.8)),
     "Rejection": (by_rejection(2000, 200_000), dict.fromkeys(KINDS, 0.8)),
-    "Gibbs": (by(bmc.Gibbs(400, warmup=100, chains=16, debug=True)), dict.fromkeys(KINDS, 0.85)),
+    # a sweep costs much the same for 32 chains as for 16, so many chains and few sweeps
+    "Gibbs": (by(bmc.Gibbs(200, warmup=100, chains=32, debug=True)), dict.fromkeys(KINDS, 0.85)),
     "MetropolisHastings": (
-        by(bmc.MetropolisHastings(400, warmup=300, chains=16)),
+        by(bmc.MetropolisHastings(200, warmup=200, chains=32)),
         dict.fromkeys(KINDS, 0.5),
     ),
     "no engine named": (by(None), dict.fromkeys(KINDS, 0.9)),
@@ -225,6 +226,8 @@ def rejected(answer: Answer, kind: str, seed: int, draw: int, observed: bool = T
 
 #: chains take longer for an answer than independent draws: nets of each kind that they are asked
 CHAIN_NETS = 10
+#: the draws of these are those of likelihood weighting (`test_summaries_agree_with_draws`)
+SUMMARY_NETS = 30
 
 
 def check_all(
@@ -248,6 +251,8 @@ def test_engine_matches_exact_answers(engine: str, kind: str) -> None:
     chains = engine in ("Gibbs", "MetropolisHastings")
     chains |= engine == "no engine named" and kind.startswith("hybrid")  # mostly Gibbs
     nets, draw = (CHAIN_NETS, 2_000) if chains else (len(SEEDS), 1_000)
+    if engine == "LikelihoodWeighting, summaries":
+        nets = SUMMARY_NETS
     assert check_all(answer, kind, nets=nets, draw=draw) >= share[kind] * nets
 
 

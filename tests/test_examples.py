@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -36,14 +38,21 @@ def tables() -> list[compare.Table]:
     return [table for example in demo.NETS for table in example.questions(200_000)]
 
 
-def test_demo_prints_tables_and_writes_pictures(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    demo.main(["--fast", "--out", str(tmp_path / "out")])
-    printed = capsys.readouterr().out
+@pytest.fixture(scope="module")
+def demonstration(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path]:
+    """What the demonstration prints, and the folder of its pictures."""
+    out = tmp_path_factory.mktemp("demonstration") / "out"
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        demo.main(["--fast", "--out", str(out)])
+    return printed.getvalue(), out
+
+
+def test_demo_prints_tables_and_writes_pictures(demonstration: tuple[str, Path]) -> None:
+    printed, out = demonstration
     for figure in ("Monte Carlo error", "ESS", "seconds"):
         assert printed.count(figure) >= 6
-    pictures = list((tmp_path / "out").iterdir())
+    pictures = list(out.iterdir())
     assert len(pictures) == printed.count("wrote ") >= 2 * len(demo.NETS) + len(demo.FIGURES)
     for path in pictures:
         assert path.read_bytes().startswith(b"\x89PNG")
@@ -143,17 +152,19 @@ def test_closed_forms_hold_by_quadrature() -> None:
 
 @pytest.mark.parametrize("example", demo.NETS, ids=lambda example: example.__name__.split(".")[1])
 def test_nets_run_by_themselves(
-    example: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    example: Any,
+    demonstration: tuple[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Twice the same pictures; the tables hold times, which differ."""
-    for folder in ("one", "two"):
-        example.main(["--fast", "--out", str(tmp_path / folder)])
+    """The pictures of the demonstration once more; the tables hold times, which differ."""
+    example.main(["--fast", "--out", str(tmp_path)])
     printed = capsys.readouterr().out
-    assert printed.count("Exact ") == 2 * len(list(example.questions(1_000)))
-    pictures = sorted((tmp_path / "one").iterdir())
+    assert printed.count("Exact ") == len(list(example.questions(1_000)))
+    pictures = sorted(tmp_path.iterdir())
     assert len(pictures) == 2
     for path in pictures:
-        assert path.read_bytes() == (tmp_path / "two" / path.name).read_bytes()
+        assert path.read_bytes() == (demonstration[1] / path.name).read_bytes()
         assert str(path) in printed
 
 
@@ -166,17 +177,19 @@ def test_every_example_is_run_by_the_demonstration_or_marked_as_a_helper() -> No
 
 @pytest.mark.parametrize("figure", demo.FIGURES, ids=lambda figure: figure.__name__.split(".")[1])
 def test_figures_run_by_themselves(
-    figure: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    figure: Any,
+    demonstration: tuple[str, Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Twice the same figures and the same picture."""
-    printed = []
-    for folder in ("one", "two"):
-        figure.main(["--fast", "--out", str(tmp_path / folder)])
-        printed.append(capsys.readouterr().out.replace(str(tmp_path / folder), ""))
-    assert printed[0] == printed[1]
-    first, second = (next((tmp_path / folder).iterdir()) for folder in ("one", "two"))
-    assert first.name == figure.__name__.split(".")[1] + ".png"
-    assert first.read_bytes() == second.read_bytes()
+    """The same figures and the same picture as in the demonstration, after other examples."""
+    figure.main(["--fast", "--out", str(tmp_path)])
+    together, out = demonstration
+    printed = capsys.readouterr().out
+    assert printed.replace(str(tmp_path), "") in together.replace(str(out), "")
+    picture = next(tmp_path.iterdir())
+    assert picture.name == figure.__name__.split(".")[1] + ".png"
+    assert picture.read_bytes() == (out / picture.name).read_bytes()
 
 
 def test_parzen_improves_with_samples_if_the_window_is_narrow() -> None:

@@ -134,8 +134,7 @@ def test_global_localisation_with_a_laser(log: Log) -> None:
     start = robot_logs.first(log, 60)
     found = [robot_logs.lost(start, 10_000, seed) for seed in range(2)]
     assert all(np.median(error[30:]) < 0.3 for error in found)
-    evenly = bmc.ParticleFilter(5_000)
-    hasty = [robot_logs.lost(start, evenly, seed, tempering=1.0) for seed in range(4)]
+    hasty = [robot_logs.lost(start, 10_000, seed, tempering=1.0) for seed in range(4)]
     assert sum(np.median(error[30:]) < 0.3 for error in hasty) <= 2
 
 

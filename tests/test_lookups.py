@@ -18,6 +18,7 @@ import bayesmc as bmc
 from bayesmc.plates import Gathered, Lookups, PlateArray
 from bayesmc.states import StateArray
 from bayesmc.tracing import Tracer, axes, claims
+from tests.restarted import Restarted
 
 COUNT = 4  # elements of the child's plate
 SHAPES = {"m": (3,), "v": (3, 2), "e": (3, 2)}  # scalars, vectors, scalars in two plates
@@ -408,6 +409,8 @@ STEPS: dict[str, Operation] = {
     "at least three": lambda p, f, r, o: np.atleast_3d(some(p, r)),
 }  # fmt: skip
 OPERATIONS = GATHERS | STEPS
+#: what a program says, and what other parents happen to be
+SAID, GIVEN = Restarted(), Restarted()
 
 
 def axis(value: Any, rng: np.random.Generator) -> int:
@@ -423,7 +426,7 @@ def run(program: Program, parents: dict[str, Any], others: int) -> list[Any]:
     pool: list[Any] = []
     with np.errstate(all="ignore"):
         for name, seed in program:
-            rng, other = np.random.default_rng(seed), np.random.default_rng([seed, others])
+            rng, other = SAID.at(seed), GIVEN.at((seed, others))
             result = OPERATIONS[name](pool, parents, rng, other)
             pool.append(np.asarray(result) if isinstance(result, Gathered) else result)
     return pool

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from bayesmc.tracing import Tracer, axes, claims
+from tests.restarted import Restarted
 
 SHAPES = {"x": (2, 3), "z": (3,)}  # x is a vector in a plate, z three scalars
 EVENTS = {"x": 1, "z": 0}
@@ -192,6 +193,8 @@ HARSH: dict[str, Operation] = {
     "nan to num": lambda p, r, o: np.nan_to_num(some(p, r)),
 }  # fmt: skip
 OPERATIONS = GENTLE | HARSH
+#: what a program says, and what other parents happen to be
+SAID, GIVEN = Restarted(), Restarted()
 WEIGHTED = [*GENTLE, *GENTLE, *HARSH]
 
 
@@ -200,7 +203,7 @@ def run(program: Program, values: Sequence[Any], others: int) -> list[Any]:
     pool = list(values)
     with np.errstate(all="ignore"):
         for name, seed in program:
-            rng, other = np.random.default_rng(seed), np.random.default_rng([seed, others])
+            rng, other = SAID.at(seed), GIVEN.at((seed, others))
             pool.append(OPERATIONS[name](pool, rng, other))
     return pool
 

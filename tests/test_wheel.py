@@ -41,8 +41,10 @@ def stranger(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         return found if found.exists() else folder / "env" / "Scripts" / "python.exe"
 
     def install(folder: Path) -> None:
-        venv.create(folder / "env", with_pip=True)
-        _pip(str(python(folder)), "install", str(wheel))
+        venv.create(folder / "env")  # pip comes from here: no need to install another one
+        # most modules of what is required are never imported, and need no bytecode
+        into = ("--python", str(python(folder)))
+        _pip(sys.executable, *into, "install", "--no-compile", str(wheel))
 
     return python(_once(tmp_path_factory, "stranger", install))
 

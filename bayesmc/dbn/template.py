@@ -416,7 +416,7 @@ class DynamicBayesNet:
             initial is not None and not isinstance(initial, Distribution) and not callable(initial)
         ):
             raise ModelError(
-                f"node {name!r}: initial= is of type {type(initial).__name__}; give the distribution of slice "
+                f"node {name!r}: initial= is of type {type(initial).__name__}; give the density of slice "
                 "0, such as Normal(0.0, 1.0), a function that returns one, or a list of probabilities"
             )
         elif initial is not None:

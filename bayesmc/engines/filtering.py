@@ -1,19 +1,28 @@
 """What engines over time share: refusals, the calls, and the one loop of those that go slice by slice.
 
 A *sequential* engine turns the state of one slice and the row of the next into the state of that slice;
-``FilterEngine.filter`` is the loop, and ``start`` and ``step`` are the same moves taken one by one. Engines
-that know all slices to be alike (finite, linear) work through them at their own speed instead.
+``pass_slices`` is the loop, and ``start`` and ``step`` are the same moves taken one by one. Engines that know
+all slices to be alike (finite, linear) work through them at their own speed instead.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
-from bayesmc.errors import BayesmcError, EvidenceError, ModelError, UnsupportedError
+from bayesmc.errors import (
+    BayesmcError,
+    EvidenceError,
+    InterruptWarning,
+    ModelError,
+    UnsupportedError,
+)
 from bayesmc.results import SeriesPosterior
 
 #: functions whose expectation is wanted in every slice, by name
@@ -176,7 +185,8 @@ class FilterEngine:
         slices, row = read_row(
             belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
         )
-        return self._absorbed(belief, slices, row)
+        with in_slice(row.t):
+            return self._absorbed(belief, slices, row)
 
     def unsupported(
         self,
@@ -218,6 +228,101 @@ def common_refusal(engine: FilterEngine, problem: SeriesProblem) -> str | None:
     )
 
 
+def pass_slices(
+    start: int,
+    steps: int,
+    move: Callable[[int], None],
+    answer: Callable[[int], Any] | None,
+    advance: Callable[[], None],
+) -> None:
+    """The loop over the slices of a series; what is done is not lost where it ends early.
+
+    Parameters
+    ----------
+    start : int
+        The slice that the first row belongs to.
+    steps : int
+    move : callable
+        Takes in the k-th row and keeps its answers.
+    answer : callable or None
+        The posterior over the first k slices, k at least 1; None where there is none to give.
+    advance : callable
+        Notes that one more slice is done.
+
+    Raises
+    ------
+    Exception, KeyboardInterrupt
+        What ``move`` raises, with the slice it happened in and, in ``filtered``, the answer about the slices
+        before.
+    """
+    k = 0
+    try:
+        for k in range(steps):
+            with in_slice(start + k):
+                move(k)
+            advance()
+    except (Exception, KeyboardInterrupt) as stop:
+        hand_over(stop, answer(k) if answer is not None and k else None)
+        raise
+
+
+def hand_over(stop: BaseException, found: SeriesPosterior | None) -> None:
+    """Put the answer so far where whoever catches the exception finds it, and say so."""
+    with suppress(AttributeError):  # an exception of somebody else's may take no attributes
+        stop.filtered = found  # type: ignore[attr-defined]
+        if found is not None:
+            last = found.start + found.steps - 1
+            before = f"slices {found.start} to {last}" if found.steps > 1 else f"slice {last}"
+            stop.add_note(f"the answer about {before} is in `error.filtered`")
+
+
+@contextmanager
+def in_slice(t: int) -> Iterator[None]:
+    """Has errors say which slice they happened in."""
+    try:
+        yield
+    except BayesmcError as error:
+        if not re.search(rf"\bslice {t}\b", str(error)):
+            error.args = (f"slice {t}: {error}", *error.args[1:])
+        raise
+    except Exception as error:  # somebody else's: its arguments may mean anything
+        with suppress(AttributeError):
+            error.add_note(f"this was in slice {t}")
+        raise
+
+
+def answer_so_far(stop: KeyboardInterrupt, engine: FilterEngine) -> Any:
+    """The posterior over the slices that a filter has done before Ctrl-C; call it from ``filter`` itself.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        No slice is done, or the engine has no answer about some of them.
+
+    Warns
+    -----
+    InterruptWarning
+    """
+    found = getattr(stop, "filtered", None)
+    if found is None:
+        raise stop
+    last = found.start + found.steps - 1
+    warnings.warn(
+        f"{type(engine).__name__}: interrupted in slice {last + 1}; the posterior has the {found.steps} "
+        f"slices up to {last}",
+        InterruptWarning,
+        stacklevel=4,
+    )
+    found.interrupted = True
+    return found
+
+
+def refuse_forecast(found: SeriesPosterior, kind: str) -> None:
+    """The last slices of a filter that was interrupted are none ahead of the data: the interrupt goes on."""
+    if kind == "forecast" and getattr(found, "interrupted", False):
+        raise KeyboardInterrupt
+
+
 class Answers(NamedTuple):
     """Tables, means and variances by node, time first."""
 
@@ -226,16 +331,22 @@ class Answers(NamedTuple):
     variances: dict[str, np.ndarray]
 
 
-def observed_answers(problem: SeriesProblem) -> Answers:
-    """What is known of nodes that are observed in full throughout: their values."""
+def observed_answers(problem: SeriesProblem, steps: int | None = None) -> Answers:
+    """What is known of nodes that are observed in full throughout: their values (in the first slices)."""
     found = Answers({}, {}, {})
     for name, seen in problem.series.observed.items():
         node = problem.model[name]
         if seen.mask is not None:
             continue
+        value = seen.value[:steps]
         if node.domain is not None:
-            found.tables[name] = np.eye(node.domain.size)[seen.value.astype(np.intp)]
+            found.tables[name] = np.eye(node.domain.size)[value.astype(np.intp)]
         else:
-            found.means[name] = seen.value.astype(float)
-            found.variances[name] = np.zeros(seen.value.shape)
+            found.means[name] = value.astype(float)
+            found.variances[name] = np.zeros(value.shape)
     return found
+
+
+def first_slices(arrays: Mapping[str, np.ndarray], steps: int) -> dict[str, np.ndarray]:
+    """The first so many rows of arrays by node, time first."""
+    return {n: a[:steps] for n, a in arrays.items()}

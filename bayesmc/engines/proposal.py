@@ -23,8 +23,10 @@ from bayesmc.network.store import unknown
 FUNCTION = "a function of named nodes that returns a distribution"
 
 
-def check_specification(engine: str, proposal: Any, accepted: str) -> dict[Key, Any]:
-    """A copy of what a user gave as proposals, its keys looked at.
+def check_specification(
+    engine: str, proposal: Any, accepted: str, option: str = "proposal"
+) -> dict[Key, Any]:
+    """A copy of what a user gave as proposals, its keys looked at; ``option`` is where, for messages.
 
     Raises
     ------
@@ -35,25 +37,28 @@ def check_specification(engine: str, proposal: Any, accepted: str) -> dict[Key, 
     """
     if not isinstance(proposal, Mapping):
         raise TypeError(
-            f"{engine}(proposal={proposal!r}): give a dict from node name to {accepted}"
+            f"{engine}({option}={proposal!r}): give a dict from node name to {accepted}"
         )
     seen: set[str] = set()
     for key in proposal:
         if not key or not all(isinstance(n, str) for n in names_of(key)):
             raise TypeError(
-                f"{engine}: the key {key!r} of proposal= is no node name; give a name, or a tuple of names "
+                f"{engine}: the key {key!r} of {option}= is no node name; give a name, or a tuple of names "
                 "that are proposed jointly"
             )
         for name in names_of(key):
             if name in seen:
                 raise ModelError(
-                    f"{engine}: {name!r} has two proposals; every node is drawn by one, so keep one of them"
+                    f"{engine}: {name!r} has two proposals in {option}=; every node is drawn by one, so keep "
+                    "one of them"
                 )
             seen.add(name)
     return dict(proposal)
 
 
-def as_function(engine: str, key: Key, given: Any, accepted: str) -> Callable[..., Any]:
+def as_function(
+    engine: str, key: Key, given: Any, accepted: str, option: str = "proposal"
+) -> Callable[..., Any]:
     """The function of a proposal; a distribution (for a block, also a dict of them) is a constant one.
 
     Raises
@@ -68,7 +73,7 @@ def as_function(engine: str, key: Key, given: Any, accepted: str) -> Callable[..
         return lambda: distribution
     if not callable(given) or isinstance(given, type):
         raise TypeError(
-            f"{engine}: the proposal for {key!r} is {given!r}; give {accepted}, or a distribution"
+            f"{engine}: the {option} for {key!r} is {given!r}; give {accepted}, or a distribution"
         )
     return given
 

@@ -197,9 +197,10 @@ class BeamFit(NamedTuple):
         Of the data (not tempered) under the model before each iteration and after the last; it
         never falls.
     converged : bool
-        Whether the last iteration gained less than the tolerance, and no parameter ended at a bound.
+        Whether the last iteration gained less than the tolerance, and ``sigma_hit`` did not end at its bound.
     at_bound : tuple of str
-        Parameters that the data would have smaller than they may be: ``"sigma_hit"``, ``"lambda_short"``.
+        Parameters that the data would have smaller than they may be: ``"sigma_hit"``, and ``"lambda_short"``
+        where short readings do not thin out along the beam.
     """
 
     model: BeamModel
@@ -250,7 +251,7 @@ def fit_beams(
     Warns
     -----
     ConvergenceWarning
-        A parameter ended at its bound: see ``BeamFit.at_bound``.
+        ``sigma_hit`` ended at ``least_sigma``.
 
     Notes
     -----
@@ -298,7 +299,7 @@ def fit_beams(
             break
         model = _maximised(model, z, expected, share, least)
     stuck = _at_bound(model, least, len(z))
-    return BeamFit(model, np.array(history), converged and not stuck, stuck)
+    return BeamFit(model, np.array(history), converged and "sigma_hit" not in stuck, stuck)
 
 
 def clean_ranges(ranges: Any, max_range: float) -> np.ndarray:
@@ -399,22 +400,20 @@ def _least(start: BeamModel, sigma: float) -> _Least:
 
 
 def _at_bound(model: BeamModel, least: _Least, count: int) -> tuple[str, ...]:
-    """Parameters that ended at their bounds, and a warning about them."""
-    why = []
+    """Parameters that ended at their bounds, and a warning about the one that spoils the fit."""
+    found = []
     if model.sigma_hit <= least.sigma_hit * (1 + 1e-4):
-        why.append(
-            f"sigma_hit ended at least_sigma={least.sigma_hit:g} m: hits hardly differ from what is "
-            "expected; are these real readings, and is expected not made of them?"
+        found.append("sigma_hit")
+        warnings.warn(
+            f"fit_beams: sigma_hit ended at least_sigma={least.sigma_hit:g} m: hits hardly differ from what "
+            "is expected; are these real readings, and is expected not made of them?",
+            ConvergenceWarning,
+            stacklevel=3,
         )
     # a rate of short readings that there are none of says nothing
     if model.lambda_short <= least.lambda_short * (1 + 1e-4) and model.z_short * count > 1:
-        why.append(
-            f"lambda_short ended at {least.lambda_short:g} per m: short readings do not thin out along "
-            "the beam"
-        )
-    if why:
-        warnings.warn("fit_beams: " + "; ".join(why), ConvergenceWarning, stacklevel=3)
-    return tuple(part.split()[0] for part in why)
+        found.append("lambda_short")
+    return tuple(found)
 
 
 def _maximised(

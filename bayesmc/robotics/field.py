@@ -69,7 +69,8 @@ class LikelihoodField:
     - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
       Evidence of a net is finite, so put scans through ``clean_ranges`` before they become a net's rows.
     - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
-      all have. Where none of several poses is on the map, that is an error.
+      all have. Where the map is farther from all of several poses than
+      the longest beam reaches, that is an error.
     - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
       end point within 0.001 cells of a border may count for the cell next to it.
     - The density is not normalised over ranges (Thrun et al., section 6.4); evidence computed with
@@ -179,7 +180,7 @@ class FieldScan(Distribution):
     ShapeError
         Poses do not have three components, angles more than one axis, or there is no beam.
     ModelError
-        From ``log_prob``: none of several poses lies on the map.
+        From ``log_prob``: from none of several poses a beam could end on the map.
     """
 
     parameter_ndim = {"pose": 1, "angles": 1}
@@ -234,8 +235,23 @@ class FieldScan(Distribution):
         if not len(ranges):
             return np.zeros(pose.shape[:-1])
         table = self.field._table
-        log = table.scores(ranges, angles, *table.place(pose.reshape(-1, 3)))
+        rows, outside = table.place(pose.reshape(-1, 3))
+        if outside is not None and outside.size > 1 and outside.all():
+            self._check_in_sight(pose, float(ranges.max()))
+        log = table.scores(ranges, angles, rows, outside)
         return log.reshape(pose.shape[:-1])
+
+    def _check_in_sight(self, pose: np.ndarray, longest: float) -> None:
+        """Refuse poses from none of which a beam could end on the map: such a start is a mistake."""
+        left, right, bottom, top = self.field.grid.extent
+        x, y = pose[..., 0], pose[..., 1]
+        away = np.maximum(np.maximum(left - x, x - right), np.maximum(bottom - y, y - top)).min()
+        if away > longest + math.hypot(*self.field.mount[:2]):
+            raise ModelError(
+                f"LikelihoodField: none of {x.size} poses lies within {away:.3g} m of the map, which spans x "
+                f"{left:g} to {right:g} and y {bottom:g} to {top:g} m, and no beam reaches that far; is the "
+                "start given in the map's frame and in metres?"
+            )
 
     def _of_pairs(self, scans: np.ndarray, pose: np.ndarray) -> np.ndarray:
         """Log densities of scans ``(n, beams)``, each from its own pose ``(n, 3)``."""
@@ -337,19 +353,8 @@ class _Table:
             found = self._gather(turn.reshape(-1, 4), rows[:, part], rooms)
             np.add.reduce(found, axis=0, out=log[part], dtype=np.float32)
         if outside is not None:
-            if count > 1 and outside.all():
-                raise self._nowhere(rows)
             log[outside] = beams * self.field.log_random
         return log
-
-    def _nowhere(self, rows: np.ndarray) -> ModelError:
-        """None of several poses is on the map: lost beyond help, or never on it."""
-        left, right, bottom, top = self.field.grid.extent
-        return ModelError(
-            f"LikelihoodField: none of {rows.shape[1]} poses lies on the map, which spans x {left:g} to "
-            f"{right:g} and y {bottom:g} to {top:g} m; is the start given in the map's frame and in metres, "
-            "or has the motion led off the map?"
-        )
 
     def along(self, pose: np.ndarray, angles: np.ndarray, ranges: np.ndarray) -> np.ndarray:
         """Log densities at ``ranges`` (..., points) along each beam, shape (poses, beams, points)."""

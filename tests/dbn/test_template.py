@@ -282,7 +282,7 @@ def test_faults_name_the_node_and_the_remedy(fault: str) -> None:
     ("initial", "error", "message"),
     [
         (np.array([1.0, 1.0, 0.0]), ParameterError, "the probabilities of a finite node"),
-        ({"mean": 0.0}, ModelError, "initial= is of type dict; give the distribution of slice 0"),
+        ({"mean": 0.0}, ModelError, "initial= is of type dict; give the density of slice 0"),
     ],
 )
 def test_starts_that_are_no_densities(initial: Any, error: type[Exception], message: str) -> None:

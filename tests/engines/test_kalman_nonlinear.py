@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -238,15 +239,22 @@ def turned(a: np.ndarray) -> np.ndarray:
     return np.remainder(a + np.pi, 2 * np.pi) - np.pi
 
 
+@functools.cache
+def turning_by_particles() -> tuple[np.ndarray, dict[str, np.ndarray], Any]:
+    """A heading, its readings, and the answer of many particles."""
+    dbn = turning()
+    drawn = dbn.sample(80, rng=5)
+    rows = {"y": drawn["y"][0]}
+    return drawn["a"][0], rows, bmc.filter(dbn, rows, engine=bmc.ParticleFilter(20_000), rng=0)
+
+
 @pytest.mark.parametrize("engine", ENGINES[:2], ids=SHORT[:2])
 def test_angles_go_the_short_way_round(engine: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     dbn = turning()
-    drawn = dbn.sample(80, rng=5)
-    heading, rows = drawn["a"][0], {"y": drawn["y"][0]}
+    heading, rows, particles = turning_by_particles()
     filtered = bmc.filter(dbn, rows, engine=engine)
     assert np.abs(filtered.mean("a")).max() <= np.pi
     assert np.abs(turned(filtered.mean("a") - heading)).max() < 0.5
-    particles = bmc.filter(dbn, rows, engine=bmc.ParticleFilter(20_000), rng=0)
     # at these concentrations a Gaussian is right to about 0.01, which 20,000 particles resolve
     assert np.abs(turned(filtered.mean("a") - particles.mean("a"))).max() < 0.02
     assert filtered.log_marginal_likelihood == pytest.approx(

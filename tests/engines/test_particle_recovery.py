@@ -9,7 +9,10 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.dbn import Row
 from bayesmc.engines.particles import anew
+from bayesmc.engines.particles import recovery as recovering
+from bayesmc.network import Observed
 
 ROWS = {"y": np.r_[np.full(3, 2.0), np.full(4, 8.0)]}
 ANYWHERE = bmc.Uniform(0.0, 10.0)
@@ -58,13 +61,91 @@ def deviation(found: np.ndarray) -> float:
 AIMED: dict[str, Any] = {"x": lambda y: bmc.Truncated(bmc.Normal(y, 0.8), 0.0, 10.0)}
 
 
-@pytest.mark.parametrize("draws", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("draws", [0.0, 0.3])
 @pytest.mark.parametrize("proposal", [None, AIMED], ids=["from the density", "aimed"])
 def test_the_evidence_is_that_of_the_declared_jump(proposal: Any, draws: float) -> None:
-    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each); where all are drawn
-    # anew, the other part of the mixture is left out
+    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each)
     found = ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=draws, proposal=proposal))
-    assert (deviation(found) < 4) == (draws < 1.0)
+    assert deviation(found) < 4
+
+
+SHORT = {"y": np.array([2.0, 2.0, 8.0, 8.0])}
+SHORT_EXACT = bmc.filter(jumping(), SHORT, engine=bmc.GridFilter({"x": (-3.0, 13.0, 1600)}))
+
+
+def short_ratios(draws: float, **options: Any) -> np.ndarray:
+    begin = bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=draws)
+    engine = bmc.ParticleFilter(300, recovery=begin, **options)
+    logs = [
+        bmc.filter(walk(), SHORT, engine=engine, rng=seed).log_marginal_likelihood
+        for seed in range(200)
+    ]
+    return np.exp(np.array(logs) - SHORT_EXACT.log_marginal_likelihood)
+
+
+def of_their_ancestors(selection: Any, lost: np.ndarray) -> np.ndarray:
+    """The weights that particles would have, had they not begun anew."""
+    return np.broadcast_to(selection.carried, (selection.particles,))
+
+
+@pytest.mark.parametrize("draws", [0.0, 0.3])
+@pytest.mark.parametrize("auxiliary", [False, True])
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 1.0])
+def test_the_evidence_however_particles_are_chosen(
+    threshold: float, auxiliary: bool, draws: float
+) -> None:
+    # alpha 6e-5 each
+    found = short_ratios(draws, ess_threshold=threshold, auxiliary=auxiliary)
+    assert deviation(found) < 4
+    assert np.log(found).std() < 1.2
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5])
+def test_lost_particles_have_no_weight_of_an_ancestor(
+    threshold: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # where they are chosen by what the row makes of their ancestors, those far off are never chosen;
+    # where they are not resampled, few have a weight, and the lost rarely one of these
+    monkeypatch.setattr(anew, "start_weights", of_their_ancestors)
+    found = short_ratios(0.3, ess_threshold=threshold, auxiliary=threshold > 0)
+    assert np.log(found).std() > 2
+    assert threshold == 0.0 or deviation(found) > 8
+
+
+def odometer(jumps: bool) -> bmc.DynamicBayesNet:
+    """A second reading looks at the slice before: how far it came."""
+    dbn = jumping() if jumps else walk()
+    first = lambda x: bmc.Normal(0.0 * x, 1.0)  # noqa: E731
+    dbn.add("came", lambda x, x_prev: bmc.Normal(x - x_prev, 1.0), initial=first)
+    return dbn
+
+
+@pytest.mark.parametrize("fault", [False, True])
+@pytest.mark.parametrize("threshold", [0.0, 0.5])
+def test_readings_of_two_slices(
+    threshold: float, fault: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if fault:  # ancestors by number, as if they all had the same weight
+        monkeypatch.setattr(anew.Lost, "_ancestors", lambda self, _, chosen, lost, rng: lost)
+    rows = {**SHORT, "came": np.array([0.0, 0.1, 5.5, 0.2])}
+    grid = bmc.GridFilter({"x": (-3.0, 13.0, 800)})
+    exact = bmc.filter(odometer(True), rows, engine=grid).log_marginal_likelihood
+    begin = bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=0.3)
+    engine = bmc.ParticleFilter(300, recovery=begin, ess_threshold=threshold)
+    logs = [
+        bmc.filter(odometer(False), rows, engine=engine, rng=seed).log_marginal_likelihood
+        for seed in range(200)
+    ]
+    found = deviation(np.exp(np.array(logs) - exact))
+    assert found > 6 if fault else found < 4  # alpha 6e-5
+
+
+def test_a_state_that_is_seen_may_have_jumped() -> None:
+    begin = bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=0.5)
+    engine = bmc.ParticleFilter(20_000, recovery=begin)
+    found = bmc.filter(walk(), {"x": [2.0, 8.0]}, engine=engine, rng=0)
+    # half of the particles weigh share * 0.1 / 0.5: standard error 1 / sqrt(n) = 0.7 %
+    assert found.log_marginal_increments[1] == pytest.approx(np.log(SHARE * 0.1), abs=0.04)
 
 
 def test_draws_beyond_the_share_are_weighed_down(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -104,6 +185,48 @@ def test_the_share_follows_how_well_rows_are_explained() -> None:
     for row in rows["y"]:
         belief = engine.step(belief, {"y": row})
     assert belief.mean("x") == found.mean("x")[-1]
+
+
+def in_view() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet(plates={"k": 3})
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 0.1), initial=ANYWHERE)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.05), plates="k")
+    return dbn
+
+
+def views(*rows: tuple[int, float]) -> dict[str, np.ndarray]:
+    """Rows that see so many of three readings, which read so much."""
+    return {"y": np.array([[at if k < seen else np.nan for k in range(3)] for seen, at in rows])}
+
+
+@pytest.mark.parametrize("one_for_all", [False, True])
+def test_readings_out_of_view_are_no_surprise(
+    one_for_all: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if one_for_all:  # the control: averages over rows of different content
+        monkeypatch.setattr(recovering, "_what_is_seen", lambda row: ())
+    begin = bmc.Recovery({"x": ANYWHERE}, slow=0.01, fast=0.9)
+    engine = bmc.ParticleFilter(3000, recovery=begin)
+    rows = [(3, 4.0)] * 8 + [(1, 4.0)] * 4 + [(3, 4.0)] * 4
+    found = bmc.filter(in_view(), views(*rows), engine=engine, rng=0)
+    assert (found.anew[9:].max() > 1000) == one_for_all
+
+
+def test_what_comes_in_turns_has_averages_of_its_own() -> None:
+    begin = bmc.Recovery({"x": ANYWHERE}, slow=0.2, fast=0.9)
+    engine = bmc.ParticleFilter(3000, recovery=begin)
+    rows = [(3, 4.0), (1, 4.0)] * 5 + [(3, 4.6), (1, 4.6)]
+    found = bmc.filter(in_view(), views(*rows), engine=engine, rng=0)
+    assert found.anew[4:11].max() < 600 and found.anew[11] > 2000
+
+
+def test_averages_of_an_endless_series_stay_small() -> None:
+    begin, averages = bmc.Recovery({"x": ANYWHERE}, slow=0.1, fast=0.5), None
+    for k in range(200):
+        mask = np.array([k >> i & 1 for i in range(8)], dtype=bool)
+        row = Row(k, {"y": Observed(np.zeros(8), mask)}, {})
+        averages = begin.averaged(averages, row, -1.0)
+    assert averages is not None and len(averages.logs) == 64 and averages.last in averages.logs
 
 
 def test_a_belief_that_narrows_needs_fewer_particles() -> None:
@@ -161,13 +284,62 @@ def test_options_travel_without_functions() -> None:
     assert pickle.loads(pickle.dumps(adapted)).adapt.widths == {"x": 0.5}
 
 
+def test_widths_compare_and_hash() -> None:
+    widths = bmc.KLD({"x": 0.5, "v": np.array([1.0, 2.0])})
+    same = bmc.KLD({"v": (1, 2), "x": 0.5})
+    assert widths == same and hash(widths) == hash(same)
+    assert widths != bmc.KLD({"x": 0.5, "v": [1.0, 3.0]})
+    assert bmc.ParticleFilter(10, adapt=widths) == bmc.ParticleFilter(10, adapt=same)
+
+
+def test_all_may_begin_anew() -> None:
+    # a share of one: every slice is a net of its own
+    engine = bmc.ParticleFilter(20_000, recovery=bmc.Recovery({"x": ANYWHERE}, share=1.0))
+    found = bmc.filter(walk(), SHORT, engine=engine, rng=0)
+    assert (found.anew[1:] == 20_000).all()
+    # the reading's density is 0.1 everywhere inside; standard error 2 %
+    np.testing.assert_allclose(found.log_marginal_increments, np.log(0.1), atol=0.1)
+
+
 WRONG: dict[str, tuple[Any, type[Exception], str]] = {
     "no share": (lambda: bmc.Recovery({"x": ANYWHERE}), ValueError, "nothing would begin anew"),
     "large share": (lambda: bmc.Recovery({"x": ANYWHERE}, share=1.5), ValueError, "0 to 1"),
     "draws": (lambda: bmc.Recovery({"x": ANYWHERE}, share=0.1, draws=-1.0), ValueError, "draws=-1"),
+    "all drawn": (
+        lambda: bmc.Recovery({"x": ANYWHERE}, share=0.1, draws=1.0),
+        ValueError,
+        "no particle would come from the slice before",
+    ),
+    "share in words": (
+        lambda: bmc.Recovery({"x": ANYWHERE}, share="a"),  # type: ignore[arg-type]
+        ValueError,
+        "0 to 1",
+    ),
+    "array": (
+        lambda: bmc.Recovery({"x": np.zeros(2)}, share=0.1),
+        TypeError,
+        "the density for 'x'",
+    ),
+    "nothing": (
+        lambda: bmc.Recovery(None, share=0.1),  # type: ignore[arg-type]
+        TypeError,
+        r"Recovery\(density=None\): give a dict",
+    ),
+    "aimed array": (
+        lambda: bmc.Recovery({"x": ANYWHERE}, share=0.1, proposal={"x": 1.0}),
+        TypeError,
+        "the proposal for 'x'",
+    ),
     "rates": (lambda: bmc.Recovery({"x": ANYWHERE}, slow=0.5, fast=0.1), ValueError, "slow < fast"),
     "tuple": (lambda: bmc.Recovery({("x", "y"): ANYWHERE}, share=0.1), TypeError, "name one node"),
-    "no dict": (lambda: bmc.Recovery(ANYWHERE, share=0.1), TypeError, "dict from node name"),
+    "no dict": (lambda: bmc.Recovery(ANYWHERE, share=0.1), TypeError, r"\(density="),
+    "width in words": (lambda: bmc.KLD({"x": "a"}), ValueError, "the width of 'x' is 'a'"),
+    "no components": (lambda: bmc.KLD({"x": []}), ValueError, "the width of 'x'"),
+    "half a particle": (
+        lambda: bmc.KLD({"x": 1.0}, least=2.5),  # type: ignore[arg-type]
+        ValueError,
+        "1 or more",
+    ),
     "no widths": (lambda: bmc.KLD({}), ValueError, "width of its bins"),
     "zero width": (lambda: bmc.KLD({"x": 0.0}), ValueError, "positive number"),
     "error": (lambda: bmc.KLD({"x": 1.0}, error=0.0), ValueError, "above 0"),
@@ -200,6 +372,21 @@ def test_wrong_options_are_named(name: str) -> None:
             {"recovery": bmc.Recovery({"y": ANYWHERE}, share=0.1)},
             "ModelError",
             "says nothing of 'x'",
+        ),
+        (
+            {"recovery": bmc.Recovery({"x": lambda y: bmc.Normal(y, 1.0)}, share=0.1)},
+            "ModelError",
+            "reads 'y', which comes after it.*proposal=",
+        ),
+        (
+            {"recovery": bmc.Recovery({"x": ANYWHERE}, share=0.1, proposal={"q": ANYWHERE})},
+            "UnknownNodeError",
+            "'q'",
+        ),
+        (
+            {"recovery": bmc.Recovery({"x": ANYWHERE}, share=0.1, proposal={"y": ANYWHERE})},
+            "ModelError",
+            "density= says nothing",
         ),
         ({"adapt": bmc.KLD({"q": 1.0})}, "UnknownNodeError", "'q'"),
         ({"adapt": bmc.KLD({"y": 1.0})}, "ModelError", "does not read"),

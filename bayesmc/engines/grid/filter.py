@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.exact import readable_bytes
-from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.filtering import FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief
@@ -167,15 +168,22 @@ class GridFilter(FilterEngine):
         mover = self._mover(problem)
         record = GridRecord(problem, mover.model, queries or {}, keep is None)
         increments = np.empty((problem.steps, *mover.model.lead))
-        with Progress(problem.steps, self.label, progress) as bar, _quiet():
-            before: Cells | None = None
-            for k in range(problem.steps):
-                cells = mover.move(before, problem.series.row(k))
-                increments[k] = cells.increment
-                record.add(k, _answers(mover, before, cells, cells.probs))
-                before = cells
-                bar.advance()
-        return record.posterior(self, "filter", increments)
+        before: Cells | None = None
+
+        def move(k: int) -> None:
+            nonlocal before
+            cells = mover.move(before, problem.series.row(k))
+            increments[k] = cells.increment
+            record.add(k, _answers(mover, before, cells, cells.probs))
+            before = cells
+
+        so_far = partial(record.posterior, self, "filter", increments)
+        try:
+            with Progress(problem.steps, self.label, progress) as bar, _quiet():
+                pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
+        except KeyboardInterrupt as stop:
+            return answer_so_far(stop, self)
+        return so_far()
 
     def smooth(
         self,
@@ -193,16 +201,18 @@ class GridFilter(FilterEngine):
         increments = np.empty((steps, *mover.model.lead))
         reach = steps if lag is None else int(lag)
         held: deque[Cells] = deque(maxlen=reach + 2)
+
+        def move(k: int) -> None:
+            cells = mover.move(held[-1] if held else None, problem.series.row(k))
+            increments[k] = cells.increment
+            held.append(cells)
+            if k == 0:
+                self._check_held(cells.probs.nbytes, min(steps, reach + 2), lag)
+            if k >= reach and k < steps - 1:
+                self._smoothed(mover, record, held, k, k - reach, k - reach)
+
         with Progress(steps, self.label, progress) as bar, _quiet():
-            for k in range(steps):
-                cells = mover.move(held[-1] if held else None, problem.series.row(k))
-                increments[k] = cells.increment
-                held.append(cells)
-                if k == 0:
-                    self._check_held(cells.probs.nbytes, min(steps, reach + 2), lag)
-                bar.advance()
-                if k >= reach and k < steps - 1:
-                    self._smoothed(mover, record, held, k, k - reach, k - reach)
+            pass_slices(problem.series.start, steps, move, None, bar.advance)
             self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
         return record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.exact import readable_bytes
-from bayesmc.engines.filtering import Queries, observed_answers
+from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BudgetError, UnsupportedError
@@ -69,22 +69,25 @@ class GridRecord:
         for name, function in self.asked.items():
             self.queries[name][k] = answers.expectation(function)
 
-    def posterior(self, engine: Any, kind: str, increments: np.ndarray) -> GridPosterior:
-        """The answers of all slices."""
-        seen = observed_answers(self.problem)
+    def posterior(
+        self, engine: Any, kind: str, increments: np.ndarray, steps: int | None = None
+    ) -> GridPosterior:
+        """The answers of all slices, or of the first so many."""
+        k = self.problem.steps if steps is None else steps
+        seen = observed_answers(self.problem, k)
         axes = self.model.axes.of
         grids = {n: tuple(a.points for a in axes[n]) for n in self.densities}
         return GridPosterior(
             self.problem.model,
             engine,
             kind,
-            increments,
+            increments[:k],
             grids,
-            self.densities,
-            tables={**seen.tables, **self.tables},
-            means={**seen.means, **self.means},
-            variances={**seen.variances, **self.variances},
-            queries={n: np.stack(rows) for n, rows in self.queries.items()},
+            first_slices(self.densities, k),
+            tables={**seen.tables, **first_slices(self.tables, k)},
+            means={**seen.means, **first_slices(self.means, k)},
+            variances={**seen.variances, **first_slices(self.variances, k)},
+            queries={n: np.stack(rows[:k]) for n, rows in self.queries.items()},
             start=self.problem.series.start,
         )
 
@@ -140,6 +143,7 @@ class GridPosterior(SeriesPosterior):
 
     def last(self, steps: int, kind: str) -> GridPosterior:
         """The last so many slices by themselves."""
+        refuse_forecast(self, kind)
         cut = super().last(steps, kind)
         return GridPosterior(
             self.model, self.engine, kind, None, self._grids,

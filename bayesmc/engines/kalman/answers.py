@@ -16,7 +16,7 @@ from bayesmc.engines.kalman.posterior import GaussianSeries, Spreads, on_circle
 def filter_answers(
     engine: Any, problem: SeriesProblem, data: SeriesData, found: Filtered
 ) -> GaussianSeries:
-    """Every slice given the rows up to it."""
+    """Every slice given the rows up to it; of the first so many, where no more were passed."""
     spreads = Spreads(found.factors, found.which)
     return _answers(engine, problem, data, "filter", found, found.means, spreads)
 
@@ -52,8 +52,8 @@ def _answers(
     spreads: Spreads,
 ) -> GaussianSeries:
     variances = spreads.variances()
-    layout = data.layouts[0]
-    answers = observed_answers(problem)
+    layout, steps = data.layouts[0], len(means)
+    answers = observed_answers(problem, steps)
     wide = variances.reshape(
         len(variances), *(1,) * (means.ndim - variances.ndim), *variances.shape[1:]
     )
@@ -62,9 +62,9 @@ def _answers(
         node = layout.slices.first[name]
         answers.means[name] = layout.unpacked(node, on_circle(layout, name, means[..., place]))
         answers.variances[name] = layout.unpacked(node, full[..., place])
-    for name, value in data.computed().items():
+    for name, value in data.computed(steps).items():
         node = layout.slices.first[name]
-        value = np.broadcast_to(value, (data.steps, *node.value_shape))
+        value = np.broadcast_to(value, (steps, *node.value_shape))
         if node.domain is not None:
             answers.tables[name] = np.eye(node.domain.size)[value.astype(np.intp)]
         else:

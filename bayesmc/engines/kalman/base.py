@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.filtering import FilterEngine, Queries
+from bayesmc.engines.filtering import FilterEngine, Queries, answer_so_far
 from bayesmc.engines.kalman.answers import filter_answers, smooth_answers
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.passes import Filtered, State, backward
@@ -83,7 +83,10 @@ class GaussianFilter(FilterEngine):
             )
         self._check_queries(queries)
         data = self._data(problem)
-        found = self._passed(problem, data, False, progress)
+        try:
+            found = self._passed(problem, data, False, progress)
+        except KeyboardInterrupt as stop:
+            return answer_so_far(stop, self)
         return filter_answers(self, problem, data, found)
 
     def smooth(

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, SeriesProblem
+from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.slice_steps import plates_apart, summed
 from bayesmc.network import Observed
@@ -72,7 +73,7 @@ class SeriesData:
         self.static = {n: o.value for n, o in series.static.items()}
         self._computed: dict[str, np.ndarray] = {}
         if any(n in slices.interface for layout in self.layouts for n in layout.computed):
-            self._computed = self._values_computed()
+            self._computed = self._values_computed(self.steps)
 
     def layout(self, k: int) -> Layout:
         """The layout of slice k."""
@@ -143,13 +144,13 @@ class SeriesData:
                 total[low:high] = certain_densities(layout, self.values(low, high), high - low)
         return total
 
-    def computed(self) -> dict[str, np.ndarray]:
-        """Values of deterministic nodes that are known throughout, time first."""
+    def computed(self, steps: int) -> dict[str, np.ndarray]:
+        """Values in the first slices of deterministic nodes that are known throughout, time first."""
         names = set(self.layouts[0].computed) & set(self.layouts[1].computed)
         if not names:
             return {}
-        found = self._computed or self._values_computed()
-        return {n: found[n] for n in names}
+        found = self._computed or self._values_computed(steps)
+        return {n: found[n][:steps] for n in names}
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -161,19 +162,20 @@ class SeriesData:
             found.append(stacked(layout, observed, (high - low,)))
         return found
 
-    def _values_computed(self) -> dict[str, np.ndarray]:
+    def _values_computed(self, steps: int) -> dict[str, np.ndarray]:
         """Deterministic nodes slice by slice, since they may read their own past."""
         rows: dict[str, list[np.ndarray]] = {}
         before: dict[str, np.ndarray] = {}
-        for k in range(self.steps):
+        for k in range(steps):
             layout, values = self.layout(k), {**self.at(k), **before}
             before = {}
             for name in layout.computed:
-                value = layout.model.evaluate(name, values)[0]
+                with in_slice(k):
+                    value = layout.model.evaluate(name, values)[0]
                 values[name] = value
                 before[name + PREVIOUS] = value
                 rows.setdefault(name, []).append(value)
-        return {n: np.stack(v) for n, v in rows.items() if len(v) == self.steps}
+        return {n: np.stack(v) for n, v in rows.items() if len(v) == steps}
 
 
 def stacked(layout: Layout, values: Mapping[str, np.ndarray], batch: tuple[int, ...]) -> np.ndarray:

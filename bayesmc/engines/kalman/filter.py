@@ -9,6 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.filtering import hand_over
+from bayesmc.engines.kalman.answers import filter_answers
 from bayesmc.engines.kalman.base import GaussianFilter
 from bayesmc.engines.kalman.covariances import rows_of
 from bayesmc.engines.kalman.data import Pattern, SeriesData
@@ -17,7 +19,7 @@ from bayesmc.engines.kalman.passes import Filtered, State, forward
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
 from bayesmc.engines.kalman.rows import Memory
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.kernels.kalman import multiplied
 
 
@@ -85,7 +87,15 @@ class KalmanFilter(GaussianFilter):
         smoothing: bool,
         advance: Callable[[int], None],
     ) -> Filtered:
-        return forward(data, self._matrices(problem, data), smoothing, advance)
+        found = forward(data, self._matrices(problem, data), smoothing, advance)
+        finite = np.isfinite(found.increments).reshape(data.steps, -1).all(axis=1)
+        if not finite.all():
+            k = int(np.argmin(finite))
+            error = DegeneracyError(f"the row of slice {k} has no density given those before", k)
+            if k:
+                hand_over(error, filter_answers(self, problem, data, found.first(k)))
+            raise error
+        return found
 
     def _matrices(self, problem: SeriesProblem, data: SeriesData) -> tuple[Linear, Linear | None]:
         if "kalman matrices" not in problem.cache:

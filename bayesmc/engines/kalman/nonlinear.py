@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.filtering import Asked
+from bayesmc.engines.filtering import Asked, pass_slices
+from bayesmc.engines.kalman.answers import filter_answers
 from bayesmc.engines.kalman.base import GaussianFilter
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.levels import Level, Made, Plan, expected_slice, why_not_matched
 from bayesmc.engines.kalman.passes import Filtered, State, Turns
+from bayesmc.engines.kalman.posterior import GaussianSeries
 from bayesmc.engines.kalman.rows import Memory, RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
@@ -103,13 +106,19 @@ class NonlinearFilter(GaussianFilter):
         )  # fmt: skip
         taker = RowTaker(self, problem.slices, data.static)
         before: Taken | None = None
-        for k in range(steps):
+
+        def move(k: int) -> None:
+            nonlocal before
             taken = taker.take(data.series.row(k), before, smoothing)
             _write(found, k, whole, taken)
             if turns is not None and before is not None:
                 _write_turn(turns, k, whole, before.layout, taken)
             before = taken
-            advance(1)
+
+        def so_far(k: int) -> GaussianSeries:
+            return filter_answers(self, problem, data, found.first(k))
+
+        pass_slices(data.series.start, steps, move, so_far, partial(advance, 1))
         return found
 
 

@@ -24,7 +24,6 @@ from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.means import all_means
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.errors import DegeneracyError
 from bayesmc.kernels.kalman import multiplied, turned
 
 
@@ -73,6 +72,12 @@ class Filtered:
     increments: np.ndarray
     turns: Turns | None
 
+    def first(self, steps: int) -> Filtered:
+        """The first so many slices, for answers; they carry no smoother."""
+        return Filtered(
+            self.means[:steps], self.factors, self.which[:steps], self.increments[:steps], None
+        )
+
 
 def forward(
     data: SeriesData,
@@ -80,14 +85,13 @@ def forward(
     smoothing: bool,
     advance: Callable[[int], None],
 ) -> Filtered:
-    """The filter: ``matrices`` are those of slice 0 and of the later ones."""
+    """The filter: ``matrices`` are those of slice 0 and of the later ones.
+
+    Increments that are not finite are for the caller to refuse; what comes before them is right.
+    """
     chosen = Chosen(data, matrices)
     covariances = worked_out(data, chosen, smoothing, advance)
     found = all_means(data, chosen, covariances, smoothing)
-    if not np.isfinite(found.increments).all():
-        at = np.isfinite(found.increments).reshape(data.steps, -1).all(axis=1)
-        k = int(np.argmin(at))
-        raise DegeneracyError(f"the row of slice {k} has no density given those before", k)
     turns = None
     if found.shifts is not None:
         turns = Turns(*_turns(data.layouts[0], covariances), found.shifts)

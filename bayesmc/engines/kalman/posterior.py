@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.distributions.circular import wrap_angle
+from bayesmc.engines.filtering import refuse_forecast
 from bayesmc.engines.kalman.rows import RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
@@ -109,6 +110,7 @@ class GaussianSeries(SeriesPosterior):
 
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
+        refuse_forecast(self, kind)
         cut = super().last(steps, kind)
         found = GaussianSeries(
             self.model, self.engine, kind, None, tables=cut._tables, means=cut._means,

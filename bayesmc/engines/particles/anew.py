@@ -7,12 +7,14 @@ drawn from where the sensor says, and are weighted by density over proposal.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import Row
+from bayesmc.dbn import PREVIOUS, Row, Slices
+from bayesmc.engines.particles.cloud import Cloud, Selection
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import Propose
@@ -30,74 +32,184 @@ class Rejuvenation:
     slice, and the evidence, are biased by that.
     """
 
-    def __init__(
-        self, plan: SlicePlan, given: Mapping[Key, Any], option: str = "rejuvenation="
-    ) -> None:
+    def __init__(self, plan: SlicePlan, given: Mapping[Key, Any]) -> None:
         self.plan = plan
-        for key in given:
-            for name in names_of(key):
-                check_target(plan.slices, name, f"ParticleFilter: {option} for {key!r}")
-        self.drawn = {n for key in given for n in names_of(key)}
-        self.first = [self._bound(plan.slices.first, k, v) for k, v in given.items()]
-        self.later = [self._bound(plan.slices.later, k, v) for k, v in given.items()]
-        short = [n for n in plan.slices.interface if plan.slices.later[n].is_stochastic]
-        missing = sorted(set(short) - self.drawn)
-        if missing:
-            raise ModelError(
-                f"ParticleFilter: {option} says nothing of {missing[0]!r}, which the next slice reads; "
-                "give a density for each of " + ", ".join(map(repr, short))
-            )
+        slices = plan.slices
+        self._first = given_densities(slices, slices.first, given, "ParticleFilter", "rejuvenation")
+        self._later = given_densities(slices, slices.later, given, "ParticleFilter", "rejuvenation")
 
     def __call__(self, row: Row) -> Sequence[Step]:
         model = self.plan.slices.model(row.t)
-        by_target = {n: p for p in (self.first if row.t == 0 else self.later) for n in p.names}
+        densities = self._first if row.t == 0 else self._later
         found: list[Step] = []
         done: set[str] = set()
         for name in self.plan.slices.dynamic:
-            if name in row.seen or name not in by_target:
+            if name in row.seen or name not in densities:
                 found.append(self.plan.step(row, name))
             elif name not in done:
-                found.append(Anew(model, row.seen, by_target[name], self.plan.apart))
-                done |= set(by_target[name].names)
+                found.append(Anew(model, row.seen, densities[name], self.plan.apart))
+                done |= set(densities[name].names)
         return found
-
-    def _bound(self, model: Model, key: Key, spec: Any) -> Any:
-        function = as_function("ParticleFilter", key, spec, FUNCTION)
-        return bound("ParticleFilter", model, key, function)
 
 
 class Lost:
-    """Steps of the particles that recovery lets begin anew."""
+    """The particles that recovery lets begin anew.
+
+    They stand for a share of the transition that does not depend on the slice before, so each of them
+    starts with an equal part of what all particles stand for, whoever its ancestor was. Where something
+    else in the slice looks at the slice before (a reading of how far the robot came, say), they get
+    ancestors by the weights these had.
+    """
 
     def __init__(self, plan: SlicePlan, options: Recovery) -> None:
         self.plan, self.options = plan, options
-        model = plan.slices.later
-        self._prior = Rejuvenation(plan, options.density, "recovery=")
+        slices, model = plan.slices, plan.slices.later
+        self._prior = given_densities(slices, model, options.density, "Recovery", "density")
         self._aimed: dict[str, Proposal] = {}
         for name, spec in (options.proposal or {}).items():
-            check_target(plan.slices, name, f"Recovery: proposal for {name!r}")
+            check_target(slices, name, f"Recovery: proposal= for {name!r}")
+            if name not in self._prior:
+                raise ModelError(
+                    f"Recovery: proposal= for {name!r}, of which density= says nothing; weights "
+                    "are density over proposal, so give both"
+                )
             function = as_function("Recovery", name, spec, FUNCTION)
             self._aimed[name] = bound("Recovery", model, name, function)
+        self._check_order()
+        self._ranks = {n: len(model[n].value_shape) for n in slices.dynamic}
+        self._before = {n + PREVIOUS: len(model[n].value_shape) for n in slices.interface}
+        rest = [n for n in slices.dynamic if n not in self._prior]
+        self._looks_back = any(set(model[n].parents) & self._before.keys() for n in rest)
+
+    def mixed(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        earlier: Cloud,
+        selection: Selection,
+        passed: tuple[dict[str, np.ndarray], Any],
+        rng: np.random.Generator,
+    ) -> tuple[dict[str, np.ndarray], Any, Selection, int]:
+        """Values and log weights where some have begun anew, what they start with, and how many these are."""
+        (values, log), n = passed, selection.particles
+        share = self.options.share_of(earlier.averages)
+        drawn = self.options.drawn(share)
+        lost = np.flatnonzero(rng.random(n) < drawn) if drawn > 0.0 else np.zeros(0, dtype=np.intp)
+        if drawn > share:
+            log = log + math.log1p(-share) - math.log1p(-drawn)
+        if not lost.size:
+            return values, log, selection, 0
+        state = self._begun(row, before, self._ancestors(earlier, selection, lost, rng), rng)
+        values = {k: self._placed(k, v, state.values[k], lost, n) for k, v in values.items()}
+        log = np.array(np.broadcast_to(log, (n,)), dtype=float)
+        log[lost] = state.log_weight + math.log(share / drawn)
+        selection = selection._replace(carried=start_weights(selection, lost))
+        return values, log, selection, lost.size
 
     def steps(self, row: Row) -> Sequence[Step]:
         """The steps of a row's slice; a proposal that looks at what is missing does not apply."""
-        model, seen = self.plan.slices.later, row.seen
+        model, seen, apart = self.plan.slices.later, row.seen, self.plan.apart
+        unknown = set(self.plan.slices.dynamic) - {n for n, o in seen.items() if o.mask is None}
         found: list[Step] = []
-        done: set[str] = set()
         for name in self.plan.slices.dynamic:
-            prior = next((p for p in self._prior.later if name in p.names), None)
-            if name in seen or prior is None:
+            prior, aimed = self._prior.get(name), self._aimed.get(name)
+            if aimed is not None and unknown & set(aimed.parents):
+                aimed = None
+            if prior is None:
                 found.append(self.plan.step(row, name))
-                continue
-            aimed = self._aimed.get(name)
-            unknown = set() if aimed is None else set(aimed.parents) & set(self.plan.slices.dynamic)
-            unknown -= done | {n for n, o in seen.items() if o.mask is None}
-            if aimed is None or unknown:
-                found.append(Anew(model, seen, prior, self.plan.apart))
-            else:
-                found += [Aimed(model, seen, aimed, self.plan.apart), _Density(model, prior)]
-            done.add(name)
+            elif name not in unknown:
+                found.append(_Density(model, prior))
+            elif aimed is None and name not in seen:
+                found.append(Anew(model, seen, prior, apart))
+            else:  # what is seen of the node, if it is in part, has its density, too
+                found += [Aimed(model, seen, aimed or prior, apart), _Density(model, prior)]
+            unknown.discard(name)
         return found
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _check_order(self) -> None:
+        """Densities of what is lost cannot look at what is drawn, or weighed, after it."""
+        order = self.plan.slices.dynamic
+        for name, density in self._prior.items():
+            after = [n for n in order[order.index(name) :] if n in density.parents]
+            if after:
+                raise ModelError(
+                    f"Recovery: density= for {name!r} reads {after[0]!r}, which comes after it: give the "
+                    "density from before the row is seen (seen values would count twice), and what looks at "
+                    f"them as proposal={{{name!r}: ...}}"
+                )
+
+    def _ancestors(
+        self, earlier: Cloud, selection: Selection, lost: np.ndarray, rng: np.random.Generator
+    ) -> np.ndarray:
+        """Positions in the slice before, for what looks at that."""
+        if self._looks_back:
+            sums = np.cumsum(earlier.weights)
+            found = np.searchsorted(sums, rng.random(lost.size) * sums[-1], side="right")
+            return np.minimum(found, len(sums) - 1)
+        return lost if selection.ancestors is None else selection.ancestors[lost]
+
+    def _begun(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        ancestors: np.ndarray,
+        rng: np.random.Generator,
+    ) -> Pass:
+        """A slice of lost particles."""
+        known = self.plan.known(row)
+        for name, value in before.items():
+            same = value.ndim == self._before[name]  # for all particles
+            known[name] = value if same else value[ancestors]
+        state = Pass(rng, (len(ancestors),), known)
+        for step in self.steps(row):
+            step(state)
+        return state
+
+    def _placed(
+        self, name: str, value: np.ndarray, new: np.ndarray, at: np.ndarray, n: int
+    ) -> np.ndarray:
+        """A node's values with some particles replaced."""
+        rank = self._ranks[name]
+        if value.ndim == rank and new.ndim == rank:
+            return value  # seen, or the same for all
+        found = np.array(value if value.ndim > rank else np.broadcast_to(value, (n, *value.shape)))
+        found[at] = new
+        return found
+
+
+def given_densities(
+    slices: Slices, model: Model, given: Mapping[Key, Any], engine: str, option: str
+) -> dict[str, Proposal]:
+    """A user's densities of a state that does not come from the slice before, by the nodes they draw.
+
+    Raises
+    ------
+    UnknownNodeError, ModelError
+        Nodes that are not drawn, or one that the next slice reads and that has no density.
+    """
+    found: dict[str, Proposal] = {}
+    for key, spec in given.items():
+        for name in names_of(key):
+            check_target(slices, name, f"{engine}: {option}= for {key!r}")
+        density = bound(engine, model, key, as_function(engine, key, spec, FUNCTION, option))
+        found |= dict.fromkeys(density.names, density)
+    short = [n for n in slices.interface if slices.later[n].is_stochastic]
+    missing = sorted(set(short) - found.keys())
+    if missing:
+        raise ModelError(
+            f"{engine}: {option}= says nothing of {missing[0]!r}, which the next slice reads; "
+            "give a density for each of " + ", ".join(map(repr, short))
+        )
+    return found
+
+
+def start_weights(selection: Selection, lost: np.ndarray) -> np.ndarray:
+    """Log weights that particles start with: the lost have equal parts of what all stand for."""
+    carried = np.array(np.broadcast_to(selection.carried, (selection.particles,)), dtype=float)
+    carried[lost] = selection.spent - math.log(selection.particles)
+    return carried
 
 
 class Aimed(Propose):

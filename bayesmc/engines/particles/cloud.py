@@ -62,6 +62,29 @@ class Cloud(NamedTuple):
     anew: int = 0
 
 
+class Selection(NamedTuple):
+    """Who has offspring, and what weight the offspring start with.
+
+    Attributes
+    ----------
+    particles : int
+        Of the next slice.
+    ancestors : ndarray of int or None
+        Sorted positions; None where everybody has one.
+    resampled : bool or ndarray of bool, shape (*apart,)
+    carried : ndarray or float
+        Log weights that the offspring have already.
+    spent : ndarray or float, shape (*apart,)
+        Log of what their sum stands for: an increment is the log of the new sum, less this.
+    """
+
+    particles: int
+    ancestors: np.ndarray | None
+    resampled: Any
+    carried: Any
+    spent: Any
+
+
 @dataclass(frozen=True)
 class Layout:
     """How the arrays of a cloud are laid out.

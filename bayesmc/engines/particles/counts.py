@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from numbers import Integral, Real
 from types import MappingProxyType
 from typing import Any
 
@@ -66,25 +67,19 @@ class KLD:
             raise ValueError(
                 f"KLD(widths={self.widths!r}): give a dict from node to the width of its bins"
             )
-        object.__setattr__(self, "widths", MappingProxyType(dict(self.widths)))
-        for name, width in self.widths.items():
-            array = np.asarray(width, dtype=float)
-            if array.ndim > 1 or not ((array > 0) & (array < np.inf)).all():
-                raise ValueError(
-                    f"KLD: the width of {name!r} is {width!r}; give a positive number, or one for each "
-                    "component"
-                )
-        if isinstance(self.least, bool) or not self.least >= 1:
+        widths = {name: _width(name, width) for name, width in self.widths.items()}
+        object.__setattr__(self, "widths", MappingProxyType(widths))
+        if isinstance(self.least, bool) or not isinstance(self.least, Integral) or self.least < 1:
             raise ValueError(f"KLD(least={self.least!r}): give a number of particles, 1 or more")
-        if not self.error > 0:
+        if not isinstance(self.error, Real) or not 0 < self.error < math.inf:
             raise ValueError(f"KLD(error={self.error!r}): give a number above 0")
-        if not 0 < self.probability < 1:
+        if not isinstance(self.probability, Real) or not 0 < self.probability < 1:
             raise ValueError(
                 f"KLD(probability={self.probability!r}): give a number between 0 and 1"
             )
 
     def __hash__(self) -> int:
-        return hash((tuple(self.widths), self.least, self.error, self.probability))
+        return hash((frozenset(self.widths.items()), self.least, self.error, self.probability))
 
     def __getstate__(self) -> dict[str, Any]:
         """A mapping proxy cannot be pickled; what it shows can."""
@@ -139,3 +134,19 @@ class KLD:
         for k in range(1, keys.shape[1]):
             code = code * spans[k] + keys[:, k]
         return len(np.unique(code))
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _width(name: str, given: Any) -> float | tuple[float, ...]:
+    """The width of a node's bins, as what compares and hashes."""
+    try:
+        array = np.asarray(given, dtype=float)
+    except (TypeError, ValueError):
+        array = np.zeros(())
+    if array.ndim > 1 or not array.size or not ((array > 0) & (array < np.inf)).all():
+        raise ValueError(
+            f"KLD: the width of {name!r} is {given!r}; give a positive number, or one for each component"
+        )
+    return tuple(array.tolist()) if array.ndim else float(array)

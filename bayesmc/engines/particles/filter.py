@@ -8,6 +8,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Any, ClassVar
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.particles.anew import Lost, Rejuvenation
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.cloud import Cloud, Layout
@@ -142,73 +143,41 @@ class ParticleFilter(FilterEngine):
     belief: ClassVar[type] = ParticleBelief
 
     def __post_init__(self) -> None:
-        n = self.particles
-        if isinstance(n, bool) or not isinstance(n, (int, np.integer)) or n < 1:
-            raise ValueError(
-                f"ParticleFilter(particles={n!r}): give a number of particles, 1 or more, such as 10_000"
+        _check_count("particles", self.particles, "such as 10_000")
+        if self.trajectories is not None:
+            _check_count(
+                "trajectories", self.trajectories, "or None for as many as there are particles"
             )
-        threshold = self.ess_threshold
-        if (
-            isinstance(threshold, bool)
-            or not isinstance(threshold, (int, float))
-            or not threshold >= 0
-        ):
-            raise ValueError(
-                f"ParticleFilter(ess_threshold={threshold!r}): give a share of the particles, 0 (never "
-                "resample) to 1 (always)"
-            )
+        _check_threshold(self.ess_threshold)
         scheme_of(self.resampling)
-        accepted = FUNCTION
+        _check_choice("backward", self.backward, "rejection", "exact")
+        _check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
+        _check_kind("adapt", self.adapt, KLD)
+        _check_kind("recovery", self.recovery, Recovery)
+        if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
+            raise TypeError(
+                f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
+                "log factors"
+            )
         for option in _FUNCTIONS:
-            given = getattr(self, option)
-            if option == "proposal" and isinstance(given, str):
-                if given != "optimal":
-                    raise ValueError(
-                        f'ParticleFilter(proposal={given!r}): give "optimal", or a dict from node name to '
-                        f"{accepted}"
-                    )
-            elif given is not None:
-                checked = check_specification("ParticleFilter", given, accepted)
-                for key, spec in checked.items():
-                    as_function("ParticleFilter", key, spec, accepted)
-                object.__setattr__(self, option, MappingProxyType(checked))
+            object.__setattr__(self, option, _read_functions(option, getattr(self, option)))
+        self._check_together()
+
+    def _check_together(self) -> None:
+        """Options that only make sense with others, or without them."""
         if isinstance(self.proposal, str) and self.initial_proposal is not None:
             raise ValueError(
                 'ParticleFilter: proposal="optimal" proposes for slice 0 too; leave initial_proposal= out'
             )
-        for option, kind in (("adapt", KLD), ("recovery", Recovery)):
-            given = getattr(self, option)
-            if given is not None and not isinstance(given, kind):
-                raise TypeError(
-                    f"ParticleFilter({option}={given!r}): give a {kind.__name__}(...), or None"
-                )
         if self.recovery is not None and self.rejuvenation is not None:
             raise ValueError(
                 "ParticleFilter: recovery= and rejuvenation= both begin anew; give one of them"
             )
         if self.adapt is not None and self.auxiliary is not False:
             raise ValueError("ParticleFilter: adapt= and auxiliary= do not go together")
-        if self.backward not in ("rejection", "exact"):
-            raise ValueError(
-                f'ParticleFilter(backward={self.backward!r}): give "rejection" or "exact"'
-            )
-        m = self.trajectories
-        if m is not None and (isinstance(m, bool) or not isinstance(m, (int, np.integer)) or m < 1):
-            raise ValueError(
-                f"ParticleFilter(trajectories={m!r}): give a number of them, 1 or more"
-            )
-        if self.on_degeneracy not in ("raise", "rejuvenate"):
-            raise ValueError(
-                f'ParticleFilter(on_degeneracy={self.on_degeneracy!r}): give "raise" or "rejuvenate"'
-            )
         if (self.on_degeneracy == "rejuvenate") != (self.rejuvenation is not None):
             raise ValueError(
                 'ParticleFilter: on_degeneracy="rejuvenate" and rejuvenation={node: density} go together'
-            )
-        if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
-            raise TypeError(
-                f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
-                "log factors"
             )
 
     def __getstate__(self) -> dict[str, Any]:
@@ -306,24 +275,12 @@ class ParticleFilter(FilterEngine):
             raise ValueError(
                 f'keep={keep!r}: give "particles", or None for answers of constant size'
             )
-        static = {n: o.value for n, o in problem.series.static.items()}
-        asked = _asked(queries or {}, problem.slices)
-        wanted = None if keep else [*problem.hidden, *asked]
-        mover = self._mover(problem.slices, static, wanted)
-        record = Record(problem, mover.layout, queries or {}, keep is not None)
-        rng = stream(seed, Purpose.FILTER)
-        rows = problem.series
-        with Progress(problem.steps, self.label, progress) as bar, _quiet():
-            cloud = None
-            for k in range(problem.steps):
-                row, old = rows.row(k), cloud
-                cloud = mover.first(row, rng) if old is None else mover.next(old, row, rng)
-                record.add(k, cloud)
-                if old is not None and keep is None:
-                    mover.recycle(old)
-                bar.advance()
-        self._warn_of_collapse(record, rows.start)
-        return record.posterior(self)
+        try:
+            found = self._passed(problem, seed, keep is not None, queries or {}, progress)
+        except KeyboardInterrupt as stop:
+            found = answer_so_far(stop, self)
+        self._warn_of_collapse(found)
+        return found
 
     def smooth(
         self,
@@ -341,7 +298,8 @@ class ParticleFilter(FilterEngine):
         sums = carried(problem.slices)
         if sums:
             raise UnsupportedError(_not_backwards(sums[0]))
-        filtered = self.filter(problem, seed, keep="particles", progress=progress)
+        filtered = self._passed(problem, seed, True, {}, progress)
+        self._warn_of_collapse(filtered)
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
@@ -370,21 +328,26 @@ class ParticleFilter(FilterEngine):
         record = Record(problem, mover.layout, queries, False)
         filtered = Record(problem, mover.layout, {}, False)
         window: deque[Cloud] = deque(maxlen=lag + 1)
-        rng, last = stream(seed, Purpose.FILTER), problem.steps - 1
+        rng, rows, last = stream(seed, Purpose.FILTER), problem.series, problem.steps - 1
+        cloud: Cloud | None = None
+
+        def move(k: int) -> None:
+            nonlocal cloud
+            row = rows.row(k)
+            cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
+            filtered.add(k, cloud)
+            window.append(cloud)
+            while window and (len(window) > lag or k == last):
+                at = k - len(window) + 1
+                record.add(at, lagged(list(window), mover.layout, mover.slices))
+                window.popleft()
+
         with Progress(problem.steps, self.label, progress) as bar, _quiet():
-            cloud = None
-            for k in range(problem.steps):
-                row = problem.series.row(k)
-                cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
-                filtered.add(k, cloud)
-                window.append(cloud)
-                while window and (len(window) > lag or k == last):
-                    at = k - len(window) + 1
-                    record.add(at, lagged(list(window), mover.layout, mover.slices))
-                    window.popleft()
-                bar.advance()
-        self._warn_of_collapse(filtered, problem.series.start)
-        return self._given_filtered(record.posterior(self, "fixed-lag"), filtered.posterior(self))
+            so_far = partial(filtered.posterior, self, "filter")
+            pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
+        whole = filtered.posterior(self)
+        self._warn_of_collapse(whole)
+        return self._given_filtered(record.posterior(self, "fixed-lag"), whole)
 
     def _given_filtered(
         self, found: FilteredParticles, filtered: FilteredParticles
@@ -420,12 +383,42 @@ class ParticleFilter(FilterEngine):
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _warn_of_collapse(self, record: Record, start: int) -> None:
+    def _passed(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        keep: bool,
+        queries: Queries,
+        progress: bool | None,
+    ) -> FilteredParticles:
+        """All slices, one by one; Ctrl-C goes on, with the answer so far."""
+        static = {n: o.value for n, o in problem.series.static.items()}
+        asked = _asked(queries, problem.slices)
+        mover = self._mover(problem.slices, static, None if keep else [*problem.hidden, *asked])
+        record = Record(problem, mover.layout, queries, keep)
+        rng, rows = stream(seed, Purpose.FILTER), problem.series
+        cloud: Cloud | None = None
+
+        def move(k: int) -> None:
+            nonlocal cloud
+            row, old = rows.row(k), cloud
+            cloud = mover.first(row, rng) if old is None else mover.next(old, row, rng)
+            record.add(k, cloud)
+            if old is not None and not keep:
+                mover.recycle(old)
+
+        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            so_far = partial(record.posterior, self, "filter")
+            pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
+        return record.posterior(self)
+
+    def _warn_of_collapse(self, filtered: FilteredParticles) -> None:
         """One warning where many slices rest on what is little more than one particle.
 
         A surprising row now and then does that to any filter, and the next rows mend it.
         """
-        ess = record.ess.reshape(len(record.ess), -1)
+        assert filtered.weight_ess is not None
+        ess = filtered.weight_ess.reshape(filtered.steps, -1)
         poor = ess < min(_COLLAPSED, 0.9 * self.particles)
         share = poor.mean(axis=0)
         worst = int(share.argmax())
@@ -435,8 +428,9 @@ class ParticleFilter(FilterEngine):
             warnings.warn(
                 f"ParticleFilter: in {int(poor[:, worst].sum())} of {len(own)} slices the {self.particles} "
                 f"particles are worth less than {_COLLAPSED:g} equally weighted ones (weight_ess; "
-                f"{own[at]:.1f} in slice {start + at}), so means, spreads and the evidence rest on one of "
-                "them: use more particles, a proposal= that looks at the observations, or less narrow noise",
+                f"{own[at]:.1f} in slice {filtered.start + at}), so means, spreads and the evidence rest on "
+                "one of them: use more particles, a proposal= that looks at the observations, or less narrow "
+                "noise",
                 LowEssWarning,
                 stacklevel=4,
             )
@@ -490,6 +484,47 @@ def _not_backwards(name: str) -> str:
         f"ParticleFilter: {name!r} is computed from its own past, so trajectories cannot be drawn "
         "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
     )
+
+
+def _check_count(option: str, given: Any, what: str) -> None:
+    if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 1:
+        raise ValueError(
+            f"ParticleFilter({option}={given!r}): give a number of {option}, 1 or more, {what}"
+        )
+
+
+def _check_threshold(given: Any) -> None:
+    if isinstance(given, bool) or not isinstance(given, (int, float)) or not given >= 0:
+        raise ValueError(
+            f"ParticleFilter(ess_threshold={given!r}): give a share of the particles, 0 (never resample) "
+            "to 1 (always)"
+        )
+
+
+def _check_choice(option: str, given: Any, one: str, other: str) -> None:
+    if given not in (one, other):
+        raise ValueError(f'ParticleFilter({option}={given!r}): give "{one}" or "{other}"')
+
+
+def _check_kind(option: str, given: Any, kind: type) -> None:
+    if given is not None and not isinstance(given, kind):
+        raise TypeError(f"ParticleFilter({option}={given!r}): give a {kind.__name__}(...), or None")
+
+
+def _read_functions(option: str, given: Any) -> Any:
+    """Functions by node, checked and frozen; ``"optimal"`` and None as they are."""
+    if option == "proposal" and isinstance(given, str):
+        if given != "optimal":
+            raise ValueError(
+                f'ParticleFilter(proposal={given!r}): give "optimal", or a dict from node name to {FUNCTION}'
+            )
+        return given
+    if given is None:
+        return None
+    functions = check_specification("ParticleFilter", given, FUNCTION, option)
+    for key, spec in functions.items():
+        as_function("ParticleFilter", key, spec, FUNCTION, option)
+    return MappingProxyType(functions)
 
 
 def _asked(queries: Queries, slices: Slices) -> list[str]:

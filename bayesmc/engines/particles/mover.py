@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Protocol
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.cloud import BLOCK, Cloud, Layout, along_plates
+from bayesmc.engines.particles.cloud import BLOCK, Cloud, Layout, Selection, along_plates
 from bayesmc.engines.particles.counts import KLD
-from bayesmc.engines.particles.recovery import Averages, LostSteps
+from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn
@@ -28,27 +28,23 @@ FirstStage = Callable[[Mapping[str, np.ndarray], Row, np.random.Generator], np.n
 WHOLE = 12288
 
 
-class Selection(NamedTuple):
-    """Who has offspring, and what weight the offspring start with.
+class Anew(Protocol):
+    """What lets a share of the particles begin anew."""
 
-    Attributes
-    ----------
-    particles : int
-        Of the next slice.
-    ancestors : ndarray of int or None
-        Sorted positions; None where everybody has one.
-    resampled : bool or ndarray of bool, shape (*apart,)
-    carried : ndarray or float
-        Log weights that the offspring have already.
-    spent : ndarray or float, shape (*apart,)
-        Log of what their sum stands for: an increment is the log of the new sum, less this.
-    """
+    @property
+    def options(self) -> Recovery: ...
 
-    particles: int
-    ancestors: np.ndarray | None
-    resampled: Any
-    carried: Any
-    spent: Any
+    def mixed(
+        self,
+        row: Row,
+        before: Mapping[str, np.ndarray],
+        earlier: Cloud,
+        selection: Selection,
+        passed: tuple[dict[str, np.ndarray], Any],
+        rng: np.random.Generator,
+    ) -> tuple[dict[str, np.ndarray], Any, Selection, int]:
+        """Values, log weights, what they start with, and how many particles have begun anew."""
+        ...
 
 
 class Mover:
@@ -71,7 +67,7 @@ class Mover:
         Nodes whose values clouds hold besides those that the next slice reads; all by default.
     counts : KLD, optional
         How many particles a slice needs, ``particles`` at most.
-    recovery : LostSteps, optional
+    recovery : Anew, optional
         Lets a share of the particles begin anew.
     """
 
@@ -86,7 +82,7 @@ class Mover:
         rejuvenate: Callable[[Row], Sequence[Step]] | None = None,
         kept: Sequence[str] | None = None,
         counts: KLD | None = None,
-        recovery: LostSteps | None = None,
+        recovery: Anew | None = None,
     ) -> None:
         self.counts, self.recovery = counts, recovery
         self.slices, self.particles = slices, particles
@@ -122,19 +118,19 @@ class Mover:
         values = cloud.values
         before = {previous: values[n] for n, previous in self._before}
         selection = self._selected(cloud, before, row, rng)
-        return self._moved(row, before, selection, cloud.averages, rng)
+        return self._moved(row, before, selection, cloud, rng)
 
     def _moved(
         self,
         row: Row,
         before: Mapping[str, np.ndarray],
         selection: Selection,
-        averages: Averages | None,
+        earlier: Cloud | None,
         rng: np.random.Generator,
     ) -> Cloud:
         values, log = self._passed(self.plan.steps(row), row, before, selection, rng)
         if self.recovery is not None:
-            return self._recovered(row, before, selection, averages, values, log, rng)
+            return self._recovered(row, before, selection, earlier, (values, log), rng)
         cloud = self._weighted(row, values, log, selection)
         if _has_weight(cloud):
             return cloud
@@ -149,48 +145,23 @@ class Mover:
         row: Row,
         before: Mapping[str, np.ndarray],
         selection: Selection,
-        averages: Averages | None,
-        values: dict[str, np.ndarray],
-        log: Any,
+        earlier: Cloud | None,
+        passed: tuple[dict[str, np.ndarray], Any],
         rng: np.random.Generator,
     ) -> Cloud:
         """The cloud where a share of the particles has begun anew."""
-        recovery, n = self.recovery, selection.particles
-        assert recovery is not None
-        lost = np.zeros(0, dtype=np.intp)
-        share = recovery.options.share_of(averages) if before else 0.0
-        drawn = recovery.options.drawn(share)
-        if drawn > 0.0:
-            lost = np.flatnonzero(rng.random(n) < drawn)
-        if drawn > share:
-            log = log + (math.log1p(-share) - math.log1p(-drawn) if drawn < 1.0 else 0.0)
-        if lost.size:
-            own = lost if selection.ancestors is None else selection.ancestors[lost]
-            known = self.plan.known(row)
-            known |= {name: self._taken(name, value, own) for name, value in before.items()}
-            state = Pass(rng, (lost.size,), known)
-            for step in recovery.steps(row):
-                step(state)
-            values = {k: self._placed(k, v, state.values[k], lost, n) for k, v in values.items()}
-            log = np.array(np.broadcast_to(log, (n,)), dtype=float)
-            log[lost] = state.log_weight + math.log(share / drawn)
+        assert self.recovery is not None
+        averages, count, (values, log) = None, 0, passed
+        if earlier is not None:
+            averages = earlier.averages
+            mixed = self.recovery.mixed(row, before, earlier, selection, passed, rng)
+            values, log, selection, count = mixed
         cloud = self._weighted(row, values, log, selection)
         if not _has_weight(cloud):
             raise self._degenerate(row, before, cloud.values, selection)
         if row.seen:
-            averages = recovery.options.averaged(averages, cloud.increment)
-        return cloud._replace(averages=averages, anew=int(lost.size))
-
-    def _placed(
-        self, name: str, value: np.ndarray, new: np.ndarray, at: np.ndarray, n: int
-    ) -> np.ndarray:
-        """A node's values with some particles replaced."""
-        rank = self._ranks[name]
-        if value.ndim == rank and new.ndim == rank:
-            return value  # seen, or the same for all
-        found = np.array(value if value.ndim > rank else np.broadcast_to(value, (n, *value.shape)))
-        found[at] = new
-        return found
+            averages = self.recovery.options.averaged(averages, row, cloud.increment)
+        return cloud._replace(averages=averages, anew=count)
 
     def _renewed(
         self,
@@ -433,7 +404,7 @@ class Mover:
         return DegeneracyError(
             f"none of {selection.particles} particles explains {what} in slice {row.t}: every weight is "
             "zero; use more particles, a proposal= that looks at the observations, less narrow noise, "
-            'or on_degeneracy="rejuvenate"',
+            'recovery=, or on_degeneracy="rejuvenate"',
             row.t,
             node,
         )

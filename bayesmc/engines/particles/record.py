@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.filtering import Queries, observed_answers
+from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.particles.belief import (
     covariance,
     expectation,
@@ -87,24 +87,28 @@ class Record:
         if self.clouds is not None:
             self.clouds.append(cloud)
 
-    def posterior(self, engine: Any, kind: str = "filter") -> FilteredParticles:
-        """The answers of all slices."""
-        seen = observed_answers(self.problem)
+    def posterior(
+        self, engine: Any, kind: str = "filter", steps: int | None = None
+    ) -> FilteredParticles:
+        """The answers of all slices, or of the first so many."""
+        k = self.problem.steps if steps is None else steps
+        seen = observed_answers(self.problem, k)
         found = FilteredParticles(
             self.problem.model,
             engine,
             kind,
-            self.increments,
-            tables={**seen.tables, **self.tables},
-            means={**seen.means, **self.means},
-            variances={**seen.variances, **self.variances},
-            queries={n: np.stack(rows) for n, rows in self.queries.items()},
+            self.increments[:k],
+            tables={**seen.tables, **first_slices(self.tables, k)},
+            means={**seen.means, **first_slices(self.means, k)},
+            variances={**seen.variances, **first_slices(self.variances, k)},
+            queries={n: np.stack(rows[:k]) for n, rows in self.queries.items()},
             start=self.problem.series.start,
         )
-        found.weight_ess, found.resampled = self.ess, self.resampled
-        found.unique_ancestors, found.rejuvenated = self.unique, self.rejuvenated
-        found.counts, found.anew = self.counts, self.anew
-        found.clouds, found.layout = self.clouds, self.layout
+        found.weight_ess, found.resampled = self.ess[:k], self.resampled[:k]
+        found.unique_ancestors, found.rejuvenated = self.unique[:k], self.rejuvenated[:k]
+        found.counts, found.anew = self.counts[:k], self.anew[:k]
+        found.clouds = None if self.clouds is None else self.clouds[:k]
+        found.layout = self.layout
         return found
 
 
@@ -166,6 +170,11 @@ class FilteredParticles(SeriesPosterior):
             found = own if cloud.ancestors is None else cloud.ancestors
             rows.append(np.broadcast_to(np.where(cloud.rejuvenated, -1, found), shape))
         return np.stack(rows)
+
+    def last(self, steps: int, kind: str) -> SeriesPosterior:
+        """The last so many slices by themselves."""
+        refuse_forecast(self, kind)
+        return super().last(steps, kind)
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Means of a function of nodes of a slice, time first; see ``ParticleBelief.expectation``."""
