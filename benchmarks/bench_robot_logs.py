@@ -98,7 +98,7 @@ def kidnapped(data: Path, seeds: Sequence[int]) -> None:
         good.append(found and worst < robot_logs.FOUND)
         when = "never" if after is None else f"after {after} scans, then at most {worst:.2f} m"
         _line(f"seed {seed}", f"cut at {at}, found {when} to the end")
-    _count(good, f"found within {FOUND_BY} scans and below {robot_logs.FOUND} m ever after")
+    _count(good, f"found by scan {FOUND_BY}, and for good")
 
 
 def wean(number: int) -> Figure:
