@@ -173,9 +173,9 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
         by(bmc.Exact()),
         {"discrete": 1, "plates": 0.95, "hybrid": 0.25, "hybrid plates": 0.25, "gaussian": 1},
     ),
-    "LikelihoodWeighting": (by(bmc.LikelihoodWeighting(20_000)), dict.fromkeys(KINDS, 0.9)),
+    "LikelihoodWeighting": (by(bmc.LikelihoodWeighting(10_000)), dict.fromkeys(KINDS, 0.9)),
     "LikelihoodWeighting, summaries": (
-        by(bmc.LikelihoodWeighting(20_000), keep="summaries"),
+        by(bmc.LikelihoodWeighting(10_000), keep="summaries"),
         dict.fromkeys(KINDS, 0.9),
     ),
     "Importance": (by_importance(bmc.Importance, 10_000), dict.fromkeys(KINDS, 0.8)),
@@ -570,7 +570,7 @@ def reweighted(change: Callable[[np.ndarray], np.ndarray | None]) -> Answer:
     """Likelihood weighting with a fault in its weights."""
 
     def answer(net: bmc.BayesNet, evidence: dict[str, Any], seed: int) -> Any:
-        right = by(bmc.LikelihoodWeighting(20_000))(net, evidence, seed)
+        right = by(bmc.LikelihoodWeighting(10_000))(net, evidence, seed)
         if right is None or right.log_weights is None or np.ptp(right.log_weights) < 0.5:
             return None  # the weights say next to nothing
         wrong = change(right.log_weights)
