@@ -69,8 +69,8 @@ class LikelihoodField:
     - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
       Evidence of a net is finite, so put scans through ``clean_ranges`` before they become a net's rows.
     - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
-      all have. Where the map is farther from all of several poses than
-      the longest beam reaches, that is an error.
+      all have. Where all of several poses are farther off the map
+      than it is wide, and than the longest beam reaches, that is an error.
     - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
       end point within 0.001 cells of a border may count for the cell next to it.
     - The density is not normalised over ranges (Thrun et al., section 6.4); evidence computed with
@@ -180,7 +180,7 @@ class FieldScan(Distribution):
     ShapeError
         Poses do not have three components, angles more than one axis, or there is no beam.
     ModelError
-        From ``log_prob``: from none of several poses a beam could end on the map.
+        From ``log_prob``: several poses are all farther off the map than it is wide.
     """
 
     parameter_ndim = {"pose": 1, "angles": 1}
@@ -242,14 +242,18 @@ class FieldScan(Distribution):
         return log.reshape(pose.shape[:-1])
 
     def _check_in_sight(self, pose: np.ndarray, longest: float) -> None:
-        """Refuse poses from none of which a beam could end on the map: such a start is a mistake."""
+        """Refuse poses that are all farther from the map than it is wide: such a start is a mistake.
+
+        A belief that was carried off the map by its wheels, or a part of it, goes on, and may come back.
+        """
         left, right, bottom, top = self.field.grid.extent
         x, y = pose[..., 0], pose[..., 1]
         away = np.maximum(np.maximum(left - x, x - right), np.maximum(bottom - y, y - top)).min()
-        if away > longest + math.hypot(*self.field.mount[:2]):
+        reach = longest + math.hypot(*self.field.mount[:2])
+        if away > max(reach, math.hypot(right - left, top - bottom)):
             raise ModelError(
-                f"LikelihoodField: none of {x.size} poses lies within {away:.3g} m of the map, which spans x "
-                f"{left:g} to {right:g} and y {bottom:g} to {top:g} m, and no beam reaches that far; is the "
+                f"LikelihoodField: all of {x.size} poses are {away:.3g} m or more off the map, which spans x "
+                f"{left:g} to {right:g} and y {bottom:g} to {top:g} m; no beam reaches that far: is the "
                 "start given in the map's frame and in metres?"
             )
 

@@ -141,12 +141,13 @@ def test_robots_beyond_the_map():
 
 
 def test_clouds_beyond_the_map():
-    """Farther off than any beam reaches there is nothing to see; a belief at the border may come back."""
-    beyond = np.array([[-4.2, 0.0, 0.0], [1e12, 0.0, 1.0], [0.0, -1e300, 0.0]])
+    """Farther off than the map is wide a start is a mistake; a belief nearer by may come back."""
+    beyond = np.array([[-14.2, 0.0, 0.0], [1e12, 0.0, 1.0], [0.0, -1e300, 0.0]])
     with pytest.raises(
-        ModelError, match="none of 3 poses lies within 3.2 m of the map, which spans x -1 to 7 and"
+        ModelError, match="all of 3 poses are 13.2 m or more off the map, which spans x -1 to 7"
     ):
         standard().given(beyond, ANGLES).log_prob(np.ones(11))
+    beyond[0, 0] = -7.2
     log = standard().given(beyond, ANGLES).log_prob(np.full(11, 4.0))
     np.testing.assert_allclose(log, 11 * np.log(0.2 / REACH))
 
