@@ -51,6 +51,10 @@ class Kernel:
         """
         raise NotImplementedError
 
+    def moved(self, values: Values, memory: Memory) -> Memory:
+        """Its memory where somebody else has put its nodes elsewhere; what it knew of the old place goes."""
+        return memory
+
     def end_warmup(self, memory: Memory) -> Memory:
         """Adaptation ends: what was learnt is frozen."""
         return memory

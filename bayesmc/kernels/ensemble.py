@@ -166,6 +166,10 @@ class BlockWalk(Kernel):
             return new, {**memory, **kept, **self._learnt(memory, u, log, rates, moves)}
         return new, counted({**memory, **kept}, taken)
 
+    def moved(self, values: Values, memory: Memory) -> Memory:
+        u, log = self._placed(values)
+        return {**memory, "u": u, "log": log}
+
     def end_warmup(self, memory: Memory) -> Memory:
         return {**memory, "steps": self.steps.frozen(memory["steps"])}
 

@@ -11,7 +11,8 @@ Holm (1979), A simple sequentially rejective multiple test procedure, Scandinavi
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -164,6 +165,26 @@ class Budget:
 BUDGET = Budget()
 
 V = TypeVar("V", bound=Verdict)
+
+
+@contextmanager
+def uncounted() -> Iterator[None]:
+    """Calls in here leave the budget alone: they are repetitions, whose alarms somebody counts.
+
+    Examples
+    --------
+    >>> from bayesmc.testing.verdict import BUDGET, Verdict, counted, uncounted
+    >>> before = BUDGET.calls.get("example", 0)
+    >>> with uncounted():
+    ...     _ = counted(Verdict("example", 0.1, []))
+    >>> BUDGET.calls.get("example", 0) == before
+    True
+    """
+    kept = dict(BUDGET.spent), dict(BUDGET.calls)
+    try:
+        yield
+    finally:
+        BUDGET.spent, BUDGET.calls = kept
 
 
 def counted(verdict: V) -> V:

@@ -13,7 +13,6 @@ Every row of a test has its own data. Kernels get them in one of three ways:
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -26,11 +25,10 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.network import pose
 from bayesmc.structure.target import Target, Values, target_of
-from bayesmc.testing import geweke_test, rank_test
+from bayesmc.testing import JointModel, geweke_test, rank_test, session
 
-#: shifts all seeds; where it is set, tests are longer, too
-SEED = os.environ.get("BAYESMC_SEED")
-SHIFT, LONGER = int(SEED or "0"), 8 if SEED else 1
+#: shifts all seeds; in a thorough run, tests are longer, too
+SHIFT, LONGER = session.seed(), session.scaled(1)
 #: chance that a right kernel fails one test at a fresh seed
 ALPHA = 1e-4
 
@@ -206,31 +204,24 @@ class Case:
         sizes = {"draws": 30, "chains": 160, **own, **sizes}
         sizes["draws"] *= LONGER
         kernel, _ = self._kernels(fault, sizes["chains"])
-        return geweke_test(
-            self._prior, self._data, kernel, self._statistics(), rng=seed + SHIFT, **sizes
-        )
+        return geweke_test(kernel, self._joint(), alpha=ALPHA, rng=seed + SHIFT, **sizes)
 
     def ranks(self, fault: str = "", seed: int = 0, **sizes: Any) -> Any:
         own = {k: v for k, v in self.sizes.items() if k in ("steps", "replications", "thinning")}
         sizes = {"steps": 4, "replications": 1000, **own, **sizes}
         sizes["replications"] *= LONGER
         kernel, reverse = self._kernels(fault, sizes["replications"])
-        return rank_test(
-            self._prior, self._data, kernel, self._statistics(), reverse_kernel=reverse,
-            alpha=ALPHA, rng=seed + SHIFT, **sizes,
-        )  # fmt: skip
+        return rank_test(kernel, self._joint(), reverse, alpha=ALPHA, rng=seed + SHIFT, **sizes)
 
     def check(self, test: str, fault: str = "", **sizes: Any) -> None:
         """A right kernel passes, a wrong one fails."""
-        if test == "geweke":
-            result = self.geweke(fault, **sizes)
-            rejected = result.rejected(ALPHA)
-        else:
-            result = self.ranks(fault, **sizes)
-            rejected = result.rejected()
-        assert bool(rejected) == bool(fault), result
+        result = (self.geweke if test == "geweke" else self.ranks)(fault, **sizes)
+        assert bool(result) != bool(fault), result
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _joint(self) -> JointModel:
+        return JointModel(self._prior, self._data, self._statistics())
 
     def _prior(self, rng: np.random.Generator, rows: int) -> Rows:
         return self._grouped(self.model.prior(rng, rows * self.members))
