@@ -23,7 +23,7 @@ from bayesmc.testing.joint import NetStates, Rows, check_sizes
 from bayesmc.testing.moves import StepFunction, is_step, sampler_of
 from bayesmc.testing.oracle import enumerate_posterior
 from bayesmc.testing.transition import KernelMatrix, Sweep, exact_sweep
-from bayesmc.testing.verdict import Comparison, Verdict, counted
+from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 
 #: joint states, at most
 _STATES = 1024
@@ -47,7 +47,7 @@ def invariant(
     """Does one step of a kernel leave the posterior of a finite net as it is?
 
     Exact for engines and kernels of bayesmc, whose transition matrix is read from the code that draws, and for
-    anything with a transition ``matrix``: ``p P = p``, to rounding, for every kernel of a sweep. A function
+    anything with a ``transition`` matrix: ``p P = p``, to rounding, for every kernel of a sweep. A function
     ``step(state, rng) -> state`` is run once from each of ``draws`` independent draws of the exact posterior; then
     the states after the step are draws of it, too, which binomial tails judge: each joint state, each state of each
     node, and that no state of probability zero was reached. The chance of a false alarm is at most
@@ -56,8 +56,8 @@ def invariant(
     Parameters
     ----------
     kernel : engine, callable, bayesmc kernel, or MarkovChain
-        As `geweke_test` takes it; or an object with ``matrix``, shape (K, K), and ``states``, the K joint states of
-        the hidden nodes in the order of the net, each a tuple (one label where a single node is hidden).
+        As `geweke_test` takes it; or an object with ``transition``, shape (K, K), and ``states``, the K joint
+        states of the hidden nodes in the order of the net, each a tuple (one label for a single node).
     net : BayesNet or FactorGraph
         Its hidden nodes are finite, with at most 1024 joint states (a function needs a BayesNet).
     evidence, inputs : dict, optional
@@ -104,6 +104,7 @@ def invariant(
     >>> bool(invariant(together, net, draws=2000, rng=0)), bool(invariant(in_turn, net, draws=2000, rng=0))
     (False, True)
     """
+    check_level("invariant", alpha)
     law, found = _prepared("invariant", kernel, net, evidence, inputs, draws, batched, rng)
     if isinstance(found, Sweep):
         tolerance = _ROUNDING + _STEPS * found.resolution
@@ -168,6 +169,7 @@ def detailed_balance(
     >>> bool(invariant(cycle, net, draws=1000, rng=0)), bool(detailed_balance(cycle, net, draws=1000, rng=0))
     (True, False)
     """
+    check_level("detailed_balance", alpha)
     law, found = _prepared("detailed_balance", kernel, net, evidence, inputs, draws, batched, rng)
     if isinstance(found, Sweep):
         tolerance = _ROUNDING + _STEPS * found.resolution
@@ -222,8 +224,10 @@ def _prepared(
         return _Law(sweep.states, sweep.elements, sweep.law), sweep
     problem = pose(net, evidence, inputs)
     law, codes = _finite(call, net, problem, evidence, inputs)
-    if hasattr(kernel, "matrix") and hasattr(kernel, "states"):
+    if hasattr(kernel, "transition") and hasattr(kernel, "states"):
         return law, _of_matrix(call, kernel, law)
+    if not callable(kernel):
+        sampler_of(call, kernel, problem)  # says what is a kernel
     hidden = [n for n, _ in codes]
     states = NetStates(
         problem.model, problem.inputs, hidden, [n for n in problem.observed if n not in hidden]
@@ -304,7 +308,7 @@ def _many(value: np.ndarray, rows: int) -> np.ndarray:
 
 def _of_matrix(call: str, kernel: Any, law: _Law) -> Sweep:
     """A chain's own matrix, its states in the order of the law."""
-    matrix = np.asarray(kernel.matrix, dtype=float)
+    matrix = np.asarray(kernel.transition, dtype=float)
     labels = [s if isinstance(s, tuple) else (s,) for s in kernel.states]
     if matrix.shape != (len(labels),) * 2 or set(labels) != set(law.states):
         raise ShapeError(

@@ -19,7 +19,7 @@ from bayesmc.network import BayesNet
 from bayesmc.randomness import seed_sequence
 from bayesmc.testing.joint import JointModel, check_sizes, values_of
 from bayesmc.testing.moves import moves_of
-from bayesmc.testing.verdict import Comparison, Verdict, counted
+from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 
 #: draws of each chain by default, and where each costs a compilation
 _DRAWS, _FEW = 200, 30
@@ -99,7 +99,8 @@ def geweke_test(
     batched : bool
         Whether ``step`` takes and returns arrays with one row for each of many states.
     warmup : int, optional
-        Sweeps in which an engine adapts beforehand; by default its own.
+        Sweeps in which an engine adapts beforehand; by default its own, at most 200 (20 where every data set
+        is compiled for).
     alpha : float
         Chance of any false alarm.
     rng : optional
@@ -141,6 +142,7 @@ def geweke_test(
     >>> bool(geweke_test(right, net, draws=50, rng=0)), bool(geweke_test(wrong, net, draws=50, rng=0))
     (True, False)
     """
+    check_level("geweke_test", alpha)
     check_sizes("geweke_test", draws=(10 if draws is None else draws, 10), chains=(chains, 8),
                 thinning=(thinning, 1))  # fmt: skip
     generator = np.random.default_rng(seed_sequence(rng))

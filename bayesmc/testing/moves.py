@@ -36,8 +36,10 @@ from bayesmc.testing.verdict import Comparison
 
 #: ``move(state, data, rng)``: the next state of every row
 Move = Callable[[Any, Any, np.random.Generator], Any]
-#: data sets, rows of each and steps on which two ways to run a kernel are compared
-_COMPARED, _ALIKE, _STEPS = 5, 3, 2
+#: data sets (of so many drawn), rows of each and steps on which two ways to run a kernel are compared
+_COMPARED, _DRAWN, _ALIKE, _STEPS = 6, 24, 64, 2
+#: sweeps of warmup by default, at most: for all rows at once, and where every data set has its own
+_WARMUP, _OWN_WARMUP = 200, 20
 #: steps after which a frozen kernel must move as it did at first
 _AGED = 25
 
@@ -57,6 +59,8 @@ class Moves:
         What is wrong for certain, before any test.
     is_quick : bool
         False where the kernel is compiled anew for every data set.
+    is_own_reverse : bool
+        Whether a function was taken for its own reverse, for want of another.
     """
 
     prior: Callable[[np.random.Generator, int], Any]
@@ -67,6 +71,7 @@ class Moves:
     faults: tuple[Comparison, ...] = ()
     why: str = ""
     is_quick: bool = True
+    is_own_reverse: bool = False
 
 
 def moves_of(
@@ -92,7 +97,9 @@ def moves_of(
     if is_step(kernel):
         forward = _of_function(call, kernel, joint, batched)
         backward = forward if reverse is None else _of_function(call, reverse, joint, batched)
-        return Moves(joint.prior, joint.simulate, found, forward, backward)
+        return Moves(
+            joint.prior, joint.simulate, found, forward, backward, is_own_reverse=reverse is None
+        )
     machine = _Machine(call, kernel, joint, warmup)
     if reverse is not None:
         other = _Machine(call, reverse, joint, warmup)
@@ -123,7 +130,13 @@ def sampler_of(call: str, kernel: Any, problem: Any) -> SweepSampler:
         found = SweepSampler(kernel.blanket.target, [kernel])  # type: ignore[attr-defined]
     elif callable(kernel) and positional(kernel) == 1:
         target = target_of(problem)
-        found = SweepSampler(target, [kernel(target)])
+        made = kernel(target)
+        if not isinstance(made, Kernel):
+            raise UnsupportedError(
+                f"{call}: {kernel!r} made {type(made).__name__} of a target, not a bayesmc kernel; a function of "
+                "your own takes two arguments, step(state, rng)"
+            )
+        found = SweepSampler(target, [made])
     else:
         raise UnsupportedError(
             f"{call}: {kernel!r} moves no states; give an engine of Markov chains (Gibbs(...), "
@@ -165,6 +178,7 @@ def _of_model(
         model.statistics,
         kernel,
         kernel if reverse is None else reverse,
+        is_own_reverse=reverse is None,
     )
 
 
@@ -204,7 +218,7 @@ class StepFunction:
         moved: list[dict[str, Any]] = []
         for row in range(rows):
             one = {n: as_evidence(v[row]) for n, v in full.items()}
-            given = self._stepped(dict(one), rng)
+            given = self._stepped(_copied(one), rng)
             moved.append(self._kept(given, one))
         after = {n: [m[n] for m in moved] for n in state if any(n in m for m in moved)}
         return {**state, **self._read(after, full, (rows,))}
@@ -244,8 +258,9 @@ class StepFunction:
             try:
                 stored = store(node, value)
             except (BayesmcError, ValueError, TypeError) as error:
+                said = str(error).replace("evidence on", "the value of")
                 raise EvidenceError(
-                    f"{self.call}: step(state, rng) returned no value: {error}"
+                    f"{self.call}: step(state, rng) returned what is no value: {said}"
                 ) from None
             if stored.shape != batch + node.value_shape:
                 raise EvidenceError(
@@ -288,11 +303,13 @@ class _Machine:
         self.call, self.kernel, self.joint = call, kernel, joint
         rng = np.random.default_rng(1)
         state = joint.prior(rng, 1)
-        self.sampler = self._compiled(joint.simulate(state, rng))
+        self.placeholder = joint.simulate(state, rng)
+        self.sampler = self._compiled(self.placeholder)
         self.members = int(getattr(self.sampler, "ensemble", 1))
         self.reversed, self.why = _reversed(call, self.sampler.kernels)
-        self.warmup = getattr(kernel, "warmup", 0) if warmup is None else warmup
         self.is_given = not joint.observed or self._is_given(rng)
+        most = _WARMUP if self.is_given else _OWN_WARMUP
+        self.warmup = min(getattr(kernel, "warmup", most), most) if warmup is None else warmup
         if not self.is_given and self.members > 1:
             raise UnsupportedError(
                 f"{call}: {kernel!r} moves ensembles, and reads what is observed when it compiles; test it with "
@@ -370,9 +387,7 @@ class _Machine:
 
     def _is_given(self, rng: np.random.Generator) -> bool:
         """Whether the kernels read what is observed only when they step."""
-        for k in range(_COMPARED):
-            state = self.joint.prior(rng, 1)
-            data = self.joint.simulate(state, rng)
+        for k, (state, data) in enumerate(self._data_sets(rng)):
             alike = _ALIKE if self.members == 1 else self.members
             state, many = _repeated(state, alike), _repeated(data, alike)
             posed = self._compiled(data)
@@ -388,6 +403,15 @@ class _Machine:
             if not all(np.allclose(found[0][n], found[1][n], rtol=1e-9) for n in found[0]):
                 return False
         return True
+
+    def _data_sets(self, rng: np.random.Generator) -> list[tuple[Rows, Rows]]:
+        """A few draws of the joint law whose data are unlike the placeholder and each other."""
+        kept: dict[bytes, tuple[Rows, Rows]] = {_key(self.placeholder): ({}, {})}
+        for _ in range(_DRAWN):
+            state = self.joint.prior(rng, 1)
+            data = self.joint.simulate(state, rng)
+            kept.setdefault(_key(data), (state, data))
+        return list(kept.values())[1 : 1 + _COMPARED]
 
     def _frozen(self, rows: int) -> Any:
         if rows not in self._memory:
@@ -434,8 +458,7 @@ class _Machine:
         rows = len(next(iter(state.values())))
         alike: dict[bytes, list[int]] = {}
         for row in range(rows):
-            key = b"".join(v[row].tobytes() for v in data.values())
-            alike.setdefault(key, []).append(row)
+            alike.setdefault(_key(data, row), []).append(row)
         found = {n: np.array(v) for n, v in state.items()}
         for key, members in alike.items():
             if key not in self._posed:
@@ -498,6 +521,10 @@ def _placed(target: Target, state: Rows, data: Rows) -> Rows:
     with marking_invalid(), np.errstate(all="ignore"):
         target.refresh(values, target.chain)
     return values
+
+
+def _key(data: Rows, row: int = 0) -> bytes:
+    return b"".join(v[row].tobytes() for v in data.values())
 
 
 def _repeated(rows: Rows, count: int) -> Rows:

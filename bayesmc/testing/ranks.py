@@ -21,7 +21,7 @@ from bayesmc.randomness import seed_sequence
 from bayesmc.testing.joint import JointModel, Statistics, check_sizes, values_of
 from bayesmc.testing.moves import Move, moves_of
 from bayesmc.testing.uniformity import uniformity_p_value
-from bayesmc.testing.verdict import Comparison, Verdict, counted
+from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -41,21 +41,29 @@ class RankResult(Verdict):
         Stages run.
     judged : float
         Family-wise level that the last stage was judged at; ``alpha`` itself where only one was planned.
+    is_own_reverse : bool
+        Whether a function was taken for its own reverse.
     """
 
     p_values: Mapping[str, float] = field(default_factory=dict)
     counts: Mapping[str, np.ndarray] = field(default_factory=dict)
     stage: int = 1
     judged: float = 0.0
+    is_own_reverse: bool = False
 
     @property
     def level(self) -> float:
         return self.judged
 
     def _remarks(self) -> list[str]:
-        if self.judged == self.alpha:
-            return []
-        return [f"  stage {self.stage}, judged at {self.judged:.3g}"]
+        found = []
+        if self.judged != self.alpha:
+            found.append(f"  stage {self.stage}, judged at {self.judged:.3g}")
+        if self.is_own_reverse and self.rejected:
+            found.append(
+                "  no reverse was given: a kernel without detailed balance is rejected though right"
+            )
+        return found
 
 
 def rank_test(
@@ -160,6 +168,7 @@ def rank_test(
     >>> bool(rank_test(right, net, rng=0)), bool(rank_test(wrong, net, rng=0))
     (True, False)
     """
+    check_level("rank_test", alpha)
     check_sizes("rank_test", steps=(steps, 1), replications=(replications, 1),
                 thinning=(thinning, 1), stages=(stages, 1), growth=(growth, 1))  # fmt: skip
     generator = np.random.default_rng(seed_sequence(rng))
@@ -185,7 +194,11 @@ def rank_test(
             break
         level /= doubt
     p_values = MappingProxyType({n: c.p_value for n, c in judged.items()})
-    return counted(RankResult("rank_test", alpha, comparisons, 0, p_values, counts, stage, level))
+    return counted(
+        RankResult(
+            "rank_test", alpha, comparisons, 0, p_values, counts, stage, level, moves.is_own_reverse
+        )
+    )
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -14,7 +14,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import TypeVar
+from typing import Any, TypeVar
+
+import numpy as np
 
 #: figures shown of a verdict
 _SHOWN = 10
@@ -80,10 +82,7 @@ class Verdict:
     skipped: int = 0
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.alpha < 1.0:
-            raise ValueError(
-                f"{self.test}(alpha={self.alpha}): give a probability strictly between 0 and 1"
-            )
+        check_level(self.test, self.alpha)
         ordered = sorted(self.comparisons, key=lambda c: (c.p_value, -c.errors))
         object.__setattr__(self, "comparisons", tuple(ordered))
 
@@ -128,6 +127,12 @@ class Verdict:
     def _remarks(self) -> list[str]:
         """Lines of a test's own, below."""
         return []
+
+
+def check_level(call: str, alpha: Any) -> None:
+    """Raise ValueError unless alpha is a probability strictly between 0 and 1."""
+    if not isinstance(alpha, (int, float, np.number)) or not 0.0 < alpha < 1.0:
+        raise ValueError(f"{call}(alpha={alpha!r}): give a probability strictly between 0 and 1")
 
 
 def holm(p_values: Sequence[float], alpha: float) -> int:
