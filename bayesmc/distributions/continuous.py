@@ -20,6 +20,11 @@ _BELOW_ONE = np.nextafter(1.0, 0.0)
 _UNDERFLOWS = 0.05  # a Gamma or Beta variate of smaller concentration can underflow to zero
 
 
+#: times ``sqrt(df)`` from where on a Student t is its power law to the last digit; SciPy errs farther out
+_FAR = 1e9
+_HALF_LOG_PI = 0.5 * float(np.log(np.pi))
+
+
 class StudentT(Distribution):
     """Student's t distribution with location and scale.
 
@@ -91,10 +96,34 @@ class StudentT(Distribution):
 
     def cdf(self, x: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
-            return special.stdtr(self.df, (np.asarray(x) - self.loc) / self.scale)
+            z = (np.asarray(x) - self.loc) / self.scale
+            below = special.stdtr(self.df, z)
+        far = (np.abs(z) > _FAR * np.sqrt(self.df)) & np.isfinite(z)
+        if not far.any():
+            return below
+        with np.errstate(over="ignore"):  # where it is not needed
+            tail = np.exp(self._log_tail - self.df * np.log(np.where(far, np.abs(z), 1.0)))
+        return np.where(far, np.where(z < 0, tail, 1.0 - tail), below)[()]
 
     def ppf(self, q: Any) -> np.ndarray:
-        return self.loc + self.scale * special.stdtrit(self.df, as_quantile(q))
+        q = as_quantile(q)
+        z = special.stdtrit(self.df, q)
+        far = (np.abs(z) > _FAR * np.sqrt(self.df)) & (q > 0) & (q < 1)
+        if far.any():
+            with np.errstate(over="ignore"):  # beyond the largest double it is infinite
+                tail = np.where(far, np.minimum(q, 1.0 - q), 0.5)
+                size = np.exp((self._log_tail - np.log(tail)) / self.df)
+            z = np.where(far, np.copysign(size, q - 0.5), z)
+        z = np.where((q <= 0) | (q >= 1), np.copysign(np.inf, q - 0.5), z)[()]  # SciPy: +inf at 0
+        return self.loc + self.scale * z
+
+    @property
+    def _log_tail(self) -> np.ndarray:
+        """log K of the tail ``K |z|**-df``."""
+        df = self.df
+        return (
+            np.log(special.poch(0.5 * df, 0.5)) + 0.5 * df * np.log(df) - np.log(df) - _HALF_LOG_PI
+        )
 
 
 class Uniform(Distribution):

@@ -372,7 +372,12 @@ def _below_inverse(x: Any, low: Any, high: Any) -> Any:
 
 def _between(u: Any, low: Any, high: Any) -> Any:
     # an average rather than low + (high - low) z: next to a bound of zero it keeps its digits
-    return low * special.expit(-u) + high * special.expit(u)
+    return low * _share(-u) + high * _share(u)
+
+
+def _share(u: Any) -> np.ndarray:
+    """``expit(u)`` down to the smallest double; SciPy's is zero from -709 on."""
+    return np.where(np.asarray(u) < -700.0, np.exp(np.minimum(u, 0.0)), special.expit(u))
 
 
 def _between_inverse(x: Any, low: Any, high: Any) -> Any:

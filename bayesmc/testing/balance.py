@@ -1,8 +1,9 @@
 """Is a posterior over finitely many states the law that a kernel keeps, and does it keep detailed balance?
 
-Where the transition matrix can be had, the answer is exact: kernels of bayesmc are read from the code that draws
-(`transition`), and chains bring their own. Functions that a user wrote are run from draws of the exact posterior, and
-their steps are counted; the counts have binomial laws, so that no limit is needed.
+Where the transition matrix can be had, the answer is exact: kernels of bayesmc are read from the code
+that draws (`transition`), and chains bring their own. Functions that a user wrote are run from draws of
+the exact posterior, and their steps are counted; the counts have binomial laws, so that no limit is
+needed.
 """
 
 from __future__ import annotations
@@ -46,12 +47,12 @@ def invariant(
 ) -> Verdict:
     """Does one step of a kernel leave the posterior of a finite net as it is?
 
-    Exact for engines and kernels of bayesmc, whose transition matrix is read from the code that draws, and for
-    anything with a ``transition`` matrix: ``p P = p``, to rounding, for every kernel of a sweep. A function
-    ``step(state, rng) -> state`` is run once from each of ``draws`` independent draws of the exact posterior; then
-    the states after the step are draws of it, too, which binomial tails judge: each joint state, each state of each
-    node, and that no state of probability zero was reached. The chance of a false alarm is at most
-    ``alpha`` (Holm's method), and zero where the answer is exact.
+    Exact for engines and kernels of bayesmc, whose transition matrix is read from the code that draws,
+    and for anything with a ``transition`` matrix: ``p P = p``, to rounding, for every kernel of a sweep.
+    A function ``step(state, rng) -> state`` is run once from each of ``draws`` independent draws of the
+    exact posterior; then the states after the step are draws of it, too, which binomial tails judge: each
+    joint state, each state of each node, and that no state of probability zero was reached. The chance of
+    a false alarm is at most ``alpha`` (Holm's method), and zero where the answer is exact.
 
     Parameters
     ----------
@@ -88,8 +89,8 @@ def invariant(
 
     Examples
     --------
-    Two binary nodes that agree more often than not. To update both given each other's *old* value, as if they did
-    not meet, does not keep their law.
+    Two binary nodes that agree more often than not. To update both given each other's *old* value, as if
+    they did not meet, does not keep their law.
 
     >>> import bayesmc as bmc
     >>> from bayesmc.testing import invariant
@@ -131,11 +132,11 @@ def detailed_balance(
 ) -> Verdict:
     """Does a kernel go from one state to another as often as back, under the posterior of a finite net?
 
-    Exact where `invariant` is; of an engine each single update is judged, as sweeps of several updates in fixed
-    order keep the posterior, but not detailed balance. For a function, steps are counted from draws of the exact
-    posterior: under detailed balance the steps between two states go either way with probability one half, which
-    is a binomial law whatever the kernel. Detailed balance implies invariance; a function may be
-    right without it.
+    Exact where `invariant` is; of an engine each single update is judged, as sweeps of several updates in
+    fixed order keep the posterior, but not detailed balance. For a function, steps are counted from draws
+    of the exact posterior: under detailed balance the steps between two states go either way with
+    probability one half, which is a binomial law whatever the kernel. Detailed balance implies
+    invariance; a function may be right without it.
 
     Parameters
     ----------
@@ -264,8 +265,8 @@ def _finite(
             continue
         if node.domain is None:
             raise UnsupportedError(
-                f"{call}: node {name!r} is hidden and has infinitely many values, so that steps between states "
-                "cannot be counted; observe it, or use rank_test or geweke_test"
+                f"{call}: node {name!r} is hidden and has infinitely many values, so that steps between "
+                "states cannot be counted; observe it, or use rank_test or geweke_test"
             )
         hidden.append(name)
     if not hidden:
@@ -312,8 +313,9 @@ def _of_matrix(call: str, kernel: Any, law: _Law) -> Sweep:
     labels = [s if isinstance(s, tuple) else (s,) for s in kernel.states]
     if matrix.shape != (len(labels),) * 2 or set(labels) != set(law.states):
         raise ShapeError(
-            f"{call}: the chain has states {labels[:4]} ..., the posterior of {law.elements} has {law.states[:4]} "
-            "...; give the same joint states, values of the hidden nodes in the order of the net"
+            f"{call}: the chain has states {labels[:4]} ..., the posterior of {law.elements} has "
+            f"{law.states[:4]} ...; give the same joint states, values of the hidden nodes in the order "
+            "of the net"
         )
     order = [labels.index(state) for state in law.states]
     matrix = matrix[np.ix_(order, order)]

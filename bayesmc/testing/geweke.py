@@ -90,8 +90,8 @@ def geweke_test(
     inputs : dict, optional
         Of the net.
     draws : int, optional
-        Draws kept of each chain, at least 10; by default 200, or 30 where an engine reads the evidence when it
-        compiles, so that every data set costs a millisecond or more.
+        Draws kept of each chain, at least 10; by default 200, or 30 where an engine reads the evidence
+        when it compiles, so that every data set costs a millisecond or more.
     chains : int
         Chains, all in one array; at least 8. The first simulator makes ``draws * chains`` draws too.
     thinning : int

@@ -1,7 +1,8 @@
 """The joint law of state and data, which tests of kernels and engines hold these against.
 
-A net says it: its hidden nodes are the state, its observed ones the data, and both are drawn forwards. A model
-that is no net gives two simulators and its statistics (`JointModel`). What moves states is not known here.
+A net says it: its hidden nodes are the state, its observed ones the data, and both are drawn forwards. A
+model that is no net gives two simulators and its statistics (`JointModel`). What moves states is not
+known here.
 """
 
 from __future__ import annotations
@@ -138,8 +139,8 @@ class NetJoint(NetStates):
         self.user_inputs = inputs
         if self.model.potentials:
             raise UnsupportedError(
-                f"the potential {next(iter(self.model.potentials))!r} reweights the net, which then cannot be "
-                "drawn forwards; write it as an observed node, or give a JointModel"
+                f"the potential {next(iter(self.model.potentials))!r} reweights the net, which then cannot "
+                "be drawn forwards; write it as an observed node, or give a JointModel"
             )
         refusal = refuse_unsampled(self.model, (), "this test")
         if refusal:
@@ -202,8 +203,9 @@ class NetJoint(NetStates):
                 if node.is_stochastic and name not in chosen:
                     source = next(iter(below & set(node.parents)))
                     raise ModelError(
-                        f"observed={list(chosen)}: the hidden node {name!r} depends on {source!r}, so that data "
-                        f"cannot be drawn given the state; observe {name!r}, too, or leave {source!r} hidden"
+                        f"observed={list(chosen)}: the hidden node {name!r} depends on {source!r}, so that "
+                        f"data cannot be drawn given the state; observe {name!r}, too, or leave "
+                        f"{source!r} hidden"
                     )
                 below.add(name)
         return tuple(n for n in self.stochastic if n in chosen)

@@ -1,13 +1,14 @@
 """Whatever moves states, as one function of state, data and random numbers.
 
 Tests of kernels take engines, single kernels of ours, and plain functions that a user wrote for one state or
-for many; here they become alike. A kernel of ours gets a warmup of its own and is frozen; whether it stays so is
-checked. What a test makes of a move is not known here.
+for many; here they become alike. A kernel of ours gets a warmup of its own and is frozen; whether it
+stays so is checked. What a test makes of a move is not known here.
 
-Engines read the evidence when they compile, and tests have other data in every row. Where a kernel reads what is
-observed only when it steps, rows of data stand in the state in the place of a placeholder ("given"); that it does
-so is seen on a few data sets, where it must draw, bit for bit, what one compiled for those data draws. Else
-every row's data are evidence of their own ("posed"), at the cost of compiling for each.
+Engines read the evidence when they compile, and tests have other data in every row. Where a kernel reads
+what is observed only when it steps, rows of data stand in the state in the place of a placeholder
+("given"); that it does so is seen on a few data sets, where it must draw, bit for bit, what one compiled
+for those data draws. Else every row's data are evidence of their own ("posed"), at the cost of compiling
+for each.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import copy
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -101,13 +103,12 @@ def moves_of(
             joint.prior, joint.simulate, found, forward, backward, is_own_reverse=reverse is None
         )
     machine = _Machine(call, kernel, joint, warmup)
-    if reverse is not None:
-        other = _Machine(call, reverse, joint, warmup)
-        other.prepare(rows)
     machine.prepare(rows)
-    backward = machine.backward if reverse is None else other.forward
+    back = machine.backward
+    if reverse is not None:
+        back = _Machine(call, reverse, joint, warmup).from_elsewhere
     return Moves(
-        machine.prior, machine.simulate, machine.grouped(found), machine.forward, backward,
+        machine.prior, machine.simulate, machine.grouped(found), machine.forward, back,
         machine.faults, machine.why, machine.is_given,
     )  # fmt: skip
 
@@ -133,8 +134,8 @@ def sampler_of(call: str, kernel: Any, problem: Any) -> SweepSampler:
         made = kernel(target)
         if not isinstance(made, Kernel):
             raise UnsupportedError(
-                f"{call}: {kernel!r} made {type(made).__name__} of a target, not a bayesmc kernel; a function of "
-                "your own takes two arguments, step(state, rng)"
+                f"{call}: {kernel!r} made {type(made).__name__} of a target, not a bayesmc kernel; a "
+                "function of your own takes two arguments, step(state, rng)"
             )
         found = SweepSampler(target, [made])
     else:
@@ -295,8 +296,8 @@ class _Moving:
 class _Machine:
     """An engine's sweep on rows of states, each with data of its own.
 
-    Where chains are ensembles, a row of the test is one ensemble, whose members have data of their own: then all
-    members are independent under the joint law.
+    Where chains are ensembles, a row of the test is one ensemble, whose members have data of their own:
+    then all members are independent under the joint law.
     """
 
     def __init__(self, call: str, kernel: Any, joint: NetJoint, warmup: int | None) -> None:
@@ -312,8 +313,8 @@ class _Machine:
         self.warmup = min(getattr(kernel, "warmup", most), most) if warmup is None else warmup
         if not self.is_given and self.members > 1:
             raise UnsupportedError(
-                f"{call}: {kernel!r} moves ensembles, and reads what is observed when it compiles; test it with "
-                "simulation_based_calibration"
+                f"{call}: {kernel!r} moves ensembles, and reads what is observed when it compiles; test it "
+                "with simulation_based_calibration"
             )
         self.faults: tuple[Comparison, ...] = ()
         self._posed: dict[bytes, Any] = {}
@@ -332,20 +333,18 @@ class _Machine:
         """Statistics of rows: of an ensemble, means over its members and products of two."""
         found: dict[str, Callable[[_Moving, Rows], Any]] = {}
         for name, statistic in statistics.items():
-            if self.members == 1:
-                found[name] = lambda state, data, f=statistic: f(state.values, data)
-                continue
-
-            def each(state: _Moving, data: Rows, f: Any = statistic) -> np.ndarray:
-                value = np.asarray(f(state.values, data), dtype=float)
-                return value.reshape(-1, self.members)
-
-            found[name] = lambda s, y, each=each: each(s, y).mean(axis=1)
-            found[f"{name}, two members"] = lambda s, y, each=each: each(s, y)[:, :2].prod(axis=1)
+            found[name] = partial(self._mean, statistic)
+            if self.members > 1:
+                found[f"{name}, two members"] = partial(self._two, statistic)
         return found
 
     def forward(self, state: _Moving, data: Rows, rng: np.random.Generator) -> _Moving:
         return self._step(state, data, rng, backwards=False)
+
+    def from_elsewhere(self, state: _Moving, data: Rows, rng: np.random.Generator) -> _Moving:
+        """A step from the state of another machine, by its own frozen kernels."""
+        memory = self._frozen(len(next(iter(state.values.values())))) if self.is_given else None
+        return self.forward(_Moving(state.values, memory), data, rng)
 
     @property
     def backward(self) -> Move | None:
@@ -374,6 +373,16 @@ class _Machine:
         self.faults = tuple(faults)
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _each(self, statistic: Callable[..., Any], state: _Moving, data: Rows) -> np.ndarray:
+        value = np.asarray(statistic(state.values, data), dtype=float)
+        return value.reshape(-1, self.members, *value.shape[1:])
+
+    def _mean(self, statistic: Callable[..., Any], state: _Moving, data: Rows) -> np.ndarray:
+        return self._each(statistic, state, data).mean(axis=1)
+
+    def _two(self, statistic: Callable[..., Any], state: _Moving, data: Rows) -> np.ndarray:
+        return self._each(statistic, state, data)[:, :2].prod(axis=1)
 
     def _compiled(self, data: Rows, row: int = 0) -> SweepSampler:
         problem = pose(self.joint.net, self.joint.evidence(data, row), self.joint.user_inputs)
@@ -547,8 +556,8 @@ def _for_rows(memory: Iterable[Any], rows: int) -> list[Any]:
 def _reversed(call: str, kernels: Sequence[Kernel]) -> tuple[tuple[Kernel, ...] | None, str]:
     """The kernels of the time-reversed sweep; None, and why, where one of them is not known.
 
-    Each kernel of ours moves elements that do not meet at once and keeps detailed balance, or does so colour by
-    colour: then the colours come in the other order.
+    Each kernel of ours moves elements that do not meet at once and keeps detailed balance, or does so
+    colour by colour: then the colours come in the other order.
     """
     found = []
     for kernel in reversed(kernels):
@@ -556,8 +565,8 @@ def _reversed(call: str, kernels: Sequence[Kernel]) -> tuple[tuple[Kernel, ...] 
         if back is None:
             shown = ", ".join(map(repr, kernel.names))
             return None, (
-                f"{call}: the kernel of {shown} ({kernel.label}) moves several parts in turn, and its reverse "
-                "is not known; give reverse=, or use geweke_test or simulation_based_calibration"
+                f"{call}: the kernel of {shown} ({kernel.label}) moves several parts in turn, and its "
+                "reverse is not known; give reverse=, or use geweke_test or simulation_based_calibration"
             )
         found.append(back)
     return tuple(found), ""
@@ -571,7 +580,7 @@ def _reverse_of(kernel: Kernel) -> Kernel | None:
         back.groups = kernel.groups[::-1]
         return back if len(kernel.groups) > 1 else kernel
     blanket = getattr(kernel, "blanket", None)
-    classes = getattr(kernel, "classes", None) or getattr(blanket, "classes", (None,))
+    classes: Any = getattr(kernel, "classes", None) or getattr(blanket, "classes", (None,))
     if len(classes) < 2:
         return kernel
     if hasattr(kernel, "classes") or blanket is None:

@@ -136,8 +136,8 @@ def rank_test(
     Raises
     ------
     UnsupportedError
-        Nothing that moves states; a net that cannot be drawn forwards; or an engine with a kernel whose reverse
-        is not known.
+        Nothing that moves states; a net that cannot be drawn forwards; or an engine with a kernel whose
+        reverse is not known.
     ModelError, ShapeError, DensityError
         As `geweke_test`.
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,8 @@ from bayesmc.testing.joint import NetJoint, Rows, Statistics
 _PILOTS = 400
 #: pairs of nodes whose products are looked at, at most
 _PAIRS = 10
+#: states of a node of numbers that are looked at one by one, at most
+_FEW = 4
 #: deviations, in spreads of the joint law, beyond which numbers are bent
 _REACH = 3.0
 
@@ -27,7 +30,7 @@ _REACH = 3.0
 def default_statistics(joint: NetJoint) -> Statistics:
     """Statistics of the hidden nodes of a net, alone, with each other and with the data.
 
-    Of every hidden node its first number (for labels: whether it is in each state but the first) and, where
+    Of every hidden node its first number (for few states: whether it is in each but the first) and, where
     it has several, the mean of all, the last one and the product of the first two; mean squares; products of
     the first numbers of two nodes, and with the mean of each observed node; and the joint log density.
     """
@@ -55,11 +58,9 @@ def _of_node(joint: NetJoint, name: str, numbers: _Numbers) -> dict[str, Callabl
     node = joint.model[name]
     domain, elements = node.domain, math.prod(node.value_shape)
     found: dict[str, Callable[[Rows, Rows], Any]] = {}
-    if domain is not None:
+    if domain is not None and (domain.labels is not None or domain.size <= _FEW):
         for code in range(1, domain.size):  # what is stored are positions among the states
-            found[f"{name} is {domain.states[code]!r}"] = lambda s, y, code=code: (
-                _flat(s[name])[:, 0] == code
-            )
+            found[f"{name} is {domain.states[code]!r}"] = partial(_is_state, name, code)
     else:
         found[f"mean of {name}"] = lambda s, y: numbers(s[name])[:, 0]
         found[f"square of {name}"] = lambda s, y: (numbers(s[name]) ** 2).mean(axis=1)
@@ -68,6 +69,10 @@ def _of_node(joint: NetJoint, name: str, numbers: _Numbers) -> dict[str, Callabl
         found[f"last of {name}"] = lambda s, y: numbers(s[name])[:, -1]
         found[f"product of two of {name}"] = lambda s, y: numbers(s[name])[:, :2].prod(axis=1)
     return found
+
+
+def _is_state(name: str, code: int, state: Rows, data: Rows) -> np.ndarray:
+    return _flat(state[name])[:, 0] == code
 
 
 def _product(first: _Numbers, second: _Numbers, a: str, b: str) -> Callable[[Rows, Rows], Any]:

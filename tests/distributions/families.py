@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from scipy import special, stats
 
 import bayesmc.distributions as d
+from bayesmc.testing import session
 
-FIXED = settings(derandomize=True, max_examples=60, deadline=None, database=None)
+FIXED = settings(derandomize=True, max_examples=session.scaled(30), deadline=None, database=None)
 
 
 def magnitudes(low: float, high: float) -> st.SearchStrategy[float]:

@@ -345,3 +345,22 @@ def test_a_wrong_formula_would_be_seen() -> None:
     value = stats.norm.logpdf(np.linspace(-3, 3, 7))
     with pytest.raises(AssertionError):
         assert_close(value * (1 + 1e-9), value)
+
+
+@pytest.mark.parametrize("df", [0.05, 0.3, 1.0, 3.0, 40.0, 1e4])
+def test_the_far_tails_of_student_t(df: float) -> None:
+    """SciPy's own stop at 1e153, are off by a factor of 8 at 1e66, and have +inf as the quantile of 0."""
+    dist = d.StudentT(df, 2.0, 3.0)
+    q = np.array([1e-3, 1e-9, 1e-12, 1e-60, 1e-200, 1e-300])
+    x = dist.ppf(q)
+    held = np.isfinite(x)
+    np.testing.assert_allclose(dist.cdf(x[held]), q[held], rtol=1e-8)
+    assert ((x[held] < 0) & (x[held] > -1.7e308)).all()
+    assert (x[~held] == -np.inf).all()
+    assert (np.log(1 / q[~held]) / df > 600).all()
+    np.testing.assert_allclose(dist.ppf(1.0 - 2.0**-40) - 2.0, 2.0 - dist.ppf(2.0**-40), rtol=1e-9)
+    assert dist.ppf(0.0) == -np.inf
+    assert dist.ppf(1.0) == np.inf
+    if df < 10:
+        slope = np.log(dist.cdf(-1e30) / dist.cdf(-1e20)) / (10 * np.log(10.0))
+        assert slope == pytest.approx(-df, rel=1e-6)

@@ -646,3 +646,12 @@ def test_parts_side_by_side_have_the_maps_of_their_supports() -> None:
 def test_only_symmetric_positive_definite_matrices_are_contained(matrix: list) -> None:
     assert not positive_definite.contains(matrix)
     assert positive_definite.contains([matrix, np.eye(2)]).tolist() == [False, True]
+
+
+def test_between_two_bounds_nothing_jumps_down_to_the_smallest_double() -> None:
+    """``expit`` underflows at -709, where ``exp`` has still 36 powers of e to go."""
+    dist = d.Beta(0.01, 0.02)
+    u = np.linspace(-740.0, -600.0, 400)
+    log = dist.log_prob(dist.constrain(u)) + dist.log_abs_det_jacobian(u)
+    np.testing.assert_allclose(np.diff(log), 0.01 * (u[1] - u[0]), atol=0.01)
+    np.testing.assert_array_equal(dist.constrain(np.array([-1e4, 1e4])) > 0, True)
