@@ -7,12 +7,14 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 PY = .venv/bin/python
 PIP_FLAGS = --disable-pip-version-check -q
 
-.PHONY: help demo test lint format docs bench peers references clean
+.PHONY: help demo test test-thorough mutants lint format docs bench peers references clean
 .NOTPARALLEL:
 
 help:
 	@echo "make demo    run the demonstration; pictures go to out/"
 	@echo "make test    run the tests, doctests and examples included"
+	@echo "make test-thorough  the same with fresh seeds and more draws; BAYESMC_SEED=N repeats a run (long)"
+	@echo "make mutants  show that each of a list of planted faults is caught"
 	@echo "make lint    ruff, formatting, mypy"
 	@echo "make format  let ruff mend formatting and import order"
 	@echo "make docs    run every snippet of README, docs and docstrings"
@@ -26,6 +28,13 @@ demo: .venv/.extras-plot,robotics
 
 test: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m pytest -q -n auto --dist worksteal
+
+# the last lines say the seed; `make test-thorough BAYESMC_SEED=N` takes it again
+test-thorough: .venv/.extras-plot,arviz,robotics,test
+	$(PY) -m pytest -q -n auto --dist worksteal --bayesmc-thorough
+
+mutants: .venv/.extras-plot,arviz,robotics,test
+	$(PY) -m tests.mutants
 
 lint: .venv/.extras-dev
 	$(PY) -m ruff check .

@@ -1,4 +1,7 @@
-"""What every test file shares: the reference data, and a Hypothesis profile without chance.
+"""What every test file shares: the reference data, and a Hypothesis profile without chance, or with.
+
+An ordinary run is the same every time. A thorough one (``--bayesmc-thorough``) lets Hypothesis draw other
+and more examples, by the seed of the run, so that ``--bayesmc-seed`` repeats them as well.
 
 Tests that hold bayesmc against published numbers take the fixture ``reference_data`` (a path),
 which marks them ``reference``; where the data is absent they are skipped, and the run's last lines
@@ -13,13 +16,26 @@ from pathlib import Path
 import hypothesis
 import pytest
 
+from bayesmc.testing import session
+
 REPOSITORY = Path(__file__).resolve().parents[1]
 ABSENT = "reference data absent"
 
 hypothesis.settings.register_profile(
-    "bayesmc", max_examples=60, derandomize=True, deadline=None, print_blob=True, database=None
+    "bayesmc",
+    max_examples=session.scaled(60, times=5),
+    derandomize=not session.is_thorough(),
+    deadline=None,
+    print_blob=True,
+    database=None,
 )
 hypothesis.settings.load_profile("bayesmc")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # Hypothesis reads the option after this
+    if session.is_thorough() and getattr(config.option, "hypothesis_seed", "") is None:
+        config.option.hypothesis_seed = str(session.seed())
 
 
 def data_root() -> Path:

@@ -3,7 +3,7 @@
 Nets of discrete nodes, and of these and a few continuous scalars, are enumerated; conditional linear-Gaussian
 ones, with vectors, are answered by brute force over their configurations.
 
-Seeds are fixed, so a run is repeatable; ``BAYESMC_SEED`` shifts them on demand. One net under one engine
+Seeds are fixed, so a run is repeatable; ``--bayesmc-seed`` shifts them on demand. One net under one engine
 is compared at a false-alarm rate of 1e-3 (Holm over its states, means and evidence), and at the fixed
 seeds none may be rejected. At fresh ones, with some 1,200 such comparisons, a chance rejection is likely
 somewhere; there a rejected net is drawn again, with other random numbers, and fails if it is rejected
@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import os
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -50,10 +49,11 @@ from bayesmc.testing import (
     random_evidence,
     random_gaussian_net,
     random_net,
+    session,
 )
 
 ALPHA = 1e-3
-SHIFT = int(os.environ.get("BAYESMC_SEED", "0"))
+SHIFT = session.seed()
 SEEDS = range(SHIFT, SHIFT + 60)
 KINDS: dict[str, dict[str, Any]] = {
     "discrete": {},

@@ -33,6 +33,17 @@ def among_beacons(tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return ranges_heard(write_plaza(tmp_path_factory.mktemp("plaza"), 300.0, bias=2.5))
 
 
+@pytest.fixture(scope="module")
+def by_marks(among_marks: Drive) -> Any:
+    """The extended Kalman filter's belief among the landmarks, which most tests look at."""
+    return landmark_localization.filtered(among_marks, KALMAN)
+
+
+@pytest.fixture(scope="module")
+def by_beacons(among_beacons: Drive) -> Any:
+    return range_only.filtered(among_beacons, KALMAN)
+
+
 # ---- from logs to slices --------------------------------------------------------------------------
 
 
@@ -78,9 +89,9 @@ def test_dead_reckoning_is_one_arc_after_the_other(mrclam: Path, among_marks: Dr
 # ---- a generated world ----------------------------------------------------------------------------
 
 
-def test_both_filters_agree_on_where_the_robot_is(among_marks: Drive) -> None:
+def test_both_filters_agree_on_where_the_robot_is(among_marks: Drive, by_marks: Any) -> None:
     """Of eight seeds the particles' error is 0.025 to 0.036 m, and the paths are 0.009 to 0.016 m apart."""
-    kalman = landmark_localization.filtered(among_marks, KALMAN).mean("pose")
+    kalman = by_marks.mean("pose")
     engine = bmc.ParticleFilter(500)
     cloud = landmark_localization.filtered(among_marks, engine, seed=1).mean("pose")
     wheels = among_marks.rmse(among_marks.reckoned)
@@ -90,21 +101,19 @@ def test_both_filters_agree_on_where_the_robot_is(among_marks: Drive) -> None:
     assert np.sqrt((apart**2).mean()) < 0.03
 
 
-def test_landmarks_that_stand_elsewhere_are_noticed(among_marks: Drive) -> None:
+def test_landmarks_that_stand_elsewhere_are_noticed(among_marks: Drive, by_marks: Any) -> None:
     """The planted fault: the list of landmarks is turned round."""
     wrong = replace(among_marks, marks=among_marks.marks[::-1])
-    right = landmark_localization.filtered(among_marks, KALMAN)
     found = landmark_localization.filtered(wrong, KALMAN)
-    assert wrong.rmse(found.mean("pose")) > 10 * among_marks.rmse(right.mean("pose"))
-    assert found.log_marginal_likelihood < right.log_marginal_likelihood - 1000
+    assert wrong.rmse(found.mean("pose")) > 10 * among_marks.rmse(by_marks.mean("pose"))
+    assert found.log_marginal_likelihood < by_marks.log_marginal_likelihood - 1000
 
 
-def test_gains_of_the_wheels_are_found(among_marks: Drive) -> None:
+def test_gains_of_the_wheels_are_found(by_marks: Any) -> None:
     """They say a tenth too much: true gains are 1 / 1.1. Within 3 sd: 1 alarm in 200 runs of two gains."""
-    belief = landmark_localization.filtered(among_marks, KALMAN)
-    off = belief.mean("gain")[-1] - 1 / 1.1
-    assert (np.abs(off) < 3 * belief.std("gain")[-1]).all()
-    assert belief.mean("gain")[-1].max() < 0.97
+    off = by_marks.mean("gain")[-1] - 1 / 1.1
+    assert (np.abs(off) < 3 * by_marks.std("gain")[-1]).all()
+    assert by_marks.mean("gain")[-1].max() < 0.97
 
 
 @pytest.mark.parametrize("bias_is", ["constant", "growing"])
@@ -119,35 +128,29 @@ def test_the_bias_is_found(among_beacons: Drive, bias_is: str) -> None:
     )
 
 
-def test_particles_find_the_bias_too(among_beacons: Drive) -> None:
+def test_particles_find_the_bias_too(among_beacons: Drive, by_beacons: Any) -> None:
     """Of eight seeds seven are within 0.45 m of the Kalman filter's, with errors up to 1.35 times as large.
 
     The eighth is 0.6 m off: at the start the bias is known to 5 m, and few of the particles survive that.
     """
-    kalman = range_only.filtered(among_beacons, KALMAN)
     cloud = range_only.filtered(among_beacons, bmc.ParticleFilter(1000), seed=1)
-    assert cloud.mean("bias")[-1] == pytest.approx(kalman.mean("bias")[-1], abs=0.5)
-    assert among_beacons.rmse(cloud.mean("pose")) < 1.7 * among_beacons.rmse(kalman.mean("pose"))
+    assert cloud.mean("bias")[-1] == pytest.approx(by_beacons.mean("bias")[-1], abs=0.5)
+    assert among_beacons.rmse(cloud.mean("pose")) < 1.7 * among_beacons.rmse(
+        by_beacons.mean("pose")
+    )
 
 
 def test_a_bias_that_is_denied_costs_the_position(
-    among_beacons: Drive, monkeypatch: pytest.MonkeyPatch
+    among_beacons: Drive, by_beacons: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The planted fault: the same template, sure that ranges are right."""
-    right = range_only.filtered(among_beacons, KALMAN)
     for name, value in (("DOUBT", 1e-3), ("GROWTH", 1e-5), ("WANDER", (1e-5, 1e-7))):
         monkeypatch.setattr(range_only, name, value)
     wrong = range_only.filtered(among_beacons, KALMAN)
-    assert among_beacons.rmse(wrong.mean("pose")) > 1.5 * among_beacons.rmse(right.mean("pose"))
-    assert wrong.log_marginal_likelihood < right.log_marginal_likelihood - 100
-
-
-@pytest.mark.parametrize("example", [landmark_localization, range_only])
-def test_examples_run(example: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    example.main(["--fast", "--out", str(tmp_path)])
-    (made,) = tmp_path.glob("*.png")
-    assert made.stat().st_size > 20_000
-    assert "particles" in capsys.readouterr().out
+    assert among_beacons.rmse(wrong.mean("pose")) > 1.5 * among_beacons.rmse(
+        by_beacons.mean("pose")
+    )
+    assert wrong.log_marginal_likelihood < by_beacons.log_marginal_likelihood - 100
 
 
 # ---- the real logs --------------------------------------------------------------------------------

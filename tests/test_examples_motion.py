@@ -1,6 +1,6 @@
 """The examples about robots that move say what exact moments, densities and grids say.
 
-That they run, twice alike, and write their pictures is held in ``test_examples``, for all examples.
+That they run and write their pictures is held in ``test_examples``, for all examples.
 """
 
 from __future__ import annotations

@@ -19,6 +19,8 @@ import pytest
 
 from tests.snippets import REPOSITORY, snippets
 
+PLUGIN = "_bayesmc_pytestplugin.py"
+
 # pip's words for "no index answers", as against a requirement that does not exist there
 UNREACHABLE = ("connection", "timed out", "temporary failure", "name resolution", "network is")
 
@@ -79,10 +81,10 @@ def test_wheel_holds_the_package_only(wheel: Path) -> None:
     assert "bayesmc/py.typed" in names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     tops = {name.split("/")[0] for name in names}
-    assert {top for top in tops if not top.endswith(".dist-info")} == {"bayesmc"}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"bayesmc", PLUGIN}
     sources = REPOSITORY.glob("bayesmc/**/*.py")
     modules = {path.relative_to(REPOSITORY).as_posix() for path in sources}
-    assert modules == {name for name in names if name.endswith(".py")}
+    assert modules | {PLUGIN} == {name for name in names if name.endswith(".py")}
 
 
 def test_readme_example_runs_from_the_wheel(stranger: Path, tmp_path: Path) -> None:
@@ -116,6 +118,37 @@ def test_extras_are_absent_and_said_so(stranger: Path, tmp_path: Path) -> None:
     assert "pip install 'bayesmc[plot]'" in ran.stderr.splitlines()[-1]
 
 
+def test_pytest_finds_the_plugin_of_the_wheel(
+    stranger: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
+) -> None:
+    def install(folder: Path) -> None:  # beside the environment, which other tests want without
+        into = ("--python", str(stranger), "install", "--no-compile", "--target", str(folder))
+        _pip(sys.executable, *into, "pytest>=8.2")
+
+    found = _once(tmp_path_factory, "pytest", install)
+    (tmp_path / "test_mine.py").write_text(
+        "from bayesmc.testing import session\n"
+        "from bayesmc.testing.verdict import Verdict, counted\n"
+        "def test_mine(rng):\n"
+        "    assert (session.seed(), session.scaled(10)) == (5, 80)\n"
+        "    assert 0 <= rng.random() < 1\n"
+        "    assert counted(Verdict('mine', 0.25, []))\n"
+    )
+    command = [
+        str(stranger),
+        "-m",
+        "pytest",
+        "-W",
+        "error",
+        "--bayesmc-thorough",
+        "--bayesmc-seed=5",
+    ]
+    ran = _run(command, tmp_path, PYTHONPATH=str(found))
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    assert "bayesmc: thorough run with seed 5" in ran.stdout
+    assert "1 statistical test spent a false-alarm budget of 0.25" in ran.stdout
+
+
 def _project() -> dict:
     import tomllib
 
@@ -133,6 +166,7 @@ def _pip(python: str, *arguments: str) -> None:
     pytest.fail(f"{' '.join(command)}\n{ran.stderr}", pytrace=False)
 
 
-def _run(command: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "VIRTUAL_ENV"))}
-    return subprocess.run(command, cwd=folder, env=kept, text=True, capture_output=True)
+def _run(command: list[str], folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
+    outer = ("PYTHON", "VIRTUAL_ENV", "PYTEST_", "BAYESMC_")
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(outer)}
+    return subprocess.run(command, cwd=folder, env={**kept, **more}, text=True, capture_output=True)

@@ -5,13 +5,16 @@ Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for 
 ``evidence_for`` only.
 """
 
+from bayesmc.testing.balance import detailed_balance, invariant
 from bayesmc.testing.conditional_gaussian import ConditionalGaussian, GaussianAnswer
 from bayesmc.testing.gaussians import GaussianOptions, gaussian_evidence, random_gaussian_net
-from bayesmc.testing.kernels import GewekeResult, RankResult, geweke_test, rank_test
-from bayesmc.testing.matching import Comparison, Match, assert_matches, compare
+from bayesmc.testing.geweke import GewekeResult, geweke_test
+from bayesmc.testing.joint import JointModel
+from bayesmc.testing.matching import Match, assert_matches, compare
 from bayesmc.testing.nets import NetOptions, random_net
 from bayesmc.testing.observing import random_evidence
 from bayesmc.testing.oracle import Enumerated, enumerate_posterior
+from bayesmc.testing.ranks import RankResult, rank_test
 from bayesmc.testing.strategies import bayes_nets, evidence_for
 from bayesmc.testing.transition import (
     KernelMatrix,
@@ -21,6 +24,7 @@ from bayesmc.testing.transition import (
     transition_p_value,
 )
 from bayesmc.testing.uniformity import uniformity_p_value
+from bayesmc.testing.verdict import Comparison, Verdict
 
 __all__ = [
     "Comparison",
@@ -29,19 +33,23 @@ __all__ = [
     "GaussianAnswer",
     "GaussianOptions",
     "GewekeResult",
+    "JointModel",
     "KernelMatrix",
     "Match",
     "NetOptions",
     "RankResult",
     "Sweep",
+    "Verdict",
     "assert_matches",
     "bayes_nets",
     "compare",
+    "detailed_balance",
     "enumerate_posterior",
     "evidence_for",
     "exact_sweep",
     "gaussian_evidence",
     "geweke_test",
+    "invariant",
     "random_evidence",
     "random_gaussian_net",
     "random_net",

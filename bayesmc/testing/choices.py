@@ -7,8 +7,9 @@ simple options, so that a search for the smallest failing net (shrinking) goes t
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,8 @@ import numpy as np
 _STEPS = 16
 #: largest relative weight of a state
 _WEIGHT = 8
+
+T = TypeVar("T")
 
 
 class Choices:
@@ -28,14 +31,20 @@ class Choices:
     group : callable, optional
         ``group(make)`` returns ``make(choices)`` and marks what it chooses as belonging together, so that
         shrinking can drop it as a whole.
+    zero_first : bool
+        Whether zero, not the lower end, is the simplest real number. It makes other numbers of the same
+        integers.
     """
 
     def __init__(
         self,
         integer: Callable[[int, int], int],
         group: Callable[[Callable[[Choices], Any]], Any] | None = None,
+        *,
+        zero_first: bool = False,
     ) -> None:
         self.integer = integer
+        self._zero_first = zero_first
         self._group = group
 
     def group(self, make: Callable[[Choices], Any]) -> Any:
@@ -52,7 +61,10 @@ class Choices:
 
     def real(self, low: float, high: float) -> float:
         """A number between ``low`` and ``high``, of a coarse grid."""
-        return low + (high - low) * self.integer(0, _STEPS) / _STEPS
+        step = self.integer(0, _STEPS)
+        if self._zero_first and low == -high:  # 0, 1, -1, 2, -2, ... steps from the middle
+            step = _STEPS // 2 + (step + 1) // 2 * (1 if step % 2 else -1)
+        return low + (high - low) * step / _STEPS
 
     def reals(self, low: float, high: float, shape: tuple[int, ...]) -> np.ndarray:
         """An array of such numbers."""
@@ -66,6 +78,27 @@ class Choices:
         table = np.array(weights, dtype=float).reshape(count, states)
         table[table.sum(axis=1) == 0] = 1.0
         return table / table.sum(axis=1, keepdims=True)
+
+
+def read_options(call: str, kind: type[T], options: Mapping[str, Any]) -> T:
+    """The options of a call, fields of the dataclass ``kind``, by name."""
+    names = [f.name for f in fields(kind)]  # type: ignore[arg-type]
+    unknown = [name for name in options if name not in names]
+    if unknown:
+        raise TypeError(f"{call}({unknown[0]}=...): no such option; it takes {', '.join(names)}")
+    try:
+        return kind(**options)
+    except ValueError as error:
+        raise ValueError(f"{call}: {error}") from None
+
+
+def read_range(name: str, value: Any, least: int) -> tuple[int, int]:
+    """A pair (fewest, most) of whole numbers, ``least <= fewest <= most``."""
+    if isinstance(value, Sequence) and len(value) == 2:
+        low, high = value
+        if all(isinstance(v, (int, np.integer)) for v in value) and least <= low <= high:
+            return int(low), int(high)
+    raise ValueError(f"{name}={value!r}: give (fewest, most) with {least} <= fewest <= most")
 
 
 def seeded(rng: np.random.Generator) -> Choices:

@@ -3,23 +3,56 @@
 What a template may hold: tables and functions, of the slice before, of the time and of an input; labels and
 numbers; plates (own, shared, read across); deterministic nodes that later slices read; continuous and finite
 observed nodes, some of which read what was observed before. Every template can be unrolled and answered
-exactly.
+exactly. Every node is a line of code that was run, which ``as_code`` shows.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet
-from bayesmc.distributions import Bernoulli, Categorical, Normal
-from bayesmc.testing.choices import Choices, seeded
+from bayesmc.testing.choices import Choices, read_options, read_range, seeded
+from bayesmc.testing.spelling import (
+    affine,
+    array,
+    as_code,
+    call,
+    declare,
+    function,
+    literal,
+    over,
+    softmax,
+)
 
 _LABELS = ("low", "mid", "high")
+
+
+@dataclass(frozen=True)
+class DbnOptions:
+    """What a random template may hold.
+
+    Attributes
+    ----------
+    nodes : (int, int)
+        Fewest and most hidden finite nodes.
+    steps : (int, int)
+        Fewest and most slices.
+    zeros : bool
+        Tables may have zeros.
+    """
+
+    nodes: tuple[int, int] = (1, 4)
+    steps: tuple[int, int] = (1, 6)
+    zeros: bool = True
+
+    def __post_init__(self) -> None:
+        read_range("nodes", self.nodes, 1)
+        read_range("steps", self.steps, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,25 +76,33 @@ class RandomDbn:
     inputs: dict[str, np.ndarray] | None
     story: str
 
+    def __repr__(self) -> str:
+        """The code that declares the template and its data."""
+        lines = [as_code(self.dbn), f"observations = {_listed(self.observations)}"]
+        if self.inputs is not None:
+            lines.append(f"inputs = {_listed(self.inputs)}")
+        return "\n".join(lines)
 
-def random_dbn(seed: Any, *, nodes: tuple[int, int] = (1, 4), steps: tuple[int, int] = (1, 6),
-               zeros: bool = True) -> RandomDbn:  # fmt: skip
+
+def random_dbn(seed: Any, **options: Any) -> RandomDbn:
     """A small random discrete template with data.
 
     Parameters
     ----------
     seed : seed or Generator
         The same seed gives the same template and data.
-    nodes : (int, int)
-        Fewest and most hidden finite nodes.
-    steps : (int, int)
-        Fewest and most slices.
-    zeros : bool
-        Tables may have zeros.
+    **options
+        Fields of `DbnOptions`: ``nodes``, ``steps``, ``zeros``.
 
     Returns
     -------
     RandomDbn
+        It prints as the code that declares it.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An option that is out of range, or unknown.
 
     Examples
     --------
@@ -69,21 +110,34 @@ def random_dbn(seed: Any, *, nodes: tuple[int, int] = (1, 4), steps: tuple[int, 
     >>> random_dbn(3).story == random_dbn(3).story
     True
     """
-    for name, (low, high) in (("nodes", nodes), ("steps", steps)):
-        if not 1 <= low <= high:
-            raise ValueError(
-                f"random_dbn({name}={(low, high)}): give (fewest, most), 1 <= fewest <= most"
-            )
+    given = read_options("random_dbn", DbnOptions, options)
     rng = np.random.default_rng(seed)
-    builder = _Builder(seeded(rng), zeros)
-    builder.build(*nodes)
-    count = int(rng.integers(steps[0], steps[1] + 1))
+    builder = _Builder(seeded(rng), given.zeros)
+    builder.build(*given.nodes)
+    count = int(rng.integers(given.steps[0], given.steps[1] + 1))
+    return _with_data(builder, count, rng, lambda: rng.random() >= 0.3)
+
+
+def build_dbn(choices: Choices, options: DbnOptions) -> RandomDbn:
+    """A random template from any source of choices; its data are drawn from a seed, which is one of them."""
+    count = choices.integer(*options.steps)
+    builder = _Builder(choices, options.zeros)
+    builder.build(*options.nodes)
+    rng = np.random.default_rng(choices.integer(0, 2**31 - 1))
+    return _with_data(builder, count, rng, lambda: choices.flag(0.7))
+
+
+def _with_data(
+    builder: _Builder, count: int, rng: np.random.Generator, has_gaps: Callable[[], bool]
+) -> RandomDbn:
     inputs = {"u": rng.normal(size=count).round(2)} if builder.has_input else None
     drawn = builder.dbn.sample(count, inputs=inputs, rng=rng)
-    observations = {
-        name: _with_gaps(np.asarray(_plain(drawn[name][0])), full, rng)
-        for name, full in builder.seen.items()
-    }
+    observations = {}
+    for name, full in builder.seen.items():
+        values = np.asarray(_plain(drawn[name][0]))
+        if not full and has_gaps():
+            values = np.ma.MaskedArray(values, mask=rng.random(values.shape) < 0.35)
+        observations[name] = values
     return RandomDbn(builder.dbn, count, observations, inputs, "; ".join(builder.story))
 
 
@@ -96,8 +150,8 @@ class _Known:
 
     name: str
     plates: tuple[str, ...]
-    card: int
-    labels: tuple[str, ...] | None
+    card: int = 0
+    labels: tuple[str, ...] | None = None
 
 
 @dataclass
@@ -120,7 +174,7 @@ class _Builder:
         self.dbn = DynamicBayesNet("", plates={"k": 2} if self.has_plate else None)
         self.has_input = c.flag(0.3)
         if self.has_input:
-            self.dbn.input("u")
+            declare(self.dbn, 'input("u")')
 
     def build(self, low: int, high: int) -> None:
         c = self.choices
@@ -156,21 +210,18 @@ class _Builder:
         past = [k for k in before if set(k.plates) <= set(plates)]
         if c.flag(0.6):
             parents = [k.name for k in tabular] + [k.name + "_prev" for k in past]
-            initial: Any = None
-            if past:
-                rows = self._rows(tabular, card)
-                initial = _looked_up(rows, [k.name for k in tabular], [k.labels for k in tabular])
-            probs = self._rows([*tabular, *past], card)
-            self.dbn.table(name, parents, probs, own.labels, plates=plates, initial=initial)
+            first = [k.name for k in tabular]
+            initial = _looked_up(self._rows(tabular, card), first, tabular) if past else ""
+            self._table(own, parents, self._rows([*tabular, *past], card), initial)
             self._tell(name, "table", parents, plates)
         else:
-            score, parents = self._score(now, before)
-            first, own_slice = self._score(now, [])
-            slopes = c.reals(-1.5, 1.5, (card,))
-            options: dict[str, Any] = {"parents": parents, "plates": plates, "states": own.labels}
+            score, parents = self._score(plates, now, before)
+            start, own_slice = self._score(plates, now, [])
+            slopes = c.reals(-1.5, 1.5, (card,)).tolist()
+            initial = ""
             if any(p.endswith("_prev") for p in parents):
-                options["initial"] = _named(_softmaxed(first, slopes), own_slice)
-            self.dbn.add(name, _softmaxed(score, slopes), **options)
+                initial = function(own_slice, softmax(start, slopes))
+            self._add(own, function(parents, softmax(score, slopes)), initial)
             self._tell(name, "softmax", parents, plates)
         self.known.append(own)
 
@@ -185,31 +236,31 @@ class _Builder:
         weight = c.real(0.5, 1.5)
         if clock:
             parents.append("t")
-        self.dbn.add(name, lambda *a: sum(a[1:], weight * a[0]) * 0.5, parents, plates)
+        total = " + ".join([f"{weight!r} * {parents[0]}", *parents[1:]])
+        self._add(_Known(name, plates), function(parents, f"0.5 * ({total})"))
         self._tell(name, "computed", parents, plates)
         shift = c.real(-1.0, 1.0)
-        self.dbn.add(
-            "e", lambda d_prev: Bernoulli(_sigmoid(np.sin(d_prev) + shift)), plates=plates,
-            initial=Bernoulli(0.4),
-        )  # fmt: skip
+        logits = affine(shift, [(1.0, "np.sin(d_prev)")])
+        body = function(["d_prev"], f"bmc.Bernoulli(logits={logits})")
+        self._add(_Known("e", plates), body, "bmc.Bernoulli(0.4)")
         self._tell("e", "bernoulli", ["d_prev"], plates)
-        self.known.append(_Known("e", plates, 2, None))
+        self.known.append(_Known("e", plates, 2))
 
     def _normal(self, name: str) -> None:
         """A continuous observed node; with the value before among its parents it has no gaps."""
         c = self.choices
         plates, recalls = self._plates(), c.flag(0.25)
         some = [k for k in self.known if c.flag(0.7)] or self.known[-1:]
-        score, parents = self._score(some, [k for k in self.known if c.flag(0.2)])
-        spread, count = c.real(0.5, 1.5), len(parents)
+        score, parents = self._score(plates, some, [k for k in self.known if c.flag(0.2)])
+        spread = c.real(0.5, 1.5)
         if recalls:
             parents = [*parents, name + "_prev"]
-        first, own = self._score(some, [])
-        make: Callable[..., Any] = lambda *a: Normal(score(a) + 0.5 * sum(a[count:]), spread)  # noqa: E731
-        start: Callable[..., Any] = lambda *a: Normal(first(a), spread)  # noqa: E731
+            score = f"{score} + 0.5 * {name}_prev"
+        first, own = self._score(plates, some, [])
         reads_back = any(p.endswith("_prev") for p in parents)
-        initial = _named(start, own) if reads_back else None
-        self.dbn.add(name, make, parents, plates, initial=initial)
+        initial = function(own, f"bmc.Normal({first}, {spread!r})") if reads_back else ""
+        body = function(parents, f"bmc.Normal({score}, {spread!r})")
+        self._add(_Known(name, plates), body, initial)
         self._tell(name, "density", parents, plates)
         self.seen[name] = recalls
 
@@ -221,11 +272,23 @@ class _Builder:
         own = _Known(name, plates, 2, ("no", "yes") if c.flag(0.3) else None)
         recalls = c.flag(0.3)
         parents = [k.name for k in inside] + ([name + "_prev"] if recalls else [])
-        initial = [0.3, 0.7] if recalls else None
-        probs = self._rows([*inside, *([own] if recalls else [])], 2)
-        self.dbn.table(name, parents, probs, own.labels, plates=plates, initial=initial)
+        rows = self._rows([*inside, *([own] if recalls else [])], 2)
+        self._table(own, parents, rows, "[0.3, 0.7]" if recalls else "")
         self._tell(name, "leaf", parents, plates)
         self.seen[name] = False
+
+    # ---- code -------------------------------------------------------------------------------
+
+    def _table(self, own: _Known, parents: list[str], rows: np.ndarray, initial: str) -> None:
+        self._run("table", own, initial, literal(parents), repr(rows.tolist()))
+
+    def _add(self, own: _Known, cpd: str, initial: str = "") -> None:
+        self._run("add", own, initial, cpd)
+
+    def _run(self, method: str, own: _Known, initial: str, *texts: str) -> None:
+        start = [f"initial={initial}"] if initial else []
+        options = {"states": own.labels, "plates": over(own.plates)}
+        declare(self.dbn, call(method, f'"{own.name}"', *texts, *start, **options))
 
     def _rows(self, above: list[_Known], card: int) -> np.ndarray:
         cards = tuple(k.card for k in above)
@@ -233,75 +296,48 @@ class _Builder:
         return rows.reshape((*cards, card))
 
     def _score(
-        self, now: list[_Known], before: list[_Known]
-    ) -> tuple[Callable[[Any], Any], list[str]]:
+        self, plates: tuple[str, ...], now: list[_Known], before: list[_Known]
+    ) -> tuple[str, list[str]]:
         """A number that is affine in finite nodes, and may read the time and the input."""
         c = self.choices
         parents = [k.name for k in now] + [k.name + "_prev" for k in before]
-        terms = [(c.real(-1.5, 1.5), k.labels[-1] if k.labels else None) for k in (*now, *before)]
+        terms = []
+        for known, parent in zip([*now, *before], parents, strict=True):
+            value = f"({parent} == {literal(known.labels[-1])})" if known.labels else parent
+            if set(known.plates) - set(plates):
+                value = f"{value}.mean()"
+            terms.append((c.real(-1.5, 1.5), value))
         if c.flag(0.3):
             parents.append("t")
-            terms.append((0.3, None))
+            terms.append((0.3, "t"))
         if self.has_input and c.flag(0.6):
             parents.append("u")
-            terms.append((0.7, None))
-        offset = c.real(-1.0, 1.0)
-
-        def score(arguments: Any) -> Any:
-            total: Any = offset
-            for (weight, label), value in zip(terms, arguments, strict=False):
-                number = value if label is None else (value == label) * 1.0
-                if hasattr(number, "mean") and hasattr(number, "plates"):
-                    number = number.mean()
-                total = total + weight * number
-            return total
-
-        return score, parents
+            terms.append((0.7, "u"))
+        return affine(c.real(-1.0, 1.0), terms), parents
 
     def _tell(self, name: str, kind: str, parents: list[str], plates: tuple[str, ...]) -> None:
         self.story.append(f"{name}[{','.join(plates)}]: {kind}({', '.join(parents)})")
 
 
-def _named(function: Callable[..., Any], names: list[str]) -> Any:
-    """The function with arguments of these names, which is how ``initial=`` finds its parents."""
-    if not names:
-        return function()
-    source = f"lambda {', '.join(names)}: function({', '.join(names)})"
-    return eval(source, {"function": function})
-
-
-def _looked_up(rows: np.ndarray, names: list[str], labels: list[Any]) -> Any:
+def _looked_up(rows: np.ndarray, names: list[str], above: list[_Known]) -> str:
     """A table as ``initial=`` takes it: probabilities, or a function of nodes of the slice."""
     if not names:
-        return rows
-    return _named(lambda *a: Categorical(rows[tuple(map(_position, a, labels))]), names)
-
-
-def _position(value: Any, labels: Any) -> Any:
-    if labels is None:
-        return value
-    return sum(k * (value == label) for k, label in enumerate(labels))
-
-
-def _softmaxed(score: Callable[[Any], Any], slopes: np.ndarray) -> Callable[..., Any]:
-    def make(*arguments: Any) -> Categorical:
-        logits = np.asarray(score(arguments), dtype=float)[..., None] * slopes
-        weights = np.exp(logits - logits.max(axis=-1, keepdims=True))
-        return Categorical(weights / weights.sum(axis=-1, keepdims=True))
-
-    return make
-
-
-def _sigmoid(x: Any) -> Any:
-    return 1.0 / (1.0 + np.exp(-np.asarray(x, dtype=float)))
+        return repr(rows.tolist())
+    at = ", ".join(f"np.asarray({k.name})" if k.labels else k.name for k in above)
+    return function(names, f"bmc.Categorical({array(rows)}[{at}])")
 
 
 def _plain(values: Any) -> Any:
     return values.labels if hasattr(values, "labels") and hasattr(values, "codes") else values
 
 
-def _with_gaps(values: np.ndarray, full: bool, rng: np.random.Generator) -> Any:
-    """The rows with some missing, as a masked array."""
-    if full or rng.random() < 0.3:
-        return values
-    return np.ma.MaskedArray(values, mask=rng.random(values.shape) < 0.35)
+def _listed(values: Mapping[str, np.ndarray]) -> str:
+    """Rows as literals, None where they are missing."""
+    return "{" + ", ".join(f'"{name}": {_rows_of(rows)}' for name, rows in values.items()) + "}"
+
+
+def _rows_of(rows: Any) -> str:
+    if not isinstance(rows, np.ma.MaskedArray):
+        return f"np.array({literal(rows.tolist())})"
+    data, mask = rows.data.tolist(), np.ma.getmaskarray(rows).astype(int).tolist()
+    return f"np.ma.MaskedArray({literal(data)}, {mask!r})"

@@ -1,7 +1,8 @@
-"""Does a posterior match an exact one? Every probability, mean and log evidence, in one decision.
+"""Does a posterior match an exact one? Its figures, and its joint draws where asked, in one decision.
 
 Monte Carlo answers are judged by their own standard errors, all comparisons together under a stated
-false-alarm rate; answers without Monte Carlo error must agree to a tolerance.
+false-alarm rate; answers without Monte Carlo error must agree to a tolerance. What draws say of an average
+stands in ``samples``, what a decision is in ``verdict``; where exact answers come from is not known here.
 """
 
 from __future__ import annotations
@@ -11,63 +12,44 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.special
 
-#: effective number of draws below which a mean or log evidence is not judged: no normal limit yet
-_MIN_ESS = 100.0
+from bayesmc.errors import UnsupportedError
+from bayesmc.randomness import seed_sequence
+from bayesmc.results.draws import DrawsPosterior
+from bayesmc.testing.figures import (
+    MIN_ESS,
+    Pair,
+    Table,
+    asked,
+    compare_angles,
+    compare_cov,
+    compare_mean,
+    compare_quantiles,
+    compare_states,
+    compare_var,
+)
+from bayesmc.testing.oracle import Enumerated
+from bayesmc.testing.samples import Draws, energy_comparison
+from bayesmc.testing.verdict import Verdict, counted
 
-
-@dataclass(frozen=True)
-class Comparison:
-    """One figure against its exact value.
-
-    Attributes
-    ----------
-    what : str
-        Node, element and state.
-    found, exact : float
-    errors : float
-        Distance in standard errors (infinite where none is allowed).
-    p_value : float
-        Of a distance at least this large, were the answer right.
-    """
-
-    what: str
-    found: float
-    exact: float
-    errors: float
-    p_value: float
-
-    def __str__(self) -> str:
-        return (
-            f"{self.what}: {self.found:.6g} against {self.exact:.6g} exact, "
-            f"{self.errors:.3g} standard errors (p = {self.p_value:.2g})"
-        )
+#: rows of a joint sample below which it is not judged
+_MIN_ROWS = 30
 
 
-@dataclass(frozen=True)
-class Match:
-    """What was compared, and what was rejected.
+@dataclass(frozen=True, eq=False, repr=False)
+class Match(Verdict):
+    """What was compared, and what does not match.
 
     Attributes
     ----------
-    comparisons : int
-        Figures compared.
-    skipped : int
-        Figures with too few effective draws to be judged.
-    worst : Comparison or None
-        The least likely one.
-    rejected : tuple of Comparison
-        Those that do not match, worst first; empty when all is well.
-    alpha : float
-        Family-wise false-alarm rate of the decision.
+    remarks : tuple of str
+        What could not be compared though it was asked for, and why.
     """
 
-    comparisons: int
-    skipped: int
-    worst: Comparison | None
-    rejected: tuple[Comparison, ...]
-    alpha: float
+    remarks: tuple[str, ...] = ()
+
+    def _remarks(self) -> list[str]:
+        return [f"  {remark}" for remark in self.remarks]
 
 
 def compare(
@@ -78,48 +60,79 @@ def compare(
     rtol: float = 1e-9,
     min_count: float = 10.0,
     names: Sequence[str] | None = None,
+    quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
+    draws: int = 0,
+    rng: Any = None,
 ) -> Match:
     """What differs between a posterior and an exact one, and whether chance explains it.
 
-    Compared are the probability of every state of every element of finite nodes, the means of all other
-    nodes, and the log evidence. A probability is judged by binomial tails at its effective count
-    ``n_eff`` (the smaller of the weights' ESS and the node's own), i.e. with the standard error under the
-    exact value; means by their standard error, at least that of the exact variance at ``n_eff``; evidence
-    by its ratio to the exact one. A state of exact probability zero must have exactly none. Holm's method
-    keeps the chance of any false alarm in one call at ``alpha``. A posterior whose ``ess`` is infinite is
-    exact, and must agree within ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is added to
-    every tolerance.
+    Compared are the log evidence, the probability of every state of every element of finite nodes, and of
+    all other nodes means, variances, quantiles and, of nodes of up to five numbers, covariances; each where
+    both can answer. With ``draws``, joint draws of all nodes are compared with draws of the exact answer,
+    too, which shows wrong dependences between right marginals.
+
+    How each is judged, at the effective number of draws:
+
+    - a probability by binomial tails at ``n_eff`` (the smaller of the weights' ESS and the node's own), i.e.
+      with the standard error under the exact value; one of exactly zero must have exactly none;
+    - a quantile by the same law of the share of draws below the exact quantile;
+    - means by their standard error, at least that of the exact variance at ``n_eff``;
+    - variances and covariances by the standard error of the squares, corrected for skewness (Hall 1992),
+      and not at all where fewer than some 30 draws decide it: the variance may be infinite then;
+    - angles by the means of their cosine and sine;
+    - log evidence by its ratio to the exact one;
+    - joint draws by their energy distance and relabelling (`same_distribution`), of weighted draws those
+      that rejection leaves independent, of chains one in twice the draws that count as one.
+
+    Holm's method keeps the chance of any false alarm in one call at ``alpha``. It is exact for
+    probabilities and quantiles of numbers from independent draws and for their joint draws, and holds in
+    the limit of many draws elsewhere. A posterior whose ``ess`` is infinite is exact, and must agree within
+    ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is added to every tolerance.
 
     It cannot see what the draws do not show: heavy weights that no draw has met (look at ``pareto_k``),
-    faults below the Monte Carlo error, errors of joint probabilities with right marginals.
+    faults below the Monte Carlo error; without ``draws``, errors of joint probabilities with right
+    marginals. Sums (``keep="summaries"``) say nothing of quantiles, covariances and the errors of variances.
 
     Parameters
     ----------
     posterior : Posterior
         Of any engine.
     exact : Enumerated or Posterior
-        Anything with ``names``, ``probabilities``, ``mean``, ``var``, ``log_marginal_likelihood``.
+        Anything with ``names``, ``probabilities``, ``mean``, ``var``, ``log_marginal_likelihood``; its
+        ``quantile(name, q)``, ``cdf(name, x)``, ``cov(name)`` and ``resample(draws, rng)`` are used where it
+        has them.
     alpha : float
         Family-wise false-alarm rate.
     rtol : float
         Tolerance without Monte Carlo error.
     min_count : float
-        Compare states with ``n_eff * p * (1 - p)`` at least this.
+        Compare states and quantiles with ``n_eff * p * (1 - p)`` at least this.
     names : sequence of str, optional
-        Nodes to compare; by default all that ``exact`` knows.
+        Nodes to compare; by default all that ``exact`` knows and the posterior kept.
+    quantiles : sequence of float
+        Compare these; none where empty.
+    draws : int
+        Joint draws to compare, of each side, at most; a few hundred tell a lot, 1000 are used at most.
+    rng : seed, Generator or None
+        For ``draws``.
 
     Returns
     -------
     Match
+        True where all is well, so that ``assert compare(posterior, exact)`` says what is not.
 
     Raises
     ------
     AssertionError
         Where the two do not even have the same shapes.
+    UnsupportedError
+        ``draws`` are asked for and ``exact`` has none to give.
+    ValueError
+        Nothing is left to compare, or a level or number is out of range.
 
     References
     ----------
-    Holm (1979), Scand. J. Statist. 6.
+    Holm (1979), Scand. J. Statist. 6; Hall (1992), JRSS B 54; Szekely and Rizzo (2004), InterStat 5.
 
     Examples
     --------
@@ -128,22 +141,11 @@ def compare(
     >>> net = bmc.BayesNet()
     >>> net.add("a", bmc.Bernoulli(0.3))
     >>> found = bmc.infer(net, engine=bmc.LikelihoodWeighting(5000), rng=0)
-    >>> compare(found, enumerate_posterior(net)).rejected
-    ()
+    >>> bool(compare(found, enumerate_posterior(net)))
+    True
     """
-    table = _Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
-    _compare_evidence(table, posterior, exact)
-    for name in names if names is not None else exact.names:
-        node = posterior.model[name]
-        if node.kind == "input":
-            continue
-        if node.domain is not None:
-            _compare_states(table, posterior, exact, name, node)
-        else:
-            _compare_mean(table, posterior, exact, name, node)
-    found = sorted(table.comparisons, key=lambda c: (c.p_value, -c.errors))
-    rejected = found[: holm([comparison.p_value for comparison in found], alpha)]
-    return Match(len(found), table.skipped, found[0] if found else None, tuple(rejected), alpha)
+    options = (alpha, rtol, min_count, names, quantiles, draws, rng)
+    return _match("compare", posterior, exact, *options)
 
 
 def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
@@ -156,7 +158,7 @@ def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
     **options
         Of `compare`: ``alpha`` (family-wise false-alarm rate, 1e-3), ``rtol`` (tolerance without
         Monte Carlo error, 1e-9), ``min_count`` (rarer states are not compared, 10), ``names``
-        (nodes to compare, all).
+        (nodes to compare, all), ``quantiles`` (five), ``draws`` (joint draws to compare, none), ``rng``.
 
     Returns
     -------
@@ -175,55 +177,71 @@ def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
     >>> net.add("a", bmc.Bernoulli(0.3))
     >>> net.add("x", lambda a: bmc.Normal(2.0 * a, 1.0))
     >>> weighted = bmc.infer(net, {"x": 1.5}, engine=bmc.LikelihoodWeighting(5000), rng=0)
-    >>> assert_matches(weighted, enumerate_posterior(net, {"x": 1.5})).comparisons
-    4
+    >>> match = assert_matches(weighted, enumerate_posterior(net, {"x": 1.5}))
+    >>> len(match.comparisons)
+    5
     """
-    match = compare(posterior, exact, **options)
-    if match.rejected:
-        shown = "\n  ".join(map(str, match.rejected[:10]))
-        more = f"\n  ... and {len(match.rejected) - 10} more" if len(match.rejected) > 10 else ""
-        raise AssertionError(
-            f"assert_matches: {len(match.rejected)} of {match.comparisons} figures of "
-            f"{posterior!r} differ from the exact ones (Holm, false-alarm rate {match.alpha:g}):"
-            f"\n  {shown}{more}"
-        )
+    given = {"alpha": 1e-3, "rtol": 1e-9, "min_count": 10.0, "names": None, "draws": 0, "rng": None,
+             "quantiles": (0.05, 0.25, 0.5, 0.75, 0.95)}  # fmt: skip
+    for key in options.keys() - given.keys():
+        raise TypeError(f"assert_matches: no option {key!r}; there are {', '.join(sorted(given))}")
+    match = _match("assert_matches", posterior, exact, **{**given, **options})
+    if not match:
+        raise AssertionError(f"{match!r}\n  of {posterior!r}")
     return match
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-class _Table:
-    """Comparisons as they come in."""
+def _match(
+    test: str,
+    posterior: Any,
+    exact: Any,
+    alpha: float,
+    rtol: float,
+    min_count: float,
+    names: Sequence[str] | None,
+    quantiles: Sequence[float],
+    draws: int,
+    rng: Any,
+) -> Match:
+    if not all(0 < q < 1 for q in quantiles):
+        raise ValueError(f"{test}(quantiles={quantiles!r}): give levels strictly between 0 and 1")
+    if isinstance(names, str):
+        raise ValueError(f"{test}(names={names!r}): give a sequence of names, as in [{names!r}]")
+    Verdict(test, alpha, ())  # says what is wrong with alpha before work is done
+    table = Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
+    sample = Draws(posterior) if isinstance(posterior, DrawsPosterior) else None
+    chosen = _chosen(posterior, exact, names)
+    _compare_evidence(table, posterior, exact)
+    for name in chosen:
+        node = posterior.model[name]
+        pair = Pair(table, posterior, exact, name, node, sample)
+        if node.domain is not None:
+            compare_states(pair)
+        elif node.angles is not None:
+            compare_angles(pair)
+        else:
+            compare_mean(pair)
+            compare_var(pair)
+            compare_cov(pair)
+            compare_quantiles(pair, quantiles)
+    remarks = _compare_joint(table, posterior, exact, chosen, draws, rng, alpha) if draws else []
+    if not table.comparisons and not table.skipped and not remarks:
+        raise ValueError(f"{test}: there is nothing to compare; name nodes that both know")
+    return counted(Match(test, alpha, table.comparisons, table.skipped, tuple(remarks)))
 
-    def __init__(self, tolerance: float, min_count: float) -> None:
-        self.tolerance = tolerance
-        self.min_count = min_count
-        self.comparisons: list[Comparison] = []
-        self.skipped = 0
 
-    def add(self, what: str, found: float, exact: float, errors: float, p_value: float) -> None:
-        comparison = Comparison(what, float(found), float(exact), float(errors), float(p_value))
-        self.comparisons.append(comparison)
-
-    def is_close(self, found: float, exact: float, scale: float = 1.0) -> bool:
-        return bool(abs(found - exact) <= self.tolerance * max(scale, abs(exact)))
-
-    def equal(self, what: str, found: float, exact: float, scale: float = 1.0) -> None:
-        """A figure without Monte Carlo error."""
-        near = self.is_close(found, exact, scale)
-        self.add(what, found, exact, 0.0 if near else np.inf, 1.0 if near else 0.0)
-
-    def normal(
-        self, what: str, found: float, exact: float, error: float, scale: float = 1.0
-    ) -> None:
-        """A figure with a normal error; what the tolerance explains does not count."""
-        excess = max(abs(found - exact) - self.tolerance * max(scale, abs(exact)), 0.0)
-        z = excess / error
-        self.add(what, found, exact, z, 2.0 * float(scipy.special.ndtr(-z)))
+def _chosen(posterior: Any, exact: Any, names: Sequence[str] | None) -> list[str]:
+    kept = getattr(posterior, "names", None)
+    wanted = list(exact.names if names is None else names)
+    if names is None and kept is not None:
+        wanted = [name for name in wanted if name in set(kept)]
+    return [name for name in wanted if posterior.model[name].kind != "input"]
 
 
-def _compare_evidence(table: _Table, posterior: Any, exact: Any) -> None:
+def _compare_evidence(table: Table, posterior: Any, exact: Any) -> None:
     found, value = posterior.log_marginal_likelihood, exact.log_marginal_likelihood
     if found is None or value is None:
         return
@@ -232,79 +250,62 @@ def _compare_evidence(table: _Table, posterior: Any, exact: Any) -> None:
         table.equal("log evidence", found, value)
     elif not error:
         table.equal("log evidence", found, value)
-    elif error > 1.0 / np.sqrt(_MIN_ESS):
+    elif error > 1.0 / np.sqrt(MIN_ESS):
         table.skipped += 1
     else:
         # the estimate of the likelihood itself is unbiased and nearly normal, its log is not
         table.normal("log evidence (ratio)", float(np.exp(found - value)), 1.0, error)
 
 
-def _compare_states(table: _Table, posterior: Any, exact: Any, name: str, node: Any) -> None:
-    found, value = posterior.probabilities(name), exact.probabilities(name)
-    if found.shape != value.shape:
-        raise AssertionError(
-            f"node {name!r}: probabilities of shape {found.shape}, not {value.shape}"
+# ---- joint draws --------------------------------------------------------------------------------
+
+
+def _compare_joint(
+    table: Table,
+    posterior: Any,
+    exact: Any,
+    names: Sequence[str],
+    draws: int,
+    rng: Any,
+    alpha: float,
+) -> list[str]:
+    """One comparison of the joint law of all nodes; remarks where there are too few rows."""
+    if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < _MIN_ROWS:
+        raise ValueError(f"compare(draws={draws!r}): give a whole number, {_MIN_ROWS} or more")
+    generator = np.random.default_rng(seed_sequence(rng))
+    found = _rows(posterior, names, int(draws), generator)
+    if found is None:
+        return ["joint draws are not compared: the posterior holds none"]
+    size = len(next(iter(found.values()), ()))
+    if size < _MIN_ROWS:
+        table.skipped += 1
+        return [
+            f"joint draws are not compared: only {size} of the posterior's are independent of each other"
+        ]
+    right = _rows(exact, names, size, generator)
+    if right is None:
+        raise UnsupportedError(
+            f"compare(draws={draws}): {type(exact).__name__} has no draws to compare with (quadrature points "
+            "are none); compare with bmc.Exact's posterior, or without draws="
         )
-    count = np.broadcast_to(_effective(posterior, name, node)[..., None], value.shape[:-1] + (1,))
-    for at in np.ndindex(value.shape):
-        p, q, n = float(value[at]), float(found[at]), float(count[(*at[:-1], 0)])
-        what = f"node {name!r}{_element(at[:-1])}, state {node.domain.states[at[-1]]!r}"
-        if p == 0.0 or p > 1 - 1e-12 or not np.isfinite(n) or not np.isfinite(q):
-            if p == 0.0 and table.tolerance < 1e-6:
-                exactly = table.is_close(q, 0.0) if not np.isfinite(n) else q == 0.0
-                table.add(what, q, p, 0.0 if exactly else np.inf, 1.0 if exactly else 0.0)
-            else:
-                table.equal(what, q, p)
-        elif n * p * (1 - p) < table.min_count:
-            table.skipped += 1
-        else:
-            _add_binomial(table, what, q, p, n)
+    nodes = {name: posterior.model[name] for name in found}
+    angles = [name for name, node in nodes.items() if node.angles is not None and node.angles.all()]
+    labels = [n for n, node in nodes.items() if node.domain is not None and node.domain.labels]
+    level = alpha / (len(table.comparisons) + 1)
+    table.comparisons.append(energy_comparison(found, right, level, generator, angles, labels))
+    return []
 
 
-def _add_binomial(table: _Table, what: str, q: float, p: float, n: float) -> None:
-    """Two-sided binomial tail at ``n`` effective draws, interpolated by the incomplete beta function."""
-    off = q - p
-    off = np.sign(off) * max(abs(off) - table.tolerance, 0.0)
-    k = min(max(n * (p + off), 0.0), n)
-    above = float(scipy.special.betainc(k, n - k + 1, p)) if k > 0 else 1.0
-    below = 1.0 - float(scipy.special.betainc(k + 1, n - k, p)) if k < n else 1.0
-    error = np.sqrt(p * (1 - p) / n)
-    table.add(what, q, p, abs(off) / error, min(1.0, 2 * min(above, below)))
-
-
-def _compare_mean(table: _Table, posterior: Any, exact: Any, name: str, node: Any) -> None:
-    found, value = np.asarray(posterior.mean(name)), np.asarray(exact.mean(name))
-    if found.shape != value.shape:
-        raise AssertionError(f"node {name!r}: mean of shape {found.shape}, not {value.shape}")
-    spread = np.sqrt(np.maximum(exact.var(name), 0.0))
-    count = np.broadcast_to(_effective(posterior, name, node), value.shape)
-    error = np.broadcast_to(posterior.mcse(name), value.shape)
-    for at in np.ndindex(value.shape):
-        what = f"mean of node {name!r}{_element(at)}"
-        m, x, sd, n = float(value[at]), float(found[at]), float(spread[at]), float(count[at])
-        if not np.isfinite(n) or not np.isfinite(x) or sd <= 1e-9 * max(1.0, abs(m)):
-            table.equal(what, x, m, max(sd, 1.0))
-        elif n < _MIN_ESS:
-            table.skipped += 1
-        else:
-            table.normal(what, x, m, max(sd / np.sqrt(n), float(error[at])), sd)
-
-
-def _effective(posterior: Any, name: str, node: Any) -> np.ndarray:
-    """Effective number of draws behind each element; the worst of its states for labels."""
-    ess = np.asarray(posterior.ess(name), dtype=float)
-    if node.domain is not None and node.domain.labels is not None:
-        ess = ess.min(axis=-1)
-    ess = np.where(np.isnan(ess), np.inf if posterior.weight_ess is None else ess, ess)
-    return ess if posterior.weight_ess is None else np.fmin(ess, posterior.weight_ess)
-
-
-def holm(p_values: Sequence[float], alpha: float) -> int:
-    """How many p-values, smallest first, Holm's step-down procedure rejects (Holm 1979)."""
-    count = len(p_values)
-    kept = (k for k, p in enumerate(p_values) if not p * (count - k) < alpha)
-    return next(kept, count)
-
-
-def _element(at: tuple[int, ...]) -> str:
-    return f"[{', '.join(map(str, at))}]" if at else ""
+def _rows(
+    answer: Any, names: Sequence[str], most: int, rng: np.random.Generator
+) -> dict[str, np.ndarray] | None:
+    """Independent draws of an answer; None where it has none."""
+    if isinstance(answer, DrawsPosterior):
+        return Draws(answer).independent(names, most, rng)
+    if isinstance(answer, Enumerated):
+        if answer.accuracy:
+            return None
+        at = rng.choice(len(answer.weights), size=most, p=answer.weights / answer.weights.sum())
+        return {name: np.asarray(answer.values(name)).view(np.ndarray)[at] for name in names}
+    drawn = asked(answer, "resample", most, rng)
+    return None if drawn is None else Draws(drawn).independent(names, most, rng)

@@ -3,36 +3,23 @@
 What a net may hold: conditional tables and functions, labelled, numeric and plain states, zero
 probabilities, continuous nodes that are affine in their parents or scaled by them, discrete children of
 continuous parents, deterministic nodes, plates (own, shared, foreign by gather or reduction). The number
-of configurations is bounded, so that every net can be enumerated. Potentials, inputs, vectors and hidden
-infinite parents are left to tests written by hand.
+of configurations is bounded, so that every net can be enumerated. Every node is a line of code that was run,
+which ``as_code`` shows. Potentials, inputs, vectors and hidden infinite parents are left to tests written by
+hand.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import (
-    Bernoulli,
-    Beta,
-    Binomial,
-    Categorical,
-    DiscreteUniform,
-    Distribution,
-    Exponential,
-    Gamma,
-    Normal,
-    Poisson,
-    StudentT,
-    Uniform,
-)
 from bayesmc.network import BayesNet
-from bayesmc.plates import PlateArray, stack
-from bayesmc.testing.choices import Choices, seeded
+from bayesmc.testing.choices import Choices, read_options, read_range, seeded
+from bayesmc.testing.spelling import affine, array, call, declare, function, literal, over, softmax
 
 _LABELS = ("no", "yes", "maybe", "never", "always")
 _NUMBERS = (-1.0, 0.5, 2.0, 3.5, 7.0)
@@ -48,38 +35,63 @@ class NetOptions:
     ----------
     nodes : (int, int)
         Fewest and most nodes.
-    states : int
-        Most states of a finite node, 2 to 5.
+    states : int or (int, int)
+        Most states of a finite node, 2 to 5, or fewest and most.
     parents : int
         Most parents of a node (an index for a gather comes on top).
     hybrid : bool
-        Continuous nodes and Poisson leaves.
+        Continuous nodes and Poisson leaves, besides finite nodes.
+    continuous : bool
+        Continuous nodes only.
     plates : bool
         Up to two plates of size 2 or 3.
     deterministic : bool
     zeros : bool
         Probabilities of zero.
+    coupling : float
+        How strongly nodes depend on their parents: a factor of the parents' weights in functions, a power
+        of the rows of tables. With 0 parents are read and change nothing.
     configurations : int
         Bound on the joint states of all nodes, 32 for a continuous scalar.
     """
 
     nodes: tuple[int, int] = (1, 6)
-    states: int = 3
+    states: int | tuple[int, int] = 3
     parents: int = 3
     hybrid: bool = False
     plates: bool = False
     deterministic: bool = True
     zeros: bool = True
     configurations: int = 1 << 15
+    continuous: bool = False
+    coupling: float = 1.0
 
     def __post_init__(self) -> None:
-        low, high = self.nodes
-        if not 1 <= low <= high:
-            raise ValueError(f"nodes={self.nodes}: give (fewest, most) with 1 <= fewest <= most")
-        if not 2 <= self.states <= len(_LABELS):
+        fewest, _ = read_range("nodes", self.nodes, 1)
+        if isinstance(self.states, tuple):
+            least, most = read_range("states", self.states, 2)
+        else:
+            least, most = 2, self.states
+        if not 2 <= least <= most <= len(_LABELS):
             raise ValueError(f"states={self.states}: give 2 to {len(_LABELS)}")
-        if self.configurations < 2:
-            raise ValueError(f"configurations={self.configurations}: give at least 2")
+        if self.configurations < least:
+            raise ValueError(f"configurations={self.configurations}: give at least {least}")
+        if self.parents < 0:
+            raise ValueError(f"parents={self.parents}: give the most parents of a node, 0 or more")
+        if not 0.0 <= self.coupling < math.inf:
+            raise ValueError(f"coupling={self.coupling}: give a factor, 0 or larger")
+        if self.continuous and self.hybrid:
+            raise ValueError("continuous=True leaves no finite nodes for hybrid=True; give one")
+        if self.continuous and _POINTS**fewest > self.configurations:
+            raise ValueError(
+                f"configurations={self.configurations}: {fewest} continuous nodes count for "
+                f"{_POINTS}**{fewest} = {_POINTS**fewest}; allow as many, or fewer nodes"
+            )
+
+    @property
+    def cards(self) -> tuple[int, int]:
+        """Fewest and most states of a finite node."""
+        return self.states if isinstance(self.states, tuple) else (2, self.states)
 
 
 def random_net(rng: Any, **options: Any) -> BayesNet:
@@ -90,21 +102,29 @@ def random_net(rng: Any, **options: Any) -> BayesNet:
     rng : seed or Generator
         The same seed gives the same net.
     **options
-        Fields of `NetOptions`: ``nodes``, ``states``, ``parents``, ``hybrid``, ``plates``,
-        ``deterministic``, ``zeros``, ``configurations``.
+        Fields of `NetOptions`: ``nodes``, ``states``, ``parents``, ``hybrid``, ``continuous``, ``plates``,
+        ``deterministic``, ``zeros``, ``coupling``, ``configurations``.
 
     Returns
     -------
     BayesNet
-        Its ``name`` says what the nodes are.
+        Its ``name`` says what the nodes are; ``as_code`` shows the code that declares it.
+
+    Raises
+    ------
+    ValueError, TypeError
+        An option that is out of range, or unknown.
 
     Examples
     --------
     >>> from bayesmc.testing import random_net
     >>> random_net(3).name == random_net(3).name
     True
+    >>> random_net(6, nodes=(2, 2)).name
+    'v0[]: logistic(); v1[]: logistic(v0)'
     """
-    return build_net(seeded(np.random.default_rng(rng)), NetOptions(**options))
+    choices = seeded(np.random.default_rng(rng))
+    return build_net(choices, read_options("random_net", NetOptions, options))
 
 
 # ---- building -----------------------------------------------------------------------------------
@@ -134,40 +154,32 @@ class Known:
         """Whether its values are positions 0, 1, ..."""
         return self.card is not None and self.states is None and self.low == 0
 
-
-@dataclass(frozen=True)
-class Term:
-    """How one parent enters a number: ``weight`` times its value, or the indicator of a label.
-
-    A foreign plate is gathered by the parent at position ``index``, or averaged over.
-    """
-
-    position: int
-    weight: float
-    label: Any = None
-    index: int | None = None
-
-    def __call__(self, arguments: Sequence[Any]) -> Any:
-        value = arguments[self.position]
-        if self.label is not None:
-            value = (value == self.label) * 1.0
-        if isinstance(value, PlateArray):
-            value = value.mean() if self.index is None else value[arguments[self.index]]
-        return self.weight * value
+    @property
+    def position(self) -> str:
+        """Code of the position of its value among its states."""
+        if self.is_labelled:
+            return f"np.asarray({self.name})"
+        if self.states is not None:
+            return f"np.searchsorted({list(self.states)!r}, {self.name})"
+        return (
+            f"{self.name} {'-' if self.low > 0 else '+'} {abs(self.low)}" if self.low else self.name
+        )
 
 
 @dataclass(frozen=True)
 class Score:
-    """A number that is affine in the parents: an offset (per plate element) and terms."""
+    """A number that is affine in the parents: an offset (per plate element) and (weight, code) terms."""
 
     offset: Any
-    terms: tuple[Term, ...]
+    terms: tuple[tuple[float, str], ...]
 
-    def __call__(self, arguments: Sequence[Any]) -> Any:
-        total: Any = self.offset
-        for term in self.terms:
-            total = total + term(arguments)
-        return total
+    def __str__(self) -> str:
+        return affine(self.offset, self.terms)
+
+    @property
+    def factor(self) -> str:
+        """Code that may stand in a product."""
+        return f"({self})" if self.terms else str(self)
 
 
 class _Builder:
@@ -184,26 +196,34 @@ class _Builder:
         self.left = float(options.configurations)
         self.story: list[str] = []
 
+    @property
+    def is_full(self) -> bool:
+        """Whether no further node could be enumerated."""
+        return self.left < (_POINTS if self.options.continuous else self.options.cards[0])
+
     def add(self, number: int, choices: Choices) -> None:
         """Declare one more node, as far as the configurations allow."""
         self.choices = choices
         name = f"v{number}"
         plates = self._plates()
         kind = self.choices.pick(self._kinds())
-        if kind in _CONTINUOUS and not self._afford(_POINTS, plates):
-            plates, kind = (), "logistic"
+        if kind in _CONTINUOUS and not self._afford(_POINTS, plates, number):
+            plates = ()
+            if not self.options.continuous:
+                kind = "logistic" if self.options.cards[0] == 2 else "softmax"
         if kind in _CONTINUOUS:
             known = self._continuous(name, kind, plates)
         elif kind == "poisson":
             score, parents = self._score(plates)
-            self._declare(name, lambda *a: Poisson(_rate(score(a))), parents, plates)
+            self._declare(name, f"bmc.Poisson({_rate(score)})", parents, plates)
             known = None  # infinitely many values: no child of it could be enumerated
         elif kind == "deterministic":
             known = self._deterministic(name, plates)
         else:
-            card = 2 if kind == "logistic" else self.choices.integer(2, self.options.states)
+            fewest, most = self.options.cards
+            card = 2 if kind == "logistic" else self.choices.integer(fewest, most)
             if not self._afford(card, plates):
-                card, plates = 2, ()
+                card, plates = fewest, ()
             known = self._finite(name, kind, card, plates)
             self.left /= float(card) ** self._elements(plates)
         if kind in _CONTINUOUS:
@@ -221,6 +241,10 @@ class _Builder:
 
     def _kinds(self) -> list[str]:
         kinds = ["table", "rows", "logistic", "softmax", "uniform integers", "binomial"]
+        if self.options.cards[0] > 2:
+            kinds.remove("logistic")
+        if self.options.continuous:
+            kinds = ["normal", "normal", "normal", *_CONTINUOUS[1:]]
         if self.options.deterministic and self.known:
             kinds.append("deterministic")
         if self.options.hybrid:
@@ -230,19 +254,24 @@ class _Builder:
     def _elements(self, plates: Sequence[str]) -> int:
         return math.prod([self.sizes[p] for p in plates])
 
-    def _afford(self, states: int, plates: Sequence[str]) -> bool:
-        return float(states) ** self._elements(plates) <= self.left
+    def _afford(self, states: int, plates: Sequence[str], number: int | None = None) -> bool:
+        """Whether a node of so many states fits; of the continuous nets, with those that must follow."""
+        after = 0
+        if number is not None and self.options.continuous:
+            after = max(0, self.options.nodes[0] - number - 1)
+        return float(states) ** (self._elements(plates) + after) <= self.left
 
     def _declare(
         self,
         name: str,
-        function: Callable[..., Any],
+        body: str,
         parents: Sequence[str],
         plates: tuple[str, ...],
         states: tuple[Any, ...] | None = None,
     ) -> None:
         self._last_parents = tuple(parents)
-        self.net.add(name, function, parents=list(parents), plates=plates, states=states)
+        text = function(parents, body)
+        declare(self.net, call("add", f'"{name}"', text, plates=over(plates), states=states))
 
     # ---- kinds ------------------------------------------------------------------------------
 
@@ -253,18 +282,18 @@ class _Builder:
         score, parents = self._score(plates)
         if kind == "uniform integers":
             low = self.choices.integer(-1, 1)
-            self._declare(name, lambda: DiscreteUniform(low, low + card - 1), (), plates)
+            self._declare(name, f"bmc.DiscreteUniform({low}, {low + card - 1})", (), plates)
             return replace(known, low=low)
         if kind == "binomial":
-            self._declare(name, lambda *a: Binomial(card - 1, _sigmoid(score(a))), parents, plates)
+            self._declare(name, f"bmc.Binomial({card - 1}, logits={score})", parents, plates)
             return known
         known = replace(known, states=self._states(card))
         if kind == "logistic":
-            make: Callable[..., Any] = lambda *a: Bernoulli(_sigmoid(score(a)))  # noqa: E731
+            body = f"bmc.Bernoulli(logits={score})"
         else:
-            slopes = self.choices.reals(-1.0, 1.0, (card,))
-            make = lambda *a: Categorical(_softmax(score(a), slopes))  # noqa: E731
-        self._declare(name, make, parents, plates, known.states)
+            slopes = self.choices.reals(-1.0, 1.0, (card,)).tolist()
+            body = softmax(str(score), slopes)
+        self._declare(name, body, parents, plates, known.states)
         return known
 
     def _tabular(self, known: Known, kind: str) -> Known:
@@ -275,45 +304,46 @@ class _Builder:
         cards = tuple(k.card for k in chosen if k.card is not None)
         assert known.card is not None
         rows = self.choices.rows(math.prod(cards), known.card, self.options.zeros)
+        if chosen and self.options.coupling != 1.0:
+            rows = rows**self.options.coupling
+            rows = rows / rows.sum(axis=1, keepdims=True)
         table = rows.reshape((*cards, known.card))
         known = replace(known, states=self._states(known.card))
         parents = [k.name for k in chosen]
         if kind == "table":
             self._last_parents = tuple(parents)
-            self.net.table(known.name, parents, table, known.states, plates=known.plates)
+            states = [] if known.states is None else [literal(known.states)]
+            texts = [f'"{known.name}"', literal(parents), repr(table.tolist()), *states]
+            declare(self.net, call("table", *texts, plates=over(known.plates)))
         else:
-            self._declare(
-                known.name,
-                lambda *a: Categorical(table[tuple(map(_position, a, chosen))]),
-                parents,
-                known.plates,
-                known.states,
-            )
+            at = ", ".join(k.position for k in chosen)
+            probs = f"{array(table)}[{at}]" if chosen else repr(table.tolist())
+            body = f"bmc.Categorical({probs})"
+            self._declare(known.name, body, parents, known.plates, known.states)
         return known
 
     def _continuous(self, name: str, kind: str, plates: tuple[str, ...]) -> Known:
         score, parents = self._score(plates)
         if kind == "normal" and parents and self.choices.flag():
             spread = self.choices.real(0.0, 1.0)
-            term = score.terms[0]  # the scale depends on a parent, too
-            make: Callable[..., Any] = lambda *a: Normal(  # noqa: E731
-                score(a), 0.75 + spread * _sigmoid(term(a))
-            )
+            term = affine(0.0, score.terms[:1])  # the scale depends on a parent, too
+            share = f"(1.0 + np.tanh(0.5 * ({term})))"  # twice a sigmoid, which cannot overflow
+            body = f"bmc.Normal({score}, 0.75 + {spread / 2!r} * {share})"
         else:
-            make = _family(kind, score, self.choices.real(0.75, 2.0))
-        self._declare(name, make, parents, plates)
+            body = _family(kind, score, self.choices.real(0.75, 2.0))
+        self._declare(name, body, parents, plates)
         return Known(name, plates, is_smooth=True)
 
     def _deterministic(self, name: str, plates: tuple[str, ...]) -> Known:
         score, parents = self._score(plates, at_least=1)
         above = [k for k in self.known if k.name in parents]
         if any(k.is_smooth for k in above) or self.choices.flag():
-            self._declare(name, lambda *a: np.asarray(score(a)), parents, plates)
+            self._declare(name, str(score), parents, plates)
             return Known(name, plates, is_smooth=any(k.is_smooth for k in above))
         # positions 0 and 1; states need finite parents that are not foreign
         inside = all(k.card is not None and set(k.plates) <= set(plates) for k in above)
         states = self._states(2) if inside else None
-        self._declare(name, lambda *a: np.where(score(a) > 0.1, 1, 0), parents, plates, states)
+        self._declare(name, f"np.where({score} > 0.1, 1, 0)", parents, plates, states)
         return Known(name, plates, 2 if states else None, states)
 
     # ---- parents ----------------------------------------------------------------------------
@@ -327,16 +357,22 @@ class _Builder:
         parents = [k.name for k in chosen]
         terms = []
         for known in chosen:
-            weight = self.choices.pick((1.0, -1.0, 0.5, -0.75))
-            label = self.choices.pick(known.states) if known.is_labelled and known.states else None
+            weight = self.options.coupling * self.choices.pick((1.0, -1.0, 0.5, -0.75))
+            value = known.name
+            if known.is_labelled and known.states:
+                value = f"({value} == {literal(self.choices.pick(known.states))})"
             index = self._index(known, plates, parents)
-            terms.append(Term(parents.index(known.name), weight, label, index))
+            if index is not None:
+                value = f"{value}[{index}]"
+            elif set(known.plates) - set(plates):
+                value = f"{value}.mean()"
+            terms.append((weight, value))
         by_element = plates and self.choices.flag(0.5)
         shape = tuple(self.sizes[p] for p in plates) if by_element else ()
         return Score(self.choices.reals(-1.0, 1.0, shape), tuple(terms)), parents
 
-    def _index(self, known: Known, plates: tuple[str, ...], parents: list[str]) -> int | None:
-        """Position of a parent to gather a foreign plate by; it may join the parents."""
+    def _index(self, known: Known, plates: tuple[str, ...], parents: list[str]) -> str | None:
+        """Name of a parent to gather a foreign plate by; it may join the parents."""
         foreign = [p for p in known.plates if p not in plates]
         if len(foreign) != 1:
             return None
@@ -350,7 +386,7 @@ class _Builder:
         name = self.choices.pick(able).name
         if name not in parents:
             parents.append(name)
-        return parents.index(name)
+        return name
 
     def _states(self, card: int) -> tuple[Any, ...] | None:
         kind = self.choices.integer(0, 2)
@@ -364,7 +400,7 @@ def build_net(choices: Choices, options: NetOptions) -> BayesNet:
     for number in range(most):
         # asked before every node, not once for their number, so that any node can be shrunk away
         more = number < fewest or choices.integer(0, most - fewest) > 0
-        if not more or (number and builder.left < 2):
+        if not more or (number and builder.is_full):
             break
         choices.group(lambda inner, n=number: builder.add(n, inner))  # type: ignore[misc]
     builder.net.name = "; ".join(builder.story)
@@ -374,34 +410,19 @@ def build_net(choices: Choices, options: NetOptions) -> BayesNet:
 _CONTINUOUS = ("normal", "student", "gamma", "beta", "exponential", "uniform")
 
 
-def _family(kind: str, score: Score, scale: float) -> Callable[..., Distribution]:
-    makers: dict[str, Callable[..., Distribution]] = {
-        "normal": lambda *a: Normal(score(a), scale),
-        "student": lambda *a: StudentT(6.0, score(a), scale),
-        "gamma": lambda *a: Gamma(1.0 + scale, _rate(score(a))),
-        "beta": lambda *a: Beta(1.0 + scale, 1.0 + _rate(score(a))),
-        "exponential": lambda *a: Exponential(_rate(score(a))),
+def _family(kind: str, score: Score, scale: float) -> str:
+    bodies = {
+        "normal": f"bmc.Normal({score}, {scale!r})",
+        "student": f"bmc.StudentT(6.0, {score}, {scale!r})",
+        "gamma": f"bmc.Gamma({1.0 + scale!r}, {_rate(score)})",
+        "beta": f"bmc.Beta({1.0 + scale!r}, 1.0 + {_rate(score)})",
+        "exponential": f"bmc.Exponential({_rate(score)})",
         # bounds that follow a continuous parent would make densities jump
-        "uniform": lambda *a: Uniform(-scale, scale + 0.0 * np.asarray(score(a))),
+        "uniform": f"bmc.Uniform({-scale!r}, {scale!r}"
+        + (f" + 0.0 * {score.factor})" if score.terms else ")"),
     }
-    return makers[kind]
+    return bodies[kind]
 
 
-def _rate(score: Any) -> np.ndarray:
-    return np.exp(1.5 * np.tanh(np.asarray(score) / 3.0))
-
-
-def _sigmoid(score: Any) -> np.ndarray:
-    return 1.0 / (1.0 + np.exp(-np.clip(score, -30.0, 30.0)))
-
-
-def _softmax(score: Any, slopes: np.ndarray) -> np.ndarray:
-    weights = np.exp(np.clip(stack([s * np.asarray(score) for s in slopes]), -30.0, 30.0))
-    return weights / weights.sum(axis=-1, keepdims=True)
-
-
-def _position(value: Any, known: Known) -> np.ndarray:
-    """Position of a finite parent's value among its states."""
-    if known.states is not None and not known.is_labelled:
-        return np.searchsorted(np.array(known.states), value)
-    return np.asarray(value) - known.low
+def _rate(score: Score) -> str:
+    return f"np.exp(1.5 * np.tanh({score.factor} / 3.0))"

@@ -8,7 +8,7 @@ factors, no elimination, no random numbers. It is slow, and refuses what it cann
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,6 +24,7 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.network import BayesNet, CompiledNode, Model, Observed, Problem, pose
+from bayesmc.results.posterior import circular_variance
 
 #: normal scores between which a continuous node is integrated: 8e-11 of the mass lies outside
 _REACH = 6.5
@@ -80,13 +81,23 @@ class Enumerated:
         return out
 
     def mean(self, name: str) -> np.ndarray:
-        """Posterior mean of a numeric node, shape ``(*plates, *event)``."""
-        return self.expectation(lambda x: x, name)
+        """Posterior mean of a numeric node, shape ``(*plates, *event)``; circular for angles."""
+        mean = self.expectation(lambda x: x, name)
+        angles = self.model[name].angles
+        if angles is None:
+            return mean
+        turned = np.arctan2(self.expectation(np.sin, name), self.expectation(np.cos, name))
+        return np.where(angles, turned, mean)
 
     def var(self, name: str) -> np.ndarray:
-        """Posterior variance, shape ``(*plates, *event)``."""
-        mean = self.mean(name)
-        return self.expectation(lambda x: (x - mean) ** 2, name)
+        """Posterior variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
+        mean = self.expectation(lambda x: x, name)
+        var = self.expectation(lambda x: (x - mean) ** 2, name)
+        angles = self.model[name].angles
+        if angles is None:
+            return var
+        turned = circular_variance(self.expectation(np.cos, name), self.expectation(np.sin, name))
+        return np.where(angles, turned, var)
 
     def expectation(self, function: Callable[..., Any], *names: str) -> np.ndarray:
         """Posterior mean of a function of the named nodes, which keeps the leading axis."""
@@ -165,13 +176,13 @@ def enumerate_posterior(
         return fine.result(0.0)
     coarse = _enumerate(problem, points // 2 + 2, _REACH - 1.0, max_configurations).result(0.0)
     result = fine.result(0.0)
-    return fine.result(_difference(result, coarse))
+    return fine.result(difference(result, coarse))
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-class _Configurations:
+class Configurations:
     """The list of configurations so far: their values and log weights."""
 
     def __init__(self, problem: Problem, limit: int) -> None:
@@ -207,8 +218,8 @@ class _Configurations:
         return Enumerated(self.model, float(total), weights, stored, accuracy)
 
 
-def _enumerate(problem: Problem, points: int, reach: float, limit: int) -> _Configurations:
-    state = _Configurations(problem, limit)
+def _enumerate(problem: Problem, points: int, reach: float, limit: int) -> Configurations:
+    state = Configurations(problem, limit)
     left_out = _barren(problem)
     scores = np.linspace(-reach, reach, points)
     rule = np.exp(-0.5 * scores**2)
@@ -221,18 +232,19 @@ def _enumerate(problem: Problem, points: int, reach: float, limit: int) -> _Conf
             if not isinstance(result, Distribution):
                 state.values[name] = state.full(name, result)
                 continue
-            _visit(state, node, result, problem.observed.get(name), grid)
+            visit(state, node, result, problem.observed.get(name), grid)
         for name in problem.model.potentials:
             state.log_weight = state.log_weight + problem.model.potential(name, state.values)
     return state
 
 
-def _visit(
-    state: _Configurations,
+def visit(
+    state: Configurations,
     node: CompiledNode,
     dist: Distribution,
     seen: Observed | None,
     grid: tuple[np.ndarray, np.ndarray],
+    weigh: bool = True,
 ) -> None:
     """Weigh by the observed elements of a node, multiply the configurations by its hidden ones."""
     count = len(state.log_weight)
@@ -243,7 +255,7 @@ def _visit(
         mask = np.ones(elements, dtype=bool) if seen.mask is None else seen.mask.ravel()
         known = seen.value.reshape(elements, *node.event_shape)
     _note_invalid(state, node, dist)
-    if mask.any():
+    if mask.any() and weigh:
         density = state.model.log_density(node.name, dist, seen.value)  # type: ignore[union-attr]
         density = np.broadcast_to(density, (count, *node.plate_shape)).reshape(count, elements)
         state.log_weight = state.log_weight + density[:, mask].sum(axis=1)
@@ -263,7 +275,7 @@ def _visit(
 
 
 def _multiply(
-    state: _Configurations,
+    state: Configurations,
     origin: np.ndarray,
     columns: list[Any],
     element: int,
@@ -291,7 +303,7 @@ def _multiply(
 
 
 def _options(
-    state: _Configurations,
+    state: Configurations,
     node: CompiledNode,
     dist: Distribution,
     grid: tuple[np.ndarray, np.ndarray],
@@ -322,7 +334,7 @@ def _options(
     return values.reshape(merged), logs.reshape(merged)
 
 
-def _note_invalid(state: _Configurations, node: CompiledNode, dist: Distribution) -> None:
+def _note_invalid(state: Configurations, node: CompiledNode, dist: Distribution) -> None:
     """Remember configurations with bad parameters: they are a fault only if they turn out possible."""
     if dist.invalid is None:
         return
@@ -365,10 +377,11 @@ def _states_of(node: CompiledNode) -> int:
     return node.domain.size
 
 
-def _difference(fine: Enumerated, coarse: Enumerated) -> float:
-    """Largest change of log evidence, probabilities, and means in standard deviations."""
+def difference(fine: Enumerated, coarse: Enumerated, without: Collection[str] = ()) -> float:
+    """Largest change of log evidence, probabilities, and means in standard deviations, over all nodes but
+    those ``without``."""
     changes = [abs(fine.log_marginal_likelihood - coarse.log_marginal_likelihood)]
-    for name in fine.names:
+    for name in (n for n in fine.names if n not in without):
         node = fine.model[name]
         if node.domain is not None:
             change = np.abs(fine.probabilities(name) - coarse.probabilities(name))

@@ -235,21 +235,21 @@ def unbroken(draws: int, keep: str, **options: Any) -> bmc.Posterior:
 
 
 @pytest.mark.parametrize("keep", KEEPS, ids=["draws", "list", "summaries"])
-@pytest.mark.parametrize("cut", [300, 64])
+@pytest.mark.parametrize("cut", [130, 64])
 @pytest.mark.parametrize("pickled", [False, True], ids=["live", "pickled"])
 @pytest.mark.parametrize("options", [{}, {"in_place": True, "thinning": 2}, {"ensemble": 5}])
 def test_going_on_is_as_if_never_stopped(
     keep: Any, cut: int, pickled: bool, options: dict[str, Any]
 ) -> None:
-    whole = unbroken(500, str(keep), **options)
+    whole = unbroken(200, str(keep), **options)
     first = quiet(draws=cut, keep=keep, **options)
     if pickled:
         first = pickle.loads(pickle.dumps(first))
     for _ in range(2):  # the first part is not used up
-        both = quiet(draws=500 - cut, keep=keep, resume=first, rng=99, **options)
+        both = quiet(draws=200 - cut, keep=keep, resume=first, rng=99, **options)
         same(whole, both)
-    third = quiet(draws=100, keep=keep, resume=both, **options)
-    same(third, unbroken(600, str(keep), **options))
+    third = quiet(draws=50, keep=keep, resume=both, **options)
+    same(third, unbroken(250, str(keep), **options))
 
 
 def test_one_draw_of_one_chain_goes_on() -> None:

@@ -21,11 +21,11 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.results import SeriesPosterior
-from bayesmc.testing import enumerate_posterior
+from bayesmc.testing import enumerate_posterior, session
 from bayesmc.testing.dbns import RandomDbn, random_dbn
 
 ENGINE = DiscreteFilter()
-SEEDS = range(64)
+SEEDS = range(session.scaled(28, times=5))
 #: rounding in two different orders of summation
 TOLERANCE = 1e-10
 
@@ -108,10 +108,10 @@ def test_random_templates_are_varied() -> None:
         assert what in stories, what
     cases = [case_of(seed) for seed in SEEDS]
     masked = [any(np.ma.is_masked(v) for v in c.observations.values()) for c in cases]
-    assert sum(masked) > 20
+    assert sum(masked) > 8
 
 
-@pytest.mark.parametrize("seed", range(100, 132))
+@pytest.mark.parametrize("seed", range(1000, 1000 + session.scaled(14, times=5)))
 def test_smoothing_and_the_most_likely_path_equal_enumeration(seed: int) -> None:
     case = random_dbn(seed, nodes=(1, 2), steps=(1, 3))
     net = case.dbn.unroll(case.steps, case.inputs)

@@ -1,8 +1,8 @@
 """``Exact`` on conditional linear-Gaussian nets: random ones against brute force, and cases by hand.
 
-Two hundred random nets are made in two forms (see ``bayesmc.testing.gaussians``); what ``Exact`` finds
+A hundred random nets are made in two forms (see ``bayesmc.testing.gaussians``); what ``Exact`` finds
 on the one is compared with dense Gaussian conditioning on the other, to 1e-8. Seeds are fixed;
-``BAYESMC_SEED`` shifts them.
+``--bayesmc-seed`` shifts them.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import os
 from collections.abc import Callable
 from typing import Any
 
@@ -28,11 +27,12 @@ from bayesmc.testing import (
     compare,
     gaussian_evidence,
     random_gaussian_net,
+    session,
 )
 
 EXACT = bmc.Exact()
-SHIFT = int(os.environ.get("BAYESMC_SEED", "0"))
-SEEDS = range(SHIFT, SHIFT + 50)
+SHIFT = session.seed()
+SEEDS = range(SHIFT, SHIFT + session.scaled(25, times=4))
 KINDS: dict[str, dict[str, Any]] = {
     "scalars": {},
     "plates": {"plates": True},
@@ -121,7 +121,7 @@ def test_compare_accepts_them(kind: str) -> None:
     for seed in SEEDS[:15]:
         match = assert_matches(*answers(kind, seed), rtol=1e-8)
         assert match.skipped == 0
-        assert match.comparisons > 0
+        assert match.comparisons
 
 
 def test_one_coefficient_off_by_a_hundredth_is_caught() -> None:
@@ -133,7 +133,7 @@ def test_one_coefficient_off_by_a_hundredth_is_caught() -> None:
             spoilt = with_a_wrong_coefficient(plain, np.random.default_rng(seed))
             if spoilt is not None:
                 caught.append(bool(wrong(spoilt.posterior(evidence), brute_force(kind, seed))))
-    assert len(caught) > 120
+    assert len(caught) > 60
     assert np.mean(caught) > 0.9  # the others multiply what is certain to be zero
 
 

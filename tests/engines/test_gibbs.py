@@ -131,11 +131,11 @@ def test_debug_runs_on_every_closed_form() -> None:
 @pytest.mark.parametrize("keep", ["draws", "summaries"])
 def test_resume_is_bit_for_bit(build, keep) -> None:
     net, evidence = build()
-    options = {"warmup": 30, "chains": 3, "thinning": 2}
-    whole = bmc.infer(net, evidence, engine=bmc.Gibbs(50, **options), rng=5, keep=keep)
-    part = bmc.infer(net, evidence, engine=bmc.Gibbs(20, **options), rng=5, keep=keep)
+    options = {"warmup": 15, "chains": 3, "thinning": 2}
+    whole = bmc.infer(net, evidence, engine=bmc.Gibbs(25, **options), rng=5, keep=keep)
+    part = bmc.infer(net, evidence, engine=bmc.Gibbs(10, **options), rng=5, keep=keep)
     part = pickle.loads(pickle.dumps(part))
-    both = bmc.infer(net, evidence, engine=bmc.Gibbs(30, **options), resume=part, keep=keep)
+    both = bmc.infer(net, evidence, engine=bmc.Gibbs(15, **options), resume=part, keep=keep)
     for name in net.graph.nodes:
         if keep == "draws":
             np.testing.assert_array_equal(whole[name], both[name])

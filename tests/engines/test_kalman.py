@@ -19,6 +19,7 @@ from bayesmc.engines.kalman import covariances as kalman_covariances
 from bayesmc.engines.kalman import means as kalman_means
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.kernels.kalman import Conditioned, condition
+from bayesmc.testing import session
 from bayesmc.testing.linear_dbns import LinearSeries, random_linear_dbn
 
 # fmt: off
@@ -71,12 +72,12 @@ def worst(case: LinearSeries, engine: Any = None) -> float:
     return max(errors)
 
 
-@pytest.mark.parametrize("seed", range(44))
+@pytest.mark.parametrize("seed", range(session.scaled(18, times=5)))
 def test_equals_exact_conditioning(seed: int) -> None:
     assert worst(random_linear_dbn(seed)) < 1e-8
 
 
-@pytest.mark.parametrize("seed", range(44, 54))
+@pytest.mark.parametrize("seed", range(100, 100 + session.scaled(6, times=5)))
 def test_forecast_equals_exact_conditioning(seed: int) -> None:
     case = random_linear_dbn(seed)
     timed = {n: v for n, v in case.observations.items() if n not in case.dbn.static_nodes}
@@ -439,7 +440,7 @@ def test_most_likely_is_the_smoothed_mean() -> None:
     np.testing.assert_array_equal(found["x"], smoothed.mean("x"))
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(session.scaled(6, times=5)))
 def test_row_by_row_equals_all_at_once(seed: int) -> None:
     case = random_linear_dbn(seed)
     engine = KalmanFilter()

@@ -19,6 +19,7 @@ from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.slopes import _MEANS, mean_of, mean_slopes
 from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
+from bayesmc.testing import session
 from bayesmc.testing.linear_dbns import random_linear_dbn
 from bayesmc.tracing import Dual, NoTangent
 
@@ -36,7 +37,7 @@ def off(found: Any, wanted: Any) -> float:
 
 
 @pytest.mark.parametrize("engine", ENGINES, ids=SHORT)
-@pytest.mark.parametrize("seed", range(16))
+@pytest.mark.parametrize("seed", range(session.scaled(6, times=5)))
 def test_equal_the_kalman_filter_on_linear_templates(seed: int, engine: Any) -> None:
     case = random_linear_dbn(seed)
     asked: list[tuple[Callable[..., Any], dict[str, Any]]] = [

@@ -96,8 +96,8 @@ SLOW = ("own density", "own densities", "independent")
 @pytest.mark.parametrize("kind", PROPOSALS)
 def test_proposals_are_corrected(kind: str) -> None:
     # these get stuck, and only long chains know their error
-    slow = {"chains": 8, "draws": 4000 if "own" in kind else 1500}
-    options = slow if kind in SLOW else {"draws": 1500}
+    slow = {"chains": 8, "draws": 2500 if "own" in kind else 1000}
+    options = slow if kind in SLOW else {"draws": 1000}
     posterior = ask(gamma_net(), SEEN, PROPOSALS[kind], **options)
     assert_mean(posterior, "rate", EXACT)
     (rate,) = posterior.acceptance.values()

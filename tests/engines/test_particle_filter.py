@@ -25,6 +25,7 @@ from bayesmc.errors import (
     UnsupportedError,
 )
 from bayesmc.resampling import SCHEMES, Adaptive
+from bayesmc.testing import session
 
 ROWS = np.array([0.3, 1.5, np.nan, 2.0, 1.1])
 
@@ -162,7 +163,7 @@ RANDOM = (
 @pytest.mark.parametrize("threshold", [0.5, 2.0], ids=["adaptive", "always"])
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_the_evidence_of_random_templates_is_unbiased(scheme: str, threshold: float) -> None:
-    """Two templates and proposals each, 2000 runs: within 4 standard errors (6e-5 each, 1.3e-3 in all).
+    """Two templates and proposals each, 800 runs: within 4 standard errors (6e-5 each, 1.3e-3 in all).
 
     Templates on which the log evidence spreads by more than 1 tell nothing and give way to the next.
     """
@@ -171,7 +172,7 @@ def test_the_evidence_of_random_templates_is_unbiased(scheme: str, threshold: fl
         options = RANDOM[(2 * turn + k + turn // 2) % len(RANDOM)]
         engine = bmc.ParticleFilter(60, resampling=scheme, ess_threshold=threshold, **options)
         for seed in range(100 * turn + 10 * k, 100 * turn + 10 * k + 5):
-            dbn, rows = random_hybrid(seed, RUNS)
+            dbn, rows = random_hybrid(seed, session.scaled(800))
             found = bmc.filter(dbn, {"y": rows}, engine=engine, rng=seed).log_marginal_likelihood
             if found.std() < 1.0:
                 break
@@ -222,11 +223,11 @@ def test_slice_zero_may_have_an_order_of_its_own() -> None:
 
 
 def test_one_filter_is_unbiased_like_many() -> None:
-    """Without plates: 400 filters one by one, within 4 standard errors (6e-5)."""
+    """Without plates: 200 filters one by one, within 4 standard errors (6e-5)."""
     dbn, engine = switching(), bmc.ParticleFilter(20, proposal={"x": nearer})
     found = [
         bmc.filter(dbn, {"y": ROWS}, engine=engine, rng=k).log_marginal_likelihood
-        for k in range(400)
+        for k in range(session.scaled(200))
     ]
     assert abs(deviation(np.array(found), EVIDENCE)) < 4
 

@@ -6,6 +6,7 @@ meet.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -21,6 +22,7 @@ from bayesmc.engines.particles.optimal import groups_of, has_moments, is_affine,
 from bayesmc.engines.particles.stages import PluggedIn
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.network.forward import Pass
+from bayesmc.testing import session
 
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 
@@ -203,7 +205,7 @@ CASES: dict[str, tuple[Build, dict[str, Any], Any]] = {
 #: cases in which thirty particles tell nothing
 WILD = ("sharp", "bent", "compass")
 #: filters side by side; where logs of estimates have a long tail, more, for their spread
-RUNS = dict.fromkeys(CASES, 1000) | {"switched": 2000}
+RUNS = dict.fromkeys(CASES, session.scaled(400)) | {"switched": session.scaled(800)}
 
 
 def side_by_side(rows: dict[str, Any], runs: int) -> dict[str, Any]:
@@ -321,8 +323,8 @@ REAL_BELIEF = LookAhead.believed
 
 
 def test_a_first_stage_does_not_spoil_the_growth_benchmark() -> None:
-    """40 series of 100 slices: errors paired with those of the bootstrap filter."""
-    dbn = bmc.DynamicBayesNet(plates={"run": 40})
+    """24 series of 80 slices: errors paired with those of the bootstrap filter."""
+    dbn = bmc.DynamicBayesNet(plates={"run": 24})
     dbn.add(
         "x",
         lambda x_prev, t: bmc.Normal(
@@ -332,7 +334,7 @@ def test_a_first_stage_does_not_spoil_the_growth_benchmark() -> None:
         plates="run",
     )
     dbn.add("y", lambda x: bmc.Normal(x**2 / 20, 1.0), plates="run")
-    drawn = dbn.sample(101, 1, rng=3)
+    drawn = dbn.sample(81, 1, rng=3)
     path, rows = drawn["x"][0], drawn["y"][0].copy()
     rows[0] = np.nan
     error = {}
@@ -499,18 +501,30 @@ def vectors(counts: bool = True) -> bmc.DynamicBayesNet:
     return dbn
 
 
+def vector_rows() -> dict[str, np.ndarray]:
+    drawn = vectors().sample(12, 1, rng=0)
+    return {"y": drawn["y"][0], "c": drawn["c"][0]}
+
+
+@functools.cache
+def evidence_by_many() -> float:
+    engine = bmc.ParticleFilter(30_000)
+    return float(bmc.filter(vectors(), vector_rows(), engine=engine, rng=1).log_marginal_likelihood)
+
+
 @pytest.mark.parametrize("auxiliary", [False, True])
 def test_the_optimal_proposal_of_a_nonlinear_block(auxiliary: bool) -> None:
-    """Of the same evidence as 100 times the particles of the bootstrap filter, with far less spread."""
-    drawn = vectors().sample(12, 1, rng=0)
-    rows = {"y": drawn["y"][0], "c": drawn["c"][0]}
+    """Of the same evidence as 100 times the particles of the bootstrap filter, with far less spread.
+
+    The mean of ten lies within 0.6, which is three of its standard errors at the spread allowed.
+    """
+    rows = vector_rows()
     engine = bmc.ParticleFilter(300, proposal="optimal", auxiliary=auxiliary)
     found = [
-        bmc.filter(vectors(), rows, engine=engine, rng=k).log_marginal_likelihood for k in range(20)
+        bmc.filter(vectors(), rows, engine=engine, rng=k).log_marginal_likelihood for k in range(10)
     ]
-    plain = bmc.filter(vectors(), rows, engine=bmc.ParticleFilter(30_000), rng=1)
     assert np.std(found) < 0.6
-    assert abs(np.mean(found) - plain.log_marginal_likelihood) < 0.6
+    assert abs(np.mean(found) - evidence_by_many()) < 0.6
 
 
 def test_vectors_that_are_affine_are_drawn_exactly() -> None:

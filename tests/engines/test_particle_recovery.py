@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import pickle
 from typing import Any
 
@@ -13,6 +14,7 @@ from bayesmc.dbn import Row
 from bayesmc.engines.particles import anew
 from bayesmc.engines.particles import recovery as recovering
 from bayesmc.network import Observed
+from bayesmc.testing import session
 
 ROWS = {"y": np.r_[np.full(3, 2.0), np.full(4, 8.0)]}
 ANYWHERE = bmc.Uniform(0.0, 10.0)
@@ -42,16 +44,27 @@ def jumping() -> bmc.DynamicBayesNet:
     return dbn
 
 
-EXACT = bmc.filter(jumping(), ROWS, engine=bmc.GridFilter({"x": (-3.0, 13.0, 1600)}))
+GRID = bmc.GridFilter({"x": (-3.0, 13.0, 1600)})
 
 
-def ratios(recovery: bmc.Recovery, runs: int = 400) -> np.ndarray:
+@functools.cache
+def exact() -> Any:
+    """Of the declared jump, by a grid."""
+    return bmc.filter(jumping(), ROWS, engine=GRID)
+
+
+@functools.cache
+def short_log_evidence() -> float:
+    return float(bmc.filter(jumping(), SHORT, engine=GRID).log_marginal_likelihood)
+
+
+def ratios(recovery: bmc.Recovery) -> np.ndarray:
     engine = bmc.ParticleFilter(300, recovery=recovery)
     logs = [
         bmc.filter(walk(), ROWS, engine=engine, rng=seed).log_marginal_likelihood
-        for seed in range(runs)
+        for seed in range(session.scaled(150))
     ]
-    return np.exp(np.array(logs) - EXACT.log_marginal_likelihood)
+    return np.exp(np.array(logs) - exact().log_marginal_likelihood)
 
 
 def deviation(found: np.ndarray) -> float:
@@ -64,23 +77,22 @@ AIMED: dict[str, Any] = {"x": lambda y: bmc.Truncated(bmc.Normal(y, 0.8), 0.0, 1
 @pytest.mark.parametrize("draws", [0.0, 0.3])
 @pytest.mark.parametrize("proposal", [None, AIMED], ids=["from the density", "aimed"])
 def test_the_evidence_is_that_of_the_declared_jump(proposal: Any, draws: float) -> None:
-    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 6e-5 each)
+    # mean of Z-hat / Z is 1 within 4 standard errors (alpha 1e-4 each)
     found = ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=draws, proposal=proposal))
     assert deviation(found) < 4
 
 
 SHORT = {"y": np.array([2.0, 2.0, 8.0, 8.0])}
-SHORT_EXACT = bmc.filter(jumping(), SHORT, engine=bmc.GridFilter({"x": (-3.0, 13.0, 1600)}))
 
 
-def short_ratios(draws: float, **options: Any) -> np.ndarray:
+def short_ratios(draws: float, runs: int = 200, **options: Any) -> np.ndarray:
     begin = bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=draws)
     engine = bmc.ParticleFilter(300, recovery=begin, **options)
     logs = [
         bmc.filter(walk(), SHORT, engine=engine, rng=seed).log_marginal_likelihood
-        for seed in range(200)
+        for seed in range(runs)
     ]
-    return np.exp(np.array(logs) - SHORT_EXACT.log_marginal_likelihood)
+    return np.exp(np.array(logs) - short_log_evidence())
 
 
 def of_their_ancestors(selection: Any, lost: np.ndarray) -> np.ndarray:
@@ -94,8 +106,8 @@ def of_their_ancestors(selection: Any, lost: np.ndarray) -> np.ndarray:
 def test_the_evidence_however_particles_are_chosen(
     threshold: float, auxiliary: bool, draws: float
 ) -> None:
-    # alpha 6e-5 each
-    found = short_ratios(draws, ess_threshold=threshold, auxiliary=auxiliary)
+    # alpha 1.2e-4 each
+    found = short_ratios(draws, session.scaled(100), ess_threshold=threshold, auxiliary=auxiliary)
     assert deviation(found) < 4
     assert np.log(found).std() < 1.2
 
@@ -129,15 +141,15 @@ def test_readings_of_two_slices(
         monkeypatch.setattr(anew.Lost, "_ancestors", lambda self, _, chosen, lost, rng: lost)
     rows = {**SHORT, "came": np.array([0.0, 0.1, 5.5, 0.2])}
     grid = bmc.GridFilter({"x": (-3.0, 13.0, 800)})
-    exact = bmc.filter(odometer(True), rows, engine=grid).log_marginal_likelihood
+    wanted = bmc.filter(odometer(True), rows, engine=grid).log_marginal_likelihood
     begin = bmc.Recovery({"x": ANYWHERE}, share=SHARE, draws=0.3)
     engine = bmc.ParticleFilter(300, recovery=begin, ess_threshold=threshold)
     logs = [
         bmc.filter(odometer(False), rows, engine=engine, rng=seed).log_marginal_likelihood
-        for seed in range(200)
+        for seed in range(200 if fault else session.scaled(100))
     ]
-    found = deviation(np.exp(np.array(logs) - exact))
-    assert found > 6 if fault else found < 4  # alpha 6e-5
+    found = deviation(np.exp(np.array(logs) - wanted))
+    assert found > 6 if fault else found < 4  # alpha 1.2e-4
 
 
 def test_a_state_that_is_seen_may_have_jumped() -> None:
@@ -166,11 +178,11 @@ def test_answers_find_back_after_a_jump() -> None:
     engine = bmc.ParticleFilter(20_000, recovery=recovery)
     found = bmc.filter(walk(), ROWS, engine=engine, rng=0)
     # standard errors below .01; fourteen figures, alpha 1e-6
-    np.testing.assert_allclose(found.mean("x"), EXACT.mean("x"), atol=0.08)
-    np.testing.assert_allclose(found.std("x"), EXACT.std("x"), atol=0.08)
+    np.testing.assert_allclose(found.mean("x"), exact().mean("x"), atol=0.08)
+    np.testing.assert_allclose(found.std("x"), exact().std("x"), atol=0.08)
     assert found.anew[0] == 0 and (abs(found.anew[1:] - 2000) < 6 * np.sqrt(2000)).all()
     without = bmc.filter(walk(), ROWS, engine=bmc.ParticleFilter(20_000), rng=0)
-    assert abs(without.mean("x")[3] - EXACT.mean("x")[3]) > 1  # the control
+    assert abs(without.mean("x")[3] - exact().mean("x")[3]) > 1  # the control
 
 
 def test_the_share_follows_how_well_rows_are_explained() -> None:
@@ -243,13 +255,13 @@ def test_a_belief_that_narrows_needs_fewer_particles() -> None:
 
 
 def test_the_evidence_of_an_adapted_number_is_unbiased() -> None:
-    exact = bmc.filter(walk(), ROWS, engine=bmc.GridFilter({"x": (-3.0, 13.0, 1600)}))
+    plain = bmc.filter(walk(), ROWS, engine=GRID)
     engine = bmc.ParticleFilter(2000, adapt=bmc.KLD({"x": 0.2}, least=400, error=0.02))
     rows = {"y": ROWS["y"][:3]}
-    exact_log = exact.log_marginal_increments[:3].sum()
+    exact_log = plain.log_marginal_increments[:3].sum()
     logs = [
         bmc.filter(walk(), rows, engine=engine, rng=seed).log_marginal_likelihood
-        for seed in range(400)
+        for seed in range(session.scaled(200))
     ]
     # numbers that look at the particles are biased in theory, at the order of 1/N (alpha 6e-5)
     assert deviation(np.exp(np.array(logs) - exact_log)) < 4

@@ -23,9 +23,10 @@ from bayesmc.engines.particles.cloud import Layout, even_cloud
 from bayesmc.engines.particles.smoothing import Backward, lagged
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import Purpose, seed_sequence, stream
+from bayesmc.testing import session
 from bayesmc.testing.dbns import random_dbn
 from bayesmc.testing.linear_dbns import random_linear_dbn
-from bayesmc.testing.matching import holm
+from bayesmc.testing.verdict import holm
 
 ALPHA = 1e-3
 RUNS, PARTICLES = 20, 600
@@ -275,7 +276,14 @@ def rejected(found: list[tuple[float, str]], alpha: float) -> list[str]:
 #: unless a template is named here, rejection knows no bound and all is drawn exactly, as tested anyway
 BOUNDED = ("switching 0", "switching 2", "switching 4, a plate", "linear 0", "linear 3", "linear 18",
            "finite 3", "finite 5", "finite 7", "a team", "weather", "pinned 2", "bridges")  # fmt: skip
-TRIED = [(n, w) for n in CASES for w in WAYS if w != "by rejection" or n in BOUNDED]
+#: templates much like others, which a thorough run alone smooths
+MORE = ("switching 1", "switching 3", "linear 3", "linear 14", "finite 5", "finite 9")
+TRIED = [
+    (n, w)
+    for n in CASES
+    for w in WAYS
+    if (w != "by rejection" or n in BOUNDED) and (n not in MORE or session.is_thorough())
+]
 # a running sum is not drawn backwards
 TRIED.remove(("linear 2", "exactly"))
 

@@ -31,8 +31,8 @@ def draws_of(
     names: list[str],
     members: int,
     ensembles: int = 32,
-    warmup: int = 400,
-    draws: int = 400,
+    warmup: int = 250,
+    draws: int = 250,
     kind: type[BlockWalk] = BlockWalk,
     **options: Any,
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:

@@ -1,8 +1,9 @@
 """Slice sampling leaves posteriors invariant: one node, several along learnt directions, like nodes at once.
 
-Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``BAYESMC_SEED``
-shifts them, and makes the tests longer. Each test is shown to fail on a kernel with a deliberate error.
-Closed forms, discrete nodes, Metropolis-Hastings and whole sweeps have files of their own.
+Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``--bayesmc-seed``
+shifts them, and ``--bayesmc-thorough`` makes the tests longer. Each test is shown to fail on a
+kernel with a deliberate error. Closed
+forms, discrete nodes, Metropolis-Hastings and whole sweeps have files of their own.
 """
 
 from __future__ import annotations

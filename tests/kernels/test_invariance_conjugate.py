@@ -1,7 +1,8 @@
 """Closed forms leave their posteriors invariant: every pair of the table, and jointly Normal blocks.
 
-Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``BAYESMC_SEED``
-shifts them, and makes the tests longer. Each test is shown to fail on a kernel with a deliberate error.
+Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``--bayesmc-seed``
+shifts them, and ``--bayesmc-thorough`` makes the tests longer. Each test is shown to fail on a
+kernel with a deliberate error.
 """
 
 from __future__ import annotations
@@ -219,7 +220,7 @@ SERIES = {
 def test_like_children(name: str, how: str, fault: str) -> None:
     """All children are one partner."""
     wrong = _kernel([_wrong(p) for p in PAIRS])
-    sizes = {"replications": 300} if how == "posed" else {}
+    sizes = {"replications": 200} if how == "posed" else {}
     case = Case(SERIES[name], _kernel(), {"wrong": wrong}, how=how, sizes=sizes)
     (partner,) = case.make(case.model.target("moving")).partners
     assert len(partner.terms) == 8

@@ -1,8 +1,9 @@
 """Kernels of discrete nodes leave their posteriors invariant: enumeration, tables, fields, blocks, jumps.
 
-Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``BAYESMC_SEED``
-shifts them, and makes the tests longer. Each test is shown to fail on a kernel with a deliberate error. All
-models have three overlapping categories, or more.
+Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``--bayesmc-seed``
+shifts them, and ``--bayesmc-thorough`` makes the tests longer. Each test is shown to fail on a
+kernel with a deliberate error. All models have three
+overlapping categories, or more.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
 """Metropolis-Hastings leaves posteriors invariant: walks, ensembles, proposals of a user.
 
-Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``BAYESMC_SEED``
-shifts them, and makes the tests longer. Each test is shown to fail on a kernel with a deliberate error.
-What adapts does so beforehand, on draws of its own, and is frozen.
+Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``--bayesmc-seed``
+shifts them, and ``--bayesmc-thorough`` makes the tests longer. Each test is shown to fail on a
+kernel with a deliberate error. What
+adapts does so beforehand, on draws of its own, and is frozen.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Whole sweeps of Gibbs sampling leave their posterior invariant: mixtures of overlapping components.
 
 All of weights, labels, means and scales move. Geweke's test and the rank test at a chance of false alarm of
-1e-4 each, at fixed seeds; ``BAYESMC_SEED`` shifts them, and makes the tests longer. A sweep is irreversible:
-the rank test gets the one in reverse order. Each test is shown to fail on a sweep with an error
-in one kernel.
+1e-4 each, at fixed seeds; ``--bayesmc-seed`` shifts them, and ``--bayesmc-thorough`` makes the tests longer.
+A sweep is irreversible: the rank test gets the one in reverse order. Each test is shown to fail on a sweep
+with an error in one kernel.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from bayesmc.pmcmc import ParticleMetropolis
 from bayesmc.pmcmc.filters import Filter
 from bayesmc.pmcmc.walk import ParameterWalk
 from bayesmc.structure.target import target_of
-from bayesmc.testing.matching import holm
+from bayesmc.testing.verdict import holm
 
 ALPHA = 1e-4
 YS = {"y": [0.5, 1.9, -0.4, 0.9]}
@@ -66,7 +66,7 @@ def rejections(posterior: Any, exact: dict[tuple[str, int], float]) -> int:
 
 def test_posterior_is_that_of_quadrature(monkeypatch: pytest.MonkeyPatch) -> None:
     exact = moments()
-    engine = ParticleMetropolis(draws=400, warmup=150, chains=300, particles=8)
+    engine = ParticleMetropolis(draws=200, warmup=100, chains=300, particles=8)
     found = bmc.infer(walk(), YS, engine=engine, rng=0)
     # false-alarm rate ALPHA, a little more with 300 chains
     assert rejections(found, exact) == 0

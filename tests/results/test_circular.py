@@ -78,7 +78,7 @@ ENGINES = [
     bmc.LikelihoodWeighting(40_000),
     bmc.Gibbs(warmup=50, draws=250),
     bmc.MetropolisHastings(
-        warmup=200, draws=4_000, proposal={"pose": RandomWalk([0.1, 0.25, 0.4])}
+        warmup=200, draws=2_000, proposal={"pose": RandomWalk([0.1, 0.25, 0.4])}
     ),
 ]
 

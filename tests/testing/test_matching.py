@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 import scipy.stats
 
 import bayesmc as bmc
+from bayesmc.errors import UnsupportedError
+from bayesmc.results.draws import DrawsPosterior
 from bayesmc.testing import assert_matches, compare, enumerate_posterior
+from bayesmc.testing.verdict import BUDGET
 
 
 def diagnosis() -> bmc.BayesNet:
@@ -39,21 +44,23 @@ def weighted(seed: int, draws: int = 4000, **options):
 def test_false_alarms_are_as_rare_as_stated() -> None:
     """At alpha = 0.05, at most 0.05 of right answers are rejected.
 
-    400 answers: more than 34 rejections (true rate 0.05) have probability 1e-3; the figures depend on
+    80 answers: more than 11 rejections (true rate 0.05) have probability 1e-3; the figures depend on
     each other and Holm is conservative, so fewer are expected, but not none at alpha = 0.5.
     """
     exact = enumerate_posterior(diagnosis(), EVIDENCE)
-    matches = [compare(weighted(seed), exact, alpha=0.05) for seed in range(400)]
-    assert sum(bool(m.rejected) for m in matches) <= scipy.stats.binom.ppf(0.999, 400, 0.05)
-    loose = [compare(weighted(seed), exact, alpha=0.5) for seed in range(60)]
+    answers = [weighted(seed, draws=3000) for seed in range(80)]
+    matches = [compare(answer, exact, alpha=0.05) for answer in answers]
+    assert sum(bool(m.rejected) for m in matches) <= scipy.stats.binom.ppf(0.999, 80, 0.05)
+    loose = [compare(answer, exact, alpha=0.5) for answer in answers[:30]]
     assert any(m.rejected for m in loose)
 
 
 @pytest.mark.parametrize("keep", ["draws", "summaries"])
 def test_a_right_answer_passes_and_says_how_much_was_compared(keep: str) -> None:
     match = assert_matches(weighted(0, keep=keep), enumerate_posterior(diagnosis(), EVIDENCE))
-    # evidence, 3 states of ill, 3 x 2 of positive, the mean of fever; none is too rare
-    assert match.comparisons + match.skipped == 1 + 3 + 6 + 1
+    # evidence, 3 states of ill, 3 x 2 of positive, mean and variance of fever, whose error only draws
+    # tell; none is too rare
+    assert len(match.comparisons) == 1 + 3 + 6 + (2 if keep == "draws" else 1)
     assert match.skipped == 0
     assert match.worst is not None
     assert not match.rejected
@@ -85,7 +92,7 @@ def test_the_message_says_what_differs_by_how_much() -> None:
     with pytest.raises(AssertionError) as caught:
         assert_matches(bad, enumerate_posterior(diagnosis(), EVIDENCE), alpha=0.01)
     text = str(caught.value)
-    for part in ("figures of", "false-alarm rate 0.01", "node 'positive'[0], state 0", "exact",
+    for part in ("figures deviate", "false-alarm rate 0.01", "node 'positive'[0], state 0", "exact",
                  "standard errors", "p = "):  # fmt: skip
         assert part in text
 
@@ -107,7 +114,7 @@ def test_rare_states_are_not_judged() -> None:
     right = bmc.infer(net, engine=bmc.LikelihoodWeighting(1000), rng=0)
     exact = enumerate_posterior(net)
     match = assert_matches(right, exact)
-    assert (match.comparisons, match.skipped) == (1, 2)  # log evidence alone is compared
+    assert (len(match.comparisons), match.skipped) == (1, 2)  # log evidence alone is compared
     assert assert_matches(right, exact, min_count=0.1).skipped == 0
 
 
@@ -116,7 +123,8 @@ def test_exact_answers_must_agree_to_the_tolerance() -> None:
     evidence = {"positive": [1, 0, 1], "fever": 38.0}
     exact = enumerate_posterior(net, evidence)
     right = bmc.infer(net, evidence, engine=bmc.Exact())
-    assert assert_matches(right, exact).comparisons == 1 + 3 + 6 + 1
+    # mean and variance of fever, which is observed
+    assert len(assert_matches(right, exact).comparisons) == 1 + 3 + 6 + 2
     off = right.probabilities("ill") + [1e-7, -1e-7, 0.0]
     bad = Shifted(right, probabilities=lambda n: off if n == "ill" else right.probabilities(n))
     with pytest.raises(AssertionError, match="node 'ill', state 'no'"):
@@ -153,3 +161,216 @@ def test_too_few_effective_draws_are_not_judged() -> None:
         few = weighted(0, draws=60)
     match = compare(few, exact)
     assert match.skipped >= 5
+
+
+# ---- variances, quantiles, covariances, angles --------------------------------------------------
+
+
+def chain_of_two() -> bmc.BayesNet:
+    net = bmc.BayesNet(plates={"i": 2})
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("v", lambda x: bmc.MvNormal(bmc.stack([x, -x]), np.eye(2)))
+    net.add("w", lambda x: bmc.Normal(x, 0.5), plates="i")
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    return net
+
+
+def answers(**options) -> tuple:
+    engine = bmc.LikelihoodWeighting(20_000)
+    found = bmc.infer(chain_of_two(), {"y": 1.0}, engine=engine, rng=0, **options)
+    return found, bmc.infer(chain_of_two(), {"y": 1.0}, engine=bmc.Exact())
+
+
+def moved(posterior, method: str, name: str, off):
+    """The same answer with one figure of one node moved."""
+    right = getattr(posterior, method)
+    wrong = copy.copy(posterior)
+    setattr(wrong, method, lambda *n: right(*n) + off if n == (name,) else right(*n))
+    return wrong
+
+
+def test_every_figure_of_numbers_is_compared() -> None:
+    found, exact = answers()
+    match = assert_matches(found, exact)
+    figures = {c.what for c in match.comparisons}
+    assert {"mean of node 'v'[1]", "variance of node 'w'[0]", "covariance of node 'v'[0] and [1]",
+            "covariance of node 'w'[0] and [1]",
+            "share of draws up to the 95% quantile of node 'x'"} <= figures  # fmt: skip
+    assert match.skipped == 0
+    # two exact answers, and draws against draws' exact source
+    assert assert_matches(exact, exact).worst.p_value == 1.0
+    few = {c.what for c in compare(*answers(keep="summaries")).comparisons}
+    assert "mean of node 'x'" in few
+    assert not any("quantile" in what or "variance of node 'x'" in what for what in few)
+    assert not any("quantile" in c.what for c in compare(found, exact, quantiles=()).comparisons)
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "off", "words"),
+    [
+        ("var", "x", 0.05, "variance of node 'x'"),
+        ("var", "w", np.array([0.0, 0.08]), "variance of node 'w'[1]"),
+        ("cov", "v", 0.1 * (1 - np.eye(2)), "covariance of node 'v'[0] and [1]"),
+    ],
+)
+def test_wrong_squares_are_named(method: str, name: str, off, words: str) -> None:
+    found, exact = answers()
+    match = compare(moved(found, method, name, off), exact)
+    assert [c.what for c in match.rejected] == [words]
+
+
+def test_a_wrong_shape_with_right_moments_shows_in_quantiles() -> None:
+    """A uniform law of the right mean and variance: mean and variance pass, quantiles do not."""
+    right, wrong = bmc.BayesNet(), bmc.BayesNet()
+    right.add("x", bmc.Normal(0.0, 1.0))
+    wrong.add("x", bmc.Uniform(-np.sqrt(3.0), np.sqrt(3.0)))
+    exact = bmc.infer(right, engine=bmc.Exact())
+    match = compare(bmc.infer(wrong, engine=bmc.LikelihoodWeighting(20_000), rng=1), exact)
+    assert match.rejected and all("quantile" in c.what for c in match.rejected)
+
+
+def test_chains_are_judged_by_their_effective_size() -> None:
+    exact = answers()[1]
+    engine = bmc.MetropolisHastings(250, warmup=150, chains=8)
+    chains = bmc.infer(chain_of_two(), {"y": 1.0}, engine=engine, rng=1)
+    assert_matches(chains, exact, names=["x"], draws=200, rng=0)
+    with pytest.raises(AssertionError, match="quantile of node 'x'"):
+        prior = bmc.infer(chain_of_two(), {"y": 0.0}, engine=engine, rng=1)
+        assert_matches(prior, exact, names=["x"])
+
+
+class Heavy:
+    """A Cauchy law, whose figures are known."""
+
+    names = ("x",)
+    log_marginal_likelihood = None
+
+    def mean(self, name: str) -> np.ndarray:
+        return np.array(np.nan)
+
+    def var(self, name: str) -> np.ndarray:
+        return np.array(np.inf)
+
+    def quantile(self, name: str, q) -> np.ndarray:
+        return scipy.stats.cauchy.ppf(q)
+
+
+def test_without_moments_quantiles_decide() -> None:
+    net = bmc.BayesNet()
+    net.add("x", bmc.StudentT(1.0, 0.0, 1.0))
+    engine = bmc.LikelihoodWeighting(20_000)
+    match = assert_matches(bmc.infer(net, engine=engine, rng=0), Heavy())
+    assert len(match.comparisons) == 5 and match.skipped == 1
+    net.add("x", bmc.StudentT(1.0, 0.1, 1.0), replace=True)
+    assert not compare(bmc.infer(net, engine=engine, rng=0), Heavy())
+
+
+def test_angles_are_compared_across_the_seam() -> None:
+    net = bmc.BayesNet()
+    net.add("t", bmc.VonMises(np.pi, 3.0))
+    net.add("y", lambda t: bmc.Normal(np.sin(t), 0.5))
+    engine = bmc.LikelihoodWeighting(20_000)
+    exact = enumerate_posterior(net, {"y": 0.1}, points=64)
+    found = bmc.infer(net, {"y": 0.1}, engine=engine, rng=0)
+    match = assert_matches(found, exact)
+    assert {"mean cosine of node 't'", "mean sine of node 't'"} <= {
+        c.what for c in match.comparisons
+    }
+    assert not compare(bmc.infer(net, {"y": 0.6}, engine=engine, rng=0), exact)
+
+
+# ---- joint draws --------------------------------------------------------------------------------
+
+
+class Uncoupled(DrawsPosterior):
+    """Every node's draws shuffled by themselves: right marginals, wrong coupling."""
+
+    def __init__(self, right: DrawsPosterior) -> None:
+        rng = np.random.default_rng(0)
+        stored = {
+            n: right._stored[n][:, rng.permutation(right._shape[1])]
+            if right._stored[n].shape[1] > 1
+            else right._stored[n]
+            for n in right.names
+        }
+        super().__init__(right.problem, right.engine, stored, right._shape, independent=True)
+
+
+def test_wrong_coupling_shows_in_joint_draws_only() -> None:
+    right = answers()[1].resample(2000, rng=0)
+    exact = answers()[1]
+    assert assert_matches(right, exact, draws=300, rng=1)
+    wrong = Uncoupled(right)
+    assert compare(wrong, exact, names=["x", "y"])
+    match = compare(wrong, exact, names=["x", "w"], draws=600, rng=1)
+    assert "joint draws of 'x', 'w' (energy distance)" in {c.what for c in match.rejected}
+
+
+def test_joint_draws_of_weighted_and_finite_answers() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.4))
+    net.add("b", lambda a: bmc.Bernoulli(0.2 + 0.6 * a))
+    net.add("c", lambda a, b: bmc.Bernoulli(0.3 + 0.2 * a + 0.2 * b))
+    found = bmc.infer(net, {"c": 1}, engine=bmc.LikelihoodWeighting(4000), rng=0)
+    exact = enumerate_posterior(net, {"c": 1})
+    assert assert_matches(found, exact, draws=300, rng=0)
+    assert not compare(Uncoupled(found.resample(4000, rng=0)), exact, draws=500, rng=0)
+
+
+def test_what_has_no_draws_says_so() -> None:
+    found, exact = answers(keep="summaries")
+    assert "holds none" in repr(compare(found, exact, draws=100))
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    drawn = bmc.infer(net, engine=bmc.LikelihoodWeighting(1000), rng=0)
+    with pytest.raises(UnsupportedError, match="has no draws to compare with"):
+        compare(drawn, enumerate_posterior(net), draws=100)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"quantiles": (0.0,)}, "strictly between 0 and 1"),
+        ({"alpha": 1.0}, "strictly between 0 and 1"),
+        ({"names": "x"}, "sequence of names"),
+        ({"names": []}, None),
+        ({"draws": 3}, "30 or more"),
+    ],
+)
+def test_wrong_options_are_named(options: dict, words: str | None) -> None:
+    found, exact = answers()
+    if words is None:
+        assert len(compare(found, exact, **options).comparisons) == 1  # log evidence
+        return
+    with pytest.raises(ValueError, match=words):
+        compare(found, exact, **options)
+
+
+def test_unknown_options_are_named() -> None:
+    with pytest.raises(TypeError, match="no option 'draw'; there are alpha, draws"):
+        assert_matches(*answers(), draw=3)
+
+
+def test_a_call_is_counted_once() -> None:
+    found, exact = answers()
+    before = BUDGET.calls.get("compare", 0), BUDGET.calls.get("assert_matches", 0)
+    compare(found, exact)
+    assert_matches(found, exact, draws=50, rng=0)
+    after = BUDGET.calls["compare"], BUDGET.calls["assert_matches"]
+    assert (after[0] - before[0], after[1] - before[1]) == (1, 1)
+
+
+def test_variances_are_averages_about_the_exact_mean() -> None:
+    """Of weighted draws, whose plain mean is another; and where all squares are equal, with no error."""
+    found, exact = answers()
+    x, w = found["x"], found.weights
+    squares = (x - exact.mean("x")) ** 2
+    error = np.sqrt((w**2 * (squares - (w * squares).sum()) ** 2).sum())
+    shown = {c.what: c for c in compare(found, exact).comparisons}["variance of node 'x'"]
+    off = (w * squares).sum() - exact.var("x")
+    assert abs(shown.errors - abs(off) / error) < 1e-4  # the tolerance is part of it
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.5))
+    net.add("b", lambda a: a / 7.0)
+    coin = bmc.infer(net, engine=bmc.LikelihoodWeighting(3000), rng=0)
+    assert assert_matches(coin, enumerate_posterior(net))

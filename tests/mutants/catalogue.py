@@ -1,0 +1,14 @@
+"""All mutants, by family."""
+
+from __future__ import annotations
+
+from tests.mutants import chains, densities, draws, exact, filters
+from tests.mutants.mutant import Mutant
+
+MUTANTS: tuple[Mutant, ...] = (
+    *chains.MUTANTS,
+    *draws.MUTANTS,
+    *exact.MUTANTS,
+    *filters.MUTANTS,
+    *densities.MUTANTS,
+)

@@ -1,0 +1,373 @@
+"""Faults of Markov chains: acceptance, adaptation, full conditionals, closed forms, blocks, slices."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+import bayesmc as bmc
+from bayesmc.kernels.collapsed import CollapsedBlock
+from bayesmc.kernels.conjugate import conjugate_kernel
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.factor_slice import FactorSlice
+from bayesmc.kernels.gaussian_block import GaussianBlock
+from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.random_walk import AdaptiveWalk
+from bayesmc.kernels.slice import Slice
+from bayesmc.structure.blanket import Blanket
+from bayesmc.testing.balance import detailed_balance, invariant
+from bayesmc.testing.geweke import geweke_test
+from bayesmc.testing.ranks import rank_test
+from bayesmc.testing.verdict import Verdict
+
+from tests.mutants.faults import Edit
+from tests.mutants.mutant import ALPHA, Mutant
+from tests.mutants.tests_of import matched
+
+Make = Callable[[], Any]
+COV = np.array([[1.0, 0.4], [0.4, 0.7]])
+
+
+def ranks(
+    kernel: Make, net: Make, replications: int = 500, **options: Any
+) -> Callable[[int], Verdict]:
+    """The exact rank test of a kernel, made anew with its net."""
+    return lambda seed: rank_test(
+        kernel(), net(), replications=replications, alpha=ALPHA, rng=seed, **options
+    )
+
+
+def joint(kernel: Make, net: Make, **options: Any) -> Callable[[int], Verdict]:
+    """Geweke's test of a kernel, made anew with its net."""
+    return lambda seed: geweke_test(kernel(), net(), alpha=ALPHA, rng=seed, **options)
+
+
+# ---- nets ---------------------------------------------------------------------------------------
+
+
+def rate() -> bmc.BayesNet:
+    """A rate, with counts."""
+    net = bmc.BayesNet(plates={"i": 2})
+    net.add("x", bmc.Gamma(2.0, 3.0))
+    net.add("y", lambda x: bmc.Poisson(x), plates="i")
+    return net
+
+
+def location() -> bmc.BayesNet:
+    """A mean whose prior is not about zero, with a hidden number and its reading."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(2.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.5))
+    net.add("z", lambda y: bmc.Normal(y, 1.0))
+    return net
+
+
+def bounded() -> bmc.BayesNet:
+    """A number between bounds, of which little is known besides."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Uniform(0.0, 1.2))
+    net.add("y", lambda x: bmc.Normal(x, 4.0))
+    return net
+
+
+def robust() -> bmc.BayesNet:
+    """A mean with two children and no closed form."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.StudentT(5.0, 0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    net.add("z", lambda x: bmc.Laplace(x, 0.7))
+    return net
+
+
+def covariance() -> bmc.BayesNet:
+    """A covariance, with hidden vectors and readings of them."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("x", bmc.InverseWishart(6.0, COV))
+    net.add("y", lambda x: bmc.MvNormal(np.zeros(2), x), plates="i")
+    net.add("z", lambda y: bmc.MvNormal(y, COV), plates="i")
+    return net
+
+
+def share() -> bmc.BayesNet:
+    """A share, with successes among trials."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Beta(2.0, 3.0))
+    net.add("y", lambda x: bmc.Binomial(4, x))
+    return net
+
+
+def shares() -> bmc.BayesNet:
+    """Shares of three words, with hidden words and readings of them."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("x", bmc.Dirichlet([1.0, 2.0, 0.7]))
+    net.add("y", lambda x: bmc.Categorical(x), plates="i")
+    net.add("z", lambda y: bmc.Normal(y, 1.0), plates="i")
+    return net
+
+
+def effects() -> bmc.BayesNet:
+    """Two coupled means."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("b", lambda a: bmc.Normal(a, 0.4))
+    net.add("y", lambda b: bmc.Normal(b, 0.5))
+    return net
+
+
+def scales() -> bmc.BayesNet:
+    """A mean and a scale."""
+    net = bmc.BayesNet()
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("s", bmc.Gamma(3.0, 3.0))
+    net.add("y", lambda m, s: bmc.Normal(m, s))
+    return net
+
+
+def count() -> bmc.BayesNet:
+    """A number, of which some are seen."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Poisson(3.0))
+    net.add("y", lambda x: bmc.Binomial(x, 0.4))
+    return net
+
+
+def ring() -> bmc.FactorGraph:
+    """Four sites round a ring that like to agree, three of which meet."""
+    graph = bmc.FactorGraph("ring", plates={"i": 4})
+    graph.variable("s", bmc.Bernoulli(0.5).support, plates="i")
+    graph.factor(lambda a, b: 0.9 * (a == b), scope=("s", "s"), index=([0, 1, 2, 3], [1, 2, 3, 0]))
+    graph.factor(
+        lambda a, b, c: 0.6 * a * b * c, scope=("s", "s", "s"), index=([0], [1], [2])
+    )
+    return graph
+
+
+def variances() -> bmc.BayesNet:
+    """Effects with a scale of their own, hidden numbers about them, and readings."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("tau", bmc.Gamma(3.0, 3.0))
+    net.add("m", lambda tau: bmc.Normal(0.0, tau), plates="i")
+    net.add("y", lambda m: bmc.Normal(m, 0.7), plates="i")
+    net.add("z", lambda y: bmc.Normal(y, 1.0), plates="i")
+    return net
+
+
+def linked() -> bmc.BayesNet:
+    """A switch that reaches a reading through what is computed from it."""
+    net = bmc.BayesNet()
+    net.add("k", bmc.Bernoulli(0.4))
+    net.add("x", bmc.Laplace(0.0, 1.0))
+    net.add("s", lambda k: 2.0 * k)
+    net.add("y", lambda s, x: bmc.Normal(s + x, 0.7))
+    return net
+
+
+def three() -> bmc.BayesNet:
+    """A node of three states, and a reading of it."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Categorical([0.2, 0.3, 0.5]))
+    net.add("y", lambda x: bmc.Bernoulli(0.2 + 0.3 * x))
+    return net
+
+
+class AlwaysCollapsed(CollapsedBlock):
+    """As after a warmup in which the scale was slow."""
+
+    def start(self, values: Any, chains: int) -> Any:
+        return {**super().start(values, chains), "slow": dict.fromkeys(self.blankets, True)}
+
+
+def collapsed(target: Any) -> CollapsedBlock:
+    block = GaussianBlock(target, {"m": Blanket(target, "m")})
+    return AlwaysCollapsed(target, block, {"tau": Blanket(target, "tau")}, {})
+
+
+def enumerated(target: Any) -> Enumerate:
+    return Enumerate(Blanket(target, "x"))
+
+
+def closed_form(target: Any) -> Any:
+    return conjugate_kernel(Blanket(target, "x"))
+
+
+def walk(target: Any) -> AdaptiveWalk:
+    return AdaptiveWalk(Blanket(target, "x"), scale=1.2, adaptive=False)
+
+
+def own_scale_walk(target: Any) -> AdaptiveWalk:
+    return AdaptiveWalk(Blanket(target, "x"), scale=1.5, adaptive=False, unconstrained=False)
+
+
+def sliced(target: Any) -> Slice:
+    return Slice(Blanket(target, "x"))
+
+
+MUTANTS = [
+    Mutant(
+        "a Hastings term is missing",
+        (Edit("bayesmc.kernels.proposed:Proposed.step",
+              "log_ratio + self._backward(state, found.new, members)", "log_ratio + forward"),),
+        ranks(lambda: bmc.MetropolisHastings(proposal={"x": lambda x: bmc.LogNormal(np.log(x), 1.0)}),
+              rate, 1000, warmup=0),
+        "rank_test, 1000 replications",
+    ),
+    Mutant(
+        "a Jacobian is missing: a random walk on the free scale",
+        (Edit("bayesmc.kernels.random_walk:AdaptiveWalk.step",
+              "found.own + found.rest + grown", "found.own + found.rest"),),
+        ranks(lambda: walk, rate, 1000),
+        "rank_test, 1000 replications",
+    ),
+    Mutant(
+        "a Jacobian is missing: ensembles",
+        (Edit("bayesmc.kernels.ensemble:BlockWalk._volume",
+              "return (flat if part.free is None else flat[:, part.free]).sum(axis=1)",
+              "return np.zeros(len(free))"),),
+        ranks(lambda: bmc.MetropolisHastings(), scales, 300, warmup=30),
+        "rank_test, 300 replications of ensembles",
+    ),
+    Mutant(
+        "a Jacobian is missing: slices along learnt directions",
+        (Edit("bayesmc.kernels.factor_slice:FactorSlice._split",
+              "volume + transform.log_abs_det_jacobian(part)", "volume"),),
+        ranks(lambda: lambda target: FactorSlice(target, ("m", "s")), scales, warmup=10),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "adaptation never freezes",
+        (Edit("bayesmc.kernels.ensemble:BlockWalk.step", "if warmup:", "if True:"),),
+        ranks(lambda: bmc.MetropolisHastings(), scales, 50, warmup=30),
+        "rank_test, 50 replications (for certain)",
+    ),
+    Mutant(
+        "the acceptance ratio is squared",
+        (Edit("bayesmc.kernels.densities:accepted", "< log_ratio", "< 2.0 * log_ratio"),),
+        ranks(lambda: own_scale_walk, location, 1000, thinning=3),
+        "rank_test, 1000 replications",
+    ),
+    Mutant(
+        "a proposal from a node's own density counts that density twice",
+        (Edit("bayesmc.kernels.jump:Jump.step",
+              "np.where(drawn & ~found.dead, 0.0, found.own)", "found.own"),),
+        joint(lambda: lambda target: Jump(Blanket(target, "x")), count, warmup=10),
+        "geweke_test, 200 draws of 64 chains",
+    ),
+    Mutant(
+        "a child is left out of a full conditional",
+        (Edit("bayesmc.structure.blanket:Blanket.log_density",
+              "for child in self.children:", "for child in self.children[:-1]:"),),
+        ranks(lambda: bmc.Gibbs(), robust, warmup=20),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "slices: the first interval lies about the point, and does not step out",
+        (Edit("bayesmc.kernels.slice:slice_move", "x - width * rng.random(x.shape)", "x - 0.5 * width",
+              (("going &= left_over > 0", "going &= False"),)),),
+        ranks(lambda: sliced, bounded, 4000, warmup=0, thinning=3,
+              statistics={"spread": lambda x: (x - 0.6) ** 2}),
+        "rank_test, 4000 replications",
+    ),
+    Mutant(
+        "slices: the level is the density itself",
+        (Edit("bayesmc.kernels.slice:slice_move",
+              "found[0] - rng.standard_exponential(x.shape)", "found[0] - 0.1"),),
+        ranks(lambda: sliced, robust, 500, warmup=0),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "inverse-Wishart degrees of freedom are off by d",
+        (Edit("bayesmc.kernels.conjugate_kinds:Covariance.natural",
+              "return base.df, base.scale", "return base.df + base.scale.shape[-1], base.scale"),),
+        ranks(lambda: closed_form, covariance, 700),
+        "rank_test, 700 replications",
+    ),
+    Mutant(
+        "a prior mean is ignored",
+        (Edit("bayesmc.kernels.conjugate_kinds:Mean.natural",
+              "precision * base.loc", "precision * np.zeros_like(base.loc)"),),
+        ranks(lambda: closed_form, location, 400),
+        "rank_test, 400 replications",
+    ),
+    Mutant(
+        "a conjugate rate is taken for a scale",
+        (Edit("bayesmc.kernels.conjugate_kinds:Scale.natural",
+              "return base.concentration - 1.0, base.rate",
+              "return base.concentration - 1.0, 1.0 / base.rate"),),
+        ranks(lambda: bmc.Gibbs(), rate),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "a Gamma's shape is off by one",
+        (Edit("bayesmc.kernels.conjugate_kinds:Scale.posterior",
+              "(exponent + 1.0) / power", "(exponent + 2.0) / power"),),
+        ranks(lambda: bmc.Gibbs(), rate),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "failures are counted as trials",
+        (Edit("bayesmc.kernels.conjugate_pairs:_of_trials",
+              'e.data.count * e.get("total_count") - e.data.total',
+              'e.data.count * e.get("total_count")'),),
+        ranks(lambda: bmc.Gibbs(), share),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "counts go to the neighbouring category",
+        (Edit("bayesmc.kernels.conjugate_pairs:_categories",
+              'e.tally(e.get("probs", 1).shape[-1])',
+              'np.roll(e.tally(e.get("probs", 1).shape[-1]), 1, axis=-1)'),),
+        ranks(lambda: closed_form, shares, 400),
+        "rank_test, 400 replications",
+    ),
+    Mutant(
+        "a variance is taken for a standard deviation: a block of means",
+        (Edit("bayesmc.kernels.gaussian_terms:BlockTerm._whitened",
+              "joint / scale[..., None]", "joint / scale[..., None] ** 2"),
+         Edit("bayesmc.kernels.gaussian_terms:BlockTerm._uniform_scale",
+              "return scale.reshape(-1)", "return scale.reshape(-1) ** 2")),
+        matched(effects, {"y": 1.0}, bmc.Gibbs(draws=100, warmup=0, chains=20)),
+        "compare with exact(), 20 chains of 100 draws",
+    ),
+    Mutant(
+        "coupled sites are updated in parallel",
+        (Edit("bayesmc.structure.colouring:colours",
+              "found = _two(count, both)", "found = np.zeros(count, dtype=np.intp)"),),
+        lambda seed: invariant(bmc.Gibbs(), ring(), alpha=ALPHA, rng=seed),
+        "invariant (exact)",
+    ),
+    Mutant(
+        "an enumeration loses the last state",
+        (Edit("bayesmc.kernels.enumerate:draw_states", "range(1, count - 1)", "range(1, count - 2)"),),
+        lambda seed: detailed_balance(enumerated, three(), {"y": 1}, alpha=ALPHA, rng=seed),
+        "detailed_balance (exact)",
+    ),
+    Mutant(
+        "a deterministic node is stale",
+        (Edit("bayesmc.engines.sweep:SweepSampler.step",
+              "self.target.refresh(values, kernel.names)", "pass"),),
+        matched(linked, {"y": 1.0}, bmc.Gibbs(draws=100, warmup=0, chains=20)),
+        "compare with exact(), 20 chains of 100 draws",
+    ),
+    Mutant(
+        "a collapsed block forgets the determinant",
+        (Edit("bayesmc.kernels.gaussian_block:GaussianBlock.log_integral", " - 0.5 * log_det", ""),),
+        joint(lambda: collapsed, variances, draws=20, chains=16),
+        "geweke_test, 20 draws of 16 chains",
+    ),
+    Mutant(
+        "a walk that is drawn to the origin is taken for symmetric",
+        (Edit("bayesmc.kernels.random_walk:AdaptiveWalk.step",
+              "free + self.steps.draw", "0.7 * free + self.steps.draw"),),
+        ranks(lambda: own_scale_walk, location, 1000, thinning=3),
+        "rank_test, 1000 replications",
+    ),
+    Mutant(
+        "a node's own density is left out of its full conditional",
+        (Edit("bayesmc.structure.blanket:Blanket.log_density",
+              "total = self.own_log(state, members)", "total = 0.0 * self.own_log(state, members)"),),
+        lambda seed: invariant(enumerated, three(), {"y": 1}, alpha=ALPHA, rng=seed),
+        "invariant (exact)",
+    ),
+]  # fmt: skip

@@ -1,0 +1,149 @@
+"""Faults over time: particle filters and smoothers, Kalman and discrete filters, chains of particle filters."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import bayesmc as bmc
+
+from tests.mutants.faults import Edit
+from tests.mutants.mutant import Mutant
+from tests.mutants.tests_of import evidence_of, matched, slices
+
+
+def line() -> bmc.DynamicBayesNet:
+    """A number that walks, with readings."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.7), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.6))
+    return dbn
+
+
+def machine() -> bmc.DynamicBayesNet:
+    """Three states that follow each other, with readings."""
+    dbn = bmc.DynamicBayesNet()
+    step = np.array([[0.1, 0.8, 0.1], [0.1, 0.2, 0.7], [0.6, 0.1, 0.3]])
+    dbn.add("z", lambda z_prev: bmc.Categorical(step[z_prev]), initial=bmc.Categorical([0.6, 0.3, 0.1]))
+    dbn.add("y", lambda z: bmc.Normal(1.5 * z, 1.0))
+    return dbn
+
+
+def unknown_drift() -> bmc.DynamicBayesNet:
+    """A walk with a drift that is not known."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("d", bmc.Normal(0.0, 1.0))
+    dbn.add("x", lambda x_prev, d: bmc.Normal(x_prev + d, 0.7), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.6))
+    return dbn
+
+
+ROWS = {"y": [0.5, 1.5, 3.0, 2.0]}
+RISING = {"y": [0.0, 2.0, 4.0]}
+PARTICLES = "unbiased_evidence_test, 100 runs of 10 particles"
+ALWAYS = bmc.ParticleFilter(10, ess_threshold=2.0)
+
+MUTANTS = [
+    Mutant(
+        "weights are not reset after resampling",
+        (Edit("bayesmc.engines.particles.mover:Mover._selected",
+              "carried: Any = 0.0", "carried: Any = cloud.log_weights[chosen]"),),
+        evidence_of(line, ROWS, ALWAYS, 100),
+        PARTICLES,
+    ),
+    Mutant(
+        "the log evidence forgets earlier weights where it does not resample",
+        (Edit("bayesmc.engines.particles.mover:Mover._weighted",
+              "log_total - selection.spent,", "float(np.log(np.mean(np.exp(log - carried)))),"),),
+        evidence_of(line, ROWS, bmc.ParticleFilter(10, ess_threshold=0.0), 100),
+        PARTICLES,
+    ),
+    Mutant(
+        "an auxiliary filter forgets the first-stage weights",
+        (Edit("bayesmc.engines.particles.mover:Mover._selected",
+              "carried = -(factor[chosen] if not self.apart else np.take_along_axis(factor, chosen, 0))",
+              "carried = 0.0"),),
+        evidence_of(line, ROWS, bmc.ParticleFilter(10, ess_threshold=2.0, auxiliary=True), 100),
+        PARTICLES,
+    ),
+    Mutant(
+        "an auxiliary filter's evidence forgets the first stage",
+        (Edit("bayesmc.engines.particles.mover:Mover._selected",
+              "gained = level + np.log(chosen_from) - total", "gained = 0.0"),),
+        evidence_of(line, ROWS, bmc.ParticleFilter(10, ess_threshold=2.0, auxiliary=True), 100),
+        PARTICLES,
+    ),
+    Mutant(
+        "offspring are those of the particle next door",
+        (Edit("bayesmc.engines.particles.mover:Mover._taken",
+              'value.take(ancestors, axis=0, mode="clip")',
+              'value.take(ancestors + 1, axis=0, mode="wrap")'),),
+        slices(bmc.filter, line, ROWS, bmc.ParticleFilter(300, ess_threshold=2.0), 30),
+        "repeated_test of filter, 30 runs of 300 particles",
+    ),
+    Mutant(
+        "backward simulation leaves the transition out",
+        (Edit("bayesmc.engines.particles.smoothing:Backward._drawn",
+              "self.log_densities(cloud, values, series, k, len(mine)) + cloud.log_weights",
+              "np.broadcast_to(cloud.log_weights, (len(mine), *cloud.log_weights.shape))"),),
+        slices(bmc.smooth, line, RISING, bmc.ParticleFilter(300, backward="exact"), 20),
+        "repeated_test of smooth, 20 runs of 300 particles",
+    ),
+    Mutant(
+        "backward simulation by rejection accepts everything",
+        (Edit("bayesmc.engines.particles.smoothing:Backward._by_rejection",
+              "< log - bound", "< 0.0 * log"),),
+        slices(bmc.smooth, line, RISING, bmc.ParticleFilter(300), 20),
+        "repeated_test of smooth, 20 runs of 300 particles",
+    ),
+    Mutant(
+        "a Kalman filter predicts without process noise",
+        (Edit("bayesmc.engines.kalman.covariances:worked_out",
+              "rows_of(moves, noise, states.root(state), pattern.absent)",
+              "rows_of(moves, np.where(np.arange(len(noise))[:, None] < len(pattern.observed), "
+              "noise, 0.0) if k else noise, states.root(state), pattern.absent)"),),
+        slices(bmc.filter, line, ROWS, bmc.KalmanFilter(), 2),
+        "repeated_test of filter (no draws)",
+    ),
+    Mutant(
+        "a Kalman smoother stops after one slice",
+        (Edit("bayesmc.engines.kalman.passes:_back_in_numbers",
+              "here = shifts[k] + link * here", "here = shifts[k]"),),
+        slices(bmc.smooth, line, ROWS, bmc.KalmanFilter(), 2),
+        "repeated_test of smooth (no draws)",
+    ),
+    Mutant(
+        "a discrete filter's transition is transposed",
+        (Edit("bayesmc.engines.discrete.chain:_forward_one",
+              "dot(last, step, out=ahead)", "dot(step, last, out=ahead)"),),
+        slices(bmc.filter, machine, ROWS, bmc.DiscreteFilter(), 2),
+        "repeated_test of filter (no draws)",
+    ),
+    Mutant(
+        "a discrete smoother's transition is transposed",
+        (Edit("bayesmc.engines.discrete.chain:_back", "np.swapaxes(matrix, -1, -2)", "matrix"),),
+        slices(bmc.smooth, machine, ROWS, bmc.DiscreteFilter(), 2),
+        "repeated_test of smooth (no draws)",
+    ),
+    Mutant(
+        "particle Metropolis forgets the prior",
+        (Edit("bayesmc.pmcmc.walk:ParameterWalk.step",
+              "(grown - log) + (estimate - likelihood)", "estimate - likelihood"),),
+        matched(unknown_drift, RISING,
+                bmc.ParticleMetropolis(draws=100, warmup=30, chains=30, particles=20)),
+        "compare with exact(), 30 chains of 100 draws",
+    ),
+    Mutant(
+        "particle Metropolis takes the estimate anew at every step",
+        (Edit("bayesmc.pmcmc.walk:ParameterWalk.step",
+              "np.where(accept, estimate, likelihood)", "estimate"),),
+        matched(unknown_drift, RISING,
+                bmc.ParticleMetropolis(draws=100, warmup=30, chains=30, particles=10)),
+        "compare with exact(), 30 chains of 100 draws",
+    ),
+    Mutant(
+        "particle Gibbs does not keep the trajectory",
+        (Edit("bayesmc.pmcmc.filters:ConditionalFilter._kept", "found[-1] = trajectory", "pass"),),
+        matched(line, RISING, bmc.ParticleGibbs(draws=100, warmup=20, chains=40, particles=4)),
+        "compare with exact(), 40 chains of 100 draws",
+    ),
+]  # fmt: skip
