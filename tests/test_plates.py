@@ -15,6 +15,7 @@ import bayesmc as bmc
 from bayesmc.errors import PlateError
 from bayesmc.plates import Gathered, PlateArray
 from bayesmc.states import StateArray
+from bayesmc.testing import session
 
 OWN = "ij"  # the child's own plates, in its order
 FOREIGN = "abc"
@@ -244,7 +245,7 @@ def test_gather_from_and_into_an_empty_plate():
 
 
 @given(layouts(3), st.data())
-@settings(max_examples=40)
+@settings(max_examples=session.scaled(40, 5))
 def test_ufuncs_align_foreign_plates_by_name(layout, data):
     sizes, batch, parts = layout
     rng = np.random.default_rng(data.draw(st.integers(0, 999)))
@@ -267,7 +268,7 @@ def test_ufuncs_align_foreign_plates_by_name(layout, data):
 
 
 @given(layouts(2), st.data())
-@settings(max_examples=40)
+@settings(max_examples=session.scaled(40, 5))
 def test_generalised_ufuncs_keep_their_core(layout, data):
     """np.vecdot and np.matvec with own, foreign and constant operands."""
     sizes, batch, parts = layout
@@ -298,7 +299,7 @@ def test_generalised_ufuncs_keep_their_core(layout, data):
 
 
 @given(layouts(1), st.data())
-@settings(max_examples=60)
+@settings(max_examples=session.scaled(60, 5))
 def test_reductions_are_the_loop(layout, data):
     sizes, batch, (part,) = layout
     rng = np.random.default_rng(data.draw(st.integers(0, 999)))
@@ -617,7 +618,7 @@ def test_stack_broadcasts_batches_first():
 
 
 @given(layouts(2), st.integers(0, 999))
-@settings(max_examples=40)
+@settings(max_examples=session.scaled(40, 5))
 def test_stack_of_foreign_parents_makes_a_vector(layout, seed):
     sizes, batch, parts = layout
     rng = np.random.default_rng(seed)

@@ -250,8 +250,8 @@ def valid(program: Program) -> list[Step]:
     for step in program:
         try:
             result = run([*kept, step], *points(0))[-1]
-        except (ValueError, IndexError, TypeError, ZeroDivisionError):
-            continue
+        except (ValueError, IndexError, TypeError, ZeroDivisionError, RuntimeWarning):
+            continue  # warnings are errors here: the mean of an empty slice
         if isinstance(result, np.ndarray) and result.size <= 200 and result.ndim <= 5:
             kept.append(step)
         elif isinstance(result, np.number):
@@ -330,7 +330,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=session.scaled(150), deadline=None)
+@settings(max_examples=session.scaled(150, 5))
 @given(STEPS)
 def test_what_is_called_affine_is(steps: list[Step]) -> None:
     program = valid(steps)

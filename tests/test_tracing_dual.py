@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 
 import bayesmc as bmc
 from bayesmc.plates import PlateArray
+from bayesmc.testing import session
 from bayesmc.tracing import Dual, NoTangent, TracedCall, Tracer, partials
 from bayesmc.tracing import tangents as rules
 
@@ -200,7 +201,7 @@ def program(steps: list[tuple[int, int, int]], x: Any) -> Any:
 STEP = st.tuples(st.integers(0, len(STEPS) - 1), st.integers(0, 9), st.integers(0, 9))
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=session.scaled(300, 5))
 @given(st.lists(STEP, min_size=1, max_size=7), st.integers(0, 10**6))
 def test_random_expressions(steps: list[tuple[int, int, int]], seed: int) -> None:
     x = np.random.default_rng(seed).uniform(-1.2, 1.2, size=(2, 3))

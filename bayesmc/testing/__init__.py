@@ -1,21 +1,46 @@
-"""Tools to test engines, and nets, against exact answers: random nets, enumeration, a statistical match;
-and Markov kernels, ours and users', against the joint law they must keep.
+"""Property-based tests of models, samplers and densities: a kit for ours and for users'.
 
-Import it by name (``import bayesmc.testing``); it needs the extra ``test`` for ``bayes_nets`` and
-``evidence_for`` only.
+Four kinds of tools. *Makers*: random nets, templates, factor graphs, distributions and weights, by seed or as
+Hypothesis strategies. *Oracles*: exact answers that share no code with the engines; `exact` picks one. *Tests* of
+posteriors (`assert_matches`, `simulation_based_calibration`, `unbiased_evidence_test`), of kernels
+(`geweke_test`, `rank_test`, `invariant`, `detailed_balance`) and of densities (`check_density`, `check_cpd`), each
+with a stated false-alarm rate and an answer that is true where nothing deviates. *Runs*: `session` says a run's
+seed and whether it is thorough, for the pytest plugin that comes with bayesmc.
+
+Import it by name (``import bayesmc.testing``). Hypothesis (extra ``test``) is needed for strategies only.
 """
 
+from bayesmc.testing import session
+from bayesmc.testing.answers import ExactAnswer, exact
 from bayesmc.testing.balance import detailed_balance, invariant
+from bayesmc.testing.calibration import CalibrationResult, simulation_based_calibration
 from bayesmc.testing.conditional_gaussian import ConditionalGaussian, GaussianAnswer
+from bayesmc.testing.conditionals import check_cpd
+from bayesmc.testing.densities import DensityCheck, check_density
+from bayesmc.testing.evidence import EvidenceResult, unbiased_evidence_test
+from bayesmc.testing.families import DistributionOptions, random_distribution
 from bayesmc.testing.gaussians import GaussianOptions, gaussian_evidence, random_gaussian_net
 from bayesmc.testing.geweke import GewekeResult, geweke_test
+from bayesmc.testing.graphs import GraphOptions, random_factor_graph
 from bayesmc.testing.joint import JointModel
 from bayesmc.testing.matching import Match, assert_matches, compare
 from bayesmc.testing.nets import NetOptions, random_net
 from bayesmc.testing.observing import random_evidence
 from bayesmc.testing.oracle import Enumerated, enumerate_posterior
+from bayesmc.testing.quadrature import Quadrature, quadrature_posterior
 from bayesmc.testing.ranks import RankResult, rank_test
-from bayesmc.testing.strategies import bayes_nets, evidence_for
+from bayesmc.testing.repeated import repeated_test
+from bayesmc.testing.samples import same_distribution
+from bayesmc.testing.spelling import as_code
+from bayesmc.testing.strategies import (
+    bayes_nets,
+    dbns,
+    distributions,
+    evidence_for,
+    factor_graphs,
+    log_weights,
+)
+from bayesmc.testing.templates import DbnOptions, RandomDbn, random_dbn
 from bayesmc.testing.transition import (
     KernelMatrix,
     Sweep,
@@ -24,37 +49,67 @@ from bayesmc.testing.transition import (
     transition_p_value,
 )
 from bayesmc.testing.uniformity import uniformity_p_value
-from bayesmc.testing.verdict import Comparison, Verdict
+from bayesmc.testing.verdict import Comparison, Verdict, uncounted
+from bayesmc.testing.weights import WeightOptions, random_log_weights
 
 __all__ = [
+    "CalibrationResult",
     "Comparison",
     "ConditionalGaussian",
+    "DbnOptions",
+    "DensityCheck",
+    "DistributionOptions",
     "Enumerated",
+    "EvidenceResult",
+    "ExactAnswer",
     "GaussianAnswer",
     "GaussianOptions",
     "GewekeResult",
+    "GraphOptions",
     "JointModel",
     "KernelMatrix",
     "Match",
     "NetOptions",
+    "Quadrature",
+    "RandomDbn",
     "RankResult",
     "Sweep",
     "Verdict",
+    "WeightOptions",
+    "as_code",
     "assert_matches",
     "bayes_nets",
+    "check_cpd",
+    "check_density",
     "compare",
+    "dbns",
     "detailed_balance",
+    "distributions",
     "enumerate_posterior",
     "evidence_for",
+    "exact",
     "exact_sweep",
+    "factor_graphs",
     "gaussian_evidence",
     "geweke_test",
     "invariant",
+    "log_weights",
+    "quadrature_posterior",
+    "random_dbn",
+    "random_distribution",
     "random_evidence",
+    "random_factor_graph",
     "random_gaussian_net",
+    "random_log_weights",
     "random_net",
     "rank_test",
+    "repeated_test",
+    "same_distribution",
+    "session",
+    "simulation_based_calibration",
     "transition_matrix",
     "transition_p_value",
+    "unbiased_evidence_test",
+    "uncounted",
     "uniformity_p_value",
 ]

@@ -133,7 +133,8 @@ def detailed_balance(
     """Does a kernel go from one state to another as often as back, under the posterior of a finite net?
 
     Exact where `invariant` is; of an engine each single update is judged, as sweeps of several updates in
-    fixed order keep the posterior, but not detailed balance. For a function, steps are counted from draws
+    fixed order keep the posterior, but not detailed balance. (An update of a lattice takes its colours in
+    turn, too, and is judged as it is.) For a function, steps are counted from draws
     of the exact posterior: under detailed balance the steps between two states go either way with
     probability one half, which is a binomial law whatever the kernel. Detailed balance implies
     invariance; a function may be right without it.

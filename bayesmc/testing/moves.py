@@ -34,6 +34,7 @@ from bayesmc.network.evidence import store
 from bayesmc.structure.target import Target, target_of
 from bayesmc.testing.joint import JointModel, NetJoint, NetStates, Rows, Statistics, as_evidence
 from bayesmc.testing.statistics import default_statistics
+from bayesmc.testing.transition import in_classes
 from bayesmc.testing.verdict import Comparison
 
 #: ``move(state, data, rng)``: the next state of every row
@@ -585,7 +586,4 @@ def _reverse_of(kernel: Kernel) -> Kernel | None:
         return kernel
     if hasattr(kernel, "classes") or blanket is None:
         return None
-    back = copy.copy(kernel)
-    back.blanket = copy.copy(blanket)
-    back.blanket.classes = blanket.classes[::-1]
-    return back
+    return in_classes(kernel, blanket.classes[::-1])

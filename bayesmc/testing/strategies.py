@@ -16,7 +16,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.errors import ModelError, missing_extra
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.testing.choices import Choices, read_options
-from bayesmc.testing.dbns import DbnOptions, RandomDbn, build_dbn
+from bayesmc.testing.templates import DbnOptions, RandomDbn, build_dbn
 from bayesmc.testing.families import DistributionOptions, build_distribution
 from bayesmc.testing.graphs import GraphOptions, build_factor_graph
 from bayesmc.testing.nets import NetOptions, build_net

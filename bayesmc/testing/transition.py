@@ -14,6 +14,7 @@ Billingsley (1961), Statistical methods in Markov chains, Annals of Mathematical
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,6 +26,9 @@ import scipy.special
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import ShapeError
 from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.proposed import Proposed
 from bayesmc.kernels.tables import TableSweep
 from bayesmc.network import BayesNet, FactorGraph, pose
 from bayesmc.shapes import owned
@@ -47,7 +51,8 @@ class KernelMatrix:
         The coarsest step of the random numbers it draws: single probabilities are good to a few of these,
         2**-53 for all but lattices.
     parts : tuple of KernelMatrix
-        Of a kernel that draws several nodes or blocks in turn, each of these updates, read by itself.
+        Of a kernel that draws several nodes, blocks or colours in turn, each of these updates, read by
+        itself.
     """
 
     names: tuple[str, ...]
@@ -244,6 +249,14 @@ def transition_p_value(matrix: Any, counts: Any) -> float:
     return float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
 
 
+def in_classes(kernel: Any, classes: list[Any]) -> Any:
+    """The same kernel that moves these classes of elements only, in this order."""
+    other = copy.copy(kernel)
+    other.blanket = copy.copy(kernel.blanket)
+    other.blanket.classes = classes
+    return other
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -260,7 +273,11 @@ def _read(space: StateSpace, kernel: Kernel) -> KernelMatrix:
 
 
 def _parts(space: StateSpace, kernel: Kernel) -> list[Kernel]:
-    """The updates of a sweep of table look-ups, in the order in which they are drawn."""
-    if not isinstance(kernel, TableSweep) or len(kernel.conditionals) == 1:
-        return []
-    return [TableSweep(space.target, [c]) for group in kernel.groups for c in group.part]
+    """The single updates of table look-ups, or of colours in turn, in the order in which they are drawn."""
+    if isinstance(kernel, TableSweep):
+        alone = len(kernel.conditionals) == 1
+        drawn = [c for group in kernel.groups for c in group.part]
+        return [] if alone else [TableSweep(space.target, [c]) for c in drawn]
+    if isinstance(kernel, (Enumerate, Jump, Proposed)) and len(kernel.blanket.classes) > 1:
+        return [in_classes(kernel, [members]) for members in kernel.blanket.classes]
+    return []

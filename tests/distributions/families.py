@@ -15,7 +15,7 @@ from scipy import special, stats
 import bayesmc.distributions as d
 from bayesmc.testing import session
 
-FIXED = settings(derandomize=True, max_examples=session.scaled(30), deadline=None, database=None)
+FEW = settings(max_examples=session.scaled(30, 5))
 
 
 def magnitudes(low: float, high: float) -> st.SearchStrategy[float]:

@@ -107,7 +107,8 @@ def test_multivariate_distributions_are_wrapped(name: str) -> None:
     assert dist.event_shape == one.shape
     draws = dist.sample_to(np.random.default_rng(0), (4, 5))
     assert draws.shape == (4, 5, *one.shape)
-    assert len(np.unique(draws.reshape(20, -1), axis=0)) > 10
+    many = dist.sample_to(np.random.default_rng(1), (200,))
+    assert len(np.unique(many.reshape(200, -1), axis=0)) > 10
     theirs = frozen.logpmf if dist.is_discrete else frozen.logpdf
     log_prob = dist.log_prob(draws)
     assert log_prob.shape == (4, 5)

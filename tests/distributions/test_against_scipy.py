@@ -13,7 +13,7 @@ from scipy import special, stats
 import bayesmc.distributions as d
 from tests.distributions.families import (
     FAMILIES,
-    FIXED,
+    FEW,
     assert_close,
     magnitudes,
     parameters_of,
@@ -27,7 +27,7 @@ NAMES = sorted(FAMILIES)
 def test_log_prob_equals_scipys(name: str) -> None:
     family = FAMILIES[name]
 
-    @FIXED
+    @FEW
     @given(parameters_of(name), st.integers(0, 2**32 - 1))
     def check(parameters: list[np.ndarray], seed: int) -> None:
         ours, theirs = family.make(*parameters), family.scipy(*parameters)
@@ -44,7 +44,7 @@ def test_log_prob_equals_scipys(name: str) -> None:
 def test_cdf_and_ppf_equal_scipys(name: str) -> None:
     family = FAMILIES[name]
 
-    @FIXED
+    @FEW
     @given(parameters_of(name), st.integers(0, 2**32 - 1))
     def check(parameters: list[np.ndarray], seed: int) -> None:
         ours, theirs = family.make(*parameters), family.scipy(*parameters)
@@ -70,7 +70,7 @@ def test_cdf_and_ppf_equal_scipys(name: str) -> None:
 def test_moments_equal_scipys(name: str) -> None:
     family = FAMILIES[name]
 
-    @FIXED
+    @FEW
     @given(parameters_of(name))
     def check(parameters: list[np.ndarray]) -> None:
         ours, theirs = family.make(*parameters), family.scipy(*parameters)
@@ -85,7 +85,7 @@ def test_moments_equal_scipys(name: str) -> None:
     check()
 
 
-@FIXED
+@FEW
 @given(st.lists(magnitudes(0.02, 1e4), min_size=1, max_size=6), st.integers(0, 2**32 - 1))
 def test_dirichlet_log_prob_equals_scipys(concentration: list[float], seed: int) -> None:
     x = np.random.default_rng(seed).dirichlet(np.full(len(concentration), 2.0), size=4)
@@ -93,7 +93,7 @@ def test_dirichlet_log_prob_equals_scipys(concentration: list[float], seed: int)
     assert_close(d.Dirichlet(concentration).log_prob(x / x.sum(-1, keepdims=True)), expected)
 
 
-@FIXED
+@FEW
 @given(st.integers(1, 5), st.integers(0, 2**32 - 1))
 def test_mvnormal_log_prob_equals_scipys(size: int, seed: int) -> None:
     # SciPy goes through eigenvalues, which lose digits as the condition grows; it is kept moderate
@@ -110,7 +110,7 @@ def test_mvnormal_log_prob_equals_scipys(size: int, seed: int) -> None:
     assert_close(d.MvNormal(loc, scale_diag=scales).log_prob(x), diagonal)
 
 
-@FIXED
+@FEW
 @given(
     st.lists(magnitudes(1e-9, 1.0), min_size=1, max_size=40),
     st.booleans(),

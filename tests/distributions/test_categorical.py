@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 import bayesmc.distributions as d
 from bayesmc.errors import ParameterError
-from tests.distributions.families import FIXED
+from tests.distributions.families import FEW
 
 
 class LazyGather:
@@ -24,7 +24,7 @@ class LazyGather:
         raise AssertionError("the gather was materialised")
 
 
-@FIXED
+@FEW
 @given(
     st.integers(1, 5), st.integers(1, 70), st.sampled_from([(), (7,), (3, 4)]), st.integers(0, 999)
 )

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 import bayesmc.distributions as d
 from bayesmc import gaussian
 from bayesmc.errors import ParameterError, ShapeError
-from tests.distributions.families import FIXED
+from tests.distributions.families import FEW
 
 
 def exact_distance(cov: np.ndarray, x: np.ndarray) -> float:
@@ -30,7 +30,7 @@ def exact_distance(cov: np.ndarray, x: np.ndarray) -> float:
     return float(sum(Fraction(w) * s for w, s in zip(x, solution, strict=True)))
 
 
-@FIXED
+@FEW
 @given(st.integers(1, 6), st.integers(0, 2**32 - 1), st.floats(0, 9))
 def test_distance_is_exact_under_bad_scaling(size: int, seed: int, decades: float) -> None:
     # components in units up to 10^18 apart: condition numbers to 10^36, no digits may be lost
@@ -56,7 +56,7 @@ def test_distance_under_the_hilbert_matrix(size: int) -> None:
     assert abs(error) <= 20 * np.finfo(float).eps * np.linalg.cond(cov)
 
 
-@FIXED
+@FEW
 @given(
     st.integers(1, 4),
     st.sampled_from([((), ()), ((3,), ()), ((), (3,)), ((2, 1), (3,)), ((3,), (3,))]),
@@ -143,7 +143,7 @@ def test_the_first_matrix_that_is_not_positive_definite_is_named() -> None:
     np.testing.assert_array_equal(factor, np.broadcast_to(np.eye(3), covs.shape))
 
 
-@FIXED
+@FEW
 @given(st.integers(1, 5), st.integers(0, 999))
 def test_the_recording_cholesky_agrees_with_lapack(size: int, seed: int) -> None:
     # a batch with one indefinite matrix takes the slower way, which must factor the rest alike

@@ -11,10 +11,10 @@ from scipy import special, stats
 import bayesmc.distributions as d
 from bayesmc.distributions import mixture as mixture_module
 from bayesmc.errors import ShapeError, UnsupportedError
-from tests.distributions.families import FIXED, assert_close
+from tests.distributions.families import FEW, assert_close
 
 
-@FIXED
+@FEW
 @given(st.integers(1, 5), st.sampled_from([(), (3,), (2, 1)]), st.integers(0, 999))
 def test_log_prob_is_a_log_sum_over_components(count: int, batch: tuple, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -75,7 +75,7 @@ def test_supports_are_joined() -> None:
     np.testing.assert_allclose(counts.probs_table.sum(), 1.0)
 
 
-@FIXED
+@FEW
 @given(st.floats(0.01, 0.99), st.integers(0, 999))
 def test_discrete_quantiles_are_the_least_that_reach_q(q: float, seed: int) -> None:
     rng = np.random.default_rng(seed)

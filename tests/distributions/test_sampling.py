@@ -1,7 +1,7 @@
 """Draws against the distributions they claim to come from, at stated false-alarm rates.
 
-Seeds are fixed, so a test that passes keeps passing; each test's false-alarm rate is ``ALARM`` were
-the seed fresh. Fewer than 1,000 tests run here, so that a fresh run would fail less than once in a thousand.
+Seeds are those of the run, so a test that passes keeps passing; each comparison's false-alarm rate is
+``ALARM``. Fewer than 1,000 are made here, 5,000 in a thorough run, which fails by chance at most once in 200.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from tests.distributions.families import FAMILIES, magnitudes, parameters_of
 
 ALARM = 1e-6
 DRAWS = 10_000
-FIXED = settings(derandomize=True, max_examples=session.scaled(15), deadline=None, database=None)
+FEW = settings(max_examples=session.scaled(15, 5))
 
 
 def uniforms(dist: d.Distribution, draws: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -44,7 +44,7 @@ def p_value(dist: d.Distribution, draws: np.ndarray, rng: np.random.Generator) -
 
 @pytest.mark.parametrize("name", sorted(FAMILIES))
 def test_draws_fit_over_parameters_and_batch_shapes(name: str) -> None:
-    @FIXED
+    @FEW
     @given(parameters_of(name), st.integers(0, 2**32 - 1))
     def check(parameters: list[np.ndarray], seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -61,11 +61,13 @@ MODERATE = [(name, values) for name, family in FAMILIES.items() for values in fa
 
 
 @pytest.mark.parametrize(("name", "values"), MODERATE)
-def test_mean_and_variance_of_draws_agree(name: str, values: tuple[float, ...]) -> None:
+def test_mean_and_variance_of_draws_agree(
+    name: str, values: tuple[float, ...], rng: np.random.Generator
+) -> None:
     # The two means are normal to a good approximation at 10^5 draws of light-tailed families; the
     # variance of (x - mean)^2 is estimated. 4.9 standard errors, two-sided: 10^-6 each.
     dist = FAMILIES[name].make(*values)
-    x = dist.sample(7, 100_000).astype(float)
+    x = dist.sample(rng, 100_000).astype(float)
     squares = (x - dist.mean) ** 2
     for sample, expected in ((x, dist.mean), (squares, dist.var)):
         error = sample.std() / np.sqrt(len(x))
@@ -75,7 +77,7 @@ def test_mean_and_variance_of_draws_agree(name: str, values: tuple[float, ...]) 
 @pytest.mark.parametrize(
     ("claimed", "drawn"),
     [
-        (d.Normal(0.0, 1.0), d.Normal(0.0, 1.12)),
+        (d.Normal(0.0, 1.0), d.Normal(0.0, 1.18)),
         (d.StudentT(3.0, 0.0, 1.0), d.Normal(0.0, 1.0)),
         (d.Gamma(2.0, 3.0), d.Gamma(2.0, 2.7)),
         (d.Beta(2.0, 3.0), d.Beta(2.2, 3.0)),
@@ -83,14 +85,14 @@ def test_mean_and_variance_of_draws_agree(name: str, values: tuple[float, ...]) 
         (d.Poisson(3.5), d.Poisson(3.8)),
         (d.Binomial(12, 0.3), d.Poisson(3.6)),
         (d.Laplace(0.0, 1.0), d.Normal(0.0, np.sqrt(2.0))),
-        (d.Cauchy(0.0, 1.0), d.Cauchy(0.1, 1.0)),
+        (d.Cauchy(0.0, 1.0), d.Cauchy(0.15, 1.0)),
         (d.HalfNormal(1.0), d.HalfNormal(1.1)),
         (d.HalfCauchy(1.0), d.HalfNormal(1.5)),
-        (d.LogNormal(0.0, 1.0), d.LogNormal(0.1, 1.0)),
+        (d.LogNormal(0.0, 1.0), d.LogNormal(0.13, 1.0)),
         (d.InverseGamma(2.0, 3.0), d.InverseGamma(2.0, 2.7)),
-        (d.Weibull(2.0, 3.0), d.Weibull(1.8, 3.0)),
-        (d.VonMises(1.0, 2.0), d.WrappedNormal(1.0, 0.848)),  # of the same circular deviation
-        (d.WrappedNormal(1.0, 1.0), d.WrappedNormal(1.1, 1.0)),
+        (d.Weibull(2.0, 3.0), d.Weibull(1.65, 3.0)),
+        (d.VonMises(1.0, 2.0), d.WrappedNormal(1.0, 0.72)),
+        (d.WrappedNormal(1.0, 1.0), d.WrappedNormal(1.15, 1.0)),
         (d.Geometric(0.3), d.Geometric(0.27)),
         (d.NegativeBinomial(3.0, 0.6), d.Poisson(4.5)),
         (d.Categorical([0.2, 0.3, 0.5]), d.Categorical([0.25, 0.3, 0.45])),
@@ -99,14 +101,14 @@ def test_mean_and_variance_of_draws_agree(name: str, values: tuple[float, ...]) 
     ids=repr,
 )
 def test_draws_of_another_distribution_are_seen(
-    claimed: d.Distribution, drawn: d.Distribution
+    claimed: d.Distribution, drawn: d.Distribution, rng: np.random.Generator
 ) -> None:
-    # negative control of the goodness-of-fit tests, at their own number of draws and alarm rate
-    rng = np.random.default_rng(0)
+    # negative control of the goodness-of-fit tests, at their own number of draws and alarm rate; the
+    # distances are such that a draw of the p-value lies 4.9 standard deviations or more below the rate
     assert p_value(claimed, drawn.sample(rng, DRAWS), rng) < ALARM
 
 
-@FIXED
+@FEW
 @given(
     st.lists(magnitudes(1e-6, 1.0), min_size=1, max_size=60),
     st.sampled_from([(), (1,), (3,), (2, 1)]),
@@ -130,7 +132,7 @@ def test_categorical_draws_fit(
         assert stats.chisquare(counts, expected * counts.sum() / expected.sum()).pvalue > ALARM
 
 
-@FIXED
+@FEW
 @given(st.integers(1, 4), st.sampled_from(["cov", "scale_tril", "scale_diag"]), st.integers(0, 999))
 def test_mvnormal_projections_fit(size: int, form: str, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -152,14 +154,14 @@ def test_mvnormal_projections_fit(size: int, form: str, seed: int) -> None:
         assert stats.kstest(distances[:, k], stats.chi2(size).cdf).pvalue > ALARM
 
 
-def test_mvnormal_with_a_wrong_correlation_is_seen() -> None:
+def test_mvnormal_with_a_wrong_correlation_is_seen(rng: np.random.Generator) -> None:
     # negative control of the projections
-    draws = d.MvNormal([0.0, 0.0], [[1.0, 0.5], [0.5, 1.0]]).sample(1, DRAWS)
+    draws = d.MvNormal([0.0, 0.0], [[1.0, 0.6], [0.6, 1.0]]).sample(rng, DRAWS)
     claimed = d.MvNormal([0.0, 0.0], [[1.0, 0.3], [0.3, 1.0]])
     assert stats.kstest(claimed.squared_mahalanobis(draws), stats.chi2(2).cdf).pvalue < ALARM
 
 
-@FIXED
+@FEW
 @given(st.lists(magnitudes(0.02, 1e3), min_size=2, max_size=5), st.integers(0, 999))
 def test_dirichlet_margins_fit(concentration: list[float], seed: int) -> None:
     # every component, and the sum of the first two, are Beta
@@ -180,7 +182,7 @@ def test_dirichlet_margins_fit(concentration: list[float], seed: int) -> None:
             assert stats.kstest(u, "uniform").pvalue > ALARM
 
 
-@FIXED
+@FEW
 @given(st.lists(magnitudes(1e-3, 1.0), min_size=1, max_size=4), st.integers(0, 999))
 def test_mixture_draws_fit(weights: list[float], seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -197,9 +199,10 @@ def test_mixture_draws_fit(weights: list[float], seed: int) -> None:
 @pytest.mark.parametrize(
     "dist", [d.InverseGamma(0.003, 1e-200), d.Weibull(0.002, 1e200), d.LogNormal(-500.0, 700.0)]
 )
-def test_draws_fit_to_the_ends_of_the_numbers(dist: d.Distribution) -> None:
+def test_draws_fit_to_the_ends_of_the_numbers(
+    dist: d.Distribution, rng: np.random.Generator
+) -> None:
     # what lies beyond the smallest and the largest number is an atom there, spread at random
-    rng = np.random.default_rng(4)
     draws = dist.sample(rng, DRAWS)
     low, high = np.finfo(float).tiny, np.finfo(float).max
     random = rng.random(DRAWS)
@@ -231,8 +234,10 @@ def test_draws_fit_to_the_ends_of_the_numbers(dist: d.Distribution) -> None:
     ],
     ids=repr,
 )
-def test_no_draw_has_density_zero_or_infinite(dist: d.Distribution) -> None:
-    draws = dist.sample(3, 20_000)
+def test_no_draw_has_density_zero_or_infinite(
+    dist: d.Distribution, rng: np.random.Generator
+) -> None:
+    draws = dist.sample(rng, 20_000)
     assert np.isfinite(dist.log_prob(draws)).all()
     assert dist.support.contains(draws).all()
 

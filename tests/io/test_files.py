@@ -14,7 +14,7 @@ from bayesmc.errors import FileFormatError, UnsupportedError
 from bayesmc.io.bif import format_bif
 from bayesmc.io.record import TableNode
 from bayesmc.io.xmlbif import format_xmlbif
-from bayesmc.testing import random_net
+from bayesmc.testing import random_net, session
 
 SUFFIXES = [".bif", ".xmlbif", ".bifxml", ".xml"]
 MARKS = {".bif": "probability (", ".xmlbif": "<TABLE>", ".bifxml": "<TABLE>", ".xml": "<TABLE>"}
@@ -68,7 +68,7 @@ def test_other_names_are_refused_with_those_known(tmp_path, call, name):
 
 
 @given(seed=st.integers(0, 2**32), suffix=st.sampled_from(SUFFIXES))
-@settings(max_examples=60)
+@settings(max_examples=session.scaled(60, 5))
 def test_random_nets_round_trip(tmp_path_factory, seed, suffix):
     net = random_net(seed, nodes=(1, 5))
     path = tmp_path_factory.mktemp("nets") / f"net{suffix}"

@@ -53,14 +53,14 @@ class Edit:
 
     def _compiled(self, function: FunctionType) -> CodeType:
         lines, _ = inspect.getsourcelines(function.__code__)
-        source = textwrap.dedent("".join(lines))
+        right = source = textwrap.dedent("".join(lines))
         for old, new in ((self.old, self.new), *self.also):
             count = source.count(old)
             if count != 1:
                 raise StaleFault(f"{self.where} holds {old!r} {count} times, not once")
             source = source.replace(old, new)
         code = _recompiled(source, function)
-        if _meaning(code) == _meaning(function.__code__):
+        if _meaning(code) == _meaning(_recompiled(right, function)):
             raise StaleFault(f"{self.where}: {self.new!r} for {self.old!r} changes nothing")
         return code
 

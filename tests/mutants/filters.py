@@ -39,37 +39,38 @@ def unknown_drift() -> bmc.DynamicBayesNet:
 
 ROWS = {"y": [0.5, 1.5, 3.0, 2.0]}
 RISING = {"y": [0.0, 2.0, 4.0]}
-PARTICLES = "unbiased_evidence_test, 100 runs of 10 particles"
-ALWAYS = bmc.ParticleFilter(10, ess_threshold=2.0)
+PARTICLES = "unbiased_evidence_test, 100 runs of 30 particles"
+MILD = {"y": [0.3, 0.8, 1.2, 0.7]}
+ALWAYS = bmc.ParticleFilter(30, ess_threshold=2.0)
 
 MUTANTS = [
     Mutant(
         "weights are not reset after resampling",
         (Edit("bayesmc.engines.particles.mover:Mover._selected",
               "carried: Any = 0.0", "carried: Any = cloud.log_weights[chosen]"),),
-        evidence_of(line, ROWS, ALWAYS, 100),
+        evidence_of(line, MILD, ALWAYS, 100),
         PARTICLES,
     ),
     Mutant(
         "the log evidence forgets earlier weights where it does not resample",
         (Edit("bayesmc.engines.particles.mover:Mover._weighted",
               "log_total - selection.spent,", "float(np.log(np.mean(np.exp(log - carried)))),"),),
-        evidence_of(line, ROWS, bmc.ParticleFilter(10, ess_threshold=0.0), 100),
-        PARTICLES,
+        evidence_of(line, MILD, bmc.ParticleFilter(30, ess_threshold=0.0), 200),
+        "unbiased_evidence_test, 200 runs of 30 particles",
     ),
     Mutant(
         "an auxiliary filter forgets the first-stage weights",
         (Edit("bayesmc.engines.particles.mover:Mover._selected",
               "carried = -(factor[chosen] if not self.apart else np.take_along_axis(factor, chosen, 0))",
               "carried = 0.0"),),
-        evidence_of(line, ROWS, bmc.ParticleFilter(10, ess_threshold=2.0, auxiliary=True), 100),
+        evidence_of(line, MILD, bmc.ParticleFilter(30, ess_threshold=2.0, auxiliary=True), 100),
         PARTICLES,
     ),
     Mutant(
         "an auxiliary filter's evidence forgets the first stage",
         (Edit("bayesmc.engines.particles.mover:Mover._selected",
               "gained = level + np.log(chosen_from) - total", "gained = 0.0"),),
-        evidence_of(line, ROWS, bmc.ParticleFilter(10, ess_threshold=2.0, auxiliary=True), 100),
+        evidence_of(line, MILD, bmc.ParticleFilter(30, ess_threshold=2.0, auxiliary=True), 100),
         PARTICLES,
     ),
     Mutant(

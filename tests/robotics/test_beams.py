@@ -14,6 +14,7 @@ from scipy import integrate, stats
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import ConvergenceWarning, ParameterError, ShapeError
 from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges, fit_beams
+from bayesmc.testing import session
 
 END = 8.0
 MODEL = BeamModel(0.5, 0.2, 0.1, 0.2, sigma_hit=0.3, lambda_short=0.7, max_range=END)
@@ -134,7 +135,7 @@ def test_far_tails_do_not_underflow():
     assert float(Beams([1.0], hit).log_prob([7.0])) == pytest.approx(-180_000, rel=1e-3)
 
 
-@settings(max_examples=40)
+@settings(max_examples=session.scaled(40, 5))
 @given(st.floats(0, 10), st.floats(0, 10), st.floats(0.01, 10), st.floats(0.01, 10))
 def test_never_nan(expected: float, reading: float, sigma: float, rate: float):
     model = replace(MODEL, sigma_hit=sigma, lambda_short=rate)

@@ -20,6 +20,7 @@ from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.robotics.field import LikelihoodField
 from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
 from bayesmc.robotics.raycast import ray_cast
+from bayesmc.testing import session
 
 ANGLES = np.linspace(-2.0, 2.0, 11)
 REACH = 6.0
@@ -89,7 +90,7 @@ def test_loop_over_beams(options: dict):
     assert np.mean(np.abs(moved - found)[on_map] > 2e-3) > 0.8  # the comparison would see one cell
 
 
-@settings(max_examples=40)
+@settings(max_examples=session.scaled(40, 5))
 @given(st.integers(0, 10**6), st.floats(-1e4, 1e4))
 def test_turns_cost_nothing(seed: int, turns: float):
     field = standard()

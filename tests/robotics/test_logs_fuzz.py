@@ -23,6 +23,7 @@ from bayesmc.robotics.logs import (
     read_plaza_ranges,
     read_wean,
 )
+from bayesmc.testing import session
 
 FORMATS = {
     "carmen": (
@@ -121,7 +122,7 @@ def quiet(log):
 
 
 @pytest.mark.parametrize("name", FORMATS)
-@settings(max_examples=60)
+@settings(max_examples=session.scaled(60, 5))
 @given(data=st.data())
 def test_every_line_is_accounted_for_and_both_modes_agree(name, data):
     read = FORMATS[name][0]
@@ -136,7 +137,7 @@ def test_every_line_is_accounted_for_and_both_modes_agree(name, data):
 
 
 @pytest.mark.parametrize("name", sorted(set(FORMATS) - {"freiburg"}))
-@settings(max_examples=40)
+@settings(max_examples=session.scaled(40, 5))
 @given(data=st.data())
 def test_sound_lines_read_as_if_they_were_alone(name, data):
     read = FORMATS[name][0]
@@ -151,7 +152,7 @@ def test_sound_lines_read_as_if_they_were_alone(name, data):
 
 
 @pytest.mark.parametrize("name", TIMED)
-@settings(max_examples=30)
+@settings(max_examples=session.scaled(30, 5))
 @given(
     place=st.integers(0, 39),
     wrong=st.floats(allow_nan=False, allow_infinity=False),
@@ -168,7 +169,7 @@ def test_one_wrong_time_costs_little(name, place, wrong, step):
     assert len(log.faults) <= 1 + 60.0 / step
 
 
-@settings(max_examples=60)
+@settings(max_examples=session.scaled(60, 5))
 @given(st.binary(max_size=400), st.booleans(), st.integers(0, 400))
 def test_any_bytes_in_a_file(tmp_path_factory, data, packed, cut):
     path = tmp_path_factory.getbasetemp() / "fuzz.log"

@@ -14,6 +14,7 @@ from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.robotics import raycast
 from bayesmc.robotics.grid import OccupancyGrid
 from bayesmc.robotics.raycast import RayTable, ray_cast
+from bayesmc.testing import session
 
 SMALL = hnp.arrays(
     bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.booleans()
@@ -71,7 +72,7 @@ def starts(grid: OccupancyGrid, count: int, seed: int, beyond: float = 0.0) -> n
     return rng.uniform(low, high, (count, 3))
 
 
-@settings(max_examples=60)
+@settings(max_examples=session.scaled(60, 5))
 @given(SMALL, st.integers(0, 10_000))
 def test_steps_of_a_fiftieth(occupied: np.ndarray, seed: int):
     grid = OccupancyGrid(occupied.astype(float), 0.5, origin=(3.0, -1.0))

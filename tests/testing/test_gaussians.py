@@ -30,6 +30,7 @@ from bayesmc.testing import (
     enumerate_posterior,
     gaussian_evidence,
     random_gaussian_net,
+    session,
 )
 from bayesmc.testing.conditional_gaussian import DiscretePart, GaussianPart, PlainNode
 
@@ -342,7 +343,7 @@ def test_what_nets_hold() -> None:
     def note(what: str, there: bool = True) -> None:
         seen[what] = seen.get(what, 0) + bool(there)
 
-    for seed in range(70):
+    for seed in range(session.seed(), session.seed() + 70):
         net, plain = random_gaussian_net(seed, **KINDS["vectors in plates"])
         for name, node in plain.nodes.items():
             kind = net[name].kind
@@ -368,7 +369,7 @@ def test_what_nets_hold() -> None:
             note("switched noise", bool(np.ptp(part.covariance, axis=over).any()))
             note("coloured noise", bool(np.triu(part.covariance, 1).any()))
         note("zero probability", any((part.table == 0).any() for part in plain.discrete))
-    assert min(seen.values()) >= 20, seen
+    assert min(seen.values()) >= 8, seen
     assert len(seen) == 15
 
 

@@ -16,6 +16,7 @@ from bayesmc.testing import (
     evidence_for,
     random_evidence,
     random_net,
+    session,
 )
 from bayesmc.testing.spelling import as_code
 
@@ -120,7 +121,7 @@ def test_evidence_is_possible_and_of_every_form() -> None:
     assert forms >= {"int", "float", "str", "ndarray", "MaskedArray", "missing labels", "NaN"}
 
 
-@settings(max_examples=30)
+@settings(max_examples=session.scaled(30, 5))
 @given(bayes_nets(**EVERYTHING), st.data())
 def test_strategies_give_valid_nets_and_possible_evidence(net: bmc.BayesNet, data) -> None:
     net.validate()

@@ -16,7 +16,7 @@ import bayesmc as bmc
 from bayesmc.diagnostics import log_sum_exp, normalised, weight_ess
 from bayesmc.errors import MissingExtraError, UnsupportedError
 from bayesmc.resampling import SCHEMES
-from bayesmc.testing import enumerate_posterior, random_evidence, random_net
+from bayesmc.testing import enumerate_posterior, random_evidence, random_net, session
 from bayesmc.testing.families import _FAMILIES, random_distribution
 from bayesmc.testing.spelling import as_code
 from bayesmc.testing.strategies import (
@@ -29,15 +29,8 @@ from bayesmc.testing.strategies import (
 )
 from bayesmc.testing.weights import random_log_weights
 
-#: no examples of earlier runs: the same in every run
-FIXED = settings(
-    max_examples=20,
-    derandomize=True,
-    deadline=None,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
-SHRINK = settings(FIXED, max_examples=300, phases=(Phase.generate, Phase.shrink))
+FEW = settings(max_examples=session.scaled(20, 5), suppress_health_check=[HealthCheck.too_slow])
+SHRINK = settings(FEW, max_examples=300, phases=(Phase.generate, Phase.shrink))
 
 
 def smallest(strategy: Any, fault: Callable[[Any], bool]) -> Any:
@@ -143,7 +136,7 @@ def test_least_states_are_kept() -> None:
         assert {len(net[n].states or ()) for n in net} <= {3, 4}
 
 
-@FIXED
+@FEW
 @given(bayes_nets(plates=True, states=(2, 4), coupling=3.0, configurations=1 << 10))
 def test_exact_equals_enumeration(net: bmc.BayesNet) -> None:
     evidence = random_evidence(net, 0)
@@ -162,7 +155,7 @@ def test_exact_equals_enumeration(net: bmc.BayesNet) -> None:
 # ---- templates, graphs --------------------------------------------------------------------------
 
 
-@settings(FIXED, max_examples=15)
+@settings(FEW, max_examples=session.scaled(15, 5))
 @given(dbns(nodes=(1, 2), steps=(1, 3)))
 def test_filters_equal_the_unrolled_net(case: Any) -> None:
     engine = bmc.DiscreteFilter()
@@ -199,7 +192,7 @@ def by_brute_force(graph: bmc.FactorGraph) -> tuple[float, dict[str, np.ndarray]
     return log_sum_exp(log_p), chances
 
 
-@FIXED
+@FEW
 @given(factor_graphs(coupling=3.0, configurations=1 << 9))
 def test_exact_sums_factor_graphs(graph: bmc.FactorGraph) -> None:
     log_z, chances = by_brute_force(graph)
@@ -225,7 +218,7 @@ def test_a_lost_factor_is_found_and_shrunk() -> None:
     assert len(as_code(found).splitlines()) == 3
 
 
-@settings(FIXED, max_examples=15)
+@settings(FEW, max_examples=session.scaled(15, 5))
 @given(factor_graphs(continuous=True))
 def test_continuous_graphs_are_gaussian_and_gibbs_takes_them(graph: bmc.FactorGraph) -> None:
     names = [n for n, v in graph.variables.items() if v.states is None]
@@ -310,7 +303,7 @@ def test_log_weights_have_what_they_promise() -> None:
     assert any(np.isneginf(random_log_weights(seed, all_zero=True)).all() for seed in range(60))
 
 
-@FIXED
+@FEW
 @given(log_weights())
 def test_weights_are_normalised_and_resampled(log_w: np.ndarray) -> None:
     weights = normalised(log_w)

@@ -106,7 +106,7 @@ def random_dbn(seed: Any, **options: Any) -> RandomDbn:
 
     Examples
     --------
-    >>> from bayesmc.testing.dbns import random_dbn
+    >>> from bayesmc.testing.templates import random_dbn
     >>> random_dbn(3).story == random_dbn(3).story
     True
     """
