@@ -27,11 +27,11 @@ demo: .venv/.extras-plot,robotics
 	$(PY) -m examples.demo
 
 test: .venv/.extras-plot,arviz,robotics,test
-	$(PY) -m pytest -q -n auto --dist worksteal
+	OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -q -n auto --dist worksteal
 
 # the last lines say the seed; `make test-thorough BAYESMC_SEED=N` takes it again
 test-thorough: .venv/.extras-plot,arviz,robotics,test
-	$(PY) -m pytest -q -n auto --dist worksteal --bayesmc-thorough
+	OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -q -n auto --dist worksteal --bayesmc-thorough
 
 mutants: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m tests.mutants

@@ -119,7 +119,7 @@ def draw(posteriors: dict[int, Any]) -> Any:
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print what each width reaches, and draw traces and histograms."""
     options = picture.options(__doc__, arguments)
-    draws = 1_000 if options.fast else 10_000
+    draws = 300 if options.fast else 10_000
     print(f"Metropolis-Hastings on two hills: {CHAINS} chains of {draws:,} steps for each width")
     posteriors = {width: explored(width, draws) for width in WIDTHS}
     report(posteriors)

@@ -189,7 +189,7 @@ def show(ax: Any, image: np.ndarray, above: robotics.Ceiling, cmap: str, **limit
 def main(arguments: Sequence[str] | None = None) -> None:
     """Print errors with and without the sensor; draw the map, the likelihoods and one drive."""
     options = picture.options(__doc__, arguments)
-    runs, particles = (4, 500) if options.fast else (RUNS, PARTICLES)
+    runs, particles = (2, 250) if options.fast else (RUNS, PARTICLES)
     above = ceiling()
     report(errors(above, runs, particles), particles)
     picture.save(draw_map(above), options.out, "ceiling_map")

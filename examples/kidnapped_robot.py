@@ -134,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     log = robot_logs.spliced(whole, AT, TO, 60 if options.fast else None)
     assert whole.truth is not None
     far = np.hypot(*(whole.truth[TO] - whole.truth[AT - 1])[:2])
-    particles = PARTICLES // 2 if options.fast else PARTICLES
+    particles = PARTICLES // 10 if options.fast else PARTICLES
     print(f"{log.name}: carried off after {AT} scans, {far:.0f} m away; {particles:,} particles")
     found = {name: run(log, recovery, AT, particles) for name, recovery in recoveries(log).items()}
     report(found, AT)

@@ -33,7 +33,7 @@ from examples.robot_logs import Log
 SEED, PARTICLES, LEAST = 1, 20_000, 1_000
 SHOWN = (0, 10, 65)  # scans after which the particles are drawn
 FRAMES, DOTS = 60, 2_000  # of the animation, and particles in each
-QUICK = 120  # scans with --fast
+QUICK = 80  # scans with --fast
 
 
 class Run(NamedTuple):

@@ -1,7 +1,7 @@
 """Every planted fault is caught, and every test passes without its fault; the harness notices when not.
 
-One fixed seed each; ``python -m tests.mutants`` takes 100 fresh ones. All tests have a false-alarm rate of 1e-6,
-and their sizes are such that a fault is missed less often than once in ten thousand seeds.
+One fixed seed each; ``python -m tests.mutants`` takes 100 fresh ones. All tests have a false-alarm rate of
+1e-6, and their sizes are such that a fault is missed less often than once in ten thousand seeds.
 """
 
 from __future__ import annotations
@@ -78,7 +78,9 @@ def test_an_alarm_without_the_fault_is_reported() -> None:
 
     row = examined(Mutant("alarm", (FAULT,), wrong, "check_density"), range(2))
     assert row.alarms == 2
-    assert any(problem.startswith("an alarm without the fault at 2 seeds") for problem in row.problems)
+    assert any(
+        problem.startswith("an alarm without the fault at 2 seeds") for problem in row.problems
+    )
 
 
 def test_an_error_is_no_catch() -> None:

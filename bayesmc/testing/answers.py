@@ -75,6 +75,16 @@ class ExactAnswer:
         """Probabilities of the states, ``(*plates, states)``; of several nodes jointly."""
         return self._by_slice(self.answer.probabilities, *names)
 
+    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions.
+
+        Raises
+        ------
+        UnsupportedError
+            An answer by quadrature.
+        """
+        return self.answer.sample(draws, rng)
+
     def mean(self, name: str) -> np.ndarray:
         """Posterior mean, ``(*plates, *event)``."""
         return self._by_slice(self.answer.mean, name)

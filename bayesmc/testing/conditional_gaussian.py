@@ -261,6 +261,19 @@ class GaussianAnswer:
         """Weights ``(C,)``, means ``(C, n)`` and covariances ``(C, n, n)`` of all scalars of the nodes."""
         return (self.weights, *self._moments(names))
 
+    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions."""
+        at = rng.choice(len(self.weights), size=draws, p=self.weights / self.weights.sum())
+        roots, size = _roots(self.covs), self.means.shape[1]
+        numbers = np.matvec(roots[at], rng.standard_normal((draws, size)))
+        numbers = self.means[at] + np.where(self._is_known[at], 0.0, numbers)
+        found = {}
+        for node in self.nodes.values():
+            columns = [self._column(node, e, at, numbers) for e in range(node.elements)]
+            shape = (draws, *node.plate_shape, *node.event_shape)
+            found[node.name] = np.stack(columns, axis=1).reshape(shape)
+        return found
+
     def density(self, name: str, points: np.ndarray) -> np.ndarray:
         """Marginal density of every scalar at ``points``, shape ``(*points.shape, *plates, *event)``.
 
@@ -275,6 +288,24 @@ class GaussianAnswer:
             parts = np.where(variances > 0, np.exp(logs), 0.0)
         density = (parts * self.weights[:, None]).sum(axis=-2)
         return density.reshape(points.shape[:-2] + node.plate_shape + node.event_shape)
+
+    @property
+    def _is_known(self) -> np.ndarray:
+        """Scalars whose variance is rounding error, by configuration."""
+        variances = np.diagonal(self.covs, axis1=1, axis2=2)
+        return variances <= 1e-12 * np.maximum(1.0, self.means**2)
+
+    def _column(
+        self, node: PlainNode, element: int, at: np.ndarray, numbers: np.ndarray
+    ) -> np.ndarray:
+        """Draws of one element of a node."""
+        if node.states is not None:
+            positions = self.states[node.name, element][at]
+            return (
+                positions if isinstance(node.states[0], str) else np.array(node.states)[positions]
+            )
+        places = [self.index[node.name, element, k] for k in range(math.prod(node.event_shape))]
+        return numbers[:, places]
 
     def _moments(self, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
         """Means and covariances by configuration; a discrete node's number has no variance there."""
@@ -304,6 +335,12 @@ class GaussianAnswer:
         if name not in self.nodes:
             raise UnknownNodeError(f"GaussianAnswer: no node {name!r}; ask {', '.join(self.nodes)}")
         return self.nodes[name]
+
+
+def _roots(covs: np.ndarray) -> np.ndarray:
+    """Square roots of covariances, which may be singular."""
+    values, vectors = np.linalg.eigh(covs)
+    return vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
 
 
 def _condition(

@@ -28,7 +28,6 @@ from bayesmc.testing.figures import (
     compare_states,
     compare_var,
 )
-from bayesmc.testing.oracle import Enumerated
 from bayesmc.testing.samples import Draws, energy_comparison
 from bayesmc.testing.verdict import Verdict, counted
 
@@ -302,10 +301,8 @@ def _rows(
     """Independent draws of an answer; None where it has none."""
     if isinstance(answer, DrawsPosterior):
         return Draws(answer).independent(names, most, rng)
-    if isinstance(answer, Enumerated):
-        if answer.accuracy:
-            return None
-        at = rng.choice(len(answer.weights), size=most, p=answer.weights / answer.weights.sum())
-        return {name: np.asarray(answer.values(name)).view(np.ndarray)[at] for name in names}
+    if hasattr(answer, "sample"):  # an oracle
+        drawn = asked(answer, "sample", most, rng)
+        return None if drawn is None else {name: drawn[name] for name in names}
     drawn = asked(answer, "resample", most, rng)
     return None if drawn is None else Draws(drawn).independent(names, most, rng)

@@ -65,6 +65,21 @@ class Enumerated:
         """What functions receive of a node: ``(configurations, *plates, *event)``."""
         return self.model[name].decode(self._of(name))
 
+    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions.
+
+        Raises
+        ------
+        UnsupportedError
+            Where points of a quadrature rule stand for continuous values.
+        """
+        if self.accuracy:
+            raise UnsupportedError(
+                "an answer by quadrature has points and no draws of continuous nodes; draw with an engine"
+            )
+        at = rng.choice(len(self.weights), size=draws, p=self.weights / self.weights.sum())
+        return {n: np.asarray(self.values(n)).view(np.ndarray)[at] for n in self.names}
+
     def probabilities(self, *names: str) -> np.ndarray:
         """Probabilities of the states, ``(*plates, states)``, or of several nodes jointly, whose plates
         lead in order of appearance and are shared by name."""

@@ -35,14 +35,14 @@ def repeated_test(
 ) -> Verdict:
     """Hold the mean of a random answer over many runs against the exact answer.
 
-    **False-alarm rate.** At most ``alpha`` for all figures of a call (Holm's method), in the limit of many runs,
-    where the answer is unbiased. A mean is judged in each tail by Student's t and by Hall's transformation of it,
-    which removes skewness to first order; the larger p-value counts. With 200 runs that is close for
-    figures no more skewed than exponential ones. What ``accuracy`` explains does not count. A figure that is
-    the same in every run has no chance in it, and must agree to 1e-9 (and ``accuracy``).
+    **False-alarm rate.** At most ``alpha`` for all figures of a call (Holm's method), in the limit of many
+    runs, where the answer is unbiased. A mean is judged in each tail by Student's t and by Hall's
+    transformation of it, which removes skewness to first order; the larger p-value counts. It is exact for
+    normal figures. What ``accuracy`` explains does not count. A figure that is the same in every run has no
+    chance in it, and must agree to 1e-9 (and ``accuracy``).
 
-    An answer may be right in the limit of many particles and biased before, as averages by normalised weights are:
-    then take many particles, few runs, or an ``accuracy``.
+    An answer may be right in the limit of many particles and biased before, as averages by normalised weights
+    are: then take many particles, few runs, or an ``accuracy``.
 
     Parameters
     ----------

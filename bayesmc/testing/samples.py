@@ -42,6 +42,10 @@ _ROWS = 1000
 _APART = 2.0
 
 
+#: digits of a column's largest number to which two samples are held against each other
+_DIGITS = 10
+
+
 def same_distribution(
     first: Any,
     second: Any,
@@ -347,7 +351,9 @@ def _features(both: np.ndarray, is_angle: bool, is_label: bool) -> list[np.ndarr
 
 
 def _ranks(column: np.ndarray) -> np.ndarray:
-    """Ranks with ties at their mean."""
+    """Ranks with ties at their mean; numbers that differ by rounding errors are tied."""
+    if column.dtype.kind == "f":
+        column = np.round(column / (np.abs(column).max(initial=0.0) or 1.0), _DIGITS)
     _, inverse, counts = np.unique(column, return_inverse=True, return_counts=True)
     last = np.cumsum(counts)
     return (last - (counts - 1) / 2)[inverse]

@@ -39,7 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for problem in row.problems:
             print(f"    ! {problem}", flush=True)
         failed += bool(row.problems)
-    print(f"\n{len(chosen) - failed} of {len(chosen)} mutants caught at every seed, without false alarms")
+    print(
+        f"\n{len(chosen) - failed} of {len(chosen)} mutants caught at every seed, without false alarms"
+    )
     return 1 if failed else 0
 
 
@@ -49,12 +51,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _read(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m tests.mutants",
-        description="Plant faults in the library one by one, and show that tests of bayesmc.testing catch them.",
+        description="Plant faults in the library one by one; tests of bayesmc.testing must catch them.",
     )
     parser.add_argument("--seeds", type=_count, default=100, help="seeds for each mutant (100)")
     parser.add_argument("--only", default="", help="mutants with this in name, place or test")
     parser.add_argument("--jobs", type=_count, default=2, help="processes (2)")
-    parser.add_argument("--seed", type=int, help="first seed; by default a fresh one, which is printed")
+    parser.add_argument(
+        "--seed", type=int, help="first seed; by default a fresh one, which is printed"
+    )
     return parser.parse_args(arguments)
 
 

@@ -18,7 +18,6 @@ from bayesmc.testing.balance import detailed_balance, invariant
 from bayesmc.testing.geweke import geweke_test
 from bayesmc.testing.ranks import rank_test
 from bayesmc.testing.verdict import Verdict
-
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
 from tests.mutants.tests_of import matched
@@ -135,9 +134,7 @@ def ring() -> bmc.FactorGraph:
     graph = bmc.FactorGraph("ring", plates={"i": 4})
     graph.variable("s", bmc.Bernoulli(0.5).support, plates="i")
     graph.factor(lambda a, b: 0.9 * (a == b), scope=("s", "s"), index=([0, 1, 2, 3], [1, 2, 3, 0]))
-    graph.factor(
-        lambda a, b, c: 0.6 * a * b * c, scope=("s", "s", "s"), index=([0], [1], [2])
-    )
+    graph.factor(lambda a, b, c: 0.6 * a * b * c, scope=("s", "s", "s"), index=([0], [1], [2]))
     return graph
 
 

@@ -8,7 +8,6 @@ import bayesmc as bmc
 from bayesmc.resampling import multinomial, residual, systematic
 from bayesmc.testing.answers import exact
 from bayesmc.testing.calibration import simulation_based_calibration
-
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
 from tests.mutants.tests_of import estimated, evidence_of, matched
@@ -79,7 +78,8 @@ MUTANTS = [
               "        self.node.name, dist, state.rng, state.batch\n    )",
               "state.values[self.node.name] = self.model.sample_stored(\n"
               "        self.node.name, dist, state.rng, state.batch\n    )\n"
-              "    state.weigh(self.model.log_density(self.node.name, dist, state.values[self.node.name]))"),),
+              "    drawn = state.values[self.node.name]\n"
+              "    state.weigh(self.model.log_density(self.node.name, dist, drawn))"),),
         matched(mixture, SEEN, WEIGHTED),
         MATCHED,
     ),
@@ -103,8 +103,8 @@ MUTANTS = [
         (Edit("bayesmc.results.draws:DrawsPosterior.quantile",
               'np.quantile(flat, levels, axis=0, weights=weights, method="inverted_cdf")',
               "np.quantile(flat, levels, axis=0)"),),
-        estimated(median, MEDIAN, 20),
-        "repeated_test, 20 runs of 2000 draws",
+        estimated(median, MEDIAN, 40),
+        "repeated_test, 40 runs of 2000 draws",
     ),
     Mutant(
         "the evidence is averaged over one draw too many",
@@ -129,10 +129,11 @@ MUTANTS = [
     ),
     Mutant(
         "what was observed is not weighed",
-        (Edit("bayesmc.network.forward:Weigh.__call__", "self.weigh(state)", "state.weigh(np.zeros(state.batch))"),),
+        (Edit("bayesmc.network.forward:Weigh.__call__",
+              "self.weigh(state)", "state.weigh(np.zeros(state.batch))"),),
         lambda seed: simulation_based_calibration(
-            bmc.LikelihoodWeighting(100), mixture(), replications=100, alpha=ALPHA, rng=seed),
-        "simulation_based_calibration, 100 replications of 100 draws",
+            bmc.LikelihoodWeighting(100), mixture(), replications=200, alpha=ALPHA, rng=seed),
+        "simulation_based_calibration, 200 replications of 100 draws",
     ),
     Mutant(
         "systematic resampling with a fixed offset",

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 import bayesmc as bmc
-
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import Mutant
 from tests.mutants.tests_of import matched

@@ -6,7 +6,6 @@ the fault must be written anew. What a fault does, and who should notice, is not
 """
 
 from __future__ import annotations
-
 import __future__
 
 import ast

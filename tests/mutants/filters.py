@@ -1,11 +1,10 @@
-"""Faults over time: particle filters and smoothers, Kalman and discrete filters, chains of particle filters."""
+"""Faults over time: particle filters, smoothers and the chains made of them, Kalman and discrete filters."""
 
 from __future__ import annotations
 
 import numpy as np
 
 import bayesmc as bmc
-
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import Mutant
 from tests.mutants.tests_of import evidence_of, matched, slices
@@ -23,7 +22,9 @@ def machine() -> bmc.DynamicBayesNet:
     """Three states that follow each other, with readings."""
     dbn = bmc.DynamicBayesNet()
     step = np.array([[0.1, 0.8, 0.1], [0.1, 0.2, 0.7], [0.6, 0.1, 0.3]])
-    dbn.add("z", lambda z_prev: bmc.Categorical(step[z_prev]), initial=bmc.Categorical([0.6, 0.3, 0.1]))
+    dbn.add(
+        "z", lambda z_prev: bmc.Categorical(step[z_prev]), initial=bmc.Categorical([0.6, 0.3, 0.1])
+    )
     dbn.add("y", lambda z: bmc.Normal(1.5 * z, 1.0))
     return dbn
 

@@ -14,10 +14,9 @@ from typing import Any
 
 from bayesmc.errors import BayesmcWarning
 from bayesmc.testing.verdict import Verdict, uncounted
-
 from tests.mutants.faults import Fault, planted
 
-#: false-alarm rate of every test here: the table of 100 seeds raises none but once in hundreds of runs
+#: false-alarm rate of every test here: a table of 100 seeds has one but once in some hundred runs
 ALPHA = 1e-6
 
 

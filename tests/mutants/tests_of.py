@@ -13,7 +13,6 @@ from bayesmc.testing.evidence import unbiased_evidence_test
 from bayesmc.testing.matching import compare
 from bayesmc.testing.repeated import repeated_test
 from bayesmc.testing.verdict import Verdict
-
 from tests.mutants.mutant import ALPHA
 
 Make = Callable[[], Any]
@@ -63,9 +62,7 @@ def slices(ask: Callable[..., Any], dbn: Make, observations: Any, engine: Any, r
 
 def estimated(estimate: Callable[[np.random.Generator], Any], right: Any, runs: int) -> Test:
     """Any estimate, in several runs."""
-    return lambda seed: repeated_test(
-        estimate, right, replications=runs, alpha=ALPHA, rng=seed
-    )
+    return lambda seed: repeated_test(estimate, right, replications=runs, alpha=ALPHA, rng=seed)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -18,11 +18,13 @@ from bayesmc.errors import (
 )
 from bayesmc.network import pose
 from bayesmc.testing import (
+    compare,
     enumerate_posterior,
     gaussian_evidence,
     random_evidence,
     random_gaussian_net,
     random_net,
+    same_distribution,
 )
 from bayesmc.testing.answers import ExactAnswer, exact
 from bayesmc.testing.linear import linear_posterior
@@ -242,3 +244,31 @@ def test_refusals() -> None:
     with pytest.raises(ZeroProbabilityError):
         exact(impossible, {"b": 0})
     assert isinstance(exact(impossible, {"b": 1}), ExactAnswer)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_draws_of_an_answer_have_its_law(seed: int) -> None:
+    """Against draws of the engine, jointly, at 1e-4; a wrong coupling with right marginals is seen."""
+    net, _ = random_gaussian_net(seed, plates=True, vectors=True)
+    evidence = gaussian_evidence(net, seed, chance=0.25)
+    answer = exact(net, evidence)
+    engine = bmc.infer(net, evidence, engine=bmc.Exact())
+    assert compare(engine, answer, 1e-4, draws=200, rng=seed)
+
+
+def test_draws_of_an_answer_are_coupled() -> None:
+    net = bmc.BayesNet()
+    net.table("a", probs=[0.4, 0.6], states=["no", "yes"])
+    net.add("x", lambda a: bmc.Normal(4.0 * (a == "yes"), 1.0))
+    answer = exact(net)
+    assert answer.method == "linear-Gaussian"
+    drawn = answer.sample(400, np.random.default_rng(0))
+    again = answer.sample(400, np.random.default_rng(1))
+    assert set(np.unique(drawn["a"])) == {0, 1}
+    assert same_distribution(drawn, again, rng=0)
+    shuffled = {**again, "a": np.random.default_rng(2).permutation(again["a"])}
+    assert not same_distribution(drawn, shuffled, rng=0)
+    curved = bmc.BayesNet()
+    curved.add("x", bmc.Gamma(2.0, 1.0))
+    with pytest.raises(UnsupportedError, match="quadrature has points and no draws"):
+        exact(curved).sample(3, np.random.default_rng(0))
