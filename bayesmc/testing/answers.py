@@ -242,11 +242,23 @@ def exact(
         "quadrature": lambda: quadrature_posterior(net, evidence, inputs),
     }
     passed_over: dict[str, str] = {}
+    partial: dict[str, Enumerated | GaussianAnswer] = {}
+    wanted = [n for n, node in problem.model.nodes.items() if node.kind != "input"]
     for method, oracle in oracles.items():
         try:
-            return ExactAnswer(method, oracle(), steps, passed_over)
+            answer = oracle()
         except UnsupportedError as error:
             passed_over[method] = str(error)
+            continue
+        left_out = [name for name in wanted if name not in answer.names]
+        if not left_out:
+            return ExactAnswer(method, answer, steps, passed_over)
+        partial[method] = answer
+        passed_over[method] = f"it leaves out {', '.join(map(repr, left_out))}"
+    if partial:  # what nothing observed depends on, and no oracle can say
+        method = max(partial, key=lambda m: len(partial[m].names))
+        others = {m: why for m, why in passed_over.items() if m != method}
+        return ExactAnswer(method, partial[method], steps, others)
     reasons = "".join(f"\n  {method}: {why}" for method, why in passed_over.items())
     raise UnsupportedError(
         f"exact: no oracle answers this net:{reasons}\nObserve more, take fewer elements or steps, or "

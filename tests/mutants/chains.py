@@ -204,8 +204,8 @@ MUTANTS = [
         "a Jacobian is missing: slices along learnt directions",
         (Edit("bayesmc.kernels.factor_slice:FactorSlice._split",
               "volume + transform.log_abs_det_jacobian(part)", "volume"),),
-        ranks(lambda: lambda target: FactorSlice(target, ("m", "s")), scales, 300, warmup=10),
-        "rank_test, 300 replications",
+        ranks(lambda: lambda target: FactorSlice(target, ("m", "s")), scales, 600, warmup=10),
+        "rank_test, 600 replications",
     ),
     Mutant(
         "adaptation never freezes",
@@ -216,8 +216,8 @@ MUTANTS = [
     Mutant(
         "the acceptance ratio is squared",
         (Edit("bayesmc.kernels.densities:accepted", "< log_ratio", "< 2.0 * log_ratio"),),
-        ranks(lambda: own_scale_walk, location, 1000, warmup=0, thinning=3),
-        "rank_test, 1000 replications",
+        ranks(lambda: own_scale_walk, location, 2000, warmup=0, thinning=3),
+        "rank_test, 2000 replications",
     ),
     Mutant(
         "a proposal from a node's own density counts that density twice",
@@ -282,8 +282,8 @@ MUTANTS = [
         (Edit("bayesmc.kernels.conjugate_pairs:_of_trials",
               'e.data.count * e.get("total_count") - e.data.total',
               'e.data.count * e.get("total_count")'),),
-        joint(lambda: bmc.Gibbs(), share, draws=20),
-        "geweke_test, 20 draws of 64 chains",
+        joint(lambda: bmc.Gibbs(), share, draws=40),
+        "geweke_test, 40 draws of 64 chains",
     ),
     Mutant(
         "counts go to the neighbouring category",

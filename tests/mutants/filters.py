@@ -79,8 +79,8 @@ MUTANTS = [
         (Edit("bayesmc.engines.particles.mover:Mover._taken",
               'value.take(ancestors, axis=0, mode="clip")',
               'value.take(ancestors + 1, axis=0, mode="wrap")'),),
-        slices(bmc.filter, line, ROWS, bmc.ParticleFilter(300, ess_threshold=2.0), 30),
-        "repeated_test of filter, 30 runs of 300 particles",
+        slices(bmc.filter, line, ROWS, bmc.ParticleFilter(300, ess_threshold=2.0), 60),
+        "repeated_test of filter, 60 runs of 300 particles",
     ),
     Mutant(
         "backward simulation leaves the transition out",
