@@ -12,11 +12,12 @@ Every row of a test has its own data. Kernels get them in one of three ways:
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,6 +36,7 @@ ALPHA = 1e-4
 #: the two tests
 TESTS = ("geweke", "ranks")
 
+T = TypeVar("T")
 Rows = dict[str, np.ndarray]
 Statistic = Callable[[Rows, Rows], np.ndarray]
 
@@ -338,6 +340,23 @@ def running() -> Iterator[None]:
 def each_fault(cases: Mapping[str, Case]) -> list[tuple[str, str]]:
     """All kernels with each of their faults, and each without."""
     return [(name, fault) for name, case in cases.items() for fault in ("", *case.faults)]
+
+
+def each_test(cases: Mapping[str, Case]) -> list[tuple[str, str, str]]:
+    """Names, faults and tests: a right kernel takes both tests, a wrong one both in a thorough run alone.
+
+    In an ordinary run the tests take turns at the faults, so that either is seen to fail in every file.
+    """
+    return in_turn(each_fault(cases))
+
+
+def in_turn(kernels: Sequence[tuple[T, str]]) -> list[tuple[T, str, str]]:
+    """The same of pairs of a name, or what else is meant, and a fault."""
+    found, turn = [], itertools.cycle(TESTS)
+    for name, fault in kernels:
+        tests = (next(turn),) if fault and not session.is_thorough() else TESTS
+        found += [(name, fault, test) for test in tests]
+    return found
 
 
 def backwards(make: Make, target: Target, memory: Memory) -> tuple[Kernel, Memory]:

@@ -25,7 +25,7 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.stacked import stacks
 from bayesmc.structure.target import Target
 from tests.kernels import invariance_models as models
-from tests.kernels.invariance import TESTS, Case, Make, Model, backwards, each_fault
+from tests.kernels.invariance import Case, Make, Model, backwards, each_test
 
 # ---- one node ----------------------------------------------------------------------------------------
 
@@ -123,8 +123,7 @@ ONE_NODE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), each_fault(ONE_NODE))
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(ONE_NODE))
 def test_one_node(name: str, fault: str, test: str) -> None:
     ONE_NODE[name].check(test, fault)
 
@@ -157,8 +156,7 @@ FACTORS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), each_fault(FACTORS))
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(FACTORS))
 def test_several_nodes(name: str, fault: str, test: str) -> None:
     FACTORS[name].check(test, fault)
 
@@ -202,7 +200,6 @@ STACKED = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), each_fault(STACKED))
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(STACKED))
 def test_like_nodes(name: str, fault: str, test: str) -> None:
     STACKED[name].check(test, fault)

@@ -23,7 +23,16 @@ from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
-from tests.kernels.invariance import TESTS, Case, Make, Model, each_fault, mixture
+from tests.kernels.invariance import (
+    TESTS,
+    Case,
+    Make,
+    Model,
+    each_fault,
+    each_test,
+    in_turn,
+    mixture,
+)
 
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
 
@@ -163,9 +172,11 @@ def _case(prior: Any, child: Callable[[Any], Any], how: str, fault: Callable[[Pa
     return Case(model, _kernel(), {"wrong": wrong}, how=how, sizes={"draws": 15, "chains": 240})
 
 
-@pytest.mark.parametrize("fault", ["", "wrong"])
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize("pair", PAIRS, ids=lambda p: "-".join(_key(p)))
+@pytest.mark.parametrize(
+    ("pair", "fault", "test"),
+    in_turn([(p, f) for p in PAIRS for f in ("", "wrong")]),
+    ids=lambda p: "-".join(_key(p)) if isinstance(p, Pair) else None,
+)
 def test_pair(pair: Pair, test: str, fault: str) -> None:
     """A pair that is new in the table has no side here, and fails."""
     case = _case(*SIDES[_key(pair)], "moving", _wrong)
@@ -328,8 +339,7 @@ KEPT_BLOCKS = {
 }
 
 
-@pytest.mark.parametrize(("name", "fault"), each_fault(BLOCKS))
-@pytest.mark.parametrize("test", TESTS)
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(BLOCKS))
 def test_block(name: str, test: str, fault: str) -> None:
     BLOCKS[name].check(test, fault)
 

@@ -25,14 +25,13 @@ from bayesmc.kernels.tables import RowSums, TableSweep, table_kernel, table_kern
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
 from tests.kernels.invariance import (
-    TESTS,
     Case,
     Make,
     Model,
     Rows,
     Statistic,
     backwards,
-    each_fault,
+    each_test,
 )
 
 CENTRES = np.array([-1.0, 0.0, 1.5])
@@ -365,12 +364,8 @@ CASES = {
 
 #: each row is posed anew, which is too slow for Geweke's test
 SLOW = "labels of numbers"
-ALL = [
-    (name, fault, test)
-    for name, fault in each_fault(CASES)
-    for test in TESTS
-    if (name, test) != (SLOW, "geweke")
-]
+ALL = each_test({name: case for name, case in CASES.items() if name != SLOW})
+ALL += [(SLOW, fault, "ranks") for fault in ("", *CASES[SLOW].faults)]
 
 
 @pytest.mark.parametrize(("name", "fault", "test"), ALL)

@@ -22,7 +22,7 @@ from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
 from tests.kernels import invariance_models as models
-from tests.kernels.invariance import TESTS, Case, Make, Model, backwards, each_fault
+from tests.kernels.invariance import Case, Make, Model, backwards, each_test
 
 # ---- walks of one node -------------------------------------------------------------------------------
 
@@ -79,8 +79,7 @@ ONE_NODE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), each_fault(ONE_NODE))
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(ONE_NODE))
 def test_one_node(name: str, fault: str, test: str) -> None:
     ONE_NODE[name].check(test, fault)
 
@@ -157,8 +156,7 @@ SEVERAL = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), each_fault(SEVERAL))
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(SEVERAL))
 def test_several_nodes(name: str, fault: str, test: str) -> None:
     SEVERAL[name].check(test, fault)
 
@@ -242,7 +240,6 @@ def _near(y: Any) -> Any:
     return weight / weight.sum(axis=-1, keepdims=True)
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), each_fault(PROPOSALS))
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(PROPOSALS))
 def test_proposal(name: str, fault: str, test: str) -> None:
     PROPOSALS[name].check(test, fault)

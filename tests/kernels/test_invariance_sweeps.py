@@ -24,7 +24,7 @@ from bayesmc.kernels.conjugate_pairs import PAIRS
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.network import pose
 from bayesmc.structure.target import Target
-from tests.kernels.invariance import TESTS, Case, Make, Model
+from tests.kernels.invariance import Case, Make, Model, in_turn
 
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
 CENTRES = np.array([[-1.0, 0.0], [0.0, 1.0], [1.5, 0.0]])
@@ -173,10 +173,10 @@ def case(name: str, how: str) -> Case:
 
 
 ALL = [(n, f) for n in NETS for f in ("", "labels")]
+ALL += [(n, "half a shape") for n in CONJUGATE]
 
 
-@pytest.mark.parametrize("test", TESTS)
-@pytest.mark.parametrize(("name", "fault"), [*ALL, *((n, "half a shape") for n in CONJUGATE)])
+@pytest.mark.parametrize(("name", "fault", "test"), in_turn(ALL))
 def test_sweep(name: str, fault: str, test: str) -> None:
     case(name, "moving").check(test, fault)
 
