@@ -1,8 +1,9 @@
-"""How often the tests of the kit raise a false alarm: ``python -m tests.alarms``, a table of counts and bounds.
+"""How often the tests of the kit raise a false alarm: ``python -m tests.alarms``, a table of counts and
+bounds.
 
 Two-node nets with right samplers, at level .01; each test 10,000 times, those that simulate whole joint laws
-1,000 times, with fresh seeds (``--seed`` repeats a run). The count of alarms may exceed the 99.9 % point of the
-binomial law in one run of a thousand. The suite holds a small part of this (`tests/testing`).
+1,000 times, with fresh seeds (``--seed`` repeats a run). The count of alarms may exceed the 99.9 % point
+of the binomial law in one run of a thousand. The suite holds a small part of this (`tests/testing`).
 """
 
 from __future__ import annotations
@@ -131,7 +132,8 @@ class Case:
 
 LOG_Z = -0.5 * 0.8**2 / 2 - 0.5 * math.log(4 * math.pi)
 CASES = (
-    Case("assert_matches, likelihood weighting", 10_000, matches(bmc.LikelihoodWeighting(1000), "hybrid, seen")),
+    Case("assert_matches, likelihood weighting", 10_000, matches(
+        bmc.LikelihoodWeighting(1000), "hybrid, seen")),
     Case("assert_matches, independent draws", 10_000, matches(bmc.LikelihoodWeighting(500), "hybrid")),
     Case("assert_matches, chains", 10_000, matches(bmc.Gibbs(150, warmup=5, chains=4), "normal")),
     Case("assert_matches with draws", 10_000, matches(bmc.LikelihoodWeighting(400), "hybrid", draws=150)),
@@ -148,7 +150,8 @@ CASES = (
     Case("geweke_test, correlated", 1000, lambda s: geweke_test(
         walk_x, normal(), batched=True, alpha=ALPHA, rng=s)),
     Case("geweke_test, Metropolis-Hastings", 1000, lambda s: geweke_test(
-        bmc.MetropolisHastings(proposal={"x": lambda x: bmc.Normal(x, 1.0)}), normal(), draws=50, alpha=ALPHA, rng=s)),
+        bmc.MetropolisHastings(proposal={"x": lambda x: bmc.Normal(x, 1.0)}), normal(), draws=50,
+        alpha=ALPHA, rng=s)),
     Case("rank_test", 1000, lambda s: rank_test(walk_x, normal(), batched=True, alpha=ALPHA, rng=s)),
     Case("rank_test, Gibbs", 1000, lambda s: rank_test(bmc.Gibbs(), finite(), alpha=ALPHA, rng=s)),
     Case("rank_test, sequential", 1000, lambda s: rank_test(

@@ -49,7 +49,7 @@ from bayesmc.testing import (
     simulation_based_calibration,
     unbiased_evidence_test,
 )
-from bayesmc.testing.joint import NetJoint
+from bayesmc.testing.kernels.joint import NetJoint
 from tests.matrix import (
     ALPHA,
     ENGINES,

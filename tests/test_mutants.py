@@ -13,7 +13,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.kernels import densities
-from bayesmc.testing.densities import check_density
+from bayesmc.testing.densities.density import check_density
 from bayesmc.testing.verdict import BUDGET, Verdict
 from tests.mutants.__main__ import main
 from tests.mutants.catalogue import MUTANTS

@@ -67,7 +67,7 @@ class Verdict:
 
     Examples
     --------
-    >>> from bayesmc.testing.verdict import Comparison, Verdict
+    >>> from bayesmc.testing import Comparison, Verdict
     >>> verdict = Verdict("example", 0.01, [Comparison("mean of node 'a'", 1.0, 1.3, 4.2, 3e-5)])
     >>> bool(verdict)
     False

@@ -22,7 +22,7 @@ from bayesmc.errors import (
 )
 from bayesmc.results import SeriesPosterior
 from bayesmc.testing import enumerate_posterior, session
-from bayesmc.testing.templates import RandomDbn, random_dbn
+from bayesmc.testing.makers.templates import RandomDbn, random_dbn
 
 ENGINE = DiscreteFilter()
 SEEDS = range(session.scaled(28, times=5))

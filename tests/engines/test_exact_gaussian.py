@@ -1,6 +1,6 @@
 """``Exact`` on conditional linear-Gaussian nets: random ones against brute force, and cases by hand.
 
-A hundred random nets are made in two forms (see ``bayesmc.testing.gaussians``); what ``Exact`` finds
+A hundred random nets are made in two forms (see ``bayesmc.testing.makers.gaussians``); what ``Exact`` finds
 on the one is compared with dense Gaussian conditioning on the other, to 1e-8. Seeds are fixed;
 ``--bayesmc-seed`` shifts them.
 """

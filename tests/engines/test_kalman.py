@@ -20,7 +20,7 @@ from bayesmc.engines.kalman import means as kalman_means
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.kernels.kalman import Conditioned, condition
 from bayesmc.testing import session
-from bayesmc.testing.linear_dbns import LinearSeries, random_linear_dbn
+from bayesmc.testing.makers.linear_dbns import LinearSeries, random_linear_dbn
 
 # fmt: off
 NILE = [

@@ -20,7 +20,7 @@ from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.slopes import _MEANS, mean_of, mean_slopes
 from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
 from bayesmc.testing import session
-from bayesmc.testing.linear_dbns import random_linear_dbn
+from bayesmc.testing.makers.linear_dbns import random_linear_dbn
 from bayesmc.tracing import Dual, NoTangent
 
 ENGINES = [

@@ -24,8 +24,8 @@ from bayesmc.engines.particles.smoothing import Backward, lagged
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.testing import session
-from bayesmc.testing.linear_dbns import random_linear_dbn
-from bayesmc.testing.templates import random_dbn
+from bayesmc.testing.makers.linear_dbns import random_linear_dbn
+from bayesmc.testing.makers.templates import random_dbn
 from bayesmc.testing.verdict import holm
 
 ALPHA = 1e-3

@@ -14,9 +14,9 @@ from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
-from bayesmc.testing.balance import detailed_balance, invariant
-from bayesmc.testing.geweke import geweke_test
-from bayesmc.testing.ranks import rank_test
+from bayesmc.testing.kernels.balance import detailed_balance, invariant
+from bayesmc.testing.kernels.geweke import geweke_test
+from bayesmc.testing.kernels.ranks import rank_test
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.testing.densities import check_density
+from bayesmc.testing.densities.density import check_density
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant

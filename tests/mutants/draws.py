@@ -6,8 +6,8 @@ import numpy as np
 
 import bayesmc as bmc
 from bayesmc.resampling import multinomial, residual, systematic
-from bayesmc.testing.answers import exact
-from bayesmc.testing.calibration import simulation_based_calibration
+from bayesmc.testing.oracles.answers import exact
+from bayesmc.testing.posteriors.calibration import simulation_based_calibration
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
 from tests.mutants.tests_of import estimated, evidence_of, matched

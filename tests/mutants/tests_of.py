@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.testing.answers import exact
-from bayesmc.testing.evidence import unbiased_evidence_test
-from bayesmc.testing.matching import compare
-from bayesmc.testing.repeated import repeated_test
+from bayesmc.testing.oracles.answers import exact
+from bayesmc.testing.posteriors.evidence import unbiased_evidence_test
+from bayesmc.testing.posteriors.matching import compare
+from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.mutant import ALPHA
 

@@ -23,7 +23,7 @@ from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import ReducibleWarning, UnsupportedError
 from bayesmc.pmcmc import ParticleGibbs
 from bayesmc.pmcmc.filters import ConditionalFilter, independent, picked
-from bayesmc.testing.matching import assert_matches
+from bayesmc.testing.posteriors.matching import assert_matches
 from bayesmc.testing.verdict import holm
 from tests.pmcmc import templates
 from tests.pmcmc.templates import Case

@@ -26,10 +26,10 @@ from bayesmc.testing import (
     random_net,
     same_distribution,
 )
-from bayesmc.testing.answers import ExactAnswer, exact
-from bayesmc.testing.linear import linear_posterior
-from bayesmc.testing.linear_dbns import random_linear_dbn
-from bayesmc.testing.quadrature import quadrature_posterior
+from bayesmc.testing.makers.linear_dbns import random_linear_dbn
+from bayesmc.testing.oracles.answers import ExactAnswer, exact
+from bayesmc.testing.oracles.linear import linear_posterior
+from bayesmc.testing.oracles.quadrature import quadrature_posterior
 
 
 def distance(found: Any, other: Any, names: Any = None) -> float:

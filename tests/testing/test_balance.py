@@ -1,7 +1,8 @@
-"""Invariance and detailed balance, exact and counted: the counts against the matrices, false alarms, wrong input.
+"""Invariance and detailed balance, exact and counted: the counts against the matrices, false alarms,
+wrong input.
 
-Right kernels at alpha = 1e-4 and fixed seeds. Counted tests are exact but for the two sides of a tail, so that the
-rate of alarms over many seeds is held against the binomial law from above (once in 1e4).
+Right kernels at alpha = 1e-4 and fixed seeds. Counted tests are exact but for the two sides of a tail, so
+that the rate of alarms over many seeds is held against the binomial law from above (once in 1e4).
 """
 
 from __future__ import annotations
@@ -37,8 +38,10 @@ def pair() -> bmc.BayesNet:
 
 
 EVIDENCE = {"c": 1}
-JOINT = np.array([[p * (q if b else 1 - q) * (0.1 + 0.2 * a + 0.3 * b) for b in (0, 1)]
-                  for a, (p, q) in enumerate(zip((0.2, 0.3, 0.5), (0.1, 0.45, 0.8), strict=True))])  # fmt: skip
+ROWS = enumerate(zip((0.2, 0.3, 0.5), (0.1, 0.45, 0.8), strict=True))
+JOINT = np.array(
+    [[p * (q if b else 1 - q) * (0.1 + 0.2 * a + 0.3 * b) for b in (0, 1)] for a, (p, q) in ROWS]
+)
 
 
 def draw(state: dict, name: str, rng: np.random.Generator, flat: float = 0.0) -> dict:

@@ -15,9 +15,9 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.errors import DensityError, ModelError, ShapeError, UnknownNodeError
-from bayesmc.testing.bands import _chance_of, ecdf_band, ecdf_points, ecdf_uniformity
-from bayesmc.testing.calibration import simulation_based_calibration
-from bayesmc.testing.shares import Draws, posterior_draws, share_below
+from bayesmc.testing.posteriors.bands import _chance_of, ecdf_band, ecdf_points, ecdf_uniformity
+from bayesmc.testing.posteriors.calibration import simulation_based_calibration
+from bayesmc.testing.posteriors.shares import Draws, posterior_draws, share_below
 from bayesmc.testing.verdict import BUDGET
 
 

@@ -11,9 +11,9 @@ import scipy.stats
 
 import bayesmc as bmc
 from bayesmc.errors import UnknownNodeError, UnsupportedError
-from bayesmc.testing.conditionals import check_cpd
-from bayesmc.testing.densities import check_density
-from bayesmc.testing.masses import Element, table_of, volume_of
+from bayesmc.testing.densities.conditionals import check_cpd
+from bayesmc.testing.densities.density import check_density
+from bayesmc.testing.densities.masses import Element, table_of, volume_of
 
 HALF = 0.5 * math.log(2 * math.pi)
 D = bmc.Density

@@ -15,7 +15,7 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.errors import DegeneracyError, DensityError, UnsupportedError, ZeroProbabilityError
-from bayesmc.testing.evidence import _judged, unbiased_evidence_test
+from bayesmc.testing.posteriors.evidence import _judged, unbiased_evidence_test
 from bayesmc.testing.verdict import BUDGET
 
 #: log density of y = 1.5 under Normal(0, sqrt 2), which `weighting` estimates

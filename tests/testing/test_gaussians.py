@@ -32,7 +32,7 @@ from bayesmc.testing import (
     random_gaussian_net,
     session,
 )
-from bayesmc.testing.conditional_gaussian import DiscretePart, GaussianPart, PlainNode
+from bayesmc.testing.oracles.conditional_gaussian import DiscretePart, GaussianPart, PlainNode
 
 KINDS: dict[str, dict[str, Any]] = {
     "scalars": {},

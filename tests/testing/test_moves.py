@@ -1,7 +1,7 @@
 """Tests of kernels on nets: functions of one state and of many, engines, single kernels of ours, wrong input.
 
-Right kernels are tested at alpha = 1e-4 and fixed seeds; every kind of mover also with a fault that both tests
-must find.
+Right kernels are tested at alpha = 1e-4 and fixed seeds; every kind of mover also with a fault that both
+tests must find.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
 from bayesmc.testing import Verdict, geweke_test, random_net, rank_test
-from bayesmc.testing.joint import NetJoint
-from bayesmc.testing.moves import moves_of
-from bayesmc.testing.statistics import default_statistics
+from bayesmc.testing.kernels.joint import NetJoint
+from bayesmc.testing.kernels.moves import moves_of
+from bayesmc.testing.kernels.statistics import default_statistics
 
 ALPHA = 1e-4
 TESTS = {"geweke": geweke_test, "ranks": rank_test}

@@ -18,7 +18,7 @@ from bayesmc.testing import (
     random_net,
     session,
 )
-from bayesmc.testing.spelling import as_code
+from bayesmc.testing.makers.spelling import as_code
 
 EVERYTHING = {"hybrid": True, "plates": True}
 

@@ -19,8 +19,8 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.testing import enumerate_posterior
-from bayesmc.testing.cells import clenshaw_curtis, integrate
-from bayesmc.testing.quadrature import Quadrature, quadrature_posterior
+from bayesmc.testing.oracles.cells import clenshaw_curtis, integrate
+from bayesmc.testing.oracles.quadrature import Quadrature, quadrature_posterior
 
 LEVELS = np.array([0.01, 0.3, 0.5, 0.99])
 

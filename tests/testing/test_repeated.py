@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import binom
 
 from bayesmc.errors import ShapeError
-from bayesmc.testing.repeated import repeated_test
+from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.verdict import uncounted
 
 

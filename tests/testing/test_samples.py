@@ -10,7 +10,7 @@ import scipy.stats
 import bayesmc as bmc
 from bayesmc.errors import ShapeError
 from bayesmc.states import StateArray
-from bayesmc.testing.samples import Draws, energy_comparison, same_distribution
+from bayesmc.testing.posteriors.samples import Draws, energy_comparison, same_distribution
 
 
 def few(total: int, level: float) -> float:

@@ -10,10 +10,10 @@ import pytest
 import bayesmc as bmc
 from bayesmc.errors import ModelError
 from bayesmc.testing import random_net
-from bayesmc.testing.families import random_distribution
-from bayesmc.testing.graphs import random_factor_graph
-from bayesmc.testing.spelling import affine, as_code
-from bayesmc.testing.templates import random_dbn
+from bayesmc.testing.makers.families import random_distribution
+from bayesmc.testing.makers.graphs import random_factor_graph
+from bayesmc.testing.makers.spelling import affine, as_code
+from bayesmc.testing.makers.templates import random_dbn
 
 NETS: dict[str, dict[str, Any]] = {
     "plates": {"plates": True, "states": 4},

@@ -17,9 +17,9 @@ from bayesmc.diagnostics import log_sum_exp, normalised, weight_ess
 from bayesmc.errors import MissingExtraError, UnsupportedError
 from bayesmc.resampling import SCHEMES
 from bayesmc.testing import enumerate_posterior, random_evidence, random_net, session
-from bayesmc.testing.families import _FAMILIES, random_distribution
-from bayesmc.testing.spelling import as_code
-from bayesmc.testing.strategies import (
+from bayesmc.testing.makers.families import _FAMILIES, random_distribution
+from bayesmc.testing.makers.spelling import as_code
+from bayesmc.testing.makers.strategies import (
     bayes_nets,
     dbns,
     distributions,
@@ -27,7 +27,7 @@ from bayesmc.testing.strategies import (
     factor_graphs,
     log_weights,
 )
-from bayesmc.testing.weights import random_log_weights
+from bayesmc.testing.makers.weights import random_log_weights
 
 FEW = settings(max_examples=session.scaled(20, 5), suppress_health_check=[HealthCheck.too_slow])
 SHRINK = settings(FEW, max_examples=300, phases=(Phase.generate, Phase.shrink))

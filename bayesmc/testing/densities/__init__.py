@@ -1,0 +1,1 @@
+"""Checks of densities that a user wrote."""

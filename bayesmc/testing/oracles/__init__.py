@@ -1,0 +1,1 @@
+"""Exact answers that share no code with the engines."""

@@ -1,0 +1,388 @@
+"""One call for the exact posterior: whichever oracle applies, or why none does.
+
+The oracles are brute force and share no code with the engines, but for how a net evaluates a node:
+listing all states, one dense Gaussian per configuration, adaptive quadrature. A template with a series is
+unrolled first, so that long series are out of reach.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.special
+
+from bayesmc.dbn import DynamicBayesNet
+from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
+from bayesmc.network import BayesNet, Model, Problem, pose
+from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
+from bayesmc.testing.oracles.enumeration import Enumerated, enumerate_posterior
+from bayesmc.testing.oracles.linear import linear_posterior
+from bayesmc.testing.oracles.quadrature import Quadrature, at_most, quadrature_posterior
+
+#: scalars over which a function is integrated under a Gaussian, and the points for each
+_MOST_SCALARS = 3
+_HERMITE = 24
+
+
+@dataclass(frozen=True, eq=False)
+class ExactAnswer:
+    """An exact posterior, whichever oracle it comes from.
+
+    Attributes
+    ----------
+    method : str
+        ``"enumeration"``, ``"linear-Gaussian"`` or ``"quadrature"``.
+    answer : Enumerated, GaussianAnswer or Quadrature
+        The oracle's own, with more to ask.
+    steps : int or None
+        Of a template: number of slices. A node of the template is then answered for all slices, time
+        leading, and ``"x[3]"`` for one.
+    passed_over : dict
+        Oracle -> why it was not the one.
+    """
+
+    method: str
+    answer: Enumerated | GaussianAnswer
+    steps: int | None
+    passed_over: dict[str, str]
+
+    @property
+    def model(self) -> Model:
+        """Of the net that was asked."""
+        return self.answer.model
+
+    @property
+    def accuracy(self) -> float:
+        """What probabilities, log evidence, and means in standard deviations are good to."""
+        return float(self.answer.accuracy)
+
+    @property
+    def log_marginal_likelihood(self) -> float:
+        """Log probability (density) of the evidence."""
+        return self.answer.log_marginal_likelihood
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that can be asked about."""
+        return self.answer.names
+
+    def probabilities(self, *names: str) -> np.ndarray:
+        """Probabilities of the states, ``(*plates, states)``; of several nodes jointly."""
+        return self._by_slice(self.answer.probabilities, *names)
+
+    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions.
+
+        Raises
+        ------
+        UnsupportedError
+            An answer by quadrature.
+        """
+        return self.answer.sample(draws, rng)
+
+    def mean(self, name: str) -> np.ndarray:
+        """Posterior mean, ``(*plates, *event)``."""
+        return self._by_slice(self.answer.mean, name)
+
+    def var(self, name: str) -> np.ndarray:
+        """Posterior variance of every scalar, ``(*plates, *event)``."""
+        return self._by_slice(self.answer.var, name)
+
+    def std(self, name: str) -> np.ndarray:
+        """Posterior standard deviation, ``(*plates, *event)``."""
+        return np.sqrt(np.maximum(self.var(name), 0.0))
+
+    def expectation(self, function: Callable[..., Any], *names: str) -> np.ndarray:
+        """Posterior mean of a function of nodes, which keeps the leading axis.
+
+        The nodes are ``names``, or the function's arguments. Under Gaussians the function is integrated
+        by Gauss-Hermite rules over at most three scalars: exact for polynomials of degree below 48,
+        good for smooth functions, and poor for those that jump.
+
+        Raises
+        ------
+        UnsupportedError
+            More than three scalars of a linear-Gaussian answer.
+        """
+        names = names or tuple(inspect.signature(function).parameters)
+        self._known(*names)
+        if isinstance(self.answer, Enumerated):
+            return self.answer.expectation(function, *names)
+        return _hermite(self.answer, function, names)
+
+    def cdf(self, name: str, x: Any) -> np.ndarray:
+        """Posterior probability of a value at most ``x``, ``(*x.shape, *plates, *event)``."""
+        points = np.asarray(x, dtype=float)
+        return self._by_slice(lambda one: self._cdf(one, points), name, lead=points.ndim)
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Posterior quantiles, ``(*q.shape, *plates, *event)``: the smallest values whose cdf is ``q``."""
+        levels = np.asarray(q, dtype=float)
+        if not ((levels > 0) & (levels < 1)).all():
+            raise ValueError(
+                f"quantile({name!r}, q={q}): give probabilities strictly between 0 and 1"
+            )
+        return self._by_slice(lambda one: self._quantile(one, levels), name, lead=levels.ndim)
+
+    def __repr__(self) -> str:
+        return (
+            f"ExactAnswer({self.method!r}, log_marginal_likelihood="
+            f"{self.log_marginal_likelihood:.6g}, accuracy={self.accuracy:.2g})"
+        )
+
+    # ---- private ----------------------------------------------------------------------------
+
+    def _known(self, *names: str) -> None:
+        for name in names:
+            if name not in self.names:
+                raise UnknownNodeError(
+                    f"exact: {name!r} is no node that this answer has; ask {', '.join(self.names)}"
+                )
+
+    def _by_slice(self, ask: Callable[..., np.ndarray], *names: str, lead: int = 0) -> np.ndarray:
+        """The answer, or those of all slices with time as the first axis of the node."""
+        if self.steps is None or all(name in self.names for name in names):
+            self._known(*names)
+            return ask(*names)
+        slices = [
+            tuple(n if n in self.names else f"{n}[{t}]" for n in names) for t in range(self.steps)
+        ]
+        for one in slices:
+            self._known(*one)
+        return np.stack([ask(*one) for one in slices], axis=lead)
+
+    def _cdf(self, name: str, points: np.ndarray) -> np.ndarray:
+        if isinstance(self.answer, Quadrature):
+            return self.answer.cdf(name, points)
+        shape = self.model[name].value_shape
+        out = np.empty((*points.shape, *shape))
+        for at, part in _parts(self.answer, name):
+            place: Any = (..., *at)
+            out[place] = _mixture_cdf(part, points)
+        return out
+
+    def _quantile(self, name: str, levels: np.ndarray) -> np.ndarray:
+        if isinstance(self.answer, Quadrature):
+            return self.answer.quantile(name, levels)
+        out = np.empty((*levels.shape, *self.model[name].value_shape))
+        for at, part in _parts(self.answer, name):
+            place: Any = (..., *at)
+            out[place] = _mixture_quantile(part, levels)
+        return out
+
+
+def exact(
+    net: BayesNet | DynamicBayesNet,
+    evidence: Mapping[str, Any] | None = None,
+    inputs: Mapping[str, Any] | None = None,
+) -> ExactAnswer:
+    """The exact posterior, by the first oracle that applies.
+
+    1. Enumeration, where everything hidden is finite.
+    2. One dense Gaussian per configuration of what is finite, where what is continuous is linear and
+       Gaussian. This is also what a Kalman smoother computes.
+    3. Adaptive quadrature, for up to four continuous unknowns of any kind (`quadrature_posterior`).
+
+    Parameters
+    ----------
+    net : BayesNet or DynamicBayesNet
+        A template is unrolled over the rows of its observations; the answer is that of smoothing.
+        Give fewer rows for filtering.
+    evidence, inputs : dict, optional
+        As for ``infer``; of a template, observations and inputs as for ``smooth``.
+
+    Returns
+    -------
+    ExactAnswer
+
+    Raises
+    ------
+    UnsupportedError
+        No oracle applies; the message says why, for each.
+    ZeroProbabilityError
+        The evidence is impossible.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.testing import exact
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.3))
+    >>> net.add("x", lambda a: bmc.Normal(2.0 * a, 1.0))
+    >>> exact(net, {"x": 1.0}).method, exact(net).method
+    ('enumeration', 'linear-Gaussian')
+    >>> float(exact(net, {"x": 1.0}).mean("a").round(12)), float(exact(net).var("x").round(12))
+    (0.3, 1.84)
+
+    A random walk seen with noise, two slices:
+
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    >>> exact(dbn, {"y": [1.0, 3.0]}).mean("x").round(12).tolist()
+    [1.0, 2.0]
+    """
+    steps = None
+    if isinstance(net, DynamicBayesNet):
+        net, evidence, steps = _unrolled(net, evidence, inputs)
+        inputs = None
+    elif not isinstance(net, BayesNet):
+        raise ModelError(
+            f"exact: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}"
+        )
+    problem = pose(net, evidence, inputs)
+    oracles: dict[str, Callable[[], Enumerated | GaussianAnswer]] = {
+        "enumeration": lambda: _enumerated(problem, net, evidence, inputs),
+        "linear-Gaussian": lambda: linear_posterior(problem),
+        "quadrature": lambda: quadrature_posterior(net, evidence, inputs),
+    }
+    passed_over: dict[str, str] = {}
+    partial: dict[str, Enumerated | GaussianAnswer] = {}
+    wanted = [n for n, node in problem.model.nodes.items() if node.kind != "input"]
+    for method, oracle in oracles.items():
+        try:
+            answer = oracle()
+        except UnsupportedError as error:
+            passed_over[method] = str(error)
+            continue
+        left_out = [name for name in wanted if name not in answer.names]
+        if not left_out:
+            return ExactAnswer(method, answer, steps, passed_over)
+        partial[method] = answer
+        passed_over[method] = f"it leaves out {', '.join(map(repr, left_out))}"
+    if partial:  # what nothing observed depends on, and no oracle can say
+        method = max(partial, key=lambda m: len(partial[m].names))
+        others = {m: why for m, why in passed_over.items() if m != method}
+        return ExactAnswer(method, partial[method], steps, others)
+    reasons = "".join(f"\n  {method}: {why}" for method, why in passed_over.items())
+    raise UnsupportedError(
+        f"exact: no oracle answers this net:{reasons}\nObserve more, take fewer elements or steps, or "
+        "use tests that need no exact answer (rank_test, geweke_test)"
+    )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _unrolled(
+    dbn: DynamicBayesNet, observations: Mapping[str, Any] | None, inputs: Mapping[str, Any] | None
+) -> tuple[BayesNet, dict[str, Any], int]:
+    """The plain net of a series, its evidence, and the number of slices."""
+    _, series = dbn.read(observations, inputs)
+    net = dbn.unroll(series.steps, inputs)
+    return net, dbn.unrolled_evidence(observations or {}), series.steps
+
+
+def _enumerated(
+    problem: Problem,
+    net: BayesNet,
+    evidence: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None,
+) -> Enumerated:
+    """All joint states, where there is nothing else: no fixed quadrature rule stands in for an exact one."""
+    for name, node in problem.model.nodes.items():
+        found = problem.observed.get(name)
+        hidden = found is None or found.mask is not None
+        if node.is_stochastic and hidden and not node.is_discrete:
+            raise UnsupportedError(f"the hidden node {name!r} is continuous")
+    return enumerate_posterior(net, evidence, inputs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One number's posterior: weighted normals, some of them points."""
+
+    weights: np.ndarray
+    means: np.ndarray
+    scales: np.ndarray
+
+
+def _parts(answer: Enumerated | GaussianAnswer, name: str) -> list[tuple[tuple[int, ...], _Part]]:
+    """Each number of a node."""
+    shape = answer.model[name].value_shape
+    if isinstance(answer, Enumerated):
+        means = np.asarray(answer.values(name), dtype=float).reshape(len(answer.weights), -1)
+        scales = np.zeros(means.shape)
+        weights = answer.weights
+    else:
+        weights, means, covs = answer.mixture(name)
+        scales = np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
+    places = list(np.ndindex(shape))
+    return [(at, _Part(weights, means[:, k], scales[:, k])) for k, at in enumerate(places)]
+
+
+def _mixture_cdf(part: _Part, x: np.ndarray) -> np.ndarray:
+    points = part.scales <= 1e-12 * np.maximum(1.0, np.abs(part.means))
+    total = at_most(part.means[points], part.weights[points], x)
+    smooth = ~points
+    z = (x[..., None] - part.means[smooth]) / part.scales[smooth]
+    return np.asarray(total + scipy.special.ndtr(z) @ part.weights[smooth])
+
+
+def _mixture_quantile(part: _Part, levels: np.ndarray) -> np.ndarray:
+    """By bisection, to the last digits; what ends within rounding of a point is that point."""
+    low = np.full(levels.shape, (part.means - 40 * part.scales).min() - 1e-9)
+    high = np.full(levels.shape, (part.means + 40 * part.scales).max())
+    for _ in range(120):
+        middle = 0.5 * (low + high)
+        below = _mixture_cdf(part, middle) < levels * (1 - 1e-13)
+        low, high = np.where(below, middle, low), np.where(below, high, middle)
+    points = part.means[part.scales == 0.0]
+    if not points.size:
+        return high
+    nearest = points[np.abs(high[..., None] - points).argmin(axis=-1)]
+    return np.where(
+        np.abs(high - nearest) <= 1e-9 * np.maximum(1.0, np.abs(nearest)), nearest, high
+    )
+
+
+def _hermite(
+    answer: GaussianAnswer, function: Callable[..., Any], names: tuple[str, ...]
+) -> np.ndarray:
+    """The mean of a function under weighted Gaussians of few scalars."""
+    smooth = [n for n in names if answer.nodes[n].states is None]
+    sizes = [math.prod(answer.model[n].value_shape) for n in smooth]
+    total = sum(sizes)
+    if total > _MOST_SCALARS:
+        raise UnsupportedError(
+            f"exact: the expectation of a function of {total} numbers ({', '.join(smooth)}) under a "
+            f"linear-Gaussian answer; {_MOST_SCALARS} at most. Ask for means and covariances of the "
+            "answer (.answer.cov), or for fewer nodes"
+        )
+    kept = np.flatnonzero(answer.weights > 1e-16)
+    if len(kept) * _HERMITE**total > 1 << 22:
+        raise BudgetError(
+            f"exact: the expectation takes {len(kept)} x {_HERMITE}^{total} points; ask for fewer nodes"
+        )
+    _, means, covs = (
+        answer.mixture(*smooth) if smooth else (None, np.zeros((len(answer.weights), 0)), None)
+    )
+    nodes, rule = np.polynomial.hermite_e.hermegauss(_HERMITE)
+    grid = np.stack(np.meshgrid(*[nodes] * total, indexing="ij"), -1).reshape(-1, total)
+    weights = np.ones(1)
+    for _ in range(total):
+        weights = np.multiply.outer(weights, rule / rule.sum()).ravel()
+    points = means[kept][:, None] + np.zeros((1, len(grid), total))
+    if covs is not None:
+        found, axes = np.linalg.eigh(covs[kept])
+        roots = axes * np.sqrt(np.maximum(found, 0.0))[:, None]
+        points = points + grid @ np.matrix_transpose(roots)
+    joint = (answer.weights[kept][:, None] * weights).ravel()
+    flat, start, arguments = points.reshape(-1, total), 0, []
+    for name in names:
+        node = answer.model[name]
+        if name in smooth:
+            stop = start + math.prod(node.value_shape)
+            arguments.append(flat[:, start:stop].reshape(-1, *node.value_shape))
+            start = stop
+            continue
+        columns = [answer.states[name, e][kept] for e in range(answer.nodes[name].elements)]
+        stored = np.stack(columns, axis=-1).reshape(len(kept), *node.plate_shape)
+        arguments.append(node.decode(np.repeat(stored, len(grid), axis=0)))
+    result = np.asarray(function(*arguments), dtype=float)
+    return np.tensordot(joint, result, axes=(0, 0))

@@ -1,0 +1,308 @@
+"""Does a posterior match an exact one? Its figures, and its joint draws where asked, in one decision.
+
+Monte Carlo answers are judged by their own standard errors, all comparisons together under a stated
+false-alarm rate; answers without Monte Carlo error must agree to a tolerance. What draws say of an average
+stands in ``samples``, what a decision is in ``verdict``; where exact answers come from is not known here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import UnsupportedError
+from bayesmc.randomness import seed_sequence
+from bayesmc.results.draws import DrawsPosterior
+from bayesmc.testing.posteriors.figures import (
+    MIN_ESS,
+    Pair,
+    Table,
+    asked,
+    compare_angles,
+    compare_cov,
+    compare_mean,
+    compare_quantiles,
+    compare_states,
+    compare_var,
+)
+from bayesmc.testing.posteriors.samples import Draws, energy_comparison
+from bayesmc.testing.verdict import Verdict, counted
+
+#: rows of a joint sample below which it is not judged
+_MIN_ROWS = 30
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Match(Verdict):
+    """What was compared, and what does not match.
+
+    Attributes
+    ----------
+    remarks : tuple of str
+        What could not be compared though it was asked for, and why.
+    """
+
+    remarks: tuple[str, ...] = ()
+
+    def _remarks(self) -> list[str]:
+        return [f"  {remark}" for remark in self.remarks]
+
+
+def compare(
+    posterior: Any,
+    exact: Any,
+    alpha: float = 1e-3,
+    *,
+    rtol: float = 1e-9,
+    min_count: float = 10.0,
+    names: Sequence[str] | None = None,
+    quantiles: Sequence[float] = (0.05, 0.25, 0.5, 0.75, 0.95),
+    draws: int = 0,
+    rng: Any = None,
+) -> Match:
+    """What differs between a posterior and an exact one, and whether chance explains it.
+
+    Compared are the log evidence, the probability of every state of every element of finite nodes, and of
+    all other nodes means, variances, quantiles and, of nodes of up to five numbers, covariances; each where
+    both can answer. With ``draws``, joint draws of all nodes are compared with draws of the exact answer,
+    too, which shows wrong dependences between right marginals.
+
+    How each is judged, at the effective number of draws:
+
+    - a probability by binomial tails at ``n_eff`` (the smaller of the weights' ESS and the node's own), i.e.
+      with the standard error under the exact value; one of exactly zero must have exactly none;
+    - a quantile by the same law of the share of draws below the exact quantile;
+    - means by their standard error, at least that of the exact variance at ``n_eff``;
+    - variances and covariances by the standard error of the squares, corrected for skewness (Hall 1992),
+      and not at all where fewer than some 30 draws decide it: the variance may be infinite then;
+    - angles by the means of their cosine and sine;
+    - log evidence by its ratio to the exact one;
+    - joint draws by their energy distance and relabelling (`same_distribution`), of weighted draws those
+      that rejection leaves independent, of chains one in twice the draws that count as one.
+
+    Holm's method keeps the chance of any false alarm in one call at ``alpha``. It is exact for
+    probabilities and quantiles of numbers from independent draws and for their joint draws, and holds in
+    the limit of many draws elsewhere. A posterior whose ``ess`` is infinite is exact, and must agree within
+    ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is added to every tolerance.
+
+    It cannot see what the draws do not show: heavy weights that no draw has met (look at ``pareto_k``),
+    faults below the Monte Carlo error; without ``draws``, errors of joint probabilities with right
+    marginals. Sums (``keep="summaries"``) say nothing of quantiles, covariances and the errors of variances.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of any engine.
+    exact : Enumerated or Posterior
+        Anything with ``names``, ``probabilities``, ``mean``, ``var``, ``log_marginal_likelihood``; its
+        ``quantile(name, q)``, ``cdf(name, x)``, ``cov(name)`` and ``resample(draws, rng)`` are used where it
+        has them.
+    alpha : float
+        Family-wise false-alarm rate.
+    rtol : float
+        Tolerance without Monte Carlo error.
+    min_count : float
+        Compare states and quantiles with ``n_eff * p * (1 - p)`` at least this.
+    names : sequence of str, optional
+        Nodes to compare; by default all that ``exact`` knows and the posterior kept.
+    quantiles : sequence of float
+        Compare these; none where empty.
+    draws : int
+        Joint draws to compare, of each side, at most; a few hundred tell a lot, 1000 are used at most.
+    rng : seed, Generator or None
+        For ``draws``.
+
+    Returns
+    -------
+    Match
+        True where all is well, so that ``assert compare(posterior, exact)`` says what is not.
+
+    Raises
+    ------
+    AssertionError
+        Where the two do not even have the same shapes.
+    UnsupportedError
+        ``draws`` are asked for and ``exact`` has none to give.
+    ValueError
+        Nothing is left to compare, or a level or number is out of range.
+
+    References
+    ----------
+    Holm (1979), Scand. J. Statist. 6; Hall (1992), JRSS B 54; Szekely and Rizzo (2004), InterStat 5.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.testing import compare, enumerate_posterior
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.3))
+    >>> found = bmc.infer(net, engine=bmc.LikelihoodWeighting(5000), rng=0)
+    >>> bool(compare(found, enumerate_posterior(net)))
+    True
+    """
+    options = (alpha, rtol, min_count, names, quantiles, draws, rng)
+    return _match("compare", posterior, exact, *options)
+
+
+def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
+    """Raise unless a posterior matches an exact one.
+
+    Parameters
+    ----------
+    posterior, exact
+        As `compare` takes them; there stands what is compared, and what cannot be seen.
+    **options
+        Of `compare`: ``alpha`` (family-wise false-alarm rate, 1e-3), ``rtol`` (tolerance without
+        Monte Carlo error, 1e-9), ``min_count`` (rarer states are not compared, 10), ``names``
+        (nodes to compare, all), ``quantiles`` (five), ``draws`` (joint draws to compare, none), ``rng``.
+
+    Returns
+    -------
+    Match
+
+    Raises
+    ------
+    AssertionError
+        Naming nodes, elements, states, both values and the number of standard errors.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.testing import assert_matches, enumerate_posterior
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Bernoulli(0.3))
+    >>> net.add("x", lambda a: bmc.Normal(2.0 * a, 1.0))
+    >>> weighted = bmc.infer(net, {"x": 1.5}, engine=bmc.LikelihoodWeighting(5000), rng=0)
+    >>> match = assert_matches(weighted, enumerate_posterior(net, {"x": 1.5}))
+    >>> len(match.comparisons)
+    5
+    """
+    given = {"alpha": 1e-3, "rtol": 1e-9, "min_count": 10.0, "names": None, "draws": 0, "rng": None,
+             "quantiles": (0.05, 0.25, 0.5, 0.75, 0.95)}  # fmt: skip
+    for key in options.keys() - given.keys():
+        raise TypeError(f"assert_matches: no option {key!r}; there are {', '.join(sorted(given))}")
+    match = _match("assert_matches", posterior, exact, **{**given, **options})
+    if not match:
+        raise AssertionError(f"{match!r}\n  of {posterior!r}")
+    return match
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _match(
+    test: str,
+    posterior: Any,
+    exact: Any,
+    alpha: float,
+    rtol: float,
+    min_count: float,
+    names: Sequence[str] | None,
+    quantiles: Sequence[float],
+    draws: int,
+    rng: Any,
+) -> Match:
+    if not all(0 < q < 1 for q in quantiles):
+        raise ValueError(f"{test}(quantiles={quantiles!r}): give levels strictly between 0 and 1")
+    if isinstance(names, str):
+        raise ValueError(f"{test}(names={names!r}): give a sequence of names, as in [{names!r}]")
+    Verdict(test, alpha, ())  # says what is wrong with alpha before work is done
+    table = Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
+    sample = Draws(posterior) if isinstance(posterior, DrawsPosterior) else None
+    chosen = _chosen(posterior, exact, names)
+    _compare_evidence(table, posterior, exact)
+    for name in chosen:
+        node = posterior.model[name]
+        pair = Pair(table, posterior, exact, name, node, sample)
+        if node.domain is not None:
+            compare_states(pair)
+        elif node.angles is not None:
+            compare_angles(pair)
+        else:
+            compare_mean(pair)
+            compare_var(pair)
+            compare_cov(pair)
+            compare_quantiles(pair, quantiles)
+    remarks = _compare_joint(table, posterior, exact, chosen, draws, rng, alpha) if draws else []
+    if not table.comparisons and not table.skipped and not remarks:
+        raise ValueError(f"{test}: there is nothing to compare; name nodes that both know")
+    return counted(Match(test, alpha, table.comparisons, table.skipped, tuple(remarks)))
+
+
+def _chosen(posterior: Any, exact: Any, names: Sequence[str] | None) -> list[str]:
+    kept = getattr(posterior, "names", None)
+    wanted = list(exact.names if names is None else names)
+    if names is None and kept is not None:
+        wanted = [name for name in wanted if name in set(kept)]
+    return [name for name in wanted if posterior.model[name].kind != "input"]
+
+
+def _compare_evidence(table: Table, posterior: Any, exact: Any) -> None:
+    found, value = posterior.log_marginal_likelihood, exact.log_marginal_likelihood
+    if found is None or value is None:
+        return
+    error = posterior.log_marginal_likelihood_mcse
+    if not np.isfinite(found):
+        table.equal("log evidence", found, value)
+    elif not error:
+        table.equal("log evidence", found, value)
+    elif error > 1.0 / np.sqrt(MIN_ESS):
+        table.skipped += 1
+    else:
+        # the estimate of the likelihood itself is unbiased and nearly normal, its log is not
+        table.normal("log evidence (ratio)", float(np.exp(found - value)), 1.0, error)
+
+
+# ---- joint draws --------------------------------------------------------------------------------
+
+
+def _compare_joint(
+    table: Table,
+    posterior: Any,
+    exact: Any,
+    names: Sequence[str],
+    draws: int,
+    rng: Any,
+    alpha: float,
+) -> list[str]:
+    """One comparison of the joint law of all nodes; remarks where there are too few rows."""
+    if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < _MIN_ROWS:
+        raise ValueError(f"compare(draws={draws!r}): give a whole number, {_MIN_ROWS} or more")
+    generator = np.random.default_rng(seed_sequence(rng))
+    found = _rows(posterior, names, int(draws), generator)
+    if found is None:
+        return ["joint draws are not compared: the posterior holds none"]
+    size = len(next(iter(found.values()), ()))
+    if size < _MIN_ROWS:
+        table.skipped += 1
+        return [
+            f"joint draws are not compared: only {size} of the posterior's are independent of each other"
+        ]
+    right = _rows(exact, names, size, generator)
+    if right is None:
+        raise UnsupportedError(
+            f"compare(draws={draws}): {type(exact).__name__} has no draws to compare with (quadrature points "
+            "are none); compare with bmc.Exact's posterior, or without draws="
+        )
+    nodes = {name: posterior.model[name] for name in found}
+    angles = [name for name, node in nodes.items() if node.angles is not None and node.angles.all()]
+    labels = [n for n, node in nodes.items() if node.domain is not None and node.domain.labels]
+    level = alpha / (len(table.comparisons) + 1)
+    table.comparisons.append(energy_comparison(found, right, level, generator, angles, labels))
+    return []
+
+
+def _rows(
+    answer: Any, names: Sequence[str], most: int, rng: np.random.Generator
+) -> dict[str, np.ndarray] | None:
+    """Independent draws of an answer; None where it has none."""
+    if isinstance(answer, DrawsPosterior):
+        return Draws(answer).independent(names, most, rng)
+    if hasattr(answer, "sample"):  # an oracle
+        drawn = asked(answer, "sample", most, rng)
+        return None if drawn is None else {name: drawn[name] for name in names}
+    drawn = asked(answer, "resample", most, rng)
+    return None if drawn is None else Draws(drawn).independent(names, most, rng)
