@@ -9,6 +9,8 @@ from typing import Any
 
 # One colour for each role, the same in all figures.
 EXACT, DRAWS, OTHER, FAINT = "#1b2a41", "#7fb2e5", "#d1495b", "#9aa5b1"
+#: points per inch of saved pictures
+DPI = 150
 
 
 def options(doc: str | None, arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -28,7 +30,7 @@ def axes(mosaic: list[list[str]], size: tuple[float, float], **keywords: Any) ->
 def save(figure: Any, folder: Path, name: str) -> None:
     """Write ``name``.png, and say where."""
     folder.mkdir(parents=True, exist_ok=True)
-    figure.savefig(folder / f"{name}.png", dpi=150)
+    figure.savefig(folder / f"{name}.png", dpi=DPI)
     pyplot().close(figure)
     print(f"wrote {folder / name}.png")
 

@@ -94,7 +94,7 @@ def test_engine_matches_exact_answers(engine: str, kind: str) -> None:
     nets, draw = (CHAIN_NETS, 2_000) if chains else (len(SEEDS), 1_000)
     if engine == "LikelihoodWeighting, summaries":
         nets = SUMMARY_NETS
-    assert check_all(answer, kind, nets=nets, draw=draw) >= share[kind] * nets
+    assert check_all(answer, kind, nets=nets, draw=draw) >= int(share[kind] * nets)
 
 
 class Sampled:

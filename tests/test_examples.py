@@ -28,6 +28,7 @@ from examples import (
     markov_chains,
     old_faithful,
     parzen,
+    picture,
     pushforward,
     rejection_and_importance,
     three_views,
@@ -40,6 +41,12 @@ TWICE = (
     if testing.session.is_thorough()
     else (old_faithful, pushforward, ising_denoising, three_views)
 )
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    if not testing.session.is_thorough():  # what is drawn is the same, and most of the time goes there
+        monkeypatch.setattr(picture, "DPI", 50)
 
 
 @pytest.fixture(scope="module")

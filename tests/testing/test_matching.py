@@ -11,7 +11,7 @@ import scipy.stats
 import bayesmc as bmc
 from bayesmc.errors import UnsupportedError
 from bayesmc.results.draws import DrawsPosterior
-from bayesmc.testing import assert_matches, compare, enumerate_posterior
+from bayesmc.testing import assert_matches, compare, enumerate_posterior, quadrature_posterior
 from bayesmc.testing.verdict import BUDGET
 
 
@@ -374,3 +374,18 @@ def test_variances_are_averages_about_the_exact_mean() -> None:
     net.add("b", lambda a: a / 7.0)
     coin = bmc.infer(net, engine=bmc.LikelihoodWeighting(3000), rng=0)
     assert assert_matches(coin, enumerate_posterior(net))
+
+
+def test_quantiles_that_are_none_of_the_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Draws may be right, and what is answered of them not: here the weights are forgotten."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    right = quadrature_posterior(net, {"y": 2.0})
+    found = bmc.infer(net, {"y": 2.0}, engine=bmc.LikelihoodWeighting(3000), rng=0)
+    assert compare(found, right)
+    flat = np.asarray(found["x"])
+    monkeypatch.setattr(type(found), "quantile", lambda self, name, q: np.quantile(flat, q))
+    wrong = compare(found, right)
+    assert not wrong
+    assert all("as answered, which is none of the draws" in c.what for c in wrong.rejected)

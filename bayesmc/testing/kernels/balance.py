@@ -21,7 +21,8 @@ from bayesmc.kernels.base import Kernel
 from bayesmc.network import BayesNet, FactorGraph, pose
 from bayesmc.randomness import seed_sequence
 from bayesmc.testing.kernels.joint import NetStates, Rows, check_sizes
-from bayesmc.testing.kernels.moves import StepFunction, is_step, sampler_of
+from bayesmc.testing.kernels.machines import sampler_of
+from bayesmc.testing.kernels.steps import StepFunction, is_step
 from bayesmc.testing.kernels.transition import KernelMatrix, Sweep, exact_sweep
 from bayesmc.testing.oracles.enumeration import enumerate_posterior
 from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted

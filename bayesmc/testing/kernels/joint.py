@@ -26,6 +26,8 @@ Rows = dict[str, np.ndarray]
 Prior = Callable[[np.random.Generator, int], Any]
 #: ``simulate(state, rng)``: data for every row of the state
 Simulate = Callable[[Any, np.random.Generator], Any]
+#: ``move(state, data, rng)``: the next state of every row
+Move = Callable[[Any, Any, np.random.Generator], Any]
 #: name -> ``statistic(state, data)``, one real number for every row
 Statistics = Mapping[str, Callable[[Any, Any], Any]]
 

@@ -18,8 +18,8 @@ import numpy as np
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet
 from bayesmc.randomness import seed_sequence
-from bayesmc.testing.kernels.joint import JointModel, Statistics, check_sizes, values_of
-from bayesmc.testing.kernels.moves import Move, moves_of
+from bayesmc.testing.kernels.joint import JointModel, Move, Statistics, check_sizes, values_of
+from bayesmc.testing.kernels.moves import moves_of
 from bayesmc.testing.kernels.uniformity import uniformity_p_value
 from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 

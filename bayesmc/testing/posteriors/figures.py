@@ -243,16 +243,17 @@ def compare_cov(pair: Pair) -> None:
 
 
 def compare_quantiles(pair: Pair, levels: Sequence[float]) -> None:
-    """The share of draws up to the exact quantile; of exact answers the quantiles themselves."""
+    """The share of draws up to the exact quantile; of exact answers the quantiles themselves.
+
+    What is answered as a quantile must be one of the draws' own, which chance does not excuse.
+    """
     if not len(levels) or not hasattr(pair.exact, "quantile"):
         return
     value = asked(pair.exact, "quantile", pair.name, list(levels))
     if value is None:
         return
     count = pair.effective(pair.node.value_shape)
-    found = None
-    if np.isinf(count).any():
-        found = asked(pair.posterior, "quantile", pair.name, list(levels))
+    found = asked(pair.posterior, "quantile", pair.name, list(levels))
     values = None if pair.sample is None else pair.sample.values(pair.name)
     for k, q in enumerate(levels):
         for at in np.ndindex(pair.node.value_shape):
@@ -261,7 +262,11 @@ def compare_quantiles(pair: Pair, levels: Sequence[float]) -> None:
             if np.isinf(count[at]) and found is not None:
                 pair.table.equal(what, float(found[(k, *at)]), x, max(abs(x), 1.0), _SQUARES)
             elif values is not None and np.isfinite(count[at]):
-                _compare_share(pair, what, _column(values, at), at, x, q)
+                column = _column(values, at)
+                if found is not None and not pair.sample.lies_at(column, float(found[(k, *at)]), q):  # type: ignore[union-attr]
+                    own = f"{what} as answered, which is none of the draws"
+                    pair.table.add(own, float(found[(k, *at)]), x, np.inf, 0.0)
+                _compare_share(pair, what, column, at, x, q)
 
 
 def _compare_share(

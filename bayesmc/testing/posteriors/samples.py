@@ -223,6 +223,15 @@ class Draws:
             return float(values.mean()), float(values.size)
         return float(values.mean()), self._chain_ess(values)
 
+    def lies_at(self, values: np.ndarray, x: float, q: float) -> bool:
+        """Whether ``x`` is a ``q``-quantile of the draws, to one of them either side."""
+        if self.weights is None:
+            below, upto, one = (values < x).mean(), (values <= x).mean(), 1.0 / values.size
+        else:
+            w = np.broadcast_to(self.weights, values.shape)
+            below, upto, one = w[values < x].sum(), w[values <= x].sum(), w.max()
+        return bool(below - one - 1e-9 <= q <= upto + one + 1e-9)
+
     def independent(
         self, names: Sequence[str], most: int, rng: np.random.Generator
     ) -> dict[str, np.ndarray]:
