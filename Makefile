@@ -7,7 +7,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 PY = .venv/bin/python
 PIP_FLAGS = --disable-pip-version-check -q
 
-.PHONY: help demo test test-thorough mutants lint format docs bench peers references clean
+.PHONY: help demo test test-thorough mutants alarms lint format docs bench peers references clean
 .NOTPARALLEL:
 
 help:
@@ -15,6 +15,7 @@ help:
 	@echo "make test    run the tests, doctests and examples included"
 	@echo "make test-thorough  the same with fresh seeds and more draws; BAYESMC_SEED=N repeats a run (long)"
 	@echo "make mutants  show that each of a list of planted faults is caught"
+	@echo "make alarms  count the false alarms of the statistical tests (long)"
 	@echo "make lint    ruff, formatting, mypy"
 	@echo "make format  let ruff mend formatting and import order"
 	@echo "make docs    run every snippet of README, docs and docstrings"
@@ -34,7 +35,10 @@ test-thorough: .venv/.extras-plot,arviz,robotics,test
 	OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -q -n auto --dist worksteal --bayesmc-thorough
 
 mutants: .venv/.extras-plot,arviz,robotics,test
-	$(PY) -m tests.mutants
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.mutants
+
+alarms: .venv/.extras-plot,arviz,robotics,test
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.alarms
 
 lint: .venv/.extras-dev
 	$(PY) -m ruff check .

@@ -45,7 +45,8 @@ TWICE = (
 
 @pytest.fixture(autouse=True)
 def small_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    if not testing.session.is_thorough():  # what is drawn is the same, and most of the time goes there
+    """The same in fewer dots, which take most of the time; in a thorough run as they are."""
+    if not testing.session.is_thorough():
         monkeypatch.setattr(picture, "DPI", 50)
 
 
@@ -74,7 +75,7 @@ def test_examples_run(example: Any, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert example in demo.NETS or tmp_path / f"{named(example)}.png" in pictures
     for path in pictures:
         content = path.read_bytes()
-        assert content.startswith(b"\x89PNG") and len(content) > 15_000
+        assert content.startswith(b"\x89PNG") and len(content) > 7_000  # empty axes: 5,600
         assert f"wrote {path}" in printed
     if example in demo.NETS:
         tables = len(list(example.questions(1_000)))
