@@ -135,10 +135,10 @@ CASES = (
     Case("assert_matches, likelihood weighting", 10_000, matches(
         bmc.LikelihoodWeighting(1000), "hybrid, seen")),
     Case("assert_matches, independent draws", 10_000, matches(bmc.LikelihoodWeighting(500), "hybrid")),
-    Case("assert_matches, chains", 10_000, matches(bmc.Gibbs(150, warmup=5, chains=4), "normal")),
+    Case("assert_matches, chains", 10_000, matches(bmc.Gibbs(60, warmup=5, chains=4), "normal")),
     Case("assert_matches with draws", 10_000, matches(bmc.LikelihoodWeighting(400), "hybrid", draws=150)),
     Case("unbiased_evidence_test", 10_000, lambda s: unbiased_evidence_test(
-        estimate, exact=LOG_Z, alpha=ALPHA, rng=s, replications=300)),
+        estimate, exact=LOG_Z, alpha=ALPHA, rng=s, replications=200)),
     Case("invariant, counted", 10_000, lambda s: invariant(
         draw_a, finite(), draws=1000, batched=True, alpha=ALPHA, rng=s)),
     Case("detailed_balance, counted", 10_000, lambda s: detailed_balance(
@@ -157,9 +157,9 @@ CASES = (
     Case("rank_test, sequential", 1000, lambda s: rank_test(
         walk_x, normal(), batched=True, alpha=ALPHA, stages=4, replications=400, rng=s)),
     Case("simulation_based_calibration", 1000, lambda s: simulation_based_calibration(
-        sample_x, normal(), alpha=ALPHA, rng=s)),
+        sample_x, normal(), alpha=ALPHA, rng=s, replications=100)),
     Case("simulation_based_calibration, Gibbs", 1000, lambda s: simulation_based_calibration(
-        bmc.Gibbs(25, warmup=5, chains=8), normal(), alpha=ALPHA, rng=s, replications=100)),
+        bmc.Gibbs(20, warmup=5, chains=4), normal(), alpha=ALPHA, rng=s, replications=40)),
 )  # fmt: skip
 
 

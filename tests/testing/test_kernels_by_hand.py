@@ -8,8 +8,7 @@ at alpha = 1e-3 for right kernels, i.e. a fresh seed would fail one run in a tho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ import scipy.special
 
 from bayesmc.errors import DensityError, ShapeError
 from bayesmc.testing import GewekeResult, JointModel, geweke_test, rank_test
-from bayesmc.testing.verdict import Comparison, uncounted
+from bayesmc.testing.verdict import Comparison
 
 # ---- a conjugate Normal model: unknown mean and precision, five observations -----------------------
 
@@ -182,13 +181,6 @@ MIXTURE_FAULTS = ("no prior", "variance", "off by one", "category prior")
 def names(result: Any) -> tuple[str, ...]:
     """Statistics that deviate."""
     return tuple(c.what.split(", rank ")[0] for c in result.rejected)
-
-
-@pytest.fixture(autouse=True)
-def repetitions(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What counts alarms spends nothing of the run's budget."""
-    with uncounted() if "alarms" in request.node.name else nullcontext():
-        yield
 
 
 def assert_binomial(rejections: int, runs: int, alpha: float, low: bool = False) -> None:
