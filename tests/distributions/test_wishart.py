@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import special, stats
+from scipy import linalg, special, stats
 
 import bayesmc as bmc
 import bayesmc.distributions as d
@@ -50,8 +50,21 @@ def test_log_prob_equals_scipys(
             stats.wishart(size + 1, np.eye(size)).rvs(4, seed).reshape(4, size, size),
         ]
     )
+    x = x[[_has_a_root(value) for value in x]]
     expected = theirs(df, scale).logpdf(np.moveaxis(x, 0, -1))
-    np.testing.assert_allclose(ours(df, scale).log_prob(x), expected, rtol=1e-10, atol=1e-10)
+    error = np.abs(ours(df, scale).log_prob(x) - expected)
+    # what rounding may cost either of a determinant whose logarithm counts about df / 2 times
+    lost = np.finfo(float).eps * (df + 4) * np.linalg.cond(x)
+    assert (error <= 1e-10 * (1 + np.abs(expected)) + lost).all(), (error, lost)
+
+
+def _has_a_root(value: np.ndarray) -> bool:
+    """Whether SciPy finds a Cholesky factor; near d - 1 degrees of freedom it may not, by rounding."""
+    try:
+        linalg.cholesky(value, lower=True)
+    except np.linalg.LinAlgError:
+        return False
+    return True
 
 
 def extended_log_prob(family: Any, df: float, scale: Any, x: Any) -> float:

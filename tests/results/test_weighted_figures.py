@@ -162,7 +162,9 @@ def test_copies_of_a_draw_do_not_shrink_its_error(sharp, how: str) -> None:
     for name in ("x", "z"):
         # resampling adds noise of its own, so somewhat above; 10,000 draws would be 20 times below
         assert 0.7 < moved.mcse(name) / sharp.mcse(name) < 3.0
-        assert moved.ess(name) <= 2 * distinct  # more than distinct where the heavy ones are central
+        assert (
+            moved.ess(name) <= 2 * distinct
+        )  # more than distinct where the heavy ones are central
     assert 0.7 < moved.mcse(lambda x: 2 * x) / sharp.mcse(lambda x: 2 * x) < 3.0
     row = moved.summary()["x"]
     assert row["mcse"] == pytest.approx(float(moved.mcse("x"))) and row["ess"] <= 2 * distinct
