@@ -1,4 +1,4 @@
-"""The pytest plugin of bayesmc: the seed of a run, the fixture ``rng``, and what false alarms were risked.
+"""The pytest plugin of bayesmc: seeds, the fixture ``rng``, what failing tests found, false alarms risked.
 
 It stands outside the package, so that pytest's start imports neither bayesmc nor NumPy, in projects too that
 have bayesmc installed and do not test with it. What tests ask of a run is in ``bayesmc.testing.session``; the
@@ -13,8 +13,9 @@ import hashlib
 import math
 import os
 import secrets
+import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,8 @@ SEED, THOROUGH = "BAYESMC_SEED", "BAYESMC_THOROUGH"
 _FRESH = 10**9
 #: failures beyond those that the last line names come about by chance with this probability
 _RARE = 1e-3
+#: verdicts shown of a failing test, the latest
+_SHOWN = 5
 
 
 @dataclass
@@ -168,6 +171,48 @@ def pytest_report_header(config: pytest.Config) -> str | None:
     return f"bayesmc: {'thorough run with ' if run.thorough else ''}seed {run.seed}"
 
 
+# ---- what failing tests found -------------------------------------------------------------------
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Forget what earlier tests found."""
+    _verdicts().clear()
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Iterator[None]:
+    """Show the false verdicts of a failing test whole: pytest cuts what ``assert`` was given to one line."""
+    outcome: Any = yield
+    report = outcome.get_result()
+    verdicts = _verdicts()
+    if not report.failed:
+        return
+    # once each: Hypothesis repeats the example that fails
+    false = list(dict.fromkeys(repr(v) for v in verdicts if not v))
+    verdicts.clear()
+    if false:
+        lines = false[-_SHOWN:]
+        if len(false) > _SHOWN:
+            lines.insert(0, f"the last {_SHOWN} of {len(false)} false verdicts:")
+        lines.append(f"the same again: pytest {item.config.stash[RUN].repeat} {_address(item)}")
+        report.sections.append(("bayesmc verdicts", "\n".join(lines)))
+
+
+def _address(item: pytest.Item) -> str:
+    """What a shell gives pytest to run this test, where pytest was called."""
+    path, here = item.path, item.config.invocation_params.dir
+    file = path.relative_to(here) if path.is_relative_to(here) else path
+    # not the item's own nodeid, as in `rng`; that of its parent has the classes
+    _, *classes = str(getattr(item.parent, "nodeid", "")).split("::")
+    return shlex.quote("::".join([file.as_posix(), *classes, item.name]))
+
+
+def _verdicts() -> Any:
+    """The verdicts of late in this process; nothing where bayesmc's tests were not even imported."""
+    return getattr(sys.modules.get("bayesmc.testing.verdict"), "LAST", [])
+
+
 # ---- the false alarms that were risked ----------------------------------------------------------
 
 
@@ -204,7 +249,8 @@ def _summary(run: Run, total: Spending, by_test: bool) -> list[str]:
     line = f"bayesmc: {tests} spent a false-alarm budget of {alpha:.3g} ({again})"
     if run.thorough:
         most = _most_by_chance(alpha)
-        line += f"; chance explains {alpha:.3g} failures on average, and hardly more than {most}"
+        # some alarms that are counted cannot happen: levels are bounds, and some comparisons have no chance
+        line += f"; chance explains at most {alpha:.3g} failures on average, hardly ever more than {most}"
     if run.lost:
         line += f"; not counted: {', '.join(run.lost)}, which ended early"
     parts = sorted(total.calls, key=lambda test: -total.spent[test]) if by_test else []

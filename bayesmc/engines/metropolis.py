@@ -201,7 +201,7 @@ class MetropolisSampler(SweepSampler):
     def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
         member = (state["sweep"] // self.thinning - 1) % self.ensemble
         now = {n: v[member :: self.ensemble] for n, v in state["values"].items()}
-        return self._completed(now, state["chains"], rng)
+        return self.completed(now, state["chains"], rng)
 
     def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
         rates = super().acceptance(state)

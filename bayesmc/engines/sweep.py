@@ -55,7 +55,7 @@ class SweepSampler:
         return {**state, "memory": memory}
 
     def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
-        return self._completed(state["values"], state["chains"], rng)
+        return self.completed(state["values"], state["chains"], rng)
 
     def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
         rates = {
@@ -73,7 +73,7 @@ class SweepSampler:
         memory = [kernel.start(values, rows) for kernel in self.kernels]
         return {"values": inside, "memory": memory, "chains": chains}
 
-    def _completed(
+    def completed(
         self, values: Mapping[str, np.ndarray], chains: int, rng: np.random.Generator
     ) -> Values:
         """All nodes' values: what is known, what the chains say, and what is drawn forward from these."""

@@ -48,6 +48,7 @@ class FactorSlice(Kernel):
         self.shapes = [target.model[n].value_shape for n in names]
         self.sizes = [int(np.prod(s, dtype=int)) for s in self.shapes]
         self.size = sum(self.sizes)
+        self.order = range(self.size)
         self.transforms = [_transform(target.model[n]) for n in names]
         self.match = "jointly with " + ", ".join(names) if len(names) > 1 else "as one vector"
 
@@ -67,7 +68,7 @@ class FactorSlice(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         x = self._joined(values)
-        for k in range(self.size):
+        for k in self.order:
             direction = memory["directions"][k]
 
             def log_density(t: np.ndarray, x: Any = x, direction: Any = direction) -> np.ndarray:

@@ -137,6 +137,7 @@ class Slice(Kernel):
         self.is_integer = blanket.node.is_discrete
         support = blanket.node.support
         self.on_logs = support is not None and is_half_line(support)
+        self.components = tuple(np.ndindex(blanket.event_shape))
 
     def start(self, values: Values, chains: int) -> Memory:
         spread = np.ones(values[self.blanket.name].shape[1:])
@@ -149,7 +150,7 @@ class Slice(Kernel):
         name = blanket.name
         state = values
         for members in blanket.classes:
-            for component in np.ndindex(blanket.event_shape):
+            for component in self.components:
                 new = self._move(state, members, component, memory, rng)
                 state = {**state, name: blanket.moved(state, new, members)}
         if warmup:

@@ -24,6 +24,8 @@ from bayesmc.states import StateArray, as_numbers
 
 #: draws on which a function is tried alone
 _DRAWS_TRIED = 8
+#: pairs of draws between which elements of a plate are changed: one pair may hide a mixing by luck
+_PAIRS_TRIED = 8
 
 
 class Query:
@@ -158,16 +160,18 @@ class Query:
 
     def _check_plates(self, stored: Mapping[str, np.ndarray], batch: Shape) -> None:
         """Changing some elements of a plate must leave the values of the others."""
-        first, last = (0,) * len(batch), tuple(n - 1 for n in batch)
+        total = math.prod(batch)
+        rows = np.linspace(0, total - 1, min(_PAIRS_TRIED, total)).round().astype(int)
+        base, other = (np.unravel_index(r, batch) for r in (rows, np.roll(rows, -1)))
         for axis, plate in enumerate(self.plates):
             size = self.plate_shape[axis]
             for chosen in masks(size) if size > 1 else ():
-                pair = {
-                    n: self._blend(n, stored[n][first], stored[n][last], plate, chosen)
+                pairs = {
+                    n: self._blend(n, stored[n][base], stored[n][other], plate, chosen)
                     for n in self.nodes
                 }
-                before, after = self._evaluate(pair, (2,))
-                rest = (slice(None),) * axis + (~chosen,)
+                before, after = np.split(self._evaluate(pairs, (2 * len(rows),)), 2)
+                rest = (slice(None),) * (axis + 1) + (~chosen,)
                 if not nearly_equal(before[rest], after[rest]):
                     raise QueryError(
                         f"query: the function mixes elements of plate {plate!r}; with plates= it acts "
@@ -177,13 +181,13 @@ class Query:
     def _blend(
         self, name: str, base: np.ndarray, other: np.ndarray, plate: str, chosen: np.ndarray
     ) -> np.ndarray:
-        """A value, and the same with the chosen elements of a plate taken from another draw."""
+        """Draws, and after them the same with the chosen elements of a plate taken from others."""
         node = self.model.nodes[name]
         if plate not in node.plates:
-            return np.stack([base, base])
-        axis = node.plates.index(plate)
+            return np.concatenate([base, base])
+        axis = 1 + node.plates.index(plate)
         mask = chosen.reshape((-1,) + (1,) * (base.ndim - axis - 1))
-        return np.stack([base, np.where(mask, other, base)])
+        return np.concatenate([base, np.where(mask, other, base)])
 
 
 def _arguments(function: Callable[..., Any], names: Mapping[str, str]) -> tuple[str, ...]:

@@ -2,9 +2,10 @@
 
 Runs of pytest are steered by ``--bayesmc-seed N`` and ``--bayesmc-thorough`` (the plugin comes with bayesmc).
 An ordinary run has the seed 0, so that it gives the same result every time; a thorough one draws a fresh
-seed, prints it, and has more draws. Module-level code of tests and conftest files may ask already, and gets
-the same on all workers; without pytest, the environment variables ``BAYESMC_SEED`` and ``BAYESMC_THOROUGH``
-say it. Inside a test the fixture ``rng`` is shorter: a generator of the run's seed and the test's name.
+seed, prints it, and has more draws where tests call `scaled`, and only there. Module-level code of tests and
+conftest files may ask already, and gets the same on all workers; without pytest, the environment variables
+``BAYESMC_SEED`` and ``BAYESMC_THOROUGH`` say it. Inside a test the fixture ``rng`` is shorter: a generator of
+the run's seed and the test's name.
 
 Examples
 --------

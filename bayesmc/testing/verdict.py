@@ -11,6 +11,8 @@ Holm (1979), A simple sequentially rejective multiple test procedure, Scandinavi
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -35,6 +37,8 @@ class Comparison:
         Distance in standard errors (infinite where none is allowed).
     p_value : float
         Of a distance at least this large, were all right.
+    kind : str
+        What ``exact`` is, in a word: expected values and other simulations have errors of their own.
     """
 
     what: str
@@ -42,10 +46,11 @@ class Comparison:
     exact: float
     errors: float
     p_value: float
+    kind: str = "exact"
 
     def __str__(self) -> str:
         return (
-            f"{self.what}: {self.found:.6g} against {self.exact:.6g} exact, "
+            f"{self.what}: {self.found:.6g} against {self.exact:.6g} {self.kind}, "
             f"{self.errors:.3g} standard errors (p = {self.p_value:.2g})"
         )
 
@@ -83,6 +88,8 @@ class Verdict:
 
     def __post_init__(self) -> None:
         check_level(self.test, self.alpha)
+        if any(math.isnan(c.p_value) for c in self.comparisons):
+            raise ValueError(f"{self.test}: a comparison has no p-value: {list(self.comparisons)}")
         ordered = sorted(self.comparisons, key=lambda c: (c.p_value, -c.errors))
         object.__setattr__(self, "comparisons", tuple(ordered))
 
@@ -168,6 +175,8 @@ class Budget:
 
 #: of this process
 BUDGET = Budget()
+#: verdicts of late, for whoever reports a failing test; who reads it clears it
+LAST: deque[Verdict] = deque(maxlen=50)
 
 V = TypeVar("V", bound=Verdict)
 
@@ -186,13 +195,17 @@ def uncounted() -> Iterator[None]:
     True
     """
     kept = dict(BUDGET.spent), dict(BUDGET.calls)
+    verdicts = list(LAST)
     try:
         yield
     finally:
         BUDGET.spent, BUDGET.calls = kept
+        LAST.clear()
+        LAST.extend(verdicts)
 
 
 def counted(verdict: V) -> V:
     """The verdict, whose ``alpha`` is now in the budget: every test of the kit returns through here."""
     BUDGET.add(verdict.test, verdict.alpha)
+    LAST.append(verdict)
     return verdict

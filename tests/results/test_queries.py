@@ -128,6 +128,17 @@ def test_mixing_elements_is_refused_where_plates_are_named(weighted, function) -
     assert weighted.expectation(function).shape == (3,)  # without plates= it may
 
 
+def test_mixing_elements_is_refused_whatever_the_draws() -> None:
+    # one pair of draws leaves the largest element where it is in 1 of 6 cases
+    net = bmc.BayesNet(plates={"p": 3})
+    net.add("g", bmc.Normal(0.0, 1.0), plates="p")
+    for seed in range(20):
+        posterior = bmc.infer(net, engine=bmc.LikelihoodWeighting(100), rng=seed)
+        with pytest.raises(QueryError, match="mixes elements of plate 'p'"):
+            posterior.expectation(lambda g: 1.0 * (g == g.max(axis=-1, keepdims=True)), plates="p")
+        assert posterior.expectation(lambda g: 1.0 * (g > 0), plates="p").shape == (3,)
+
+
 @pytest.mark.parametrize(
     "function",
     [

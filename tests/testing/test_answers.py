@@ -10,6 +10,7 @@ import scipy.stats
 
 import bayesmc as bmc
 from bayesmc.errors import (
+    BudgetError,
     ModelError,
     ParameterError,
     UnknownNodeError,
@@ -272,3 +273,48 @@ def test_draws_of_an_answer_are_coupled() -> None:
     curved.add("x", bmc.Gamma(2.0, 1.0))
     with pytest.raises(UnsupportedError, match="quadrature has points and no draws"):
         exact(curved).sample(3, np.random.default_rng(0))
+
+
+def test_answers_are_drawn_from_by_seed() -> None:
+    coin = bmc.BayesNet()
+    coin.add("a", bmc.Bernoulli(0.4))
+    net, evidence = mixture()
+    for answer in (
+        exact(coin),
+        exact(coin).answer,
+        exact(net, evidence),
+        exact(net, evidence).answer,
+    ):
+        once, again = answer.sample(50, 3), answer.sample(50, rng=3)
+        assert all((once[n] == again[n]).all() for n in once)
+        assert len(answer.sample(5)["a"]) == 5
+        assert any((once[n] != answer.sample(50, 4)[n]).any() for n in once)
+
+
+def test_the_error_of_an_integral_can_be_asked_for() -> None:
+    net = bmc.BayesNet()
+    net.add("r", bmc.Gamma(3.0, 2.0))
+    net.add("n", lambda r: bmc.Poisson(r))
+    rough, fine = exact(net, {"n": 4}, rtol=1e-2), exact(net, {"n": 4})
+    assert fine.accuracy < rough.accuracy < 0.1
+    assert rough.answer.evaluations < fine.answer.evaluations
+    with pytest.raises(ValueError, match=r"exact\(rtol=0\): give a number from 1e-13"):
+        exact(net, {"n": 4}, rtol=0)
+    assert len(repr(fine.answer)) < 120
+    assert repr(fine.answer).startswith("Quadrature(log_marginal_likelihood=-")
+
+
+def test_what_cannot_be_known_finely_is_known_roughly() -> None:
+    """Evaluations that are too few for the accuracy of two unknowns, and enough for 1e-4."""
+    net = bmc.BayesNet()
+    net.add("s", bmc.Gamma(2.0, 1.0))
+    net.add("x", lambda s: bmc.Normal(0.0, s))
+    net.add("y", lambda x: bmc.Normal(np.abs(x), 0.05))
+    evidence = {"y": 0.1}
+    fine = quadrature_posterior(net, evidence)
+    assert fine.evaluations > 60_000
+    rough = quadrature_posterior(net, evidence, max_evaluations=40_000)
+    assert 1e-6 < rough.accuracy < 1e-3
+    assert abs(rough.log_marginal_likelihood - fine.log_marginal_likelihood) < rough.accuracy
+    with pytest.raises(BudgetError, match="is asked for"):
+        quadrature_posterior(net, evidence, max_evaluations=40_000, rtol=1e-7)

@@ -14,7 +14,14 @@ import pytest
 from scipy import stats
 
 import bayesmc as bmc
-from bayesmc.errors import DensityError, ModelError, ShapeError, UnknownNodeError
+from bayesmc.errors import (
+    DensityError,
+    ModelError,
+    ShapeError,
+    UnknownNodeError,
+    UnsupportedError,
+)
+from bayesmc.testing.kernels.joint import JointModel
 from bayesmc.testing.posteriors.bands import _chance_of, ecdf_band, ecdf_points, ecdf_uniformity
 from bayesmc.testing.posteriors.calibration import simulation_based_calibration
 from bayesmc.testing.posteriors.shares import Draws, posterior_draws, share_below
@@ -249,7 +256,9 @@ def test_ranks_of_a_node_do_not_see_that_data_are_ignored() -> None:
     wrong = sampler(0.0, 1.0, 0.0)
     assert simulation_based_calibration(wrong, normal_net(), statistics=blind, rng=0)
     seeing = {"x*y": lambda x, y: x * y}
-    assert not simulation_based_calibration(wrong, normal_net(), statistics=seeing, rng=0)
+    caught = simulation_based_calibration(wrong, normal_net(), statistics=seeing, rng=0)
+    assert not caught
+    assert "x*y: its values at the draws lie too low" in repr(caught)
 
 
 class Forgetful(bmc.LikelihoodWeighting):
@@ -298,11 +307,35 @@ def test_a_picture_has_a_panel_for_each_statistic() -> None:
     assert deviants.isdisjoint(colours[n] for n in found.ranks if n not in found.deviating)
     drawn = axes[0].lines[-1].get_ydata()[1:-1]
     np.testing.assert_allclose(drawn, found.ecdf_difference["node 'x'"])
+    assert axes[0].figure.get_suptitle() == "band: 99.9% for all 3 statistics together"
+    pyplot.close("all")
+
+
+@pytest.mark.parametrize(("count", "named"), [(3, "all"), (25, "those that deviate")])
+def test_a_picture_in_one_axes_tells_statistics_apart(count: int, named: str) -> None:
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    powers = {f"s{k}": lambda x, y, k=k: x if k == 1 else y + 0.0 * x for k in range(count)}
+    found = simulation_based_calibration(
+        sampler(0.6, 0.5**0.5), normal_net(), statistics=powers, replications=80, alpha=0.05, rng=0
+    )
+    assert found.deviating == ("s1",)
     _, ax = pyplot.subplots()
     assert all(one is ax for one in found.plot(ax))
-    assert [t.get_text() for t in ax.get_legend().get_texts()] == [
-        n for n in found.ranks if n in found.deviating
-    ]
+    lines = {line.get_label(): line for line in ax.lines if line.get_label() in found.ranks}
+    assert set(lines) == set(found.ranks)
+    assert len({(line.get_color(), line.get_linestyle()) for line in lines.values()}) == count
+    thick = max(lines.values(), key=lambda line: line.get_linewidth())
+    assert thick is lines["s1"]
+    assert thick is ax.lines[-1]
+    legend = ax.get_legend()
+    expected = list(found.ranks) if named == "all" else ["s1"]
+    assert [t.get_text() for t in legend.get_texts()] == expected
+    for text, handle in zip(legend.get_texts(), legend.legend_handles, strict=True):
+        assert handle.get_color() == lines[text.get_text()].get_color()
+    assert ax.get_title() == f"band: 95% for all {count} statistics together"
     pyplot.close("all")
 
 
@@ -344,3 +377,46 @@ def test_wrong_arguments_are_named() -> None:
             simulation_based_calibration(
                 None, net, statistics={"root": lambda x: np.sqrt(x)}, rng=0
             )
+
+
+@pytest.mark.parametrize(
+    ("statistics", "words"),
+    [
+        (["x"], "statistics is a list, not a dict; give a dict of name -> function of nodes"),
+        (lambda x: x, "statistics is a function, not a dict; give a dict"),
+        ({"a": "x"}, r"statistics\['a'\] is 'x', which is not a function; give a dict"),
+        ({"a": 3}, r"statistics\['a'\] is 3, which is not a function; give a dict"),
+        ({"a": np.zeros(2)}, r"statistics\['a'\] is array\(.*, which is not a function"),
+        ({3: lambda x: x}, "the name 3 of a statistic is not a string"),
+    ],
+)
+def test_statistics_that_are_no_dict_of_functions_are_refused(statistics: Any, words: str) -> None:
+    with pytest.raises(TypeError, match=f"simulation_based_calibration: {words}"):
+        simulation_based_calibration(None, normal_net(), statistics=statistics)
+
+
+def test_what_is_no_net_is_refused_with_what_to_do() -> None:
+    net = normal_net()
+    dbn = bmc.DynamicBayesNet()
+    joint = JointModel(lambda rng, n: rng.normal(size=n), lambda x, rng: x, {})
+    call = "simulation_based_calibration"
+    with pytest.raises(UnsupportedError, match=rf"{call}: .* {call}\(engine, dbn.unroll\(10\)\)"):
+        simulation_based_calibration(bmc.ParticleFilter(10), dbn)
+    with pytest.raises(
+        UnsupportedError, match=rf"{call}: a JointModel .*rank_test\(kernel, model\)"
+    ):
+        simulation_based_calibration(bmc.Gibbs(), joint)  # type: ignore[arg-type]
+    with pytest.raises(
+        TypeError, match=rf"{call}: the engine comes first; write {call}\(engine, net\)"
+    ):
+        simulation_based_calibration(net, bmc.Gibbs())  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=f"{call}: net is a int; give a BayesNet"):
+        simulation_based_calibration(None, 3)  # type: ignore[arg-type]
+
+
+def test_the_net_of_a_template_is_calibrated_as_its_error_says() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    net = dbn.unroll(3)
+    assert simulation_based_calibration(None, net, replications=20, rng=0)

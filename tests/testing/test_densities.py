@@ -6,11 +6,12 @@ import math
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.special
 import scipy.stats
 
 import bayesmc as bmc
-from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.errors import BroadcastError, UnknownNodeError, UnsupportedError
 from bayesmc.testing.densities.conditionals import check_cpd
 from bayesmc.testing.densities.density import check_density
 from bayesmc.testing.densities.masses import Element, table_of, volume_of
@@ -62,6 +63,45 @@ def shared(rng: np.random.Generator, shape: tuple) -> np.ndarray:
 def leaning(rng: np.random.Generator, shape: tuple) -> np.ndarray:
     x, z = rng.normal(size=(2, *shape))
     return np.stack([x, 0.9 * x + math.sqrt(0.19) * z], axis=-1)
+
+
+ROOT = np.linalg.cholesky([[1.0, 0.6], [0.6, 1.0]])
+SAMPLERS = {
+    "right": lambda z: z @ ROOT.T,
+    "no correlation": lambda z: z,
+    "the root's transpose": lambda z: z @ ROOT,
+    "wide": lambda z: 1.2 * z @ ROOT.T,
+    "shifted": lambda z: 0.2 + z @ ROOT.T,
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "size"), [*((kind, 2) for kind in SAMPLERS), ("right", 4), ("the root's transpose", 4)]
+)
+def test_moments_of_vectors_are_those_of_the_integral(kind: str, size: int) -> None:
+    """By the product rule and by importance sampling; each fault is 6 standard errors off or more."""
+    cov = scipy.linalg.block_diag(*[ROOT @ ROOT.T] * (size // 2))
+    right = bmc.MvNormal(np.zeros(size), cov)
+
+    def draw(rng: np.random.Generator, shape: tuple) -> np.ndarray:
+        pairs = SAMPLERS[kind](rng.normal(size=(*shape, size // 2, 2)))
+        return pairs.reshape(*shape, size)
+
+    density = D(right.log_prob, draw, event_shape=size)
+    check = check_density(density, draws=3000, rng=0)
+    assert bool(check) == (kind == "right"), check
+    assert check or any("far values drawn in" in fault for fault in check.faults)
+
+
+def test_a_spread_off_by_a_twentieth_is_seen() -> None:
+    """The mean square of 10,000 draws is 7 standard errors off; missed with probability 1e-3 each."""
+    for seed in range(5):
+        check = check_density(D(gauss, normal(1.05)), draws=10_000, rng=seed)
+        assert any("mean square of the draws' normal scores" in fault for fault in check.faults)
+    wide = D(bmc.Poisson(20.0).log_prob, lambda r, s: r.poisson(20.0, size=s) + 4 * (r.random(s) < 0.1),
+             support="nonnegative integer")  # fmt: skip
+    check = check_density(wide, draws=10_000, rng=0)
+    assert any("draws' normal scores" in fault for fault in check.faults), check
 
 
 class Wrong(bmc.Normal):
@@ -264,6 +304,27 @@ def test_faults_of_nodes_come_with_the_parents_values(kind: str) -> None:
         assert check
     else:
         assert any(words in fault for fault in check.faults), check
+
+
+def test_faults_elsewhere_are_no_faults_of_a_node() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.5, 0.5))
+    net.add("x", lambda a: bmc.Normal(a, 1.0))
+    net.add("mixing", lambda a: bmc.Normal(np.mean(a), 1.0))
+    net.add("after", lambda mixing: bmc.Normal(mixing, 1.0))
+    net.add("orphan", lambda nobody: bmc.Normal(nobody, 1.0))
+    assert check_cpd(net, "x", draws=1000, rng=0)
+    assert not check_cpd(net, "mixing", draws=1000, rng=0)
+    with pytest.raises(BroadcastError, match="node 'mixing'"):  # an ancestor's
+        check_cpd(net, "after", draws=1000, rng=0)
+
+
+def test_negative_probabilities_come_with_the_parents_values() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Normal(0.5, 0.5))
+    net.add("k", lambda a: bmc.Categorical(np.stack([a, 1 - a], axis=-1)))
+    fault = check_cpd(net, "k", rng=0).faults[0]
+    assert fault.startswith("at a=1.0709: a probability is negative, -0.070858: "), fault
 
 
 def test_what_has_no_density_is_refused() -> None:

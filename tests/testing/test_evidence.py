@@ -205,11 +205,16 @@ LAWS: dict[str, Callable[[np.random.Generator], np.ndarray]] = {
 }
 
 
+def logs_of(ratios: np.ndarray) -> np.ndarray:
+    with np.errstate(divide="ignore"):
+        return np.log(ratios)
+
+
 @pytest.mark.parametrize("law", LAWS)
 def test_the_level_holds_for_skewed_ratios(law: str) -> None:
     """At most 9 alarms of 300 at level 0.01 but for a chance of 1e-3; Student's t is over it."""
     rng = np.random.default_rng(3)
-    alarms = sum(_judged(LAWS[law](rng), 0.0)[0].p_value < 0.01 for _ in range(300))
+    alarms = sum(_judged(logs_of(LAWS[law](rng)), 0.0)[0].p_value < 0.01 for _ in range(300))
     assert alarms <= stats.binom.ppf(0.999, 300, 0.01)
 
 
@@ -218,13 +223,37 @@ def test_ratios_that_are_too_uneven_are_not_called_too_small() -> None:
     found = unbiased_evidence_test(lambda rng: rng.normal(-8.0, 4.0), exact=0.0, rng=1)
     assert found.ratios.mean() < 0.5
     assert stats.ttest_1samp(found.ratios, 1.0).pvalue < 1e-3
-    assert found
+    assert not found.rejected
     assert found.uneven
     assert "too uneven to tell whether their mean is too small" in repr(found)
+
+
+def test_what_was_not_judged_is_not_true() -> None:
+    """No alarm either: nothing is rejected, and the text says what to do."""
+    found = unbiased_evidence_test(lambda rng: rng.normal(-8.0, 4.0), exact=0.0, rng=1)
+    assert not found
+    assert not found.judged
+    assert "not judged: the ratios are worth" in repr(found)
+    assert "take more draws in each run, so that runs are more even" in repr(found)
     none = unbiased_evidence_test(lambda rng: -math.inf, exact=0.0, replications=100)
-    assert none
-    assert none.uneven
-    assert none.ess == 0.0
+    assert not none
+    assert (none.rejected, none.judged, none.uneven, none.ess) == ((), False, True, 0.0)
+    assert "not judged: every run of 100 estimated zero" in repr(none)
+
+
+@pytest.mark.parametrize("off", [-1e6, -800.0, -40.0, 40.0, 800.0, 1e6])
+@pytest.mark.parametrize("spread", [0.0, 1e-6, 0.5])
+def test_estimates_that_are_off_by_more_than_floats_hold(off: float, spread: float) -> None:
+    found = unbiased_evidence_test(
+        lambda rng: off + spread * rng.normal(), exact=0.0, replications=100, rng=0
+    )
+    assert [c.p_value for c in found.rejected] == [pytest.approx(0.0, abs=1e-6)]
+    assert not found
+    uneven = unbiased_evidence_test(
+        lambda rng: off + 8.0 * rng.normal(), exact=0.0, replications=100, rng=0
+    )
+    assert not uneven
+    assert uneven.judged == (off > 0)
 
 
 def test_ratios_that_are_too_uneven_are_called_too_large() -> None:
@@ -234,8 +263,7 @@ def test_ratios_that_are_too_uneven_are_called_too_large() -> None:
     rng = np.random.default_rng(0)
     alarms = 0
     for _ in range(400):
-        ratios = np.exp(rng.normal(-4.5, 3.0, 200))
-        alarms += _judged(ratios, 0.0)[0].p_value < 0.05
+        alarms += _judged(rng.normal(-4.5, 3.0, 200), 0.0)[0].p_value < 0.05
     assert alarms <= stats.binom.ppf(0.999, 400, 0.05)
 
 

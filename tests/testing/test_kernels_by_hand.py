@@ -253,7 +253,7 @@ def test_geweke_constants() -> None:
     result = geweke(model, kernel, statistics, draws=11, chains=8)
     assert names(result) == ("sign",)
     assert result.p_values["size"] == 1.0
-    assert result.p_values["sign"] == 0.0
+    assert result.p_values["sign"] < 1e-3
 
 
 # ---- ranks -------------------------------------------------------------------------------------
@@ -410,8 +410,8 @@ def test_thinning_applies_the_kernel_more_often() -> None:
         return state
 
     model, _ = plain()
-    ranks(model, kernel, {"x": lambda s, y: s}, steps=3, thinning=5, replications=10)
-    assert calls == [10] * (2 * 3 * 5)
+    ranks(model, kernel, {"x": lambda s, y: s}, steps=3, thinning=5, replications=20)
+    assert calls == [20] * (2 * 3 * 5)
     calls.clear()
     geweke(model, kernel, {"x": lambda s, y: s}, draws=10, thinning=3, chains=8)
     assert calls == [8] * (10 * 3)

@@ -9,9 +9,15 @@ import pytest
 import scipy.stats
 
 import bayesmc as bmc
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import ShapeError, UnknownNodeError, UnsupportedError
 from bayesmc.results.draws import DrawsPosterior
-from bayesmc.testing import assert_matches, compare, enumerate_posterior, quadrature_posterior
+from bayesmc.testing import (
+    assert_matches,
+    compare,
+    enumerate_posterior,
+    quadrature_posterior,
+    repeated_test,
+)
 from bayesmc.testing.verdict import BUDGET
 
 
@@ -113,8 +119,10 @@ def test_rare_states_are_not_judged() -> None:
     net.add("a", bmc.Categorical([0.9995, 0.0005]))
     right = bmc.infer(net, engine=bmc.LikelihoodWeighting(1000), rng=0)
     exact = enumerate_posterior(net)
-    match = assert_matches(right, exact)
+    match = compare(right, exact)
     assert (len(match.comparisons), match.skipped) == (1, 2)  # log evidence alone is compared
+    with pytest.raises(AssertionError, match="nothing was judged: 2 figures.*take more draws"):
+        assert_matches(right, exact)
     assert assert_matches(right, exact, min_count=0.1).skipped == 0
 
 
@@ -123,8 +131,10 @@ def test_exact_answers_must_agree_to_the_tolerance() -> None:
     evidence = {"positive": [1, 0, 1], "fever": 38.0}
     exact = enumerate_posterior(net, evidence)
     right = bmc.infer(net, evidence, engine=bmc.Exact())
-    # mean and variance of fever, which is observed
-    assert len(assert_matches(right, exact).comparisons) == 1 + 3 + 6 + 2
+    # what is observed is compared only where it is asked for
+    assert len(assert_matches(right, exact).comparisons) == 1 + 3
+    asked = assert_matches(right, exact, names=["ill", "positive", "fever"])
+    assert len(asked.comparisons) == 1 + 3 + 6 + 2
     off = right.probabilities("ill") + [1e-7, -1e-7, 0.0]
     bad = Shifted(right, probabilities=lambda n: off if n == "ill" else right.probabilities(n))
     with pytest.raises(AssertionError, match="node 'ill', state 'no'"):
@@ -389,3 +399,113 @@ def test_quantiles_that_are_none_of_the_draws(monkeypatch: pytest.MonkeyPatch) -
     wrong = compare(found, right)
     assert not wrong
     assert all("as answered, which is none of the draws" in c.what for c in wrong.rejected)
+
+
+# ---- what must not pass in silence --------------------------------------------------------------
+
+
+def test_rare_states_that_are_far_too_frequent_are_caught() -> None:
+    rare, often = bmc.BayesNet(), bmc.BayesNet()
+    rare.add("a", bmc.Bernoulli(0.001))
+    often.add("a", bmc.Bernoulli(0.508))
+    found = bmc.infer(often, engine=bmc.LikelihoodWeighting(1000), rng=0)
+    match = compare(found, enumerate_posterior(rare))
+    assert not match
+    assert {c.what for c in match.rejected} == {"node 'a', state 0", "node 'a', state 1"}
+
+
+def test_looking_at_rare_states_costs_no_false_alarms() -> None:
+    """200 states, each expected five times: some are met ten times, and are judged for that.
+
+    More than 14 alarms of 100 right answers have probability 1e-4 at alpha = 0.05; without the price of
+    looking nearly half of them would be one.
+    """
+    net = bmc.BayesNet()
+    net.add("a", bmc.Categorical(np.full(200, 1 / 200)))
+    exact = enumerate_posterior(net)
+    rng = np.random.default_rng(5)
+    alarms = judged = 0
+    for _ in range(100):
+        match = compare({"a": rng.integers(200, size=1000)}, exact, alpha=0.05)
+        alarms += not match
+        judged += len(match.comparisons) > 0
+    assert judged > 60
+    assert alarms <= 14  # more have probability 1e-4
+
+
+def own(seed: int, rho: float = 0.0, draws: int = 4000) -> dict:
+    """Draws of x and w given y = 1 by autoregression; ``rho`` of each on the one before."""
+    rng = np.random.default_rng(seed)
+    z = rng.normal(size=(draws, 3))
+    for t in range(1, draws):
+        z[t] = rho * z[t - 1] + np.sqrt(1 - rho**2) * z[t]
+    x = 0.5 + np.sqrt(0.5) * z[:, 0]
+    return {"x": x, "w": x[:, None] + 0.5 * z[:, 1:]}
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.8])
+def test_draws_of_ones_own(rho: float) -> None:
+    exact = answers()[1]
+    match = assert_matches(own(0, rho), exact, draws=200, rng=0)
+    figures = {c.what for c in match.comparisons}
+    assert {"mean of node 'x'", "variance of node 'w'[1]", "joint draws of 'x', 'w' (energy distance)",
+            "share of draws up to the 95% quantile of node 'x'"} <= figures  # fmt: skip
+    off = own(0, rho)
+    with pytest.raises(AssertionError, match="mean of node 'x'.*\n(.*\n)*.*draws of your own"):
+        assert_matches({**off, "x": off["x"] + 0.3}, exact)
+    shuffled = np.random.default_rng(1).permutation(off["x"])
+    assert not compare({**off, "x": shuffled}, exact, 0.05, draws=400, rng=0)
+
+
+def test_states_of_ones_own_draws() -> None:
+    net = diagnosis()
+    exact = enumerate_posterior(net, {"positive": [1, 0, 1], "fever": 38.0})
+    states, p = np.array(["no", "mild", "severe"]), exact.probabilities("ill")
+    rng = np.random.default_rng(0)
+    assert len(assert_matches({"ill": rng.choice(states, size=2000, p=p)}, exact).comparisons) == 3
+    assert not compare({"ill": rng.choice(states, size=2000, p=p[::-1])}, exact)
+
+
+def test_what_was_asked_for_and_not_compared_is_no_match() -> None:
+    found, exact = answers(keep="summaries")
+    with pytest.raises(AssertionError, match=r"draws=100\): joint draws are not compared: .* none"):
+        assert_matches(found, exact, draws=100)
+
+
+def test_wrong_arguments_are_named() -> None:
+    found, exact = answers()
+    oracle = enumerate_posterior(diagnosis(), EVIDENCE)
+    with pytest.raises(TypeError, match=r"stands first; swap the two: compare\(posterior, exact\)"):
+        compare(oracle, weighted(0))
+    with pytest.raises(TypeError, match="assert_matches: posterior=3 is no posterior; give one of"):
+        assert_matches(3, exact)
+    with pytest.raises(TypeError, match="compare: exact=3 is no answer; give one"):
+        compare(found, 3)
+    with pytest.raises(
+        UnknownNodeError, match="compare: the exact answer has a node 'ill'.*same net"
+    ):
+        compare(found, oracle)
+    with pytest.raises(
+        UnknownNodeError, match=r"names=\['q'\]\): 'q' is no node .* name some of x, "
+    ):
+        compare(found, exact, names=["q"])
+    with pytest.raises(UnknownNodeError, match="the draws have 'q'.*it has x, v, w, y"):
+        compare({"q": np.zeros(10)}, exact)
+    with pytest.raises(ShapeError, match=r"draws of 'w' have shape \(10,\); give \('draws', 2\)"):
+        compare({"w": np.zeros(10)}, exact)
+    with pytest.raises(ShapeError, match="give one number for all"):
+        compare({"x": np.zeros(10), "w": np.zeros((9, 2))}, exact)
+    with pytest.raises(TypeError, match="need an exact answer with a model.*not Heavy"):
+        compare({"x": np.zeros(10)}, Heavy())
+
+
+@pytest.mark.parametrize("size", [1e3, 1e120, 1e200])
+def test_means_of_huge_numbers_are_judged(size: float) -> None:
+    """Squares of such numbers overflow; a mean off by its own size must not pass for that."""
+
+    def estimate(rng: np.random.Generator) -> float:
+        return size * (1.0 + 0.1 * rng.normal())
+
+    assert repeated_test(estimate, size, rng=0)
+    assert not repeated_test(estimate, 2 * size, rng=0)
+    assert not repeated_test(estimate, 0.0, rng=0)

@@ -16,12 +16,14 @@ import bayesmc as bmc
 from bayesmc.errors import BayesmcError, EvidenceError, ModelError, UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
+from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.proposed import Proposed
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
-from bayesmc.testing import Verdict, geweke_test, random_net, rank_test
+from bayesmc.testing import Verdict, geweke_test, random_net, rank_test, uncounted
 from bayesmc.testing.kernels.joint import NetJoint
+from bayesmc.testing.kernels.machines import Machine
 from bayesmc.testing.kernels.moves import moves_of
 from bayesmc.testing.kernels.statistics import default_statistics
 
@@ -95,7 +97,7 @@ def test_functions_of_one_state_and_of_many(batched: bool) -> None:
 def test_a_step_in_one_order_is_not_its_own_reverse() -> None:
     found = rank_test(sweep, labelled(), batched=True, replications=20_000, rng=0)
     assert not found
-    assert "no reverse was given" in repr(found)
+    assert "keeps no detailed balance" in repr(found)
     assert rank_test(draw_z, labelled(), batched=True, replications=20_000, rng=0, alpha=ALPHA)
 
 
@@ -327,3 +329,79 @@ def test_all_results_are_verdicts() -> None:
     found = rank_test(draw_z, labelled(), batched=True, replications=50, rng=0)
     assert isinstance(found, Verdict)
     assert found.p_value == min(1.0, min(found.p_values.values()) * len(found.p_values))
+
+
+# ---- what a review found -------------------------------------------------------------------------
+
+
+def test_vector_slices_are_reversed() -> None:
+    """Directions are taken in turn, so that the reverse takes them the other way; at 1e-4."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.MvNormal([0.0, 0.0], [[1.0, 0.95], [0.95, 1.0]]))
+    net.add("y", lambda x: bmc.Normal(x[..., 0] ** 3, 1.0))
+    statistics = {"p": lambda x: (x[..., 0] - x[..., 1]) * x[..., 1]}
+
+    def slices(target: Any) -> Kernel:
+        return FactorSlice(target, ("x",))
+
+    options: dict[str, Any] = {"statistics": statistics, "steps": 2, "warmup": 0, "alpha": ALPHA}
+    assert rank_test(slices, net, replications=6000, rng=7, **options)
+    assert not rank_test(slices, net, slices, replications=20_000, rng=7, **options)
+
+
+def test_few_data_sets_are_compiled_for_each() -> None:
+    """A rare observation must not be taken for the placeholder."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(0.5))
+    net.add("b", lambda a: bmc.Bernoulli(0.1 + 0.8 * a))
+    net.add("y", lambda a, b: bmc.Bernoulli(0.04 * a * b))
+    assert not Machine("test", bmc.Gibbs(), NetJoint(net), None).is_given
+    statistics = {"a": lambda a: 1.0 * a, "ab": lambda a, b, y: a * b * (1.0 + 9.0 * y)}
+    assert geweke_test(bmc.Gibbs(), net, draws=100, statistics=statistics, alpha=ALPHA, rng=3)
+
+
+@pytest.mark.parametrize("name", ["integers", "bounds", "forward"])
+def test_data_whose_support_depends_on_the_state(name: str) -> None:
+    net = bmc.BayesNet()
+    engine: Any = bmc.Gibbs()
+    if name == "integers":
+        net.add("n", bmc.Poisson(3.0))
+        net.add("y", lambda n: bmc.Binomial(n, 0.4))
+    elif name == "bounds":
+        net.add("n", bmc.Gamma(2.0, 1.0))
+        net.add("y", lambda n: bmc.Uniform(0.0, n))
+    else:
+        net.add("n", bmc.Normal(0.0, 1.0))
+        net.add("y", lambda n: bmc.Normal(n, 1.0))
+        net.add("next", lambda n: bmc.Normal(n, 1.0))
+        engine = bmc.MetropolisHastings(warmup=20)
+    assert rank_test(engine, net, observed="y", replications=60, alpha=1e-5, rng=0)
+
+
+def test_rare_states_raise_no_alarm() -> None:
+    """A state that hardly comes has no normal limit: 30 runs at .01, of which 4 or more once in 1e4."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Bernoulli(1e-3))
+    net.add("y", lambda a: bmc.Normal(1.0 * a, 1.0))
+
+    def step(state: dict, rng: np.random.Generator) -> dict:
+        one = 1e-3 * np.exp(-0.5 * (state["y"] - 1.0) ** 2)
+        none = 0.999 * np.exp(-0.5 * state["y"] ** 2)
+        return {"a": (rng.random(np.shape(one)) < one / (one + none)).astype(int)}
+
+    statistics = {"a": lambda a: 1.0 * a}
+    with uncounted():
+        found = [
+            geweke_test(step, net, batched=True, statistics=statistics, draws=60, alpha=0.01, rng=s)
+            for s in range(30)
+        ]
+    assert sum(not f for f in found) < 4
+    often = geweke_test(lambda s, rng: {"a": 1}, net, statistics=statistics, draws=20, rng=0)
+    assert not often  # what finds the rare state all the time does
+
+
+def test_words_for_what_is_no_joint_law() -> None:
+    net = labelled()
+    expecting(UnsupportedError, "arguments are .kernel, net.", net, sweep)
+    expecting(ValueError, "give a dict of name -> function", sweep, net, statistics=["a"])
+    expecting(ValueError, "replications=3", sweep, net, replications=3)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,7 +18,7 @@ import scipy.stats
 
 import _bayesmc_pytestplugin as plugin
 from bayesmc.testing import session
-from bayesmc.testing.verdict import BUDGET, Verdict, counted, uncounted
+from bayesmc.testing.verdict import BUDGET, Comparison, Verdict, counted, uncounted
 
 pytest_plugins = "pytester"
 
@@ -210,7 +211,7 @@ def test_workers_share_a_fresh_seed_and_their_budgets_are_summed(runs: Runs) -> 
     found = re.fullmatch(
         "bayesmc: 5 statistical tests spent a false-alarm budget of 0.65 "
         r"\(repeat with (--bayesmc-thorough --bayesmc-seed (\d+))\); "
-        "chance explains 0.65 failures on average, and hardly more than 4",
+        "chance explains at most 0.65 failures on average, hardly ever more than 4",
         line,
     )
     assert found
@@ -232,6 +233,111 @@ def test_a_worker_that_ended_early_is_named() -> None:
         "bayesmc: 1 statistical test spent a false-alarm budget of 0.25 (seed 0); "
         "not counted: gw1, which ended early"
     ]
+
+
+# ---- verdicts of failing tests ------------------------------------------------------------------
+
+FAILING = """
+import pytest
+from bayesmc.testing.verdict import Comparison, Verdict, counted
+
+def verdict(test, p=1e-9, count=1):
+    made = [Comparison(f"mean of {test} {k} " + "x" * 80, 1.0, 2.0, 9.0, p) for k in range(count)]
+    return counted(Verdict(test, 0.001, made))
+
+def test_passes():
+    assert not verdict("quiet")
+
+@pytest.mark.parametrize("k", [1])
+@pytest.mark.xdist_group("together")
+def test_fails(k):
+    assert verdict("right", p=0.5)
+    assert not verdict("wanted")
+    assert verdict("wrong", count=3)
+
+def test_other():
+    assert 1 == 2
+
+class TestMany:
+    def test_many(self):
+        for k in range(9):
+            assert not verdict(f"number {k // 2}")
+        for k in range(7):
+            assert not verdict(f"late {k}")
+        assert False
+
+@pytest.mark.xfail
+def test_expected():
+    assert verdict("expected")
+
+@pytest.fixture
+def broken():
+    assert verdict("fixture")
+
+def test_of_a_fixture(broken): pass
+
+@pytest.fixture
+def late():
+    yield
+    assert False
+
+def test_twice(late):
+    assert verdict("once")
+"""
+
+
+def sections(output: str) -> list[list[str]]:
+    """Lines below each heading of ours."""
+    pattern = r"^-+ bayesmc verdicts -+\n(.*?^the same again: [^\n]*)$"
+    return [found.split("\n") for found in re.findall(pattern, output, flags=re.M | re.S)]
+
+
+@pytest.mark.parametrize(
+    "workers", [(), ("-n", "1", "--dist", "loadgroup")], ids=["alone", "worker"]
+)
+def test_a_failing_test_shows_its_false_verdicts_whole(
+    pytester: pytest.Pytester, workers: tuple[str, ...]
+) -> None:
+    pytester.makepyfile(test_inner=FAILING)
+    done = pytester.runpytest_inprocess("-p", "no:cacheprovider", "--bayesmc-seed=3", *workers)
+    done.assert_outcomes(failed=4, passed=1, errors=2, xfailed=1)
+    output = done.stdout.str()
+    found = {s[-1].rsplit("::")[-1]: s for s in sections(output)}
+    assert len(sections(output)) == len(found)
+    # not test_passes, whose false verdict was wanted, nor what others have left to test_other
+    assert set(found) == {"test_fails[1]'", "test_many", "test_of_a_fixture", "test_twice"}
+    figures = [Comparison(f"mean of wrong {k} " + "x" * 80, 1.0, 2.0, 9.0, 1e-9) for k in range(3)]
+    assert found["test_fails[1]'"][2:] == [
+        *repr(Verdict("wrong", 0.001, figures)).split("\n"),
+        "the same again: pytest --bayesmc-seed 3 'test_inner.py::test_fails[1]'",
+    ]
+    assert found["test_fails[1]'"][0].startswith("wanted: ")  # it stays a candidate
+    assert found["test_many"][0] == "the last 5 of 12 false verdicts:"
+    assert [s.split(":")[0] for s in found["test_many"][1:-1:2]] == [
+        f"late {k}" for k in range(2, 7)
+    ]
+    assert found["test_many"][-1].endswith(" test_inner.py::TestMany::test_many")
+    assert found["test_twice"][0].startswith("once: ")
+
+
+def test_one_test_can_be_run_again(pytester: pytest.Pytester) -> None:
+    """With the command that its report gives: the same draws fail in the same way."""
+    pytester.makepyfile(
+        test_inner="""
+        import pytest
+        from bayesmc.testing.verdict import Comparison, Verdict, counted
+
+        @pytest.mark.parametrize("k", range(3))
+        def test_it(k, rng):
+            what = f"draw {rng.bytes(8).hex()}"
+            assert counted(Verdict("it", 0.01, [Comparison(what, 1.0, 2.0, 9.0, 1e-9)]))
+        """
+    )
+    first = pytester.runpytest_inprocess("-p", "no:cacheprovider", "--bayesmc-thorough")
+    shown = sections(first.stdout.str())[1]
+    again = shlex.split(shown[-1].removeprefix("the same again: pytest "))
+    second = pytester.runpytest_inprocess("-p", "no:cacheprovider", *again)
+    assert sections(second.stdout.str()) == [shown]
 
 
 @pytest.mark.parametrize("mean", [1e-6, 1e-3, 1.0005e-3, 0.41, 3.0, 50.0, 900.0])

@@ -7,13 +7,14 @@ what comes back to `inspect`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import Distribution, marking_invalid
-from bayesmc.errors import BayesmcError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import BayesmcError, ParameterError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, CompiledNode, Model, forward, pose
 from bayesmc.randomness import seed_sequence
 from bayesmc.shapes import first_index
@@ -44,7 +45,8 @@ def check_cpd(
     gives the same whether asked for all of them at once or one by one, as ``net.validate`` promises, which is
     called, too. At the first few of them (of unlike values): everything that `check_density` looks at.
 
-    A right node fails with probability at most ``alpha``, with the same limits.
+    Only the node and its ancestors are looked at. A right node fails with probability at most ``alpha``,
+    with the same limits.
 
     Parameters
     ----------
@@ -75,7 +77,7 @@ def check_cpd(
     UnsupportedError
         The node is deterministic or an input, or an ancestor cannot be sampled.
     ModelError
-        The net is wrong elsewhere.
+        An ancestor is wrong.
 
     References
     ----------
@@ -104,13 +106,17 @@ def check_cpd(
     if name not in net:
         raise UnknownNodeError(f"{call}: no node {name!r}; there are {', '.join(net.nodes)}")
     report = Report(alpha, np.random.default_rng(seed_sequence(rng)))
+    family = _family(net, name, inputs)
     try:
-        problem = pose(net, None, inputs)
+        problem = pose(family, None, inputs)
     except BayesmcError as error:  # not even a model: nothing else can be asked
         _own_fault(error, name, report)
+        if isinstance(error, ParameterError):
+            report.comparisons.pop()
+            report.fault(_with_parents(family, name, inputs, report) or _in_words(error))
     else:
         try:
-            net.validate(inputs)
+            family.validate(inputs)
             report.fine("validate")
         except BayesmcError as error:
             _own_fault(error, name, report)
@@ -120,6 +126,57 @@ def check_cpd(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _family(net: BayesNet, name: str, inputs: Mapping[str, Any] | None) -> BayesNet:
+    """The node and its ancestors: faults elsewhere are no faults of its."""
+    declared = net.declarations
+    wanted, seen, todo = set(inputs or ()), set(), [name]
+    while todo:
+        node = todo.pop()
+        if node in declared and node not in seen:
+            seen.add(node)
+            todo.extend(declared[node].parents)
+    wanted |= seen
+    return _net_of(net, {n: d for n, d in declared.items() if n in wanted})
+
+
+def _net_of(net: BayesNet, declared: Mapping[str, Any]) -> BayesNet:
+    """A net with the same plates and other declarations."""
+    return BayesNet.of(net.name, declared, net._plates)
+
+
+def _with_parents(
+    family: BayesNet, name: str, inputs: Mapping[str, Any] | None, report: Report
+) -> str | None:
+    """A fault of the parameters so gross that no model is compiled, at values of the parents drawn."""
+    declared = family.declarations
+    own = declared.pop(name)
+    above = _net_of(family, declared)
+    parents = [p for p in dict.fromkeys(own.parents) if p in declared]
+    try:
+        drawn = above.sample(_BATCH, report.rng, inputs=inputs)
+        for row in range(_BATCH):
+            # inputs have their values already, and are the same in every draw
+            values = {p: drawn[p][row] for p in parents if p in drawn and p not in (inputs or ())}
+            fixed = above.do(values)
+            try:
+                pose(_net_of(family, {**fixed.declarations, name: own}), None, inputs)
+            except ParameterError as error:
+                if f"node {name!r}" in str(error):
+                    told = ", ".join(f"{p}={_in_short(v)}" for p, v in values.items())
+                    return (f"at {told}: " if told else "") + _in_words(error)
+    except BayesmcError:
+        return None
+    return None
+
+
+def _in_words(error: BayesmcError) -> str:
+    """What a parameter's fault is; a row of probabilities that sums to 1 has something negative."""
+    text = str(error)
+    # the error of a model has lost the row, but for what the message shows
+    negative = re.search(r"sum to 1 .*got .*?(-[0-9][0-9.e+-]*)", text, re.DOTALL)
+    return f"a probability is negative, {negative[1]}: {text}" if negative else text
 
 
 def _own_fault(error: BayesmcError, name: str, report: Report) -> None:
@@ -208,7 +265,8 @@ def _check_parameters(
         problem = alone.problem
     except BayesmcError as error:
         problem = error
-    report.fault(f"{_told(model, node, values, row)}{problem}{share}")
+    words = _in_words(problem) if isinstance(problem, BayesmcError) else problem
+    report.fault(f"{_told(model, node, values, row)}{words}{share}")
     return bad
 
 
@@ -295,8 +353,10 @@ def _told(model: Model, node: CompiledNode, values: Mapping[str, np.ndarray], ro
     parts = []
     for parent, value in picked.items():
         shown = model[parent].decode(value)
-        text = np.array2string(
-            np.asarray(getattr(shown, "labels", shown)), precision=4, threshold=6
-        )
-        parts.append(f"{parent}={' '.join(text.split())}")
+        parts.append(f"{parent}={_in_short(shown)}")
     return f"at {', '.join(parts)}: " if parts else ""
+
+
+def _in_short(value: Any) -> str:
+    text = np.array2string(np.asarray(getattr(value, "labels", value)), precision=4, threshold=6)
+    return " ".join(text.split())

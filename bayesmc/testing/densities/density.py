@@ -63,9 +63,11 @@ def check_density(
 
     - It integrates to 1: by adaptive quadrature (one number), a product rule (two or three), summation (whole
       numbers), importance sampling (more). Counts of several kinds are not summed.
-    - Its draws follow it: of numbers, Kolmogorov's statistic and a chi-square of the probability integral
-      transform, of whole numbers a chi-square, of vectors the energy distance from draws that the density
-      alone has made (by rejection). They lie in the support, and are independent along every axis.
+    - Its draws follow it: of numbers, Kolmogorov's statistic, a chi-square of the probability integral
+      transform, and mean and variance of the normal scores; of whole numbers a chi-square and the scores; of
+      vectors means, squares and products of up to six numbers in unconstrained coordinates (far values drawn
+      in) against their integrals, and the energy distance from draws that the density alone has made (by
+      rejection). They lie in the support, and are independent along every axis.
     - The log density is finite inside the support (it may be -inf on whole numbers, and anywhere with
       ``gaps``), -inf outside, and nowhere NaN.
     - Shapes: every batch and sample shape gives the same values, element by element.

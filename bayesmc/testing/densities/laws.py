@@ -14,9 +14,15 @@ import scipy.special
 
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.testing.densities.masses import Element, Table, Volume, line_of, volume_of
+from bayesmc.testing.densities.moments import (
+    average_of,
+    check_moments,
+    check_scores,
+    check_table_scores,
+)
 from bayesmc.testing.densities.reports import Report
 from bayesmc.testing.kernels.uniformity import uniformity_p_value
-from bayesmc.testing.posteriors.samples import Average, energy_comparison
+from bayesmc.testing.posteriors.samples import energy_comparison
 
 #: an integral is one within this, or within what the rule itself doubts
 _ROUNDING = 1e-6
@@ -33,7 +39,7 @@ _EXPECTED = 10.0
 #: draws that effectively decide an error, at least
 _SUPPORT = 30.0
 #: rows of vectors that are compared
-_ROWS = 300
+_ROWS = 400
 #: components of a vector that are looked at
 _COMPONENTS = 24
 
@@ -56,7 +62,9 @@ def check_line(
         values = samples.astype(float)
         if is_angle:
             values = np.mod(values + np.pi, 2 * np.pi) - np.pi
-        _check_transform(np.asarray(law.cdf(values)), report)
+        levels = np.asarray(law.cdf(values))
+        _check_transform(levels, report)
+        check_scores(levels, report)
     if is_angle:
         grid = law.ppf((np.arange(8192) + 0.5) / 8192)
         _check_direction(element, np.exp(1j * np.asarray(grid)).mean(), report)
@@ -75,7 +83,11 @@ def _check_transform(levels: np.ndarray, report: Report) -> None:
     gap = float(max((steps - u).max(), (u - steps + 1 / n).max()))
     p_value = min(1.0, 2.0 * float(scipy.special.smirnov(n, min(gap, 1.0))))  # bounds both sides
     report.judge(
-        "draws against the cdf (Kolmogorov's distance)", gap, 0.0, gap * math.sqrt(n), p_value
+        "draws against the cdf (Kolmogorov's distance, beside none)",
+        gap,
+        0.0,
+        gap * math.sqrt(n),
+        p_value,
     )
     counts = np.bincount(np.minimum((u * _CELLS).astype(int), _CELLS - 1), minlength=_CELLS)
     pearson = float(((counts - n / _CELLS) ** 2).sum() / (n / _CELLS))
@@ -83,7 +95,9 @@ def _check_transform(levels: np.ndarray, report: Report) -> None:
         p_value = uniformity_p_value(counts)
     else:
         p_value = float(scipy.special.chdtrc(_CELLS - 1, pearson))
-    what = "draws against the density (chi-square of 20 cells)"
+    what = (
+        "draws against the density (chi-square of 20 cells, beside its mean were the sampler right)"
+    )
     _judge_pearson(report, what, pearson, _CELLS - 1, p_value)
 
 
@@ -167,6 +181,7 @@ def check_table(element: Element, samples: np.ndarray | None, table: Table, repo
     probs = table.probs / total
     if samples is not None:
         _check_counts(samples, table.values, probs, report)
+        check_table_scores(samples, table.values, probs, report)
     mean = float(table.values @ probs)
     _check_figures(element, mean, math.sqrt(float((table.values - mean) ** 2 @ probs)), report)
     below = np.cumsum(probs)
@@ -199,7 +214,10 @@ def _check_counts(
     wanted = np.bincount(cell, weights=expected, minlength=size)
     pearson = float(((counts - wanted) ** 2 / wanted).sum())
     p_value = float(scipy.special.chdtrc(size - 1, pearson))
-    what = f"draws against the probabilities (chi-square of {size} cells)"
+    what = (
+        f"draws against the probabilities (chi-square of {size} cells, beside its mean were "
+        "the sampler right)"
+    )
     _judge_pearson(report, what, pearson, size - 1, p_value)
 
 
@@ -218,11 +236,13 @@ def check_volume(element: Element, samples: np.ndarray | None, report: Report) -
             {"x": flat[:_ROWS]}, {"x": rows}, report.level, report.rng, angles, what="draws"
         )
         report.judge(
-            "draws against the density (energy distance)",
+            "draws against the density (energy distance, beside its mean were the sampler right)",
             found.found, found.exact, found.errors, found.p_value,
         )  # fmt: skip
     else:
         report.remark("draws against the density: too few draws could be made from it")
+    with np.errstate(all="ignore"):
+        check_moments(element, samples, volume, report)
     turns = element.support.angles(flat.shape[1])
     for what in ("mean", "var"):
         given = _given(element, what)
@@ -233,7 +253,7 @@ def check_volume(element: Element, samples: np.ndarray | None, report: Report) -
                 column = flat[:, k] if what == "mean" else (flat[:, k] - flat[:, k].mean()) ** 2
                 label = f"{what} of component {k}, from draws"
                 if np.ptp(column) > 1e-12 * max(1.0, abs(exact)):
-                    report.average(label, _average(column), exact, abs(exact) + 1.0)
+                    report.average(label, average_of(column), exact, abs(exact) + 1.0)
                 else:
                     report.agree(label, float(column.mean()), exact, 1e-9, f"{label}: not {exact}")
 
@@ -251,13 +271,3 @@ def _judge_total(volume: Volume, report: Report) -> None:
         report.agree("integral", total, 1.0, 1e-9, words)
     else:
         report.average("integral, by importance sampling", volume.drawn, 1.0, 1.0)
-
-
-def _average(column: np.ndarray) -> Average:
-    off = column - column.mean()
-    second, third, fourth = ((off**k).mean() for k in (2, 3, 4))
-    n = len(column)
-    error = math.sqrt(second / n)
-    return Average(
-        float(column.mean()), error, third / second**1.5 / math.sqrt(n), n * second**2 / fourth
-    )

@@ -108,6 +108,24 @@ class Table:
 
 
 @dataclass(frozen=True, eq=False)
+class Rule:
+    """Points with masses, whose sums are integrals against a density.
+
+    Attributes
+    ----------
+    points : ndarray, shape (n, size)
+        In unconstrained coordinates.
+    masses : ndarray, shape (n,)
+    coarse : ndarray, shape (n,) or None
+        Masses of every second point, for the error; None where the points are drawn.
+    """
+
+    points: np.ndarray
+    masses: np.ndarray
+    coarse: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
 class Volume:
     """The integral of a density of vectors.
 
@@ -119,12 +137,15 @@ class Volume:
         The same by importance sampling.
     draws : ndarray, shape (n, *event_shape)
         Independent draws from the density, perhaps few.
+    rules : tuple of Rule
+        The product rule, where there is one, and the importance sampler.
     """
 
     total: float
     error: float
     drawn: Average
     draws: np.ndarray
+    rules: tuple[Rule, ...] = ()
 
 
 def line_of(element: Element, points: np.ndarray) -> InverseCdf:
@@ -176,7 +197,7 @@ def volume_of(element: Element, draws: np.ndarray | None, rng: np.random.Generat
     transform = element.transform
     shape = transform.unconstrained_shape
     size = math.prod(shape)
-    turns = _free_angles(element.support, size)
+    turns = free_angles(element.support, size)
 
     def log_density(u: np.ndarray) -> np.ndarray:
         u = u.reshape(u.shape[:-1] + shape)
@@ -186,16 +207,34 @@ def volume_of(element: Element, draws: np.ndarray | None, rng: np.random.Generat
 
     free = None
     if draws is not None:
-        free = np.asarray(transform.unconstrain(draws)).reshape(len(draws), size)
+        free = free_draws(element, draws)
         free = free[np.isfinite(free).all(axis=1)]
     places = _places(log_density, free, size, turns)
-    total, error = math.nan, math.inf
+    total, error, rules = math.nan, math.inf, []
     if size in _GRID:
-        tried = [_grid_total(log_density, place, turns) for place in places]
-        total, error = min(tried, key=lambda pair: pair[1])
-    drawn, kept = _importance(log_density, places, turns, rng)
+        tried = [_grid(log_density, place, turns) for place in places]
+        total, error, rule = min(tried, key=lambda found: found[1])
+        rules.append(rule)
+    drawn, kept, sampled = _importance(log_density, places, turns, rng)
     values = np.asarray(transform.constrain(kept.reshape(len(kept), *shape)))
-    return Volume(total, error, drawn, values)
+    return Volume(total, error, drawn, values, (*rules, sampled))
+
+
+def free_draws(element: Element, draws: np.ndarray) -> np.ndarray:
+    """Draws in unconstrained coordinates, shape (draws, size)."""
+    with np.errstate(all="ignore"):
+        return np.asarray(element.transform.unconstrain(draws)).reshape(len(draws), -1)
+
+
+def free_angles(support: Support, size: int) -> np.ndarray:
+    """Which of the unconstrained numbers are angles, shape (size,)."""
+    if support.kind != "product":
+        return np.full(size, support.kind == "circle")
+    parts = []
+    for part, count in support.parts:
+        width = max(count, 1) - (part.kind == "simplex")
+        parts.append(np.full(width, part.kind == "circle"))
+    return np.concatenate(parts)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -213,17 +252,6 @@ def _support_of(support: Support, batch: Shape, index: Shape) -> Support:
         for b in (support.low, support.high)
     )
     return Support(support.kind, low, high, support.open_low, support.open_high)
-
-
-def _free_angles(support: Support, size: int) -> np.ndarray:
-    """Which of the unconstrained numbers are angles, shape (size,)."""
-    if support.kind != "product":
-        return np.full(size, support.kind == "circle")
-    parts = []
-    for part, count in support.parts:
-        width = max(count, 1) - (part.kind == "simplex")
-        parts.append(np.full(width, part.kind == "circle"))
-    return np.concatenate(parts)
 
 
 def _places(
@@ -266,9 +294,10 @@ def _root(cov: np.ndarray, turns: np.ndarray) -> np.ndarray:
         return np.sqrt(scale)
 
 
-def _grid_total(
+def _grid(
     log_density: Callable[[np.ndarray], np.ndarray], place: _Place, turns: np.ndarray
-) -> tuple[float, float]:
+) -> tuple[float, float, Rule]:
+    """The integral by the product rule, how far it may be off, and the rule."""
     centre, root = place
     size = len(centre)
     count = _GRID[size]
@@ -289,13 +318,24 @@ def _grid_total(
     u = np.where(turns, z, centre + (z * numbers) @ root.T)
     # sums of logs over a column of the factor that is an angle's own are left out
     log_stretch = np.log(np.diagonal(root)[numbers]).sum()
-    values = np.exp(log_density(u.reshape(-1, size)) + log_stretch).reshape((count,) * size)
-    fine, coarse = values, values[(slice(None, None, 2),) * size]
-    for weight in reversed(weights):
-        fine, coarse = fine @ weight, coarse @ (2 * weight[::2])
-    if not math.isfinite(float(fine)):
-        return math.nan, math.inf
-    return float(fine), abs(float(fine) - float(coarse))
+    points = u.reshape(-1, size)
+    values = np.exp(log_density(points) + log_stretch)
+    every = np.zeros(count)
+    every[::2] = 2.0
+    fine = values * _product(weights)
+    coarse = values * _product([every * weight for weight in weights])
+    total, again = float(fine.sum()), float(coarse.sum())
+    if not math.isfinite(total):
+        total, again = math.nan, math.inf
+    return total, abs(total - again) if total == total else math.inf, Rule(points, fine, coarse)
+
+
+def _product(weights: list[np.ndarray]) -> np.ndarray:
+    """Weights of a product rule, as the points run."""
+    found = np.ones(1)
+    for weight in weights:
+        found = (found[:, None] * weight).ravel()
+    return found
 
 
 def _importance(
@@ -303,8 +343,8 @@ def _importance(
     places: list[_Place],
     turns: np.ndarray,
     rng: np.random.Generator,
-) -> tuple[Average, np.ndarray]:
-    """The integral from draws of a mixture of t distributions, and the draws that rejection keeps."""
+) -> tuple[Average, np.ndarray, Rule]:
+    """The integral from draws of a mixture of t distributions, the draws that rejection keeps, and all."""
     size = len(turns)
     which = rng.integers(len(places), size=_DRAWS)
     z = rng.normal(size=(_DRAWS, size))
@@ -318,7 +358,7 @@ def _importance(
     log_weight = log_density(u) - log_proposal
     top = log_weight.max()
     if not math.isfinite(top):
-        return Average(0.0, 0.0, 0.0, 0.0), u[:0]
+        return Average(0.0, 0.0, 0.0, 0.0), u[:0], Rule(u[:0], np.empty(0), None)
     weights = np.exp(log_weight - top)
     off = weights - weights.mean()
     second, third, fourth = ((off**k).mean() for k in (2, 3, 4))
@@ -332,7 +372,7 @@ def _importance(
         average = Average(scale, 0.0, 0.0, float(_DRAWS))
     accepted = rng.random(_DRAWS) < weights
     accepted[weights.argmax()] = False  # given the largest weight, the others are independent
-    return average, u[accepted]
+    return average, u[accepted], Rule(u, weights, None)
 
 
 def _log_t(u: np.ndarray, place: _Place, turns: np.ndarray) -> np.ndarray:

@@ -42,8 +42,9 @@ class Report:
         self.comparisons.append(Fault(self.place + what, math.nan, math.nan, math.inf, 0.0))
 
     def judge(self, what: str, found: float, exact: float, errors: float, p_value: float) -> None:
-        numbers = map(float, (found, exact, errors, p_value))
-        self.comparisons.append(Comparison(self.place + what, *numbers))
+        self.comparisons.append(
+            Comparison(self.place + what, float(found), float(exact), float(errors), float(p_value))
+        )
 
     def fine(self, what: str, found: float = 0.0, exact: float = 0.0) -> None:
         """Something that was looked at, and is as it should be."""

@@ -217,7 +217,7 @@ def _prepared(
     rng: Any,
 ) -> tuple[_Law, Sweep | _Counted]:
     """The exact law, and either matrices or counts."""
-    check_sizes(call, draws=(draws, 1))
+    check_sizes(call, draws=(draws, 100))
     if isinstance(kernel, (ChainEngine, Kernel)) or (callable(kernel) and not is_step(kernel)):
         if inputs is not None:
             raise UnsupportedError(
@@ -417,4 +417,6 @@ def _binomial(what: str, count: Any, draws: int, p: float) -> Comparison:
     above = float(scipy.special.bdtrc(k - 1, draws, p)) if k >= 1 else 1.0
     error = np.sqrt(draws * p * (1 - p)) or 1.0
     errors = abs(k - draws * p) / error
-    return Comparison(what, k, draws * p, float(errors), min(1.0, 2.0 * min(below, above)))
+    return Comparison(
+        what, k, draws * p, float(errors), min(1.0, 2.0 * min(below, above)), "expected"
+    )

@@ -23,6 +23,8 @@ from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 
 #: draws of each chain by default, and where each costs a compilation
 _DRAWS, _FEW = 200, 30
+#: effective draws of the rarer of two values below which a mean has no normal limit
+_FEWEST = 30.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -166,10 +168,13 @@ def geweke_test(
             data = moves.simulate(state, generator)
         successive[t] = values_of("geweke_test", moves.statistics, state, data, chains)
     found = [_compare_means(name, joint[:, s], successive[:, s].T) for s, name in enumerate(names)]
-    comparisons = [*moves.faults, *(comparison for comparison, _ in found)]
+    judged = [c for c, _ in found if c is not None]
+    comparisons = [*moves.faults, *judged]
     ess = {name: size for name, (_, size) in zip(names, found, strict=True)}
-    p_values = MappingProxyType({n: c.p_value for n, (c, _) in zip(names, found, strict=True)})
-    return counted(GewekeResult("geweke_test", alpha, comparisons, 0, p_values, ess))
+    p_values = MappingProxyType({c.what: c.p_value for c in judged})
+    return counted(
+        GewekeResult("geweke_test", alpha, comparisons, len(names) - len(judged), p_values, ess)
+    )
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -177,22 +182,33 @@ def geweke_test(
 
 def _compare_means(
     name: str, joint: np.ndarray, successive: np.ndarray
-) -> tuple[Comparison, float]:
-    """One statistic, and its effective size; ``successive`` has shape (chain, draw)."""
+) -> tuple[Comparison | None, float]:
+    """One statistic, and its effective size; ``successive`` has shape (chain, draw).
+
+    None where nearly all values are the same in both, and too few others for a normal limit.
+    """
     ess = _mean_ess(successive)
+    found, counts = np.unique(joint, return_counts=True)
+    mode = found[counts.argmax()] if len(found) < 5 else np.nan  # of many values none counts
+    others = (joint != mode).mean() * joint.size, (successive != mode).mean() * ess
+    if 0.0 < max(others) < _FEWEST:
+        return None, ess
     with np.errstate(over="ignore"):
         difference = float(successive.mean() - joint.mean())
     # The spread of the independent draws: under the null it is that of the chains too, and a chain
-    # that runs off does not hide behind its own spread.
-    error = float(joint.std()) * np.sqrt(1.0 / joint.size + 1.0 / ess)
+    # that runs off does not hide behind its own spread; one that finds what is rare has only its own.
+    spread = float(joint.std())
+    if others[0] < _FEWEST:
+        spread = max(spread, float(successive.std()))
+    error = spread * np.sqrt(1.0 / joint.size + 1.0 / ess)
     tiny = 1e-12 * max(1.0, abs(float(joint.mean())))
     if error <= tiny:  # a constant: equal or not, up to rounding
         z = 0.0 if abs(difference) <= tiny else float(np.copysign(np.inf, difference))
     else:
         z = difference / error
     p_value = 2.0 * float(scipy.special.stdtr(len(successive) - 1, -abs(z)))
-    found, exact = float(successive.mean()), float(joint.mean())
-    return Comparison(name, found, exact, abs(z), p_value), ess
+    means = float(successive.mean()), float(joint.mean())
+    return Comparison(name, *means, abs(z), p_value, "under the joint law"), ess
 
 
 def _mean_ess(values: np.ndarray) -> float:

@@ -36,6 +36,9 @@ Statistics = Mapping[str, Callable[[Any, Any], Any]]
 class JointModel:
     """A model that is no net, as tests of kernels take it.
 
+    A kernel of it is a function ``kernel(state, data, rng)`` that moves *all rows at once*, each with random
+    numbers of its own (``rng.normal(size=n)``, not ``rng.normal()``), and returns the next state.
+
     Attributes
     ----------
     prior : callable
@@ -135,6 +138,11 @@ class NetJoint(NetStates):
                 "a FactorGraph cannot be drawn forwards, so there is no joint law of state and data to test "
                 "against; test its kernels with invariant(kernel, graph), or give a JointModel"
             )
+        if not isinstance(net, BayesNet):
+            raise UnsupportedError(
+                f"the joint law is that of a BayesNet (or JointModel), not of {type(net).__name__}; "
+                "arguments are (kernel, net), and a template is unrolled first: dbn.unroll(steps)"
+            )
         self.net: BayesNet = net
         problem = pose(net, None, inputs)
         super().__init__(problem.model, problem.inputs, (), ())
@@ -178,6 +186,11 @@ class NetJoint(NetStates):
 
     def read(self, statistics: Mapping[str, Callable[..., Any]]) -> Statistics:
         """Users' statistics, functions whose argument names are nodes, as functions of state and data."""
+        if not isinstance(statistics, Mapping) or not all(map(callable, statistics.values())):
+            raise ValueError(
+                f"statistics={statistics!r}: give a dict of name -> function whose arguments are nodes, as "
+                "{'x squared': lambda x: x**2}"
+            )
         return {name: self._reading(name, f) for name, f in statistics.items()}
 
     # ---- private -------------------------------------------------------------------------------

@@ -83,7 +83,7 @@ def moves_of(
         back = Machine(call, reverse, joint, warmup).from_elsewhere
     return Moves(
         machine.prior, machine.simulate, machine.grouped(found), machine.forward, back,
-        machine.faults, machine.why, machine.is_given,
+        machine.faults, machine.why, machine.is_given, machine.is_own_reverse and reverse is None,
     )  # fmt: skip
 
 
@@ -107,6 +107,11 @@ def _of_model(
             raise UnsupportedError(
                 f"{call}: with a JointModel give kernel(state, data, rng) -> state, not {move!r}"
             )
+    wrong = [n for n in ("prior", "simulate") if not callable(getattr(model, n))]
+    if wrong or not isinstance(model.statistics, Mapping):
+        raise ModelError(
+            f"{call}: JointModel({(wrong or ['statistics'])[0]}=...) is no {'function' if wrong else 'dict'}"
+        )
     if not model.statistics:
         raise ValueError(f"{call}: no statistics; give a dict of name -> statistic(state, data)")
     return Moves(

@@ -17,12 +17,16 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.testing.kernels.joint import NetJoint, Rows, Statistics
 
+#: what statistics are scaled by is drawn apart from any test
+_ENTROPY = 0x5CA1E_0F_4B17
 #: draws by which statistics are scaled
 _PILOTS = 400
 #: pairs of nodes whose products are looked at, at most
 _PAIRS = 10
 #: states of a node of numbers that are looked at one by one, at most
 _FEW = 4
+#: states that come less or more often than all but so many are no statistic
+_RARE = 0.01
 #: deviations, in spreads of the joint law, beyond which numbers are bent
 _REACH = 3.0
 
@@ -34,13 +38,13 @@ def default_statistics(joint: NetJoint) -> Statistics:
     it has several, the mean of all, the last one and the product of the first two; mean squares; products of
     the first numbers of two nodes, and with the mean of each observed node; and the joint log density.
     """
-    rng = np.random.default_rng(2024)
+    rng = np.random.default_rng(np.random.SeedSequence(_ENTROPY))
     state = joint.prior(rng, _PILOTS)
     pilots = {**state, **joint.simulate(state, rng)}
     numbers = {n: _numbers(joint, n, pilots[n]) for n in (*joint.hidden, *joint.observed)}
     found: dict[str, Callable[[Rows, Rows], Any]] = {"log density": _log_density(joint, pilots)}
     for name in joint.hidden:
-        found |= _of_node(joint, name, numbers[name])
+        found |= _of_node(joint, name, numbers[name], pilots[name])
     for a, b in itertools.islice(itertools.combinations(joint.hidden, 2), _PAIRS):
         found[f"product of {a} and {b}"] = _product(numbers[a], numbers[b], a, b)
     for a, b in itertools.islice(itertools.product(joint.hidden, joint.observed), _PAIRS):
@@ -54,12 +58,16 @@ def default_statistics(joint: NetJoint) -> Statistics:
 _Numbers = Callable[[np.ndarray], np.ndarray]
 
 
-def _of_node(joint: NetJoint, name: str, numbers: _Numbers) -> dict[str, Callable]:
+def _of_node(
+    joint: NetJoint, name: str, numbers: _Numbers, pilots: np.ndarray
+) -> dict[str, Callable]:
     node = joint.model[name]
     domain, elements = node.domain, math.prod(node.value_shape)
     found: dict[str, Callable[[Rows, Rows], Any]] = {}
     if domain is not None and (domain.labels is not None or domain.size <= _FEW):
         for code in range(1, domain.size):  # what is stored are positions among the states
+            if not _RARE <= (_flat(pilots)[:, 0] == code).mean() <= 1.0 - _RARE:
+                continue  # the log density sees what is rare
             found[f"{name} is {domain.states[code]!r}"] = partial(_is_state, name, code)
     else:
         found[f"mean of {name}"] = lambda s, y: numbers(s[name])[:, 0]

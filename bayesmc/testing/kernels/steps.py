@@ -100,9 +100,10 @@ class StepFunction:
                     f"{self.call}: step(state, rng) returned what is no value: {said}"
                 ) from None
             if stored.shape != batch + node.value_shape:
+                lead = 0 if self.batched else 1  # of one state no rows are seen
                 raise EvidenceError(
-                    f"{self.call}: step(state, rng) returned {name!r} with shape {stored.shape}, not "
-                    f"{batch + node.value_shape}"
+                    f"{self.call}: step(state, rng) returned {name!r} with shape {stored.shape[lead:]}, not "
+                    f"{(batch + node.value_shape)[lead:]}"
                 )
             found[name] = stored
         return found
@@ -110,7 +111,7 @@ class StepFunction:
     def _moved_data(self, name: str) -> ModelError:
         return ModelError(
             f"{self.call}: step(state, rng) moved {name!r}, which is data; a kernel moves hidden nodes given "
-            f"the data, which here are {list(self.joint.observed)} (observed= says otherwise)"
+            f"the data, which here are {list(self.joint.observed)}"
         )
 
 

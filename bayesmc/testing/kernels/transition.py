@@ -15,7 +15,7 @@ Billingsley (1961), Statistical methods in Markov chains, Annals of Mathematical
 from __future__ import annotations
 
 import copy
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -249,7 +249,7 @@ def transition_p_value(matrix: Any, counts: Any) -> float:
     return float(scipy.special.chdtrc(freedom, statistic)) if freedom else 1.0
 
 
-def in_classes(kernel: Any, classes: list[Any]) -> Any:
+def in_classes(kernel: Any, classes: Sequence[Any]) -> Any:
     """The same kernel that moves these classes of elements only, in this order."""
     other = copy.copy(kernel)
     other.blanket = copy.copy(kernel.blanket)

@@ -22,7 +22,12 @@ from bayesmc.network import BayesNet, Model, Problem, pose
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
 from bayesmc.testing.oracles.enumeration import Enumerated, enumerate_posterior
 from bayesmc.testing.oracles.linear import linear_posterior
-from bayesmc.testing.oracles.quadrature import Quadrature, at_most, quadrature_posterior
+from bayesmc.testing.oracles.quadrature import (
+    Quadrature,
+    at_most,
+    check_rtol,
+    quadrature_posterior,
+)
 
 #: scalars over which a function is integrated under a Gaussian, and the points for each
 _MOST_SCALARS = 3
@@ -75,8 +80,10 @@ class ExactAnswer:
         """Probabilities of the states, ``(*plates, states)``; of several nodes jointly."""
         return self._by_slice(self.answer.probabilities, *names)
 
-    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    def sample(self, draws: int, rng: Any = None) -> dict[str, np.ndarray]:
         """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions.
+
+        ``rng`` is a seed or generator.
 
         Raises
         ------
@@ -180,6 +187,8 @@ def exact(
     net: BayesNet | DynamicBayesNet,
     evidence: Mapping[str, Any] | None = None,
     inputs: Mapping[str, Any] | None = None,
+    *,
+    rtol: float | None = None,
 ) -> ExactAnswer:
     """The exact posterior, by the first oracle that applies.
 
@@ -195,10 +204,13 @@ def exact(
         Give fewer rows for filtering.
     evidence, inputs : dict, optional
         As for ``infer``; of a template, observations and inputs as for ``smooth``.
+    rtol : float, optional
+        Relative error of the integral, where it comes to quadrature (`quadrature_posterior`).
 
     Returns
     -------
     ExactAnswer
+        Its ``accuracy`` says what it is good to.
 
     Raises
     ------
@@ -227,6 +239,7 @@ def exact(
     >>> exact(dbn, {"y": [1.0, 3.0]}).mean("x").round(12).tolist()
     [1.0, 2.0]
     """
+    check_rtol("exact", rtol)
     steps = None
     if isinstance(net, DynamicBayesNet):
         net, evidence, steps = _unrolled(net, evidence, inputs)
@@ -239,7 +252,7 @@ def exact(
     oracles: dict[str, Callable[[], Enumerated | GaussianAnswer]] = {
         "enumeration": lambda: _enumerated(problem, net, evidence, inputs),
         "linear-Gaussian": lambda: linear_posterior(problem),
-        "quadrature": lambda: quadrature_posterior(net, evidence, inputs),
+        "quadrature": lambda: quadrature_posterior(net, evidence, inputs, rtol=rtol),
     }
     passed_over: dict[str, str] = {}
     partial: dict[str, Enumerated | GaussianAnswer] = {}

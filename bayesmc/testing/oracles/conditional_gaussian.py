@@ -17,6 +17,7 @@ import numpy as np
 
 from bayesmc.errors import UnknownNodeError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import BayesNet, Model, pose
+from bayesmc.randomness import seed_sequence
 
 #: one element of a discrete node; one component of one element of a continuous node
 Variable = tuple[str, int]
@@ -261,11 +262,15 @@ class GaussianAnswer:
         """Weights ``(C,)``, means ``(C, n)`` and covariances ``(C, n, n)`` of all scalars of the nodes."""
         return (self.weights, *self._moments(names))
 
-    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions."""
-        at = rng.choice(len(self.weights), size=draws, p=self.weights / self.weights.sum())
+    def sample(self, draws: int, rng: Any = None) -> dict[str, np.ndarray]:
+        """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions.
+
+        ``rng`` is a seed or generator.
+        """
+        generator = np.random.default_rng(seed_sequence(rng))
+        at = generator.choice(len(self.weights), size=draws, p=self.weights / self.weights.sum())
         roots, size = _roots(self.covs), self.means.shape[1]
-        numbers = np.matvec(roots[at], rng.standard_normal((draws, size)))
+        numbers = np.matvec(roots[at], generator.standard_normal((draws, size)))
         numbers = self.means[at] + np.where(self._is_known[at], 0.0, numbers)
         found = {}
         for node in self.nodes.values():

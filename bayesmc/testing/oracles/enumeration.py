@@ -24,6 +24,7 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.network import BayesNet, CompiledNode, Model, Observed, Problem, pose
+from bayesmc.randomness import seed_sequence
 from bayesmc.results.posterior import circular_variance
 
 #: normal scores between which a continuous node is integrated: 8e-11 of the mass lies outside
@@ -65,8 +66,10 @@ class Enumerated:
         """What functions receive of a node: ``(configurations, *plates, *event)``."""
         return self.model[name].decode(self._of(name))
 
-    def sample(self, draws: int, rng: np.random.Generator) -> dict[str, np.ndarray]:
+    def sample(self, draws: int, rng: Any = None) -> dict[str, np.ndarray]:
         """Independent joint draws of all nodes, ``(draws, *plates, *event)``; labels as their positions.
+
+        ``rng`` is a seed or generator.
 
         Raises
         ------
@@ -77,7 +80,8 @@ class Enumerated:
             raise UnsupportedError(
                 "an answer by quadrature has points and no draws of continuous nodes; draw with an engine"
             )
-        at = rng.choice(len(self.weights), size=draws, p=self.weights / self.weights.sum())
+        generator = np.random.default_rng(seed_sequence(rng))
+        at = generator.choice(len(self.weights), size=draws, p=self.weights / self.weights.sum())
         return {n: np.asarray(self.values(n)).view(np.ndarray)[at] for n in self.names}
 
     def probabilities(self, *names: str) -> np.ndarray:

@@ -17,7 +17,7 @@ import numpy as np
 import scipy.special
 
 from bayesmc.distributions import Distribution, marking_invalid
-from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import BayesNet, CompiledNode, Problem, pose
 from bayesmc.testing.oracles.enumeration import Configurations, Enumerated, difference, visit
 from bayesmc.testing.oracles.hidden import HiddenPart
@@ -27,13 +27,15 @@ from bayesmc.testing.oracles.integral import REACH, Integral
 _MOST = 4
 #: relative error asked for, by dimension
 _RTOLS = (1e-9, 1e-8, 1e-7, 1e-6, 1e-4)
+#: relative error that is better than no answer, where nobody asked for another
+_ENOUGH = 1e-4
 #: share of the mass that the weighted points may leave out
 _DROPPED = 1e-13
 #: hidden leaves are represented by so many points
 _LEAF_POINTS = 32
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Quadrature(Enumerated):
     """The posterior as weighted points of a quadrature rule; it answers what `Enumerated` does, and more.
 
@@ -52,6 +54,12 @@ class Quadrature(Enumerated):
     left_out: tuple[str, ...] = ()
     evaluations: int = 0
     _integral: Integral | None = field(default=None, repr=False)
+
+    def __repr__(self) -> str:
+        return (
+            f"Quadrature(log_marginal_likelihood={self.log_marginal_likelihood:.6g}, "
+            f"accuracy={self.accuracy:.2g}, {len(self.weights)} points of {', '.join(self.names)})"
+        )
 
     def cdf(self, name: str, x: Any) -> np.ndarray:
         """Posterior probability of a value at most ``x``, shape ``(*x.shape, *plates, *event)``.
@@ -182,7 +190,8 @@ def quadrature_posterior(
         As for ``infer``.
     rtol : float, optional
         Relative error of the integral (of the estimate, which overstates it); by default 1e-8, 1e-7, 1e-6
-        and 1e-4 for one to four continuous unknowns.
+        and 1e-4 for one to four continuous unknowns; where that is out of reach, 1e-4 is taken for it, and
+        ``accuracy`` says so.
     max_evaluations : int
         Of the joint density, over all configurations.
     max_configurations : int
@@ -199,7 +208,8 @@ def quadrature_posterior(
     UnsupportedError
         Too many continuous unknowns (4 at most), or unknowns with infinitely many discrete values.
     BudgetError
-        ``rtol`` is out of reach of ``max_evaluations``, or there are too many configurations.
+        ``rtol`` (1e-4 by default) is out of reach of ``max_evaluations``, or there are too many
+        configurations.
     ZeroProbabilityError
         The evidence is impossible.
     ParameterError, DensityError
@@ -236,17 +246,29 @@ def quadrature_posterior(
             f"quadrature_posterior: {hidden.dimension} continuous unknowns ({names}), {_MOST} at most; "
             "observe some, take a smaller net, or where it is linear and Gaussian ask exact()"
         )
-    rtol = _RTOLS[hidden.dimension] if rtol is None else rtol
-    integral = Integral(hidden, rtol, max_evaluations, starts)
+    wanted = _RTOLS[hidden.dimension] if rtol is None else rtol
+    try:
+        integral = Integral(hidden, wanted, max_evaluations, starts)
+    except BudgetError:
+        if rtol is not None or wanted >= _ENOUGH:
+            raise
+        # an answer that says how good it is tells more than none
+        integral = Integral(hidden, _ENOUGH, max_evaluations, starts)
     return _answer(problem, hidden, integral)
+
+
+def check_rtol(call: str, rtol: Any) -> None:
+    """Raise ValueError unless a relative error that can be asked for, or None."""
+    number = isinstance(rtol, (int, float, np.number)) and not isinstance(rtol, bool)
+    if rtol is not None and not (number and 1e-13 <= rtol < 1.0):
+        raise ValueError(f"{call}(rtol={rtol!r}): give a number from 1e-13 to below 1")
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
 def _check(rtol: float | None, max_evaluations: int, starts: int) -> None:
-    if rtol is not None and not 1e-13 <= rtol < 1.0:
-        raise ValueError(f"quadrature_posterior(rtol={rtol}): give a number from 1e-13 to below 1")
+    check_rtol("quadrature_posterior", rtol)
     if max_evaluations < 1 or starts < 1:
         raise ValueError(
             f"quadrature_posterior(max_evaluations={max_evaluations}, starts={starts}): give at least 1"

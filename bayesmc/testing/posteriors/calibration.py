@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 
 from bayesmc.auto import infer
+from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.engines.base import Engine
-from bayesmc.errors import BayesmcWarning, missing_extra
-from bayesmc.network import BayesNet
+from bayesmc.errors import BayesmcWarning, UnsupportedError, missing_extra
+from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
-from bayesmc.testing.kernels.joint import NetJoint, Rows, check_sizes
+from bayesmc.testing.kernels.joint import JointModel, NetJoint, Rows, check_sizes
 from bayesmc.testing.posteriors.bands import Uniformity, ecdf_band, ecdf_points, ecdf_uniformity
-from bayesmc.testing.posteriors.quantities import Quantities
+from bayesmc.testing.posteriors.quantities import Quantities, is_default
 from bayesmc.testing.posteriors.shares import Draws, posterior_draws, share_below, users_draws
 from bayesmc.testing.verdict import Comparison, Verdict, counted
 
@@ -33,6 +34,8 @@ _CALL = "simulation_based_calibration"
 _ROWS = 100_000
 #: effective weighted draws below which the uniform law of a rank is not to be relied upon
 _FEW = 50
+#: with one Axes for all: colours, line styles where those are used up, and statistics that a legend names
+_COLOURS, _STYLES, _NAMED = 10, ("-", "--", ":", "-."), 12
 #: colours of statistics that agree and that deviate, inches of a panel, panels in a row
 _PLAIN, _DEVIANT, _PANEL, _COLUMNS = "#2a6f97", "#c1440e", (2.8, 2.2), 4
 
@@ -84,7 +87,9 @@ class CalibrationResult(Verdict):
         }
 
     def plot(self, ax: Any = None) -> Any:
-        """Draw the differences of distribution functions with their band; what deviates is coloured.
+        """Draw the differences of distribution functions with their band.
+
+        In panels what deviates is red; in one Axes it is thick, and every statistic has a colour of its own.
 
         A hump means that truths lie too low among the draws, a dip that they lie too high; up first and down
         later that the posterior is too narrow, down first that it is too wide.
@@ -103,10 +108,10 @@ class CalibrationResult(Verdict):
         MissingExtraError
             Without matplotlib (the extra ``plot``).
         """
-        names = list(self.ranks)
+        names, together = list(self.ranks), ax is not None
         axes = _panels(len(names)) if ax is None else np.array([ax] * len(names), dtype=object)
         deviating = set(self.deviating)
-        difference = self.ecdf_difference
+        difference, lines = self.ecdf_difference, {}
         edges = np.concatenate([[0.0], self.points, [1.0]])
         for one in dict.fromkeys(axes):
             low, high = (np.pad(b - self.points, 1) for b in (self.low, self.high))
@@ -118,22 +123,39 @@ class CalibrationResult(Verdict):
         # what deviates lies above the others
         for name, one in sorted(zip(names, axes, strict=True), key=lambda n: n[0] in deviating):
             off = name in deviating
-            colour = _DEVIANT if off else _PLAIN
-            label = name if off and ax is not None else None
-            one.plot(edges, np.pad(difference[name], 1), color=colour, linewidth=1.4, label=label)
-            if ax is None:
+            colour, style = _DEVIANT if off else _PLAIN, "-"
+            if together:
+                more, which = divmod(names.index(name), _COLOURS)
+                colour, style = f"C{which}", _STYLES[more % len(_STYLES)]
+            (lines[name],) = one.plot(
+                edges, np.pad(difference[name], 1), color=colour, linestyle=style, label=name,
+                linewidth=(2.2 if off else 1.0) if together else 1.4,
+            )  # fmt: skip
+            if not together:
                 one.set_title(name, fontsize="small", color=colour if off else "black")
-        if ax is not None and deviating:
-            ax.legend(frameon=False, fontsize="small")
-        if ax is None:
-            axes[0].figure.supxlabel("share of the posterior below the truth", fontsize="medium")
-            axes[0].figure.supylabel("ECDF difference", fontsize="medium")
-        else:
-            ax.set(xlabel="share of the posterior below the truth", ylabel="ECDF difference")
+        if together:
+            named = [n for n in names if n in deviating or len(names) <= _NAMED]
+            if named:
+                ax.legend([lines[n] for n in named], named, frameon=False, fontsize="small")
+        self._label(axes[0], together)
         return axes
 
+    def _label(self, ax: Any, together: bool) -> None:
+        """Axes' labels, and the level of the band."""
+        count = len(self.ranks)
+        of = f"all {count} statistics together" if count > 1 else "the statistic"
+        title = f"band: {100 * (1 - self.alpha):.6g}% for {of}"
+        x, y = "share of the posterior below the truth", "ECDF difference"
+        if together:
+            ax.set(xlabel=x, ylabel=y)
+            ax.set_title(title, fontsize="medium")
+        else:
+            ax.figure.supxlabel(x, fontsize="medium")
+            ax.figure.supylabel(y, fontsize="medium")
+            ax.figure.suptitle(title, fontsize="medium")
+
     def _remarks(self) -> list[str]:
-        lines = [f"  {name}: {_in_words(self.ranks[name])}" for name in self.deviating]
+        lines = [f"  {name}: {_in_words(name, self.ranks[name])}" for name in self.deviating]
         runs = len(next(iter(self.ranks.values())))
         lines += [f"  {count} of {runs} runs warned: {kind}" for kind, count in self.warned.items()]
         if self.uncertain:
@@ -183,7 +205,8 @@ def simulation_based_calibration(
         Nodes that are data; by default the stochastic nodes without children, if any other node is
         stochastic.
     replications : int
-        Runs of the engine, at least 20. With 200, shares of ranks are known to about 0.035.
+        Runs of the engine, at least 20. With 200, shares of ranks are known to about 0.035. A call takes as
+        long as so many runs do: for a chain of a few thousand sweeps, seconds to minutes.
     statistics : dict, optional
         Name -> function whose arguments name nodes, hidden or observed, as in queries, and which returns one
         number for each draw. By default every element of the hidden nodes (codes, of labels; of nodes with
@@ -207,7 +230,9 @@ def simulation_based_calibration(
     Raises
     ------
     ModelError, UnsupportedError
-        The net cannot be drawn from, or nothing is hidden.
+        The net cannot be drawn from, or is a template or a JointModel, or nothing is hidden.
+    TypeError
+        ``net`` is something else, or a statistic is not a function.
     DensityError
         A statistic is NaN.
     Exception
@@ -215,7 +240,7 @@ def simulation_based_calibration(
 
     Notes
     -----
-    Chains cost little in numbers: Gibbs with ``chains=20, draws=25`` is faster than one long chain.
+    Chains cost little in numbers: ``Gibbs(chains=20, draws=25, warmup=50)`` is faster than one long chain.
 
     References
     ----------
@@ -246,6 +271,7 @@ def simulation_based_calibration(
     check_sizes(_CALL, replications=(replications, 20), draws=(draws, 1))
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"{_CALL}(alpha={alpha}): give a probability strictly between 0 and 1")
+    _check_net(engine, net)
     joint = NetJoint(net, observed, inputs)
     figures = Quantities(_CALL, joint, statistics)
     seed = seed_sequence(rng)
@@ -272,6 +298,23 @@ def simulation_based_calibration(
             uncertain=sum(uncertain),
         )
     )
+
+
+def _check_net(engine: Any, net: Any) -> None:
+    if isinstance(net, DynamicBayesNet):
+        raise UnsupportedError(
+            f"{_CALL}: a DynamicBayesNet has no fixed number of slices; give the net of some, as in "
+            f"{_CALL}(engine, dbn.unroll(10)), with an engine of infer or a function that runs the filter"
+        )
+    if isinstance(net, JointModel):
+        raise UnsupportedError(
+            f"{_CALL}: a JointModel has no named nodes to give an engine as evidence; declare the model as a "
+            "BayesNet, or test the kernel with rank_test(kernel, model) or geweke_test(kernel, model)"
+        )
+    if isinstance(engine, (BayesNet, DynamicBayesNet, FactorGraph, JointModel)):
+        raise TypeError(f"{_CALL}: the engine comes first; write {_CALL}(engine, net)")
+    if not isinstance(net, (BayesNet, FactorGraph)):
+        raise TypeError(f"{_CALL}: net is a {type(net).__name__}; give a BayesNet")
 
 
 # ---- running ------------------------------------------------------------------------------------
@@ -368,8 +411,10 @@ def _comparison(name: str, found: Uniformity, count: int) -> Comparison:
     return Comparison(what, found.share, found.point, abs(found.excess) / error, found.p_value)
 
 
-def _in_words(ranks: np.ndarray) -> str:
+def _in_words(name: str, ranks: np.ndarray) -> str:
     """What is wrong with the draws, as far as mean and spread of the ranks show it."""
+    # a user's statistic takes the draws elsewhere, and says nothing of where they lie themselves
+    default = is_default(name)
     count = len(ranks)
     shift = (ranks.mean() - 0.5) * math.sqrt(12 * count)
     spread = (((ranks - 0.5) ** 2).mean() - 1 / 12) * math.sqrt(180 * count)
@@ -377,10 +422,13 @@ def _in_words(ranks: np.ndarray) -> str:
         return "neither shifted nor of a wrong spread: look at plot()"
     if abs(shift) > abs(spread):
         side = "low" if shift > 0 else "high"
-        return f"draws lie too {side} (ranks of the truth average {ranks.mean():.3f}, not 0.5)"
+        draws = "draws" if default else "its values at the draws"
+        return f"{draws} lie too {side} (ranks of the truth average {ranks.mean():.3f}, not 0.5)"
     tails = (np.abs(ranks - 0.5) > 0.4).mean()
-    width = "narrow" if spread > 0 else "wide"
-    return f"draws are too {width} ({tails:.0%} of truths in their outer fifth, not 20%)"
+    width = "draws are too " + ("narrow" if spread > 0 else "wide")
+    if not default:
+        width = "its values at the draws spread too " + ("little" if spread > 0 else "far")
+    return f"{width} ({tails:.0%} of truths in their outer fifth, not 20%)"
 
 
 def _panels(count: int) -> np.ndarray:

@@ -43,6 +43,10 @@ _FEW = 30.0
 _EVEN = 0.5
 #: the figure that is judged
 _WHAT = "mean of estimated over exact evidence"
+#: standard errors beyond which it does not matter how many
+_FAR = 1e6
+#: logs of numbers that are held within floating point
+_LARGEST = 700.0
 #: relative difference of an estimate without Monte Carlo error
 _ROUNDING = 1e-9
 
@@ -54,7 +58,7 @@ class EvidenceResult(Verdict):
     Attributes
     ----------
     ratios : ndarray, shape (replications,)
-        Estimated over exact evidence, one of each run.
+        Estimated over exact evidence, one of each run; infinite beyond floating point.
     log_exact : float
         Log of the exact evidence.
     ess : float
@@ -73,13 +77,27 @@ class EvidenceResult(Verdict):
         """Whether the ratios are so uneven that only a mean above 1 could be judged."""
         return _is_uneven(self.ess, self.tail, len(self.ratios))
 
+    @property
+    def judged(self) -> bool:
+        """Whether the mean was judged: not where ratios are uneven, unless it is too large."""
+        return not self.uneven or bool(self.rejected)
+
+    def __bool__(self) -> bool:
+        return self.judged and not self.rejected
+
     def _remarks(self) -> list[str]:
         if not self.uneven:
             return []
+        if self.ess == 0.0:
+            reason = f"every run of {len(self.ratios)} estimated zero"
+        else:
+            reason = (
+                f"the ratios are worth {self.ess:.0f} of {len(self.ratios)} runs, with tail shape "
+                f"{self.tail:.2g}: too uneven to tell whether their mean is too small"
+            )
         return [
-            f"  the ratios are worth {self.ess:.0f} of {len(self.ratios)} runs, with tail shape "
-            f"{self.tail:.2g}: too uneven to tell whether their mean is too small; give the engine "
-            "more draws or better proposals, or choose likelier evidence"
+            f"  {'' if self.judged else 'not judged: '}{reason}; take more draws in each run, so that runs "
+            "are more even, or better proposals, or likelier evidence"
         ]
 
 
@@ -107,9 +125,10 @@ def unbiased_evidence_test(
     1.5 times that there).
 
     Where ratios are heavier, with a tail of shape above 0.5, whose variance may be infinite, or worth fewer
-    than 30 runs, no test can tell that their mean is too small, and none is tried: ``uneven`` is true, and
-    the answer says so. That their mean is too large is judged by a bet then, at most at ``alpha`` whatever
-    their law.
+    than 30 runs, no test can tell that their mean is too small, and none is tried: ``uneven`` is true. The
+    answer is then not true although nothing is ``rejected``, and says that nothing was judged; such an answer
+    is no alarm, and not counted in the rate. That their mean is too large is judged by a bet then, at most at
+    ``alpha`` whatever their law.
 
     Parameters
     ----------
@@ -135,7 +154,7 @@ def unbiased_evidence_test(
     Returns
     -------
     EvidenceResult
-        True if the mean does not deviate; with ``ratios``.
+        True if the mean was judged and does not deviate; with ``ratios``.
 
     Raises
     ------
@@ -180,16 +199,17 @@ def unbiased_evidence_test(
     estimate = _estimator(engine, net, evidence, inputs)
     seeds = seed_sequence(rng).spawn(replications)
     logs = np.array([_one(estimate, seed) for seed in seeds])
-    with np.errstate(over="ignore"):
-        ratios = np.exp(logs - log_exact)
-    if not np.isfinite(ratios).all():
-        run = int(np.flatnonzero(~np.isfinite(ratios))[0])
+    bad = np.isnan(logs) | (logs == np.inf)
+    if bad.any():
+        run = int(np.flatnonzero(bad)[0])
         raise DensityError(
             f"{_CALL}: run {run} estimated a log evidence of {logs[run]:.6g}, against {log_exact:.6g} exact; "
             "estimates must be finite logs, or minus infinity for zero"
         )
+    with np.errstate(over="ignore"):
+        ratios = np.exp(logs - log_exact)
     ratios.flags.writeable = False
-    figure, ess, tail = _judged(ratios, accuracy)
+    figure, ess, tail = _judged(logs - log_exact, accuracy)
     return counted(
         EvidenceResult(
             _CALL, alpha, [figure], ratios=ratios, log_exact=log_exact, ess=ess, tail=tail
@@ -279,25 +299,38 @@ def _one(estimate: Callable[[np.random.SeedSequence], Any], seed: np.random.Seed
 # ---- the decision --------------------------------------------------------------------------------
 
 
-def _judged(ratios: np.ndarray, accuracy: float) -> tuple[Comparison, float, float]:
-    """The mean against 1; what the ratios are worth, and their tail where it is judged one-sidedly."""
-    count, mean, spread = len(ratios), float(ratios.mean()), float(ratios.std(ddof=1))
+def _judged(logs: np.ndarray, accuracy: float) -> tuple[Comparison, float, float]:
+    """The mean of ratios, given by their logs, against 1; what the ratios are worth, and their tail.
+
+    All is reckoned in units of the largest ratio, since logs may be off by more than floats can hold.
+    """
+    count, top = len(logs), float(logs.max())
+    if top == -math.inf:
+        return Comparison(_WHAT, 0.0, 1.0, 0.0, 1.0), 0.0, math.nan
+    scaled = np.exp(logs - top)
+    mean, spread = float(scaled.mean()), float(scaled.std(ddof=1))
+    found = _bounded(top + math.log(mean))
     tolerance = accuracy + _ROUNDING
-    if mean > 0.0 and spread <= _ROUNDING * mean:
-        off = 0.0 if abs(mean - 1.0) <= tolerance else math.inf
-        equal = Comparison(_WHAT, mean, 1.0, off, 1.0 if off == 0.0 else 0.0)
+    if spread <= _ROUNDING * mean:
+        off = 0.0 if abs(found - 1.0) <= tolerance else math.inf
+        equal = Comparison(_WHAT, found, 1.0, off, 1.0 if off == 0.0 else 0.0)
         return equal, float(count), math.nan
     # what the error of the exact value explains does not count
-    off = math.copysign(max(abs(mean - 1.0) - tolerance, 0.0), mean - 1.0)
-    z = off / (spread / math.sqrt(count)) if spread > 0.0 else 0.0
-    ess = float(ratios.sum() ** 2 / (ratios**2).sum()) if mean > 0.0 else 0.0
-    with np.errstate(divide="ignore"):
-        tail = pareto_k(np.log(ratios), count) if mean > 0.0 else math.nan
+    one = _bounded(-top)
+    off = math.copysign(max(abs(mean - one) - tolerance * one, 0.0), mean - one)
+    z = min(max(off / (spread / math.sqrt(count)), -_FAR), _FAR)
+    ess = float(scaled.sum() ** 2 / (scaled**2).sum())
+    tail = pareto_k(logs, count)
     if _is_uneven(ess, tail, count):
-        p_value = _too_large(ratios / (1.0 + tolerance))
+        p_value = _too_large(logs - math.log1p(tolerance))
     else:
-        p_value = _p_value(z, ratios)
-    return Comparison(_WHAT, mean, 1.0, abs(z), p_value), ess, tail
+        p_value = _p_value(z, scaled)
+    return Comparison(_WHAT, found, 1.0, abs(z), p_value), ess, tail
+
+
+def _bounded(log: float) -> float:
+    """The exponential, held within floating point."""
+    return math.exp(min(max(log, -_LARGEST), _LARGEST))
 
 
 def _is_uneven(ess: float, tail: float, count: int) -> bool:
@@ -305,15 +338,15 @@ def _is_uneven(ess: float, tail: float, count: int) -> bool:
     return ess < _FEW or (ess < _EVEN * count and tail > _HEAVY)
 
 
-def _too_large(ratios: np.ndarray) -> float:
+def _too_large(logs: np.ndarray) -> float:
     """p-value of a mean of at most 1, exact for all nonnegative numbers (Waudby-Smith and Ramdas 2024).
 
     Who bets a fixed share on each ratio to exceed 1 multiplies his stake on average by at most 1, whatever
     their law; by Markov's inequality one over the stake is a p-value. The stake is spread over some shares.
     """
-    shares = 0.5 ** np.arange(1, 12)
-    gains = np.log1p(shares[:, None] * (ratios - 1.0)).sum(axis=1)
-    return min(1.0, math.exp(-max(log_sum_exp(gains) - math.log(len(shares)), 0.0)))
+    shares = 0.5 ** np.arange(1, 12)[:, None]
+    gains = np.logaddexp(np.log1p(-shares), np.log(shares) + logs).sum(axis=1)
+    return min(1.0, math.exp(-max(float(log_sum_exp(gains)) - math.log(len(shares)), 0.0)))
 
 
 def _p_value(z: float, ratios: np.ndarray) -> float:

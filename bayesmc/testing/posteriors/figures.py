@@ -31,6 +31,9 @@ _MAX_COV = 5
 _SQUARES = 100.0
 #: standard errors, in units of the figure, that are rounding
 _ROUNDING = 1e-12
+#: p-values of rare states that were judged because they are too frequent are multiplied by their number and
+#: by this: the choice of what to judge looked at the draws, and adds at most a twentieth of ``alpha`` so
+_PICKED = 10.0
 #: standard deviation, for values about 1, below which a node is taken for constant
 _CONSTANT = 1e-7
 
@@ -43,6 +46,24 @@ class Table:
         self.min_count = min_count
         self.comparisons: list[Comparison] = []
         self.skipped = 0
+        #: states too rare to be judged, and those of them that the draws show often all the same
+        self._rare = 0
+        self._frequent: list[Comparison] = []
+
+    def rare(self, frequent: Comparison | None) -> None:
+        """A state that is too rare to be judged, or a comparison where the draws show it often."""
+        self._rare += 1
+        if frequent is None:
+            self.skipped += 1
+        else:
+            self._frequent.append(frequent)
+
+    def settle(self) -> None:
+        """Take in the rare states that were judged, at the price of having looked for them."""
+        for one in self._frequent:
+            p_value = min(1.0, _PICKED * self._rare * one.p_value)
+            self.add(one.what, one.found, one.exact, one.errors, p_value)
+        self._frequent = []
 
     def add(self, what: str, found: float, exact: float, errors: float, p_value: float) -> None:
         comparison = Comparison(what, float(found), float(exact), float(errors), float(p_value))
@@ -135,14 +156,15 @@ def compare_states(pair: Pair) -> None:
             else:
                 table.equal(what, q, p)
         elif n * p * (1 - p) < table.min_count:
-            table.skipped += 1
+            often = n * q * (1 - q) >= table.min_count
+            table.rare(_binomial(table, what, q, p, n) if often else None)
         else:
-            _add_binomial(table, what, q, p, n)
+            table.comparisons.append(_binomial(table, what, q, p, n))
 
 
-def _add_binomial(
+def _binomial(
     table: Table, what: str, q: float, p: float, n: float, shown: tuple[float, float] | None = None
-) -> None:
+) -> Comparison:
     """Two-sided binomial tail at ``n`` effective draws, interpolated by the incomplete beta function."""
     off = q - p
     off = np.sign(off) * max(abs(off) - table.tolerance, 0.0)
@@ -151,7 +173,8 @@ def _add_binomial(
     below = 1.0 - float(scipy.special.betainc(k + 1, n - k, p)) if k < n else 1.0
     error = np.sqrt(p * (1 - p) / n)
     found, exact = shown or (q, p)
-    table.add(what, found, exact, abs(off) / error, min(1.0, 2 * min(above, below)))
+    errors = float(abs(off) / error)
+    return Comparison(what, float(found), float(exact), errors, min(1.0, 2 * min(above, below)))
 
 
 def compare_mean(pair: Pair) -> None:
@@ -287,7 +310,8 @@ def _compare_share(
     if not n * p * (1 - p) >= pair.table.min_count:
         pair.table.skipped += 1
     else:
-        _add_binomial(pair.table, f"share of draws up to the {what}", share, p, n)
+        shown = f"share of draws up to the {what}"
+        pair.table.comparisons.append(_binomial(pair.table, shown, share, p, n))
 
 
 def compare_angles(pair: Pair) -> None:

@@ -7,13 +7,15 @@ stands in ``samples``, what a decision is in ``verdict``; where exact answers co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import ShapeError, UnknownNodeError, UnsupportedError
+from bayesmc.network import Model, Problem
+from bayesmc.network.evidence import store
 from bayesmc.randomness import seed_sequence
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.testing.posteriors.figures import (
@@ -33,6 +35,8 @@ from bayesmc.testing.verdict import Verdict, counted
 
 #: rows of a joint sample below which it is not judged
 _MIN_ROWS = 30
+#: draws of a user's own from which an effective number can be told
+_MIN_OWN = 8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,9 +47,12 @@ class Match(Verdict):
     ----------
     remarks : tuple of str
         What could not be compared though it was asked for, and why.
+    of_nodes : int
+        Comparisons that are about nodes, and not about the evidence.
     """
 
     remarks: tuple[str, ...] = ()
+    of_nodes: int = 0
 
     def _remarks(self) -> list[str]:
         return [f"  {remark}" for remark in self.remarks]
@@ -85,8 +92,10 @@ def compare(
 
     Holm's method keeps the chance of any false alarm in one call at ``alpha``. It is exact for
     probabilities and quantiles of numbers from independent draws and for their joint draws, and holds in
-    the limit of many draws elsewhere. A posterior whose ``ess`` is infinite is exact, and must agree within
-    ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is added to every tolerance.
+    the limit of many draws elsewhere. (Rare states that are too frequent are judged because of what the draws
+    show; their p-values pay for that, but for at most a twentieth of ``alpha``.) A posterior whose ``ess`` is
+    infinite is exact, and must agree within ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is added
+    to every tolerance.
 
     It cannot see what the draws do not show: heavy weights that no draw has met (look at ``pareto_k``),
     faults below the Monte Carlo error; without ``draws``, errors of joint probabilities with right
@@ -94,8 +103,9 @@ def compare(
 
     Parameters
     ----------
-    posterior : Posterior
-        Of any engine.
+    posterior : Posterior or dict
+        Of any engine; or draws of your own, node -> ``(draws, *plates, *event)``, in the order in which they
+        were drawn: they are taken for one chain, and judged by their effective number.
     exact : Enumerated or Posterior
         Anything with ``names``, ``probabilities``, ``mean``, ``var``, ``log_marginal_likelihood``; its
         ``quantile(name, q)``, ``cdf(name, x)``, ``cov(name)`` and ``resample(draws, rng)`` are used where it
@@ -105,9 +115,11 @@ def compare(
     rtol : float
         Tolerance without Monte Carlo error.
     min_count : float
-        Compare states and quantiles with ``n_eff * p * (1 - p)`` at least this.
+        Compare states and quantiles with ``n_eff * p * (1 - p)`` at least this, where ``p`` is exact; and
+        rarer states whose share among the draws is as large.
     names : sequence of str, optional
-        Nodes to compare; by default all that ``exact`` knows and the posterior kept.
+        Nodes to compare; by default all that ``exact`` knows and the posterior kept, but for those that
+        are wholly observed.
     quantiles : sequence of float
         Compare these; none where empty.
     draws : int
@@ -128,6 +140,10 @@ def compare(
         ``draws`` are asked for and ``exact`` has none to give.
     ValueError
         Nothing is left to compare, or a level or number is out of range.
+    TypeError
+        ``posterior`` is none, or the two are swapped.
+    UnknownNodeError
+        The posterior is of another net, or a name is unknown.
 
     References
     ----------
@@ -166,7 +182,9 @@ def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
     Raises
     ------
     AssertionError
-        Naming nodes, elements, states, both values and the number of standard errors.
+        Naming nodes, elements, states, both values and the number of standard errors; or because nothing
+        could be judged: no figure of any node though some were skipped, or no joint draws though they were
+        asked for.
 
     Examples
     --------
@@ -178,15 +196,26 @@ def assert_matches(posterior: Any, exact: Any, **options: Any) -> Match:
     >>> weighted = bmc.infer(net, {"x": 1.5}, engine=bmc.LikelihoodWeighting(5000), rng=0)
     >>> match = assert_matches(weighted, enumerate_posterior(net, {"x": 1.5}))
     >>> len(match.comparisons)
-    5
+    3
     """
     given = {"alpha": 1e-3, "rtol": 1e-9, "min_count": 10.0, "names": None, "draws": 0, "rng": None,
              "quantiles": (0.05, 0.25, 0.5, 0.75, 0.95)}  # fmt: skip
     for key in options.keys() - given.keys():
         raise TypeError(f"assert_matches: no option {key!r}; there are {', '.join(sorted(given))}")
     match = _match("assert_matches", posterior, exact, **{**given, **options})
+    shown = "draws of your own" if isinstance(posterior, Mapping) else repr(posterior)
     if not match:
-        raise AssertionError(f"{match!r}\n  of {posterior!r}")
+        raise AssertionError(f"{match!r}\n  of {shown}")
+    if match.skipped and not match.of_nodes:
+        raise AssertionError(
+            f"assert_matches: nothing was judged: {match.skipped} figures have too few effective draws, and "
+            f"no other is of a hidden node; take more draws\n  of {shown}"
+        )
+    if match.remarks:
+        raise AssertionError(
+            f"assert_matches(draws={options['draws']}): {'; '.join(match.remarks)}; take or keep more "
+            f"draws, or leave draws= out\n  of {shown}"
+        )
     return match
 
 
@@ -210,10 +239,12 @@ def _match(
     if isinstance(names, str):
         raise ValueError(f"{test}(names={names!r}): give a sequence of names, as in [{names!r}]")
     Verdict(test, alpha, ())  # says what is wrong with alpha before work is done
+    posterior = _read(test, posterior, exact)
     table = Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
     sample = Draws(posterior) if isinstance(posterior, DrawsPosterior) else None
-    chosen = _chosen(posterior, exact, names)
+    chosen = _chosen(test, posterior, exact, names)
     _compare_evidence(table, posterior, exact)
+    of_evidence = len(table.comparisons)
     for name in chosen:
         node = posterior.model[name]
         pair = Pair(table, posterior, exact, name, node, sample)
@@ -226,18 +257,92 @@ def _match(
             compare_var(pair)
             compare_cov(pair)
             compare_quantiles(pair, quantiles)
+    table.settle()
     remarks = _compare_joint(table, posterior, exact, chosen, draws, rng, alpha) if draws else []
     if not table.comparisons and not table.skipped and not remarks:
         raise ValueError(f"{test}: there is nothing to compare; name nodes that both know")
-    return counted(Match(test, alpha, table.comparisons, table.skipped, tuple(remarks)))
+    of_nodes = len(table.comparisons) - of_evidence
+    return counted(Match(test, alpha, table.comparisons, table.skipped, tuple(remarks), of_nodes))
 
 
-def _chosen(posterior: Any, exact: Any, names: Sequence[str] | None) -> list[str]:
+def _chosen(test: str, posterior: Any, exact: Any, names: Sequence[str] | None) -> list[str]:
     kept = getattr(posterior, "names", None)
+    nodes = posterior.model.nodes
+    unknown = [n for n in (exact.names if names is None else names) if n not in nodes]
+    if unknown and names is None:
+        raise UnknownNodeError(
+            f"{test}: the exact answer has a node {unknown[0]!r}, the posterior has {', '.join(nodes)}; give "
+            "two answers about the same net, or names= of nodes that both have"
+        )
+    unknown += [n for n in names or () if n not in exact.names]
+    if unknown:
+        raise UnknownNodeError(
+            f"{test}(names={list(names or ())!r}): {unknown[0]!r} is no node that both answers have; name "
+            f"some of {', '.join(n for n in exact.names if n in nodes)}"
+        )
     wanted = list(exact.names if names is None else names)
-    if names is None and kept is not None:
-        wanted = [name for name in wanted if name in set(kept)]
-    return [name for name in wanted if posterior.model[name].kind != "input"]
+    if names is None:
+        seen = _observed(posterior)
+        wanted = [n for n in wanted if (kept is None or n in set(kept)) and n not in seen]
+    return [name for name in wanted if nodes[name].kind != "input"]
+
+
+def _observed(posterior: Any) -> set[str]:
+    """Nodes all of whose elements are data."""
+    problem = getattr(posterior, "problem", None)
+    observed = {} if problem is None else problem.observed
+    return {name for name, seen in observed.items() if seen.mask is None}
+
+
+def _read(test: str, posterior: Any, exact: Any) -> Any:
+    """The posterior, or one made of a user's own draws; raises where the two are none."""
+    if not all(hasattr(exact, part) for part in ("names", "mean", "log_marginal_likelihood")):
+        raise TypeError(
+            f"{test}: exact={exact!r:.200} is no answer; give one, as exact(net, evidence) or bmc.Exact() "
+            "finds it"
+        )
+    if isinstance(posterior, Mapping):
+        return _own_draws(test, posterior, exact)
+    if all(hasattr(posterior, part) for part in ("model", "mean", "ess", "mcse")):
+        return posterior
+    if hasattr(exact, "ess") and hasattr(posterior, "log_marginal_likelihood"):
+        fault = f"{type(posterior).__name__} is an exact answer and stands first"
+        raise TypeError(f"{test}: {fault}; swap the two: {test}(posterior, exact)")
+    raise TypeError(
+        f"{test}: posterior={posterior!r:.200} is no posterior; give one of bmc.infer, or a dict of your own "
+        "draws, node -> array of shape (draws, *plates, *event)"
+    )
+
+
+def _own_draws(test: str, draws: Mapping[str, Any], exact: Any) -> DrawsPosterior:
+    """A user's draws as one chain of a posterior."""
+    model: Model | None = getattr(exact, "model", None)
+    if model is None:
+        raise TypeError(
+            f"{test}: draws of your own need an exact answer with a model, as exact(net, evidence) gives it, "
+            f"not {type(exact).__name__}"
+        )
+    stored = {}
+    for name, values in draws.items():
+        if name not in exact.names:
+            raise UnknownNodeError(
+                f"{test}: the draws have {name!r}, which is no node of the exact answer; it has "
+                f"{', '.join(exact.names)}"
+            )
+        node, shape = model[name], np.shape(values)
+        if len(shape) != 1 + len(node.value_shape) or shape[1:] != node.value_shape:
+            raise ShapeError(
+                f"{test}: draws of {name!r} have shape {shape}; give {('draws', *node.value_shape)}, one row "
+                "for each draw"
+            )
+        stored[name] = store(node, values)[None]
+    sizes = {name: values.shape[1] for name, values in stored.items()}
+    if len(set(sizes.values())) != 1 or min(sizes.values()) < _MIN_OWN:
+        raise ShapeError(
+            f"{test}: the nodes have {sizes} draws; give one number for all, {_MIN_OWN} or more"
+        )
+    problem = Problem(None, model, {}, {})  # type: ignore[arg-type]
+    return DrawsPosterior(problem, None, stored, (1, next(iter(sizes.values()))))
 
 
 def _compare_evidence(table: Table, posterior: Any, exact: Any) -> None:

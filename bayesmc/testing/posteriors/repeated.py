@@ -22,6 +22,10 @@ from bayesmc.testing.verdict import Comparison, Verdict, counted
 _CALL = "repeated_test"
 #: relative difference of figures without chance in them
 _ROUNDING = 1e-9
+#: numbers above it are judged in units of the largest
+_HUGE = 1e90
+#: standard errors beyond which it does not matter how many
+_FAR = 1e12
 
 
 def repeated_test(
@@ -141,16 +145,21 @@ def _check(found: Mapping[str, np.ndarray], wanted: Mapping[str, np.ndarray]) ->
 def _judged(what: str, values: np.ndarray, exact: float, accuracy: float) -> Comparison:
     """The mean of some runs against the exact figure."""
     count, mean = len(values), float(values.mean())
+    largest = float(np.abs(values).max())
+    if not math.isfinite(mean):
+        return Comparison(what, mean, exact, math.inf, 0.0)
+    if largest > _HUGE:  # squares and cubes would overflow
+        allowed = accuracy * min(1.0, max(1.0, abs(exact)) / largest)
+        shrunk = _judged(what, values / largest, exact / largest, allowed)
+        return Comparison(what, mean, exact, shrunk.errors, shrunk.p_value)
     unit = max(1.0, abs(exact))
     off = mean - exact
     excess = math.copysign(max(abs(off) - accuracy * unit, 0.0), off)
     spread = float(values.std(ddof=1))
-    if not math.isfinite(mean):
-        return Comparison(what, mean, exact, math.inf, 0.0)
     if spread <= _ROUNDING * unit:
         errors, p_value = (0.0, 1.0) if abs(excess) <= _ROUNDING * unit else (math.inf, 0.0)
         return Comparison(what, mean, exact, errors, p_value)
-    z = excess * math.sqrt(count) / spread
+    z = min(max(excess * math.sqrt(count) / spread, -_FAR), _FAR)
     skewness = float((((values - mean) / spread) ** 3).mean())
     return Comparison(what, mean, exact, abs(z), _p_value(z, skewness, count))
 
