@@ -173,7 +173,7 @@ def alarms(case: Case, seeds: list[int]) -> int:
     """How many of these runs raise an alarm."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", BayesmcWarning)
-        return sum(not case.one(seed) for seed in seeds)
+        return sum(bool(case.one(seed).rejected) for seed in seeds)
 
 
 def _batch(job: tuple[int, list[int]]) -> int:

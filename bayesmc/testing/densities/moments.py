@@ -29,8 +29,11 @@ _SUPPORT = 30.0
 
 def check_scores(levels: np.ndarray, report: Report) -> None:
     """Normal scores of draws of one number, from their cdf values: mean 0 and variance 1, exactly so."""
+    levels = levels[~np.isnan(levels)]  # faults that are told elsewhere
     scores = scipy.special.ndtri(np.clip(levels, _EDGE, 1.0 - _EDGE))
     n = len(scores)
+    if not n:
+        return
     mean, square = float(scores.mean()), float((scores**2).sum())
     z = abs(mean) * math.sqrt(n)
     report.judge(

@@ -41,9 +41,19 @@ class Report:
     def fault(self, what: str) -> None:
         self.comparisons.append(Fault(self.place + what, math.nan, math.nan, math.inf, 0.0))
 
-    def judge(self, what: str, found: float, exact: float, errors: float, p_value: float) -> None:
+    def judge(
+        self,
+        what: str,
+        found: float,
+        exact: float,
+        errors: float,
+        p_value: float,
+        kind: str = "exact",
+    ) -> None:
         self.comparisons.append(
-            Comparison(self.place + what, float(found), float(exact), float(errors), float(p_value))
+            Comparison(
+                self.place + what, float(found), float(exact), float(errors), float(p_value), kind
+            )
         )
 
     def fine(self, what: str, found: float = 0.0, exact: float = 0.0) -> None:

@@ -359,7 +359,9 @@ class HiddenPart:
             numbers[..., f.element, :] = free[..., f.start : f.stop]
         numbers = numbers.reshape(*batch, *node.plate_shape, *shape)
         value = self._filled(node, transform.constrain(numbers))
-        return value, transform.log_abs_det_jacobian(numbers)
+        # beyond the largest float the volume would grow on while value and density stand still
+        most = math.log(np.finfo(float).max) * math.prod(shape)
+        return value, np.minimum(transform.log_abs_det_jacobian(numbers), most)
 
     def _is_beyond(self, f: FreeElement, value: np.ndarray, free: np.ndarray) -> Any:
         """Where the way from free numbers to a value does not lead back."""

@@ -94,8 +94,8 @@ def compare(
     probabilities and quantiles of numbers from independent draws and for their joint draws, and holds in
     the limit of many draws elsewhere. (Rare states that are too frequent are judged because of what the draws
     show; their p-values pay for that, but for at most a twentieth of ``alpha``.) A posterior whose ``ess`` is
-    infinite is exact, and must agree within ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is added
-    to every tolerance.
+    infinite is exact, and must agree within ``rtol * max(1, |value|)``. The ``accuracy`` of ``exact`` is
+    added to every tolerance.
 
     It cannot see what the draws do not show: heavy weights that no draw has met (look at ``pareto_k``),
     faults below the Monte Carlo error; without ``draws``, errors of joint probabilities with right
@@ -296,7 +296,7 @@ def _observed(posterior: Any) -> set[str]:
 
 def _read(test: str, posterior: Any, exact: Any) -> Any:
     """The posterior, or one made of a user's own draws; raises where the two are none."""
-    if not all(hasattr(exact, part) for part in ("names", "mean", "log_marginal_likelihood")):
+    if not all(hasattr(exact, part) for part in ("names", "log_marginal_likelihood")):
         raise TypeError(
             f"{test}: exact={exact!r:.200} is no answer; give one, as exact(net, evidence) or bmc.Exact() "
             "finds it"
