@@ -91,7 +91,7 @@ def test_batched_functions() -> None:
 
 
 def test_false_alarms() -> None:
-    runs, alpha = 150, 0.1
+    runs, alpha = 80, 0.1
     with uncounted():
         found = [
             [
