@@ -38,7 +38,7 @@ from bayesmc.testing import (
 
 ALPHA = 1e-3
 SHIFT = session.seed()
-SEEDS = range(SHIFT, SHIFT + 60)
+SEEDS = range(SHIFT, SHIFT + session.scaled(40, 3))
 KINDS: dict[str, dict[str, Any]] = {
     "discrete": {},
     "plates": {"plates": True},
@@ -151,7 +151,7 @@ def by_rejection(draws: int, max_proposals: int) -> Answer:
     return answer
 
 
-#: name -> (answer, least share of the 60 nets of each kind that it must answer)
+#: name -> (answer, least share of the nets of each kind that it must answer)
 ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
     "Exact": (
         by(bmc.Exact()),

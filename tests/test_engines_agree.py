@@ -8,8 +8,8 @@ Seeds are fixed, so a run is repeatable; ``--bayesmc-seed`` shifts them on deman
 is compared at a false-alarm rate of 1e-3 (Holm over its states, means and evidence), and at the fixed
 seeds none may be rejected. At fresh ones, with some 1,200 such comparisons, a chance rejection is likely
 somewhere; there a rejected net is drawn again, with other random numbers, and fails if it is rejected
-again (1e-6 each, 1e-3 for a whole run); and more than 3 first rejections among 60 nets (probability
-5e-7) fail, too.
+again (1e-6 each, 1e-3 for a whole run); and more than 3 first rejections among the nets of a kind (of 120,
+probability 8e-6) fail, too.
 """
 
 from __future__ import annotations

@@ -343,9 +343,9 @@ def each_fault(cases: Mapping[str, Case]) -> list[tuple[str, str]]:
 
 
 def each_test(cases: Mapping[str, Case]) -> list[tuple[str, str, str]]:
-    """Names, faults and tests: a right kernel takes both tests, a wrong one both in a thorough run alone.
+    """Names, faults and tests: all with both tests in a thorough run.
 
-    In an ordinary run the tests take turns at the faults, so that either is seen to fail in every file.
+    In an ordinary run the tests take turns at kernels and faults: either is seen to fail in every file.
     """
     return in_turn(each_fault(cases))
 
@@ -354,7 +354,7 @@ def in_turn(kernels: Sequence[tuple[T, str]]) -> list[tuple[T, str, str]]:
     """The same of pairs of a name, or what else is meant, and a fault."""
     found, turn = [], itertools.cycle(TESTS)
     for name, fault in kernels:
-        tests = (next(turn),) if fault and not session.is_thorough() else TESTS
+        tests = TESTS if session.is_thorough() else (next(turn),)
         found += [(name, fault, test) for test in tests]
     return found
 
