@@ -377,7 +377,8 @@ def _between(u: Any, low: Any, high: Any) -> Any:
 
 def _share(u: Any) -> np.ndarray:
     """``expit(u)`` down to the smallest double; SciPy's is zero from -709 on."""
-    return np.where(np.asarray(u) < -700.0, np.exp(np.minimum(u, 0.0)), special.expit(u))
+    share, far = special.expit(u), np.asarray(u) < -700.0
+    return np.where(far, np.exp(np.minimum(u, 0.0)), share) if far.any() else share
 
 
 def _between_inverse(x: Any, low: Any, high: Any) -> Any:
