@@ -15,7 +15,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from bayesmc.auto import filter as filter_series
 from bayesmc.diagnostics import log_sum_exp, pareto_k
@@ -32,6 +31,7 @@ from bayesmc.errors import (
 from bayesmc.randomness import seed_sequence
 from bayesmc.testing.kernels.joint import check_sizes
 from bayesmc.testing.oracles.answers import exact as exact_answer
+from bayesmc.testing.posteriors.skewed import mean_p_value
 from bayesmc.testing.verdict import Comparison, Verdict, counted
 
 _CALL = "unbiased_evidence_test"
@@ -324,7 +324,9 @@ def _judged(logs: np.ndarray, accuracy: float) -> tuple[Comparison, float, float
     if _is_uneven(ess, tail, count):
         p_value = _too_large(logs - math.log1p(tolerance))
     else:
-        p_value = _p_value(z, scaled)
+        centred = scaled - scaled.mean()
+        skewness = float((centred**3).mean() / (centred**2).mean() ** 1.5)
+        p_value = mean_p_value(z, skewness, count)
     return Comparison(_WHAT, found, 1.0, abs(z), p_value), ess, tail
 
 
@@ -347,18 +349,3 @@ def _too_large(logs: np.ndarray) -> float:
     shares = 0.5 ** np.arange(1, 12)[:, None]
     gains = np.logaddexp(np.log1p(-shares), np.log(shares) + logs).sum(axis=1)
     return min(1.0, math.exp(-max(float(log_sum_exp(gains)) - math.log(len(shares)), 0.0)))
-
-
-def _p_value(z: float, ratios: np.ndarray) -> float:
-    """Two-sided, of a studentised mean: in each tail the larger of Student's and Hall's.
-
-    Hall (1992), the monotone transformation of his eq. 2.4: ``z + a z^2 / 3 + a^2 z^3 / 27 + a / 6`` with
-    ``a`` the skewness over the root of the number of runs is normal but for terms of order one over it.
-    """
-    count = len(ratios)
-    centred = ratios - ratios.mean()
-    skewness = float((centred**3).mean() / (centred**2).mean() ** 1.5)
-    a = skewness / math.sqrt(count)
-    bent = z + a * z**2 / 3 + a**2 * z**3 / 27 + a / 6
-    tails = scipy.special.stdtr(count - 1, np.array([[z, bent], [-z, -bent]]))
-    return float(min(1.0, 2.0 * tails.max(axis=1).min()))

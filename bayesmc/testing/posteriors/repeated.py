@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from bayesmc.errors import ShapeError
 from bayesmc.randomness import seed_sequence
 from bayesmc.testing.kernels.joint import check_sizes
+from bayesmc.testing.posteriors.skewed import mean_p_value
 from bayesmc.testing.verdict import Comparison, Verdict, counted
 
 _CALL = "repeated_test"
@@ -161,12 +161,4 @@ def _judged(what: str, values: np.ndarray, exact: float, accuracy: float) -> Com
         return Comparison(what, mean, exact, errors, p_value)
     z = min(max(excess * math.sqrt(count) / spread, -_FAR), _FAR)
     skewness = float((((values - mean) / spread) ** 3).mean())
-    return Comparison(what, mean, exact, abs(z), _p_value(z, skewness, count))
-
-
-def _p_value(z: float, skewness: float, count: int) -> float:
-    """Two-sided, of a studentised mean: in each tail the larger of Student's and Hall's (his eq. 2.4)."""
-    a = skewness / math.sqrt(count)
-    bent = z + a * z**2 / 3 + a**2 * z**3 / 27 + a / 6
-    tails = scipy.special.stdtr(count - 1, np.array([[z, bent], [-z, -bent]]))
-    return float(min(1.0, 2.0 * tails.max(axis=1).min()))
+    return Comparison(what, mean, exact, abs(z), mean_p_value(z, skewness, count))

@@ -28,6 +28,7 @@ from bayesmc.errors import ShapeError
 from bayesmc.randomness import seed_sequence
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.states import StateArray
+from bayesmc.testing.posteriors.skewed import unskewed
 from bayesmc.testing.verdict import Comparison, Verdict, counted
 
 #: relabellings at least as far apart after which no more are drawn (Besag and Clifford 1991)
@@ -167,7 +168,7 @@ class Average:
         t, g = off / self.error, self.skewness
         # cut where the cubic has left the centre: all is decided there
         t = min(max(t, -1e3), 1e3)
-        corrected = t + g * (t * t / 3 + 1 / 6) + g * g * t**3 / 27 if off else 0.0
+        corrected = unskewed(t, g) if off else 0.0
         return abs(t), 2.0 * float(scipy.special.ndtr(-abs(corrected)))
 
 
