@@ -39,6 +39,11 @@ class DrawsPosterior(Posterior):
         Which weighted draw each was resampled from; copies of one draw count once in errors.
     streams : int
         Random streams used so far, so that ``resume`` takes fresh ones.
+
+    Attributes
+    ----------
+    independent, ancestors, streams
+        As given.
     """
 
     def __init__(
@@ -55,8 +60,8 @@ class DrawsPosterior(Posterior):
         super().__init__(problem, engine)
         self._stored = dict(stored)
         self._shape = shape
-        self._independent = independent
-        self._ancestors = ancestors
+        self.independent = independent
+        self.ancestors = ancestors
         self.streams = streams
         self._inputs = dict(problem.inputs)
         self.log_weights = log_weights
@@ -183,11 +188,11 @@ class DrawsPosterior(Posterior):
 
     def mcse(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
-        if self._ancestors is not None:
+        if self.ancestors is not None:
             return diagnostics.weighted_mcse(*self._distinct(values))
         if self.weights is not None:
             return diagnostics.weighted_mcse(values, self.weights)
-        if self._independent:
+        if self.independent:
             count = math.prod(self._shape)
             spread = (
                 values.std(axis=(0, 1), ddof=1) if count > 1 else np.full(values.shape[2:], np.nan)
@@ -197,17 +202,17 @@ class DrawsPosterior(Posterior):
 
     def ess(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
-        if self._ancestors is not None:
+        if self.ancestors is not None:
             return diagnostics.weighted_ess(*self._distinct(values))
         if self.weights is not None:
             return diagnostics.weighted_ess(values, self.weights)
-        if self._independent:
+        if self.independent:
             return np.full(values.shape[2:], float(math.prod(self._shape)))
         return diagnostics.chain_statistic("ess", values)
 
     def rhat(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
-        if self.weights is not None or self._independent or self._ancestors is not None:
+        if self.weights is not None or self.independent or self.ancestors is not None:
             return np.full(values.shape[2:], np.nan)
         return diagnostics.chain_statistic("rhat", values)
 
@@ -242,8 +247,8 @@ class DrawsPosterior(Posterior):
             ]
             for name, values in self._stored.items()
         }
-        ancestors = picked if self._ancestors is None else self._ancestors[picked]
-        duplicated = self.weights is not None or self._ancestors is not None
+        ancestors = picked if self.ancestors is None else self.ancestors[picked]
+        duplicated = self.weights is not None or self.ancestors is not None
         return DrawsPosterior(
             self._live("resample"),
             self.engine,
@@ -322,8 +327,8 @@ class DrawsPosterior(Posterior):
             self.engine,
             stored,
             self._shape,
-            independent=self._independent,
-            ancestors=self._ancestors,
+            independent=self.independent,
+            ancestors=self.ancestors,
         )
 
     def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
@@ -357,8 +362,8 @@ class DrawsPosterior(Posterior):
 
     def _distinct(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Each resampled draw once, weighted by its copies."""
-        assert self._ancestors is not None
-        _, first, copies = np.unique(self._ancestors, return_index=True, return_counts=True)
+        assert self.ancestors is not None
+        _, first, copies = np.unique(self.ancestors, return_index=True, return_counts=True)
         return values[:, first], (copies / copies.sum())[None]
 
     def _of(self, name: str) -> np.ndarray:

@@ -17,6 +17,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.network import pose
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.testing import JointModel, geweke_test, rank_test, session
+from bayesmc.testing.kernels.joint import NetJoint
 
 #: shifts all seeds; in a thorough run, tests are longer, too
 SHIFT, LONGER = session.seed(), session.scaled(1)
@@ -92,29 +94,17 @@ class Model:
         return {n: self.compiled[n].decode(v[row]) for n, v in data.items()}
 
     def prior(self, rng: np.random.Generator, rows: int) -> Rows:
-        if self.draw is not None:
-            return self.draw(rng, rows)
-        return self._forward({}, self.hidden, rng, rows)
+        return self._joint.prior(rng, rows) if self.draw is None else self.draw(rng, rows)
 
     def data(self, state: Rows, rng: np.random.Generator | int = 0) -> Rows:
         rng = np.random.default_rng(rng) if isinstance(rng, int) else rng
-        if self.respond is not None:
-            return self.respond(state, rng)
-        return self._forward(state, self.seen, rng, _rows(state))
+        return (
+            self._joint.simulate(state, rng) if self.respond is None else self.respond(state, rng)
+        )
 
-    def _forward(
-        self, given: Rows, names: Sequence[str], rng: np.random.Generator, rows: int
-    ) -> Rows:
-        target = self.target("moving")
-        values: Values = {**target.known, **given}
-        with running():
-            for name, node in target.model.nodes.items():
-                if name in names:
-                    dist, _ = target.model.evaluate(name, values)
-                    values[name] = target.model.sample_stored(name, dist, rng, (rows,))
-                elif name in target.links and all(p in values for p in node.parents):
-                    values[name], _ = target.model.evaluate(name, values)
-        return {n: values[n] for n in names}
+    @cached_property
+    def _joint(self) -> NetJoint:
+        return NetJoint(self.net, self.seen)
 
     def statistics(self) -> dict[str, Statistic]:
         """Numbers that show wrong places, spreads and dependences of what moves."""

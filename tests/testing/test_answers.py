@@ -112,6 +112,19 @@ def test_a_hidden_markov_model() -> None:
     assert found.quantile("z", [0.01, 0.99]).shape == (2, 4)
 
 
+def test_a_constant_above_states() -> None:
+    """A node without parents that is computed, not drawn (``t[0]`` of an unrolled template is one)."""
+    net = bmc.BayesNet()
+    net.add("c", lambda: 0.4)
+    net.add("a", lambda c: bmc.Bernoulli(c))
+    net.add("x", lambda a, c: bmc.Normal(a + c, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    found, other = exact(net, {"y": 1.0}), bmc.infer(net, {"y": 1.0}, engine=bmc.Exact())
+    assert found.method == "linear-Gaussian"
+    assert found.mean("x") == pytest.approx(other.mean("x"))
+    assert quadrature_posterior(net, {"y": 1.0}).mean("x") == pytest.approx(other.mean("x"))
+
+
 def mixture() -> tuple[bmc.BayesNet, dict[str, Any]]:
     net = bmc.BayesNet()
     net.add("a", bmc.Bernoulli(0.3))

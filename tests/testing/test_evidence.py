@@ -15,6 +15,7 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.errors import DegeneracyError, DensityError, UnsupportedError, ZeroProbabilityError
+from bayesmc.testing import exact
 from bayesmc.testing.posteriors.evidence import _judged, unbiased_evidence_test
 from bayesmc.testing.verdict import BUDGET
 
@@ -298,3 +299,16 @@ def test_wrong_arguments_are_named() -> None:
         unbiased_evidence_test(lambda rng: math.nan, exact=0.0)
     with pytest.raises(TypeError, match="return one real number"):
         unbiased_evidence_test(lambda rng: np.zeros(3), exact=0.0)
+
+
+def test_static_nodes_that_a_filter_knows_are_no_evidence() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("m", bmc.Normal(0.0, 2.0))
+    dbn.add("x", lambda x_prev, m: bmc.Normal(x_prev + m, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    rows = {"m": 1.3, "y": [0.3, 1.1]}
+    for engine in (bmc.ParticleFilter(20), bmc.KalmanFilter()):
+        assert unbiased_evidence_test(engine, dbn, rows, replications=200, alpha=1e-4, rng=0)
+    assert not unbiased_evidence_test(
+        bmc.ParticleFilter(20), dbn, rows, exact=exact(dbn, rows), replications=200, rng=0
+    )

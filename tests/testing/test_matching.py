@@ -15,6 +15,7 @@ from bayesmc.testing import (
     assert_matches,
     compare,
     enumerate_posterior,
+    exact,
     quadrature_posterior,
     repeated_test,
 )
@@ -509,3 +510,44 @@ def test_means_of_huge_numbers_are_judged(size: float) -> None:
     assert repeated_test(estimate, size, rng=0)
     assert not repeated_test(estimate, 2 * size, rng=0)
     assert not repeated_test(estimate, 0.0, rng=0)
+
+
+# ---- beliefs over time --------------------------------------------------------------------------
+
+
+def level() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("m", bmc.Normal(0.0, 2.0))
+    dbn.add("x", lambda x_prev, m: bmc.Normal(0.5 * x_prev + m, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    return dbn
+
+
+LEVEL = {"m": 1.3, "y": [0.3, np.nan, 1.1]}
+
+
+def test_smoothed_and_filtered_beliefs() -> None:
+    right, other = exact(level(), LEVEL), exact(level(), {**LEVEL, "y": [0.3, np.nan, 1.2]})
+    assert right.log_static == pytest.approx(float(bmc.Normal(0.0, 2.0).log_prob(1.3)))
+    smoothed, filtered = bmc.smooth(level(), LEVEL), bmc.filter(level(), LEVEL)
+    assert assert_matches(smoothed, right).of_nodes >= 8
+    last = assert_matches(filtered, right)
+    assert any("'x[2]'" in c.what for c in last.comparisons)
+    assert not any("'x[1]'" in c.what for c in last.comparisons)
+    for answer in (smoothed, filtered):
+        found = [c.what for c in compare(answer, other).rejected]
+        assert "log evidence" in found and "mean of node 'x[2]'" in found
+    # an answer that does not say what static nodes contribute leaves the evidence out
+    engine = bmc.infer(level(), LEVEL, engine=bmc.Exact())
+    assert compare(smoothed, engine)
+
+
+def test_beliefs_that_cannot_be_judged() -> None:
+    right = exact(level(), LEVEL)
+    particles = bmc.filter(level(), LEVEL, engine=bmc.ParticleFilter(2000), rng=0)
+    with pytest.raises(UnsupportedError, match="repeated_test"):
+        compare(particles, right)
+    with pytest.raises(UnsupportedError, match="given none of the rows"):
+        compare(bmc.forecast(level(), LEVEL, steps=1), right)
+    with pytest.raises(ShapeError, match="about 2 slices, the exact answer about 3"):
+        compare(bmc.smooth(level(), {"m": 1.3, "y": [0.3, 0.1]}), right)

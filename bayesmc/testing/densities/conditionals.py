@@ -16,6 +16,7 @@ import numpy as np
 from bayesmc.distributions import Distribution, marking_invalid
 from bayesmc.errors import BayesmcError, ParameterError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, CompiledNode, Model, forward, pose
+from bayesmc.network.parts import ancestral, with_nodes
 from bayesmc.randomness import seed_sequence
 from bayesmc.shapes import first_index
 from bayesmc.testing.densities.density import DensityCheck, inspect
@@ -106,7 +107,8 @@ def check_cpd(
     if name not in net:
         raise UnknownNodeError(f"{call}: no node {name!r}; there are {', '.join(net.nodes)}")
     report = Report(alpha, np.random.default_rng(seed_sequence(rng)))
-    family = _family(net, name, inputs)
+    # faults elsewhere are no faults of its
+    family = ancestral(net, (name, *(inputs or ())))
     try:
         problem = pose(family, None, inputs)
     except BayesmcError as error:  # not even a model: nothing else can be asked
@@ -128,32 +130,13 @@ def check_cpd(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _family(net: BayesNet, name: str, inputs: Mapping[str, Any] | None) -> BayesNet:
-    """The node and its ancestors: faults elsewhere are no faults of its."""
-    declared = net.declarations
-    wanted, seen, todo = set(inputs or ()), set(), [name]
-    while todo:
-        node = todo.pop()
-        if node in declared and node not in seen:
-            seen.add(node)
-            todo.extend(declared[node].parents)
-    wanted |= seen
-    return _net_of(net, {n: d for n, d in declared.items() if n in wanted})
-
-
-def _net_of(net: BayesNet, declared: Mapping[str, Any]) -> BayesNet:
-    """A net with the same plates and other declarations."""
-    return BayesNet.of(net.name, declared, net._plates)
-
-
 def _with_parents(
     family: BayesNet, name: str, inputs: Mapping[str, Any] | None, report: Report
 ) -> str | None:
     """A fault of the parameters so gross that no model is compiled, at values of the parents drawn."""
-    declared = family.declarations
-    own = declared.pop(name)
-    above = _net_of(family, declared)
-    parents = [p for p in dict.fromkeys(own.parents) if p in declared]
+    own = family.declarations[name]
+    above = ancestral(family, (*own.parents, *(inputs or ())))
+    parents = [p for p in dict.fromkeys(own.parents) if p in above]
     try:
         drawn = above.sample(_BATCH, report.rng, inputs=inputs)
         for row in range(_BATCH):
@@ -161,7 +144,7 @@ def _with_parents(
             values = {p: drawn[p][row] for p in parents if p in drawn and p not in (inputs or ())}
             fixed = above.do(values)
             try:
-                pose(_net_of(family, {**fixed.declarations, name: own}), None, inputs)
+                pose(with_nodes(fixed, {name: own}), None, inputs)
             except ParameterError as error:
                 if f"node {name!r}" in str(error):
                     told = ", ".join(f"{p}={_in_short(v)}" for p, v in values.items())

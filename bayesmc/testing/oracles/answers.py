@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ import scipy.special
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, Model, Problem, pose
+from bayesmc.network.parts import ancestral
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
 from bayesmc.testing.oracles.enumeration import Enumerated, enumerate_posterior
 from bayesmc.testing.oracles.linear import linear_posterior
@@ -49,12 +50,16 @@ class ExactAnswer:
         leading, and ``"x[3]"`` for one.
     passed_over : dict
         Oracle -> why it was not the one.
+    log_static : float
+        Of a template: log density of its observed static nodes. Filters take these as known, so that their
+        log evidence is smaller than ``log_marginal_likelihood`` by so much: it is that of the rows.
     """
 
     method: str
     answer: Enumerated | GaussianAnswer
     steps: int | None
     passed_over: dict[str, str]
+    log_static: float = 0.0
 
     @property
     def model(self) -> Model:
@@ -240,9 +245,11 @@ def exact(
     [1.0, 2.0]
     """
     check_rtol("exact", rtol)
-    steps = None
+    steps, log_static = None, 0.0
     if isinstance(net, DynamicBayesNet):
+        static = net.static_nodes
         net, evidence, steps = _unrolled(net, evidence, inputs)
+        log_static = _log_static(net, static, evidence)
         inputs = None
     elif not isinstance(net, BayesNet):
         raise ModelError(
@@ -265,13 +272,13 @@ def exact(
             continue
         left_out = [name for name in wanted if name not in answer.names]
         if not left_out:
-            return ExactAnswer(method, answer, steps, passed_over)
+            return ExactAnswer(method, answer, steps, passed_over, log_static)
         partial[method] = answer
         passed_over[method] = f"it leaves out {', '.join(map(repr, left_out))}"
     if partial:  # what nothing observed depends on, and no oracle can say
         method = max(partial, key=lambda m: len(partial[m].names))
         others = {m: why for m, why in passed_over.items() if m != method}
-        return ExactAnswer(method, partial[method], steps, others)
+        return ExactAnswer(method, partial[method], steps, others, log_static)
     reasons = "".join(f"\n  {method}: {why}" for method, why in passed_over.items())
     raise UnsupportedError(
         f"exact: no oracle answers this net:{reasons}\nObserve more, take fewer elements or steps, or "
@@ -289,6 +296,14 @@ def _unrolled(
     _, series = dbn.read(observations, inputs)
     net = dbn.unroll(series.steps, inputs)
     return net, dbn.unrolled_evidence(observations or {}), series.steps
+
+
+def _log_static(net: BayesNet, static: Sequence[str], evidence: Mapping[str, Any]) -> float:
+    """Log density of those static nodes that are observed."""
+    seen = {name: evidence[name] for name in static if name in evidence}
+    if not seen:
+        return 0.0
+    return exact(ancestral(net, seen), seen).log_marginal_likelihood
 
 
 def _enumerated(

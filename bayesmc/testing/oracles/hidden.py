@@ -105,7 +105,9 @@ class HiddenPart:
             for name, node in self.visited():
                 result, _ = self.model.evaluate(name, values)
                 if not isinstance(result, Distribution):
-                    values[name] = result
+                    # a constant has no axis of configurations
+                    constant = np.ndim(result) == len(node.value_shape)
+                    values[name] = np.asarray(result)[None] if constant else result
                 elif not self._hidden(node).size:
                     values[name] = problem.observed[name].value[None]
                 elif result.is_discrete:

@@ -139,7 +139,8 @@ def unbiased_evidence_test(
         where they are uneven.
     net : BayesNet or DynamicBayesNet, optional
     evidence : dict, optional
-        As for ``infer``; of a template observations, as for ``filter``.
+        As for ``infer``; of a template observations, as for ``filter``. Static nodes that are observed are
+        known there, and no part of the evidence.
     inputs : dict, optional
     exact : float or object, optional
         Log of the exact evidence, or anything with ``log_marginal_likelihood`` (and perhaps
@@ -195,7 +196,7 @@ def unbiased_evidence_test(
     check_sizes(_CALL, replications=(replications, 100))
     if not 0.0 < alpha < 1.0:
         raise ValueError(f"{_CALL}(alpha={alpha}): give a probability strictly between 0 and 1")
-    log_exact, accuracy = _exact(net, evidence, inputs, exact)
+    log_exact, accuracy = _exact(engine, net, evidence, inputs, exact)
     estimate = _estimator(engine, net, evidence, inputs)
     seeds = seed_sequence(rng).spawn(replications)
     logs = np.array([_one(estimate, seed) for seed in seeds])
@@ -220,7 +221,7 @@ def unbiased_evidence_test(
 # ---- what is asked -------------------------------------------------------------------------------
 
 
-def _exact(net: Any, evidence: Any, inputs: Any, exact: Any) -> tuple[float, float]:
+def _exact(engine: Any, net: Any, evidence: Any, inputs: Any, exact: Any) -> tuple[float, float]:
     """Log of the exact evidence, and its error."""
     if exact is None:
         if net is None:
@@ -228,6 +229,8 @@ def _exact(net: Any, evidence: Any, inputs: Any, exact: Any) -> tuple[float, flo
                 f"{_CALL}: give a net and evidence, or exact=, the log of the evidence that is estimated"
             )
         exact = exact_answer(net, evidence, inputs)
+        if isinstance(engine, FilterEngine):  # its evidence is that of the rows
+            return exact.log_marginal_likelihood - exact.log_static, exact.accuracy
     value = getattr(exact, "log_marginal_likelihood", exact)
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
         raise TypeError(

@@ -18,6 +18,7 @@ from bayesmc.network import Model, Problem
 from bayesmc.network.evidence import store
 from bayesmc.randomness import seed_sequence
 from bayesmc.results.draws import DrawsPosterior
+from bayesmc.results.series import SeriesPosterior
 from bayesmc.testing.posteriors.figures import (
     MIN_ESS,
     Pair,
@@ -31,6 +32,7 @@ from bayesmc.testing.posteriors.figures import (
     compare_var,
 )
 from bayesmc.testing.posteriors.samples import Draws, energy_comparison
+from bayesmc.testing.posteriors.slices import Slices
 from bayesmc.testing.verdict import Verdict, counted
 
 #: rows of a joint sample below which it is not judged
@@ -103,9 +105,11 @@ def compare(
 
     Parameters
     ----------
-    posterior : Posterior or dict
+    posterior : Posterior, SeriesPosterior or dict
         Of any engine; or draws of your own, node -> ``(draws, *plates, *event)``, in the order in which they
-        were drawn: they are taken for one chain, and judged by their effective number.
+        were drawn: they are taken for one chain, and judged by their effective number. Of a template, what
+        ``smooth`` answers, or ``filter`` of its last slice, by engines without Monte Carlo error; take a
+        larger ``rtol`` for those that approximate.
     exact : Enumerated or Posterior
         Anything with ``names``, ``probabilities``, ``mean``, ``var``, ``log_marginal_likelihood``; its
         ``quantile(name, q)``, ``cdf(name, x)``, ``cov(name)`` and ``resample(draws, rng)`` are used where it
@@ -137,7 +141,8 @@ def compare(
     AssertionError
         Where the two do not even have the same shapes.
     UnsupportedError
-        ``draws`` are asked for and ``exact`` has none to give.
+        ``draws`` are asked for and ``exact`` has none to give; beliefs over time are a particle filter's,
+        one run of which does not tell its error (`repeated_test`), or forecasts.
     ValueError
         Nothing is left to compare, or a level or number is out of range.
     TypeError
@@ -303,6 +308,9 @@ def _read(test: str, posterior: Any, exact: Any) -> Any:
         )
     if isinstance(posterior, Mapping):
         return _own_draws(test, posterior, exact)
+    if isinstance(posterior, SeriesPosterior):
+        _model(test, "beliefs over time", exact)
+        return Slices(test, posterior, exact)
     if all(hasattr(posterior, part) for part in ("model", "mean", "ess", "mcse")):
         return posterior
     if hasattr(exact, "ess") and hasattr(posterior, "log_marginal_likelihood"):
@@ -314,14 +322,19 @@ def _read(test: str, posterior: Any, exact: Any) -> Any:
     )
 
 
-def _own_draws(test: str, draws: Mapping[str, Any], exact: Any) -> DrawsPosterior:
-    """A user's draws as one chain of a posterior."""
+def _model(test: str, what: str, exact: Any) -> Model:
     model: Model | None = getattr(exact, "model", None)
     if model is None:
         raise TypeError(
-            f"{test}: draws of your own need an exact answer with a model, as exact(net, evidence) gives it, "
+            f"{test}: {what} need an exact answer with a model, as exact(net, evidence) gives it, "
             f"not {type(exact).__name__}"
         )
+    return model
+
+
+def _own_draws(test: str, draws: Mapping[str, Any], exact: Any) -> DrawsPosterior:
+    """A user's draws as one chain of a posterior."""
+    model = _model(test, "draws of your own", exact)
     stored = {}
     for name, values in draws.items():
         if name not in exact.names:

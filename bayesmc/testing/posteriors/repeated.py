@@ -43,7 +43,8 @@ def repeated_test(
     runs, where the answer is unbiased. A mean is judged in each tail by Student's t and by Hall's
     transformation of it, which removes skewness to first order; the larger p-value counts. It is exact for
     normal figures. What ``accuracy`` explains does not count. A figure that is the same in every run has no
-    chance in it, and must agree to 1e-9 (and ``accuracy``).
+    chance in it, and must agree to 1e-9 (and ``accuracy``); leave out probabilities so small that all runs
+    together may miss the event.
 
     An answer may be right in the limit of many particles and biased before, as averages by normalised weights
     are: then take many particles, few runs, or an ``accuracy``.

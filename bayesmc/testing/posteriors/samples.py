@@ -185,13 +185,13 @@ class Draws:
         self.posterior = posterior
         self.weights = posterior.weights
         self._picked: np.ndarray | None = None
-        ancestors = posterior._ancestors
+        ancestors = posterior.ancestors
         if ancestors is not None:
             # copies of one draw count once, with their number for a weight
             _, self._picked, copies = np.unique(ancestors, return_index=True, return_counts=True)
             self.weights = (copies / copies.sum())[None]
         # 0: independent; else members of an ensemble that draws come from in turn
-        self.block = 0 if posterior._independent else getattr(posterior, "ensemble_size", 1)
+        self.block = 0 if posterior.independent else getattr(posterior, "ensemble_size", 1)
 
     def values(self, name: str) -> np.ndarray:
         """Draws of a node as numbers, shape ``(chain, draw, *plates, *event)``; of labels their codes."""

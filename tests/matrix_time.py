@@ -1,0 +1,188 @@
+"""The part of the matrix that is about time: random templates with data, their exact answers, the engines.
+
+Templates of finite nodes are unrolled and enumerated, linear-Gaussian ones unrolled and conditioned as one
+dense Gaussian.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+import bayesmc as bmc
+from bayesmc.errors import (
+    BudgetError,
+    DegeneracyError,
+    LowEssWarning,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
+from bayesmc.results.series import SeriesPosterior
+from bayesmc.testing import exact, random_dbn, session
+from bayesmc.testing.makers.linear_dbns import random_linear_dbn
+from tests.matrix import DOUBTS, SHIFT
+
+#: "static": a static node is unknown, which particle chains alone answer
+KINDS = ("finite", "linear", "static")
+#: templates of each kind for engines that compute, and for those with particles, which take longer
+MANY, FEW = session.scaled(8, 5), session.scaled(3, 10)
+#: runs of a particle filter
+RUNS = session.scaled(40, 8)
+#: spread of the logs of their estimates up to which so many runs have a mean with an error
+EVEN = 0.7
+
+
+@dataclass(frozen=True, eq=False)
+class Series:
+    """A template, data for it, and the exact answer given all of them."""
+
+    dbn: bmc.DynamicBayesNet
+    observations: dict[str, Any]
+    inputs: dict[str, Any] | None
+    exact: Any
+
+
+@functools.cache
+def series(kind: str, seed: int) -> Series | None:
+    """None where it is too large to be answered exactly."""
+    if kind == "finite":
+        case: Any = random_dbn(seed, nodes=(1, 3), steps=(2, 4))
+    else:
+        case = random_linear_dbn(seed, vague=2.0)
+    data = dict(case.observations)
+    if kind == "static":
+        if "level" not in data:
+            return series(kind, seed + 10_000)
+        del data["level"]
+    try:
+        answer = exact(case.dbn, data, case.inputs or None)
+    except (UnsupportedError, BudgetError):
+        return None
+    if any(n not in answer.names for n, node in answer.model.nodes.items() if node.is_stochastic):
+        return None
+    return Series(case.dbn, data, case.inputs or None, answer)
+
+
+def cases(kind: str, count: int) -> list[tuple[int, Series]]:
+    """The first so many templates of a kind that can be answered exactly, with their seeds."""
+    every = ((seed, series(kind, seed)) for seed in itertools.count(SHIFT))
+    found = ((seed, case) for seed, case in every if case is not None)
+    return list(itertools.islice(found, count))
+
+
+#: engines that compute: engine, its tolerance, kinds of templates all of which it answers
+COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
+    "DiscreteFilter": (bmc.DiscreteFilter(), 1e-9, ("finite",)),
+    "GridFilter": (bmc.GridFilter(), 1e-9, ("finite",)),
+    "KalmanFilter": (bmc.KalmanFilter(), 1e-7, ("linear",)),
+    "ExtendedKalmanFilter": (bmc.ExtendedKalmanFilter(), 1e-6, ("linear",)),
+    "UnscentedKalmanFilter": (bmc.UnscentedKalmanFilter(), 1e-6, ("linear",)),
+    "no engine named": (None, 1e-7, ("finite", "linear")),
+}
+
+#: particle filters, of few particles: what is tested has no bias whatever their number
+PARTICLES: dict[str, dict[str, Any]] = {
+    "bootstrap": {},
+    "auxiliary": {"auxiliary": True},
+    "optimal": {"proposal": "optimal"},
+}
+
+#: engines of chains; the share of the templates that they answer, without a doubt of their own
+CHAINS: dict[str, tuple[Any, dict[str, float]]] = {
+    "ParticleGibbs": (
+        bmc.ParticleGibbs(draws=300, warmup=50, chains=16, particles=40),
+        {"finite": 0.6, "linear": 0.3, "static": 0.3},
+    ),
+    "ParticleMetropolis": (
+        bmc.ParticleMetropolis(draws=500, warmup=200, chains=16, particles=40),
+        {"static": 0.3},
+    ),
+}
+
+
+def answered(case: Series, engine: Any, seed: int) -> Any:
+    """The posterior of all slices by an engine of chains; None where it refuses, or doubts its answer."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            posterior = bmc.infer(
+                case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=seed
+            )
+        except UnsupportedError:
+            return None
+    assert all(issubclass(w.category, DOUBTS) for w in caught)
+    return None if caught else posterior
+
+
+def unbiased(case: Series, engine: bmc.ParticleFilter) -> tuple[Callable[[Any], Any], Any]:
+    """Estimates without bias, of any number of particles, and what they estimate.
+
+    They are figures times estimated over exact evidence: filtered ones of the last slice, and smoothed ones
+    of the first where the engine smooths (Del Moral 2004, Feynman-Kac formulae, sec. 7.4.2; Del Moral,
+    Doucet and Singh 2010, A backward particle interpretation of Feynman-Kac formulae, M2AN 44).
+    """
+    questions = {"filter": (bmc.filter, case.exact.steps - 1), "smooth": (bmc.smooth, 0)}
+    log_exact = case.exact.log_marginal_likelihood - case.exact.log_static
+
+    def ask(what: str, rng: Any) -> SeriesPosterior:
+        return questions[what][0](
+            case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=rng
+        )
+
+    right: dict[str, Any] = {}
+    finite: dict[str, bool] = {}
+    places: dict[str, Any] = {}
+    for what, (_, t) in list(questions.items()):
+        try:
+            first = ask(what, 0)
+        except UnsupportedError:  # a running sum is not drawn backwards
+            del questions[what]
+            continue
+        finite |= {n: first.model[n].domain is not None for n in first.names}
+        for name in first.names:
+            if hidden(case, name):
+                value = figure(case.exact, name, finite[name])[t]
+                places[f"{what} {name}"] = place = common(value, finite[name])
+                right[f"{what} {name}"] = value[place]
+
+    def estimate(rng: np.random.Generator) -> dict[str, Any]:
+        found = {key: np.zeros(np.shape(value)) for key, value in right.items()}
+        for what, (_, t) in questions.items():
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", LowEssWarning)  # few particles are wanted here
+                    answer = ask(what, rng)
+            except (DegeneracyError, ZeroProbabilityError):
+                continue  # an estimate of zero
+            ratio = np.exp(np.sum(answer.log_marginal_likelihood) - log_exact)
+            for name in answer.names:
+                if f"{what} {name}" in right:
+                    value = figure(answer, name, finite[name])[t]
+                    found[f"{what} {name}"] = ratio * value[places[f"{what} {name}"]]
+        return found
+
+    return estimate, right
+
+
+def hidden(case: Series, name: str) -> bool:
+    """Whether some of the node is not data."""
+    rows = case.observations.get(name)
+    if rows is None or np.ma.is_masked(rows):
+        return True
+    return rows.dtype.kind == "f" and bool(np.isnan(rows).any())
+
+
+def figure(answer: Any, name: str, finite: bool) -> np.ndarray:
+    """Probabilities of states, or means; time first."""
+    return answer.probabilities(name) if finite else answer.mean(name)
+
+
+def common(exact: np.ndarray, finite: bool) -> Any:
+    """Where figures are judged: not those of states that no run may meet."""
+    return np.where(exact >= 0.02) if finite else ...

@@ -1,0 +1,165 @@
+"""Every engine over time on random templates, under every test that applies.
+
+The part of the matrix that `test_engines_agree` leaves out: answers against exact ones, estimates that have
+no bias however few the particles, calibration. A comparison that chance has a part in has a false-alarm rate
+of 1e-4 (Holm over its figures); an ordinary run has some 40 of them, at fixed seeds, a thorough one some 400.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.errors import ConvergenceWarning, ZeroProbabilityError
+from bayesmc.testing import (
+    compare,
+    repeated_test,
+    session,
+    simulation_based_calibration,
+    unbiased_evidence_test,
+    uncounted,
+)
+from tests.matrix_time import (
+    CHAINS,
+    COMPUTING,
+    EVEN,
+    FEW,
+    MANY,
+    PARTICLES,
+    RUNS,
+    answered,
+    cases,
+    unbiased,
+)
+
+ALPHA = 1e-4
+
+
+@pytest.mark.parametrize("engine", COMPUTING)
+def test_filters_and_smoothers_match_exact_answers(engine: str) -> None:
+    """Every slice given all rows, and the last one filtered; there is no chance in it."""
+    engine_used, rtol, kinds = COMPUTING[engine]
+    for kind in kinds:
+        for _, case in cases(kind, MANY):
+            given: dict[str, Any] = {"inputs": case.inputs, "engine": engine_used}
+            smoothed = bmc.smooth(case.dbn, case.observations, **given)
+            found = compare(smoothed, case.exact, rtol=rtol)
+            assert found, (case.dbn, found)
+            filtered = bmc.filter(case.dbn, case.observations, **given)
+            found = compare(filtered, case.exact, rtol=rtol)
+            assert found, (case.dbn, found)
+
+
+@pytest.mark.parametrize("kind", ["finite", "linear"])
+@pytest.mark.parametrize("variant", PARTICLES)
+def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
+    """Evidence, filtered and smoothed figures, of fifty particles."""
+    engine = bmc.ParticleFilter(50, trajectories=20, **PARTICLES[variant])
+    tried = 0
+    chosen = cases(kind, 3 * FEW)
+    if not session.is_thorough():  # variants take turns at templates
+        chosen = chosen[list(PARTICLES).index(variant) :: len(PARTICLES)]
+    for seed, case in chosen:
+        options: dict[str, Any] = {"alpha": ALPHA, "rng": np.random.SeedSequence([seed, 5])}
+        evidence = unbiased_evidence_test(
+            engine, case.dbn, case.observations, inputs=case.inputs, replications=100, **options
+        )
+        assert not evidence.rejected, evidence
+        with np.errstate(divide="ignore"):
+            spread = np.log(evidence.ratios).std()
+        if not spread <= EVEN:
+            continue  # the mean over a few runs would have no error to judge by
+        estimate, right = unbiased(case, engine)
+        found = repeated_test(estimate, right, replications=RUNS, **options)
+        assert found, (case.dbn, found)
+        tried += 1
+    assert tried
+
+
+@pytest.mark.parametrize(("engine", "kind"), [(e, k) for e in CHAINS for k in CHAINS[e][1]])
+def test_particle_chains_match_exact_answers(engine: str, kind: str) -> None:
+    engine_used, shares = CHAINS[engine]
+    asked = 0
+    for seed, case in cases(kind, FEW):
+        posterior = answered(case, engine_used, seed)
+        if posterior is not None:
+            found = compare(posterior, case.exact, ALPHA)
+            assert found, (case.dbn, found)
+            asked += 1
+    assert asked >= int(shares[kind] * FEW)
+
+
+def jumping() -> bmc.DynamicBayesNet:
+    """A regime, and a level that it drives by an unknown gain."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("gain", bmc.Normal(1.0, 0.5))
+    dbn.table("z", ["z_prev"], [[0.8, 0.2], [0.3, 0.7]], initial=[0.5, 0.5])
+    dbn.add(
+        "x",
+        lambda x_prev, z, gain: bmc.Normal(0.7 * x_prev + gain * z, 0.6),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 0.8))
+    return dbn
+
+
+@pytest.mark.parametrize("engine", CHAINS)
+def test_particle_chains_are_calibrated(engine: str) -> None:
+    dbn, steps = jumping(), 3
+    chains = {"ParticleGibbs": bmc.ParticleGibbs, "ParticleMetropolis": bmc.ParticleMetropolis}
+    short = chains[engine](draws=25, warmup=50, chains=8, particles=20)
+    rows = [f"y[{t}]" for t in range(steps)]
+
+    def ask(evidence: dict[str, Any], rng: Any) -> Any:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            return bmc.infer(dbn, {"y": [evidence[n] for n in rows]}, engine=short, rng=rng)
+
+    found = simulation_based_calibration(
+        ask, dbn.unroll(steps), observed=rows, replications=session.scaled(40, 4), alpha=ALPHA,
+        rng=session.seed(),
+    )  # fmt: skip
+    assert found, found
+
+
+# ---- negative controls --------------------------------------------------------------------------
+
+
+def upside_down(case: Any) -> dict[str, Any]:
+    """The data with the last row first."""
+    static = case.dbn.static_nodes
+    return {n: v if n in static else v[::-1] for n, v in case.observations.items()}
+
+
+@pytest.mark.parametrize("kind", ["finite", "linear"])
+def test_data_in_the_wrong_order_are_seen(kind: str) -> None:
+    seen = 0
+    for _, case in cases(kind, MANY):
+        try:
+            smoothed = bmc.smooth(case.dbn, upside_down(case), inputs=case.inputs)
+        except ZeroProbabilityError:
+            continue
+        with uncounted():
+            seen += not compare(smoothed, case.exact, rtol=1e-6)
+    assert seen >= 0.8 * MANY
+
+
+def test_a_bias_of_few_particles_is_seen() -> None:
+    """Averages by normalised weights are biased; times the evidence they are not."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.7))
+    rows = {"y": [1.5, 2.0]}
+    exact = bmc.infer(dbn, rows, engine=bmc.Exact()).mean("x[1]")
+    engine = bmc.ParticleFilter(5)
+
+    def plain(rng: np.random.Generator) -> float:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return float(bmc.filter(dbn, rows, engine=engine, rng=rng).mean("x")[-1])
+
+    assert not repeated_test(plain, exact, replications=400, alpha=ALPHA, rng=0)
