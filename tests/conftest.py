@@ -23,7 +23,7 @@ ABSENT = "reference data absent"
 
 hypothesis.settings.register_profile(
     "bayesmc",
-    max_examples=session.scaled(60, times=5),
+    max_examples=session.scaled(40, times=8),
     derandomize=not session.is_thorough(),
     deadline=None,
     print_blob=True,

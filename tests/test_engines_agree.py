@@ -66,9 +66,10 @@ from tests.matrix import (
 )
 
 #: chains take longer for an answer than independent draws: nets of each kind that they are asked
-CHAIN_NETS = session.scaled(6, 5)
-#: the draws of these are those of likelihood weighting (`test_summaries_agree_with_draws`)
-SUMMARY_NETS = 30
+CHAIN_NETS = session.scaled(5, 6)
+#: the draws of sums are those of likelihood weighting (`test_summaries_agree_with_draws`), and those of no
+#: engine named those of the one that is chosen
+SOME_NETS = session.scaled(20, 3)
 
 
 def check_all(
@@ -92,10 +93,8 @@ def test_engine_matches_exact_answers(engine: str, kind: str) -> None:
     chains = engine in ("Gibbs", "MetropolisHastings")
     chains |= engine == "no engine named" and kind.startswith("hybrid")  # mostly Gibbs
     nets, draw = (CHAIN_NETS, 2_000) if chains else (len(SEEDS), 1_000)
-    if engine == "LikelihoodWeighting, summaries":
-        nets = SUMMARY_NETS
-    if (engine, kind) == ("Rejection", "discrete"):
-        draw = 5_000
+    if engine in ("LikelihoodWeighting, summaries", "no engine named"):
+        nets = min(nets, SOME_NETS)
     assert check_all(answer, kind, nets=nets, draw=draw) >= int(share[kind] * nets)
 
 
@@ -268,7 +267,7 @@ def joint_nets(kind: str, count: int) -> Iterator[tuple[int, bmc.BayesNet]]:
 def test_sweeps_keep_finite_posteriors(engine: str, kind: str) -> None:
     """Exactly: the matrices are read from the code that draws."""
     asked = 0
-    for seed in range(SHIFT, SHIFT + session.scaled(40 if kind == "discrete" else 8)):
+    for seed in range(SHIFT, SHIFT + session.scaled(40 if kind == "discrete" else 5)):
         net = random_net(seed, nodes=(2, 4), configurations=256, **KINDS[kind])
         evidence = random_evidence(net, seed)
         try:
@@ -290,11 +289,11 @@ def test_sweeps_keep_finite_posteriors(engine: str, kind: str) -> None:
 def test_sweeps_keep_all_posteriors(engine: str, kind: str) -> None:
     """By ranks and by Geweke's test, at 1e-5 each: what little they see of a net in an ordinary run, they
     see of many in a thorough one."""
-    for seed, net in joint_nets(kind, session.scaled(2, 10)):
+    for seed, net in joint_nets(kind, session.scaled(1, 20)):
         options: dict[str, Any] = {"alpha": 1e-5, "rng": np.random.SeedSequence([seed, 77])}
         try:
             found = rank_test(
-                CHAIN_ENGINES[engine], net, replications=session.scaled(80, 4), **options
+                CHAIN_ENGINES[engine], net, replications=session.scaled(40, 8), **options
             )
             assert found, (seed, net.name, found)
         except UnsupportedError as error:
@@ -336,7 +335,7 @@ def test_engines_are_calibrated(engine: str, kind: str) -> None:
         if not callable(asks) and asks.unsupported(net, evidence):
             continue
         found = simulation_based_calibration(
-            asks, net, replications=session.scaled(24, 5), alpha=1e-5, rng=seed
+            asks, net, replications=session.scaled(20 if chains else 24, 5), alpha=1e-5, rng=seed
         )
         assert found, (seed, net.name, found)
         asked += 1

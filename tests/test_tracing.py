@@ -330,7 +330,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=session.scaled(150, 5))
+@settings(max_examples=session.scaled(100, 8))
 @given(STEPS)
 def test_what_is_called_affine_is(steps: list[Step]) -> None:
     program = valid(steps)

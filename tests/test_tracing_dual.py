@@ -201,7 +201,7 @@ def program(steps: list[tuple[int, int, int]], x: Any) -> Any:
 STEP = st.tuples(st.integers(0, len(STEPS) - 1), st.integers(0, 9), st.integers(0, 9))
 
 
-@settings(max_examples=session.scaled(300, 5))
+@settings(max_examples=session.scaled(150, 10))
 @given(st.lists(STEP, min_size=1, max_size=7), st.integers(0, 10**6))
 def test_random_expressions(steps: list[tuple[int, int, int]], seed: int) -> None:
     x = np.random.default_rng(seed).uniform(-1.2, 1.2, size=(2, 3))

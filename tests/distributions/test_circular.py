@@ -37,7 +37,7 @@ def brute_wrapped_normal(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.asarray(total - np.log(np.sqrt(TURN) * np.asarray(scale, np.longdouble)), float)
 
 
-@settings(max_examples=session.scaled(120, 5))
+@settings(max_examples=session.scaled(60, 10))
 @given(st.lists(ANGLE, min_size=1, max_size=8), ANGLE, CONCENTRATION)
 def test_von_mises_log_prob_equals_scipys(x: list[float], loc: float, k: float) -> None:
     # SciPy takes cos - 1 of the distance as it comes, which cancels a turn away: x is kept within
@@ -45,7 +45,7 @@ def test_von_mises_log_prob_equals_scipys(x: list[float], loc: float, k: float) 
     assert_close(d.VonMises(loc, k).log_prob(at), stats.vonmises(k).logpdf(at - loc))
 
 
-@settings(max_examples=session.scaled(120, 5))
+@settings(max_examples=session.scaled(60, 10))
 @given(st.floats(-np.pi, np.pi), SCALE)
 def test_wrapped_normal_log_prob_equals_the_wrapped_sum(x: float, scale: float) -> None:
     ours = d.WrappedNormal(0.0, scale).log_prob(x)
@@ -69,7 +69,7 @@ def wrapped_normal_errors(x: np.ndarray, scale: np.ndarray) -> np.ndarray:
     return np.abs(off) / np.maximum(np.abs(expected), 1.0)
 
 
-@settings(max_examples=session.scaled(120, 5))
+@settings(max_examples=session.scaled(60, 10))
 @given(
     st.lists(st.floats(-np.pi, np.pi), min_size=1, max_size=6),
     st.lists(SCALE, min_size=1, max_size=3),
@@ -178,7 +178,7 @@ def _near(low: float, high: float, loc: float) -> list[float] | None:
     return [p for p in points if low < p < high] or None
 
 
-@settings(max_examples=session.scaled(100, 5))
+@settings(max_examples=session.scaled(60, 8))
 @given(st.floats(-np.pi, np.pi), magnitudes(1e-3, 49.0))
 def test_von_mises_cdf_equals_scipys_series(x: float, k: float) -> None:
     # centred, where both count from -pi; above 50 SciPy approximates by a normal to about 1e-5

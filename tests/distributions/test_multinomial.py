@@ -20,7 +20,7 @@ ALARM = 1e-6
 DRAWS = 20_000
 
 
-@settings(max_examples=session.scaled(200, 5))
+@settings(max_examples=session.scaled(100, 10))
 @given(
     st.integers(0, 5000),
     st.lists(magnitudes(1e-6, 1.0), min_size=1, max_size=6),

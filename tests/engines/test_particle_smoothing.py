@@ -277,7 +277,8 @@ def rejected(found: list[tuple[float, str]], alpha: float) -> list[str]:
 BOUNDED = ("switching 0", "switching 2", "switching 4, a plate", "linear 0", "linear 3", "linear 18",
            "finite 3", "finite 5", "finite 7", "a team", "weather", "pinned 2", "bridges")  # fmt: skip
 #: templates much like others, which a thorough run alone smooths
-MORE = ("switching 1", "switching 3", "linear 3", "linear 14", "finite 5", "finite 9")
+MORE = ("switching 1", "switching 3", "switching 5, a plate", "linear 3", "linear 14", "linear 18",
+        "finite 5", "finite 7", "finite 9", "pinned 1")  # fmt: skip
 TRIED = [
     (n, w)
     for n in CASES

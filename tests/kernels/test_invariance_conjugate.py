@@ -231,7 +231,7 @@ SERIES = {
 def test_like_children(name: str, how: str, fault: str) -> None:
     """All children are one partner."""
     wrong = _kernel([_wrong(p) for p in PAIRS])
-    sizes = {"replications": 200} if how == "posed" else {}
+    sizes = {"replications": 100} if how == "posed" else {}
     case = Case(SERIES[name], _kernel(), {"wrong": wrong}, how=how, sizes=sizes)
     (partner,) = case.make(case.model.target("moving")).partners
     assert len(partner.terms) == 8

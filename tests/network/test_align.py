@@ -125,7 +125,7 @@ def gathering_nets(draw):
 
 
 @given(gathering_nets(), st.integers(0, 999))
-@settings(max_examples=session.scaled(200, 5))
+@settings(max_examples=session.scaled(100, 10))
 def test_log_prob_of_a_gathering_net_is_the_loop(layout, seed):
     """The joint density of values with mixed batch ranks equals a sum over single elements."""
     sizes, foreign, spare, child, v_plates, z_plates, w_plates, ranks = layout
