@@ -34,6 +34,7 @@ from bayesmc.testing import (
     geweke_test,
     invariant,
     rank_test,
+    repeated_test,
     simulation_based_calibration,
     unbiased_evidence_test,
 )
@@ -160,6 +161,8 @@ CASES = (
         sample_x, normal(), alpha=ALPHA, rng=s, replications=100)),
     Case("simulation_based_calibration, Gibbs", 1000, lambda s: simulation_based_calibration(
         bmc.Gibbs(20, warmup=5, chains=4), normal(), alpha=ALPHA, rng=s, replications=40)),
+    Case("repeated_test", 10_000, lambda s: repeated_test(
+        lambda rng: math.exp(estimate(rng)), math.exp(LOG_Z), alpha=ALPHA, rng=s)),
 )  # fmt: skip
 
 
