@@ -130,17 +130,23 @@ def unbiased(case: Series, engine: bmc.ParticleFilter) -> tuple[Callable[[Any], 
     questions = {"filter": (bmc.filter, case.exact.steps - 1), "smooth": (bmc.smooth, 0)}
     log_exact = case.exact.log_marginal_likelihood - case.exact.log_static
 
-    def ask(what: str, rng: Any) -> SeriesPosterior:
-        return questions[what][0](
-            case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=rng
-        )
+    def ask(what: str, rng: Any) -> SeriesPosterior | None:
+        """None where no particle is possible: an estimate of zero."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", LowEssWarning)  # few particles are wanted here
+            try:
+                return questions[what][0](
+                    case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=rng
+                )
+            except (DegeneracyError, ZeroProbabilityError):
+                return None
 
     right: dict[str, Any] = {}
     finite: dict[str, bool] = {}
     places: dict[str, Any] = {}
     for what, (_, t) in list(questions.items()):
         try:
-            first = ask(what, 0)
+            first = next(a for seed in range(100) if (a := ask(what, seed)) is not None)
         except UnsupportedError:  # a running sum is not drawn backwards
             del questions[what]
             continue
@@ -154,12 +160,9 @@ def unbiased(case: Series, engine: bmc.ParticleFilter) -> tuple[Callable[[Any], 
     def estimate(rng: np.random.Generator) -> dict[str, Any]:
         found = {key: np.zeros(np.shape(value)) for key, value in right.items()}
         for what, (_, t) in questions.items():
-            try:
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore", LowEssWarning)  # few particles are wanted here
-                    answer = ask(what, rng)
-            except (DegeneracyError, ZeroProbabilityError):
-                continue  # an estimate of zero
+            answer = ask(what, rng)
+            if answer is None:
+                continue
             ratio = np.exp(np.sum(answer.log_marginal_likelihood) - log_exact)
             for name in answer.names:
                 if f"{what} {name}" in right:

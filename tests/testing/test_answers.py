@@ -125,6 +125,41 @@ def test_a_constant_above_states() -> None:
     assert quadrature_posterior(net, {"y": 1.0}).mean("x") == pytest.approx(other.mean("x"))
 
 
+def test_static_nodes_of_plates_whose_size_data_tell() -> None:
+    dbn = bmc.DynamicBayesNet(plates={"p": None})
+    dbn.add_static("a", bmc.Normal(0.0, 1.0), plates="p")
+    dbn.add_static("s", lambda a: bmc.Normal(a.sum("p"), 1.0))
+    dbn.add(
+        "x", lambda x_prev, a: bmc.Normal(x_prev + a, 1.0), initial=bmc.Normal(0.0, 1.0), plates="p"
+    )
+    dbn.add("y", lambda x, s: bmc.Normal(x + s, 1.0), plates="p")
+    rows = {"s": 0.3, "y": np.array([[0.1, 0.2], [0.3, -0.4]])}
+    found = exact(dbn, rows)
+    assert found.log_static is None  # one of them is hidden
+    a = np.array([0.5, -0.1])
+    log = bmc.Normal(0.0, 1.0).log_prob(a).sum() + bmc.Normal(a.sum(), 1.0).log_prob(0.3)
+    assert exact(dbn, {**rows, "a": a}).log_static == pytest.approx(float(log))
+
+
+@pytest.mark.parametrize("evidence", [{"y": 1.0}, {}], ids=str)
+def test_covariances(evidence: dict[str, Any]) -> None:
+    """Of enumerated, linear and integrated answers."""
+    net, _ = mixture()
+    net.add("k", lambda a: bmc.Categorical(bmc.stack([0.5, 0.3 + 0.1 * a, 0.2 - 0.1 * a])))
+    found, other = exact(net, evidence), bmc.infer(net, evidence, engine=bmc.Exact())
+    np.testing.assert_allclose(found.cov("x", "w"), other.cov("x", "w"), rtol=1e-9)
+    seen = exact(net, {"x": 1.5, "y": 1.0})
+    assert seen.method == "enumeration"
+    p = seen.probabilities("a", "k")
+    a, k = np.arange(2), np.arange(3)
+    mean_a, mean_k = p.sum(1) @ a, p.sum(0) @ k
+    assert seen.cov("a", "k")[0, 1] == pytest.approx((a - mean_a) @ p @ (k - mean_k))
+    integrated = quadrature_posterior(net, {"y": 1.0, "k": 1})
+    assert integrated.var("x") == pytest.approx(
+        exact(net, {"y": 1.0, "k": 1}).cov("x")[0, 0], rel=1e-6
+    )
+
+
 def mixture() -> tuple[bmc.BayesNet, dict[str, Any]]:
     net = bmc.BayesNet()
     net.add("a", bmc.Bernoulli(0.3))

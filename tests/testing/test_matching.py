@@ -539,7 +539,33 @@ def test_smoothed_and_filtered_beliefs() -> None:
         assert "log evidence" in found and "mean of node 'x[2]'" in found
     # an answer that does not say what static nodes contribute leaves the evidence out
     engine = bmc.infer(level(), LEVEL, engine=bmc.Exact())
-    assert compare(smoothed, engine)
+    plain = exact(level().unroll(3), level().unrolled_evidence(LEVEL))
+    for without in (engine, plain):
+        match = assert_matches(smoothed, without)
+        assert not any("evidence" in c.what for c in match.comparisons)
+    # what is data is not compared
+    assert not any("'y[0]'" in c.what for c in assert_matches(smoothed, engine).comparisons)
+
+
+def turning() -> bmc.DynamicBayesNet:
+    dbn = bmc.DynamicBayesNet()
+    turn = np.array([[0.8, -0.4], [0.4, 0.8]])
+    start = bmc.MvNormal([0.0, 0.0], [[1.0, 0.6], [0.6, 2.0]])
+    dbn.add("x", lambda x_prev: bmc.MvNormal(x_prev @ turn.T, np.eye(2)), initial=start)
+    dbn.add("y", lambda x: bmc.Normal(x[..., 0], 1.0))
+    return dbn
+
+
+def test_covariances_of_beliefs() -> None:
+    rows = {"y": [0.5, -0.2]}
+    right = exact(turning(), rows)
+    smoothed = bmc.smooth(turning(), rows)
+    match = assert_matches(smoothed, right)
+    assert sum(c.what.startswith("covariance") for c in match.comparisons) == 2
+    other = bmc.smooth(turning(), rows)
+    other.cov = lambda name: -smoothed.cov(name)
+    found = compare(other, right).rejected
+    assert found and all(c.what.startswith("covariance") for c in found)
 
 
 def test_beliefs_that_cannot_be_judged() -> None:
@@ -549,5 +575,16 @@ def test_beliefs_that_cannot_be_judged() -> None:
         compare(particles, right)
     with pytest.raises(UnsupportedError, match="given none of the rows"):
         compare(bmc.forecast(level(), LEVEL, steps=1), right)
-    with pytest.raises(ShapeError, match="about 2 slices, the exact answer about 3"):
-        compare(bmc.smooth(level(), {"m": 1.3, "y": [0.3, 0.1]}), right)
+    short = bmc.smooth(level(), {"m": 1.3, "y": [0.3, 0.1]})
+    for longer in (right, bmc.infer(level(), LEVEL, engine=bmc.Exact())):
+        with pytest.raises(ShapeError, match="about 2 slices, the exact answer about 3"):
+            compare(short, longer)
+    with pytest.raises(UnknownNodeError, match="only one of the two knows a node"):
+        compare(bmc.smooth(turning(), {"y": [0.1, np.nan, 0.2]}), right)
+    filtered = bmc.filter(level(), LEVEL)
+    with pytest.raises(UnknownNodeError, match="last slice alone"):
+        compare(filtered, right, names=["x[0]"])
+    with pytest.raises(TypeError, match="it stands first"):
+        compare(right, filtered)
+    with pytest.raises(TypeError, match="is what an engine believes"):
+        compare(filtered, filtered)

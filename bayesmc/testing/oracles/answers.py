@@ -17,9 +17,11 @@ import numpy as np
 import scipy.special
 
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn.unroll import indexed
+from bayesmc.distributions import marking_invalid
 from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, Model, Problem, pose
-from bayesmc.network.parts import ancestral
+from bayesmc.network.joint import node_log_prob
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
 from bayesmc.testing.oracles.enumeration import Enumerated, enumerate_posterior
 from bayesmc.testing.oracles.linear import linear_posterior
@@ -50,16 +52,19 @@ class ExactAnswer:
         leading, and ``"x[3]"`` for one.
     passed_over : dict
         Oracle -> why it was not the one.
-    log_static : float
-        Of a template: log density of its observed static nodes. Filters take these as known, so that their
-        log evidence is smaller than ``log_marginal_likelihood`` by so much: it is that of the rows.
+    observed : frozenset of str
+        Nodes that are data in all their elements.
+    log_static : float or None
+        Of a template whose static nodes are observed: their log density. Filters take them as known, so that
+        their log evidence, which is that of the rows, is ``log_marginal_likelihood`` less this.
     """
 
     method: str
     answer: Enumerated | GaussianAnswer
     steps: int | None
     passed_over: dict[str, str]
-    log_static: float = 0.0
+    observed: frozenset[str] = frozenset()
+    log_static: float | None = None
 
     @property
     def model(self) -> Model:
@@ -108,6 +113,20 @@ class ExactAnswer:
     def std(self, name: str) -> np.ndarray:
         """Posterior standard deviation, ``(*plates, *event)``."""
         return np.sqrt(np.maximum(self.var(name), 0.0))
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Posterior covariances of all scalars of the nodes, one after the other, shape ``(d, d)``."""
+        self._known(*names)
+        if isinstance(self.answer, Enumerated):
+
+            def products(*values: np.ndarray) -> np.ndarray:
+                columns = np.concatenate([np.reshape(v, (len(v), -1)) for v in values], axis=1)
+                off = columns.astype(float) - means
+                return off[:, :, None] * off[:, None]
+
+            means = np.concatenate([np.ravel(self.mean(name)) for name in names])
+            return self.answer.expectation(products, *names)
+        return np.atleast_2d(self.answer.cov(*names))
 
     def expectation(self, function: Callable[..., Any], *names: str) -> np.ndarray:
         """Posterior mean of a function of nodes, which keeps the leading axis.
@@ -162,7 +181,7 @@ class ExactAnswer:
             self._known(*names)
             return ask(*names)
         slices = [
-            tuple(n if n in self.names else f"{n}[{t}]" for n in names) for t in range(self.steps)
+            tuple(n if n in self.names else indexed(n, t) for n in names) for t in range(self.steps)
         ]
         for one in slices:
             self._known(*one)
@@ -245,17 +264,18 @@ def exact(
     [1.0, 2.0]
     """
     check_rtol("exact", rtol)
-    steps, log_static = None, 0.0
+    steps, static = None, None
     if isinstance(net, DynamicBayesNet):
         static = net.static_nodes
         net, evidence, steps = _unrolled(net, evidence, inputs)
-        log_static = _log_static(net, static, evidence)
         inputs = None
     elif not isinstance(net, BayesNet):
         raise ModelError(
             f"exact: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}"
         )
     problem = pose(net, evidence, inputs)
+    observed = frozenset(n for n, seen in problem.observed.items() if seen.mask is None)
+    log_static = None if static is None else _log_static(problem, static)
     oracles: dict[str, Callable[[], Enumerated | GaussianAnswer]] = {
         "enumeration": lambda: _enumerated(problem, net, evidence, inputs),
         "linear-Gaussian": lambda: linear_posterior(problem),
@@ -272,13 +292,13 @@ def exact(
             continue
         left_out = [name for name in wanted if name not in answer.names]
         if not left_out:
-            return ExactAnswer(method, answer, steps, passed_over, log_static)
+            return ExactAnswer(method, answer, steps, passed_over, observed, log_static)
         partial[method] = answer
         passed_over[method] = f"it leaves out {', '.join(map(repr, left_out))}"
     if partial:  # what nothing observed depends on, and no oracle can say
         method = max(partial, key=lambda m: len(partial[m].names))
         others = {m: why for m, why in passed_over.items() if m != method}
-        return ExactAnswer(method, partial[method], steps, others, log_static)
+        return ExactAnswer(method, partial[method], steps, others, observed, log_static)
     reasons = "".join(f"\n  {method}: {why}" for method, why in passed_over.items())
     raise UnsupportedError(
         f"exact: no oracle answers this net:{reasons}\nObserve more, take fewer elements or steps, or "
@@ -298,12 +318,23 @@ def _unrolled(
     return net, dbn.unrolled_evidence(observations or {}), series.steps
 
 
-def _log_static(net: BayesNet, static: Sequence[str], evidence: Mapping[str, Any]) -> float:
-    """Log density of those static nodes that are observed."""
-    seen = {name: evidence[name] for name in static if name in evidence}
-    if not seen:
-        return 0.0
-    return exact(ancestral(net, seen), seen).log_marginal_likelihood
+def _log_static(problem: Problem, static: Sequence[str]) -> float | None:
+    """Log density of static nodes, whose parents are static, too; None where one of them is hidden."""
+    values = {name: value[None] for name, value in problem.inputs.items()}
+    total: Any = 0.0
+    with marking_invalid(), np.errstate(all="ignore"):
+        for name, node in problem.model.nodes.items():
+            if name not in static or node.kind == "input":
+                continue
+            if not node.is_stochastic:
+                values[name], _ = problem.model.evaluate(name, values)
+                continue
+            seen = problem.observed.get(name)
+            if seen is None or seen.mask is not None:
+                return None
+            values[name] = seen.value[None]
+            total = total + node_log_prob(problem.model, name, values[name], values, total)
+    return float(np.sum(total))
 
 
 def _enumerated(

@@ -139,8 +139,8 @@ def unbiased_evidence_test(
         where they are uneven.
     net : BayesNet or DynamicBayesNet, optional
     evidence : dict, optional
-        As for ``infer``; of a template observations, as for ``filter``. Static nodes that are observed are
-        known there, and no part of the evidence.
+        As for ``infer``; of a template observations, as for ``filter``. To a filter, static nodes that are
+        observed are known, and no part of the evidence; to a function of yours they are a part.
     inputs : dict, optional
     exact : float or object, optional
         Log of the exact evidence, or anything with ``log_marginal_likelihood`` (and perhaps
@@ -229,8 +229,6 @@ def _exact(engine: Any, net: Any, evidence: Any, inputs: Any, exact: Any) -> tup
                 f"{_CALL}: give a net and evidence, or exact=, the log of the evidence that is estimated"
             )
         exact = exact_answer(net, evidence, inputs)
-        if isinstance(engine, FilterEngine):  # its evidence is that of the rows
-            return exact.log_marginal_likelihood - exact.log_static, exact.accuracy
     value = getattr(exact, "log_marginal_likelihood", exact)
     if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
         raise TypeError(
@@ -243,7 +241,9 @@ def _exact(engine: Any, net: Any, evidence: Any, inputs: Any, exact: Any) -> tup
         )
     if not math.isfinite(value):
         raise ValueError(f"{_CALL}: exact log evidence {value}; give a finite number")
-    return float(value), float(getattr(exact, "accuracy", 0.0) or 0.0)
+    # the evidence of a filter is that of the rows alone
+    static = getattr(exact, "log_static", None) if isinstance(engine, FilterEngine) else None
+    return float(value) - (static or 0.0), float(getattr(exact, "accuracy", 0.0) or 0.0)
 
 
 def _estimator(

@@ -32,7 +32,7 @@ from bayesmc.testing.posteriors.figures import (
     compare_var,
 )
 from bayesmc.testing.posteriors.samples import Draws, energy_comparison
-from bayesmc.testing.posteriors.slices import Slices
+from bayesmc.testing.posteriors.slices import SlicePosterior
 from bayesmc.testing.verdict import Verdict, counted
 
 #: rows of a joint sample below which it is not judged
@@ -285,22 +285,34 @@ def _chosen(test: str, posterior: Any, exact: Any, names: Sequence[str] | None) 
             f"{test}(names={list(names or ())!r}): {unknown[0]!r} is no node that both answers have; name "
             f"some of {', '.join(n for n in exact.names if n in nodes)}"
         )
+    missing = [n for n in names or () if kept is not None and n not in kept]
+    if missing:
+        raise UnknownNodeError(
+            f"{test}(names={list(names or ())!r}): the posterior does not answer for {missing[0]!r}, but for "
+            f"{', '.join(kept or ())} (of a filter, the last slice alone is given all rows)"
+        )
     wanted = list(exact.names if names is None else names)
     if names is None:
-        seen = _observed(posterior)
+        seen = _observed(posterior) | _observed(exact)
         wanted = [n for n in wanted if (kept is None or n in set(kept)) and n not in seen]
     return [name for name in wanted if nodes[name].kind != "input"]
 
 
-def _observed(posterior: Any) -> set[str]:
+def _observed(answer: Any) -> set[str]:
     """Nodes all of whose elements are data."""
-    problem = getattr(posterior, "problem", None)
-    observed = {} if problem is None else problem.observed
-    return {name for name, seen in observed.items() if seen.mask is None}
+    problem = getattr(answer, "problem", None)
+    if problem is None:
+        return set(getattr(answer, "observed", ()))
+    return {name for name, seen in problem.observed.items() if seen.mask is None}
 
 
 def _read(test: str, posterior: Any, exact: Any) -> Any:
     """The posterior, or one made of a user's own draws; raises where the two are none."""
+    if isinstance(exact, SeriesPosterior):
+        hint = f"{test}(beliefs, exact(dbn, observations))"
+        if not isinstance(posterior, SeriesPosterior):
+            hint = f"it stands first, as in {hint}"
+        raise TypeError(f"{test}: exact={exact!r:.200} is what an engine believes; {hint}")
     if not all(hasattr(exact, part) for part in ("names", "log_marginal_likelihood")):
         raise TypeError(
             f"{test}: exact={exact!r:.200} is no answer; give one, as exact(net, evidence) or bmc.Exact() "
@@ -310,7 +322,7 @@ def _read(test: str, posterior: Any, exact: Any) -> Any:
         return _own_draws(test, posterior, exact)
     if isinstance(posterior, SeriesPosterior):
         _model(test, "beliefs over time", exact)
-        return Slices(test, posterior, exact)
+        return SlicePosterior(test, posterior, exact)
     if all(hasattr(posterior, part) for part in ("model", "mean", "ess", "mcse")):
         return posterior
     if hasattr(exact, "ess") and hasattr(posterior, "log_marginal_likelihood"):

@@ -5,22 +5,23 @@ What a posterior is compared with is not known here.
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ShapeError, UnsupportedError
+from bayesmc.dbn.unroll import indexed
+from bayesmc.errors import ShapeError, UnknownNodeError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results.series import SeriesPosterior
 
-#: kinds of beliefs that are given all rows in every slice, and those that are only in the last
-_SMOOTHED, _FILTERED = ("smooth",), ("filter", "fixed-lag")
 
-
-class Slices:
+class SlicePosterior:
     """A `SeriesPosterior` without Monte Carlo error, with a node for each slice: ``"x[0]"``, ``"x[1]"``.
 
-    Of a filter, and of smoothing with a fixed lag, only the last slice is given all rows; it alone is there.
+    Of a filter, and of smoothing with a fixed lag, the last slice alone is there: earlier ones are not given
+    all rows (or, within the lag, are, and left out all the same).
 
     Parameters
     ----------
@@ -34,6 +35,8 @@ class Slices:
     ------
     UnsupportedError
         It holds particles, or forecasts.
+    UnknownNodeError
+        The exact answer is about another template.
     ShapeError
         The exact answer is about more slices, or fewer.
     """
@@ -48,29 +51,20 @@ class Slices:
                 "repeated_test(function of rng that runs the filter, exact figures), "
                 "unbiased_evidence_test(engine, dbn, observations)"
             )
-        if series.kind not in (*_SMOOTHED, *_FILTERED):
+        if series.kind not in ("smooth", "filter", "fixed-lag"):
             raise UnsupportedError(
                 f"{test}: {series!r} is given none of the rows it is about; compare what bmc.smooth or "
                 "bmc.filter answers"
             )
-        steps, reached = getattr(exact, "steps", None), series.start + series.steps
-        if steps not in (None, reached):
-            raise ShapeError(
-                f"{test}: {series!r} is about {reached} slices, the exact answer about {steps}; give both "
-                "the same rows"
-            )
         self._series, self.model = series, exact.model
-        first = 0 if series.kind in _SMOOTHED else series.steps - 1
+        self._check(test, series)
+        first = 0 if series.kind == "smooth" else series.steps - 1
         self._places = {
-            _unrolled(name, series.start + t, self.model): (name, t)
+            indexed(name, series.start + t): (name, t)
             for t in range(first, series.steps)
             for name in series.names
         }
-        found = series.log_marginal_likelihood
-        known = getattr(exact, "log_static", None)  # static nodes are no part of its evidence
-        self.log_marginal_likelihood = (
-            None if found is None or known is None else float(np.sum(found)) + known
-        )
+        self.log_marginal_likelihood = self._log_evidence(series, exact)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -81,6 +75,15 @@ class Slices:
 
     def var(self, name: str) -> np.ndarray:
         return self._at("var", name)
+
+    def cov(self, name: str) -> np.ndarray:
+        size = math.prod(self.model[name].value_shape)
+        if not hasattr(self._series, "cov"):
+            raise UnsupportedError(f"{self!r} has no covariances")
+        found = self._at("cov", name)
+        if found.shape != (size, size):  # plates that are filtered apart
+            raise UnsupportedError(f"{self!r} has no covariances between the elements of {name!r}")
+        return found
 
     def probabilities(self, name: str) -> np.ndarray:
         return self._at("probabilities", name)
@@ -95,15 +98,48 @@ class Slices:
     def __repr__(self) -> str:
         return repr(self._series)
 
+    # ---- private -------------------------------------------------------------------------------
+
+    def _check(self, test: str, series: SeriesPosterior) -> None:
+        """The exact answer is about the same nodes and slices."""
+        mine = [n for n, node in series.model.nodes.items() if node.is_stochastic]
+        theirs = {_of_slice(name) for name in _stochastic(self.model)}
+        unknown = [n for n in (*mine, *series.names) if indexed(n, 0) not in self.model.nodes]
+        unknown = [n for n in unknown if n not in self.model.nodes]
+        unknown += [name for name in theirs if name not in series.model.nodes]
+        if unknown:
+            raise UnknownNodeError(
+                f"{test}: only one of the two knows a node {unknown[0]!r}; give beliefs and an exact answer "
+                "about the same template: compare(bmc.smooth(dbn, rows), exact(dbn, rows))"
+            )
+        reached = series.start + series.steps
+        steps = next(t for t in itertools.count() if not self._has(series.names, t))
+        if steps != reached:
+            raise ShapeError(
+                f"{test}: {series!r} is about {reached} slices, the exact answer about {steps}; give both "
+                "the same rows"
+            )
+
+    def _has(self, names: tuple[str, ...], t: int) -> bool:
+        return any(indexed(name, t) in self.model.nodes for name in names)
+
+    def _log_evidence(self, series: SeriesPosterior, exact: Any) -> float | None:
+        """Log density of all data; None where it is not known what static nodes, no part of it, add."""
+        known = getattr(exact, "log_static", None)
+        if known is None and all(_of_slice(n) != n for n in _stochastic(self.model)):
+            known = 0.0
+        found = series.log_marginal_likelihood
+        return None if found is None or known is None else float(np.sum(found)) + known
+
     def _at(self, figure: str, name: str) -> np.ndarray:
         of, t = self._places[name]
         return np.asarray(getattr(self._series, figure)(of))[t]
 
 
-# ---- private ------------------------------------------------------------------------------------
+def _stochastic(model: Model) -> list[str]:
+    return [name for name, node in model.nodes.items() if node.is_stochastic]
 
 
-def _unrolled(name: str, t: int, model: Model) -> str:
-    """The name of a slice's node; static ones have one name for all slices."""
-    own = f"{name}[{t}]"
-    return own if own in model.nodes else name
+def _of_slice(name: str) -> str:
+    """The template's name of an unrolled node."""
+    return name.rpartition("[")[0] or name
