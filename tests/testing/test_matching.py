@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import copy
+import warnings
 
 import numpy as np
 import pytest
 import scipy.stats
 
 import bayesmc as bmc
-from bayesmc.errors import ShapeError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import ConvergenceWarning, ShapeError, UnknownNodeError, UnsupportedError
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.testing import (
     assert_matches,
@@ -588,3 +589,20 @@ def test_beliefs_that_cannot_be_judged() -> None:
         compare(right, filtered)
     with pytest.raises(TypeError, match="is what an engine believes"):
         compare(filtered, filtered)
+
+
+def test_chains_that_hardly_reach_a_tail_raise_no_alarm() -> None:
+    """Forty chains that stay long where they are: the share beyond a tail seems better known than it is."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.7), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.6))
+    rows = {"y": [0.0, 2.0, 4.0]}
+    right, engine = (
+        exact(dbn, rows),
+        bmc.ParticleGibbs(draws=100, warmup=20, chains=40, particles=4),
+    )
+    for seed in (2011774679, 2011774724):  # alarmed at p = 3e-14 and 1e-8
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            found = bmc.infer(dbn, rows, engine=engine, rng=np.random.default_rng(seed))
+        assert not compare(found, right, 1e-6).rejected

@@ -289,12 +289,19 @@ def compare_quantiles(pair: Pair, levels: Sequence[float]) -> None:
                 if found is not None and not pair.sample.lies_at(column, float(found[(k, *at)]), q):  # type: ignore[union-attr]
                     own = f"{what} as answered, which is none of the draws"
                     pair.table.add(own, float(found[(k, *at)]), x, np.inf, 0.0)
-                _compare_share(pair, what, column, at, x, q)
+                _compare_share(pair, what, column, at, x, q, float(count[at]))
 
 
 def _compare_share(
-    pair: Pair, what: str, column: np.ndarray, at: tuple[int, ...], x: float, q: float
+    pair: Pair,
+    what: str,
+    column: np.ndarray,
+    at: tuple[int, ...],
+    x: float,
+    q: float,
+    most: float,
 ) -> None:
+    """``most`` is the effective number of draws of the node, which chains do not exceed in a tail."""
     assert pair.sample is not None
     p = q
     atom = pair.node.is_discrete or bool((np.abs(column - x) <= 1e-9 * (1 + abs(x))).mean() > 1e-2)
@@ -307,6 +314,8 @@ def _compare_share(
     if not 0 < p < 1 or column.min() == column.max():
         return
     share, n = pair.sample.share(column <= x, p)
+    if pair.sample.block:  # chains that are slow to reach a tail look independent there
+        n = min(n, most)
     if not n * p * (1 - p) >= pair.table.min_count:
         pair.table.skipped += 1
     else:

@@ -83,7 +83,8 @@ def compare(
 
     - a probability by binomial tails at ``n_eff`` (the smaller of the weights' ESS and the node's own), i.e.
       with the standard error under the exact value; one of exactly zero must have exactly none;
-    - a quantile by the same law of the share of draws below the exact quantile;
+    - a quantile by the same law of the share of draws below the exact quantile, of chains at most at the
+      effective number of draws of the node;
     - means by their standard error, at least that of the exact variance at ``n_eff``;
     - variances and covariances by the standard error of the squares, corrected for skewness (Hall 1992),
       and not at all where fewer than some 30 draws decide it: the variance may be infinite then;
