@@ -6,6 +6,8 @@ and more examples, by the seed of the run, so that ``--bayesmc-seed`` repeats th
 Tests that hold bayesmc against published numbers take the fixture ``reference_data`` (a path),
 which marks them ``reference``; where the data is absent they are skipped, and the run's last lines
 say how many, so that a green run without data is not mistaken for a checked one.
+
+Tests marked ``thorough`` take long and are much like others; an ordinary run leaves them out.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ ABSENT = "reference data absent"
 
 hypothesis.settings.register_profile(
     "bayesmc",
-    max_examples=session.scaled(40, times=8),
+    max_examples=session.scaled(30, times=10),
     derandomize=not session.is_thorough(),
     deadline=None,
     print_blob=True,
@@ -53,10 +55,14 @@ def reference_data() -> Path:
     return root
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     for item in items:
         if "reference_data" in getattr(item, "fixturenames", ()):
             item.add_marker("reference")
+    if not session.is_thorough():
+        left = [item for item in items if item.get_closest_marker("thorough")]
+        config.hook.pytest_deselected(items=left)
+        items[:] = [item for item in items if not item.get_closest_marker("thorough")]
 
 
 @pytest.hookimpl(trylast=True)

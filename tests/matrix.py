@@ -38,7 +38,7 @@ from bayesmc.testing import (
 
 ALPHA = 1e-3
 SHIFT = session.seed()
-SEEDS = range(SHIFT, SHIFT + session.scaled(40, 3))
+SEEDS = range(SHIFT, SHIFT + session.scaled(30, 4))
 KINDS: dict[str, dict[str, Any]] = {
     "discrete": {},
     "plates": {"plates": True},

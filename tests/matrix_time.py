@@ -31,9 +31,9 @@ from tests.matrix import DOUBTS, SHIFT
 #: "static": a static node is unknown, which particle chains alone answer
 KINDS = ("finite", "linear", "static")
 #: templates of each kind for engines that compute, and for those with particles, which take longer
-MANY, FEW = session.scaled(8, 5), session.scaled(3, 10)
+MANY, FEW = session.scaled(5, 8), session.scaled(2, 15)
 #: runs of a particle filter
-RUNS = session.scaled(40, 8)
+RUNS = session.scaled(30, 10)
 #: spread of the logs of their estimates up to which so many runs have a mean with an error
 EVEN = 0.7
 

@@ -164,6 +164,7 @@ def test_mrclam_as_well_as_the_reference(reference_data: Path) -> None:
     assert found["dead reckoning"] > 10 * found["extended Kalman"]
 
 
+@pytest.mark.thorough
 def test_plaza_without_subtracting_a_bias(reference_data: Path) -> None:
     drive = ranges_heard(reference_data / "robot" / "plaza")
     belief = range_only.filtered(drive, KALMAN)

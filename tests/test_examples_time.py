@@ -101,6 +101,7 @@ def test_noise_of_van_der_merwe_has_the_moments_that_guides_take() -> None:
         assert sd == pytest.approx(np.sqrt((p @ (x - centre) ** 2) / p.sum()), rel=0.01)
 
 
+@pytest.mark.thorough
 def test_stochastic_volatility_has_the_reference_likelihood(
     reference_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,7 +121,7 @@ def test_particle_chains_are_calibrated(engine: str) -> None:
             return bmc.infer(dbn, {"y": [evidence[n] for n in rows]}, engine=short, rng=rng)
 
     found = simulation_based_calibration(
-        ask, dbn.unroll(steps), observed=rows, replications=session.scaled(40, 4), alpha=ALPHA,
+        ask, dbn.unroll(steps), observed=rows, replications=session.scaled(20, 8), alpha=ALPHA,
         rng=session.seed(),
     )  # fmt: skip
     assert found, found

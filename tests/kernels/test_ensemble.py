@@ -208,7 +208,10 @@ def test_angles_near_the_cut(prior: Any, members: int) -> None:
     assert 0.1 < (found["h"] > 0).mean() < 0.9
 
 
-@pytest.mark.parametrize(("kind", "right"), [(BlockWalk, True), (Unwrapped, False)])
+@pytest.mark.parametrize(
+    ("kind", "right"),
+    [(BlockWalk, True), pytest.param(Unwrapped, False, marks=pytest.mark.thorough)],
+)
 def test_angles_do_not_run_off(kind: type[BlockWalk], right: bool) -> None:
     """Differences that take in turns double every few sweeps: in the end doubles tell none apart."""
     prior = PRIORS["wrapped normal"]

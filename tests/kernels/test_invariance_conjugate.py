@@ -227,11 +227,14 @@ SERIES = {
 
 
 @pytest.mark.parametrize("fault", ["", "wrong"])
-@pytest.mark.parametrize(("name", "how"), [*((n, "moving") for n in SERIES), ("mean", "posed")])
+@pytest.mark.parametrize(
+    ("name", "how"),
+    [*((n, "moving") for n in SERIES), pytest.param("mean", "posed", marks=pytest.mark.thorough)],
+)
 def test_like_children(name: str, how: str, fault: str) -> None:
     """All children are one partner."""
     wrong = _kernel([_wrong(p) for p in PAIRS])
-    sizes = {"replications": 100} if how == "posed" else {}
+    sizes = {"replications": 200} if how == "posed" else {}
     case = Case(SERIES[name], _kernel(), {"wrong": wrong}, how=how, sizes=sizes)
     (partner,) = case.make(case.model.target("moving")).partners
     assert len(partner.terms) == 8
@@ -344,7 +347,13 @@ def test_block(name: str, test: str, fault: str) -> None:
     BLOCKS[name].check(test, fault)
 
 
-@pytest.mark.parametrize(("name", "fault"), each_fault(KEPT_BLOCKS))
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        pytest.param(*case, marks=[pytest.mark.thorough] if case[0] == "slices" else [])
+        for case in each_fault(KEPT_BLOCKS)
+    ],
+)
 def test_block_with_what_is_kept_of_the_evidence(name: str, fault: str) -> None:
     KEPT_BLOCKS[name].check("ranks", fault, replications=32)
 

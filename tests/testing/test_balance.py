@@ -90,6 +90,7 @@ def test_batched_functions() -> None:
     assert not invariant(shared, pair(), EVIDENCE, batched=True, rng=0)
 
 
+@pytest.mark.thorough
 def test_false_alarms() -> None:
     runs, alpha = 80, 0.1
     with uncounted():

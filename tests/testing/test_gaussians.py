@@ -51,7 +51,7 @@ def user_values(draw: dict[str, Any], i: int) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_both_forms_have_one_density(kind: str) -> None:
-    for seed in range(30):
+    for seed in range(session.scaled(15, 4)):
         net, plain = random_gaussian_net(seed, **KINDS[kind])
         draw = net.sample(2, rng=seed)
         found = net.log_prob(draw)
@@ -62,7 +62,7 @@ def test_both_forms_have_one_density(kind: str) -> None:
 def test_a_wrong_coefficient_or_scale_changes_the_density() -> None:
     """Negative control: the comparison of densities notices one part in a hundred."""
     noticed = []
-    for seed in range(40):
+    for seed in range(session.scaled(20, 4)):
         net, plain = random_gaussian_net(seed, **KINDS["vectors in plates"])
         draw = net.sample(1, rng=seed)
         right = plain.log_prob(user_values(draw, 0))
@@ -73,13 +73,13 @@ def test_a_wrong_coefficient_or_scale_changes_the_density() -> None:
             wrong = dataclasses.replace(plain, gaussian=tuple(parts))
             if parts and any(getattr(p, field).any() for p in parts):
                 noticed.append(abs(wrong.log_prob(user_values(draw, 0)) - right) > 1e-9)
-    assert len(noticed) > 50
+    assert len(noticed) > 25
     assert np.mean(noticed) > 0.95
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_both_forms_know_the_same_nodes(kind: str) -> None:
-    for seed in range(30):
+    for seed in range(session.scaled(15, 4)):
         net, plain = random_gaussian_net(seed, **KINDS[kind])
         model = pose(net, {}, None).model
         assert list(plain.nodes) == list(net)
@@ -95,7 +95,7 @@ def test_the_posterior_is_the_joint_density_over_the_evidence(kind: str) -> None
     """Bayes' rule at single points. Posterior densities integrate to one by construction, so that this
     holds only if weights, Gaussians and evidence are right, all of them."""
     points = 0
-    for seed in range(40):
+    for seed in range(session.scaled(20, 4)):
         net, plain = random_gaussian_net(seed, **KINDS[kind])
         evidence = gaussian_evidence(net, seed)
         answer = plain.posterior(evidence)
@@ -392,7 +392,7 @@ def test_evidence_is_of_every_kind() -> None:
 
 
 def test_options_are_kept() -> None:
-    for seed in range(30):
+    for seed in range(session.scaled(15, 4)):
         net, plain = random_gaussian_net(seed, nodes=(2, 3), states=2, deterministic=False)
         assert 2 <= len(net) <= 3
         assert all(len(node.states or "ab") == 2 for node in plain.nodes.values())

@@ -424,7 +424,7 @@ def test_hypothesis_of_our_own_tests(
         return (pytester.path / "note").read_text()
 
     ordinary, thorough = examples(1), examples(1, "--bayesmc-thorough")
-    assert ordinary.startswith("60 ")
+    assert ordinary.startswith("30 ")
     assert examples(2) == ordinary
     assert thorough.startswith("300 ")
     assert examples(2, "--bayesmc-thorough") != thorough
