@@ -31,16 +31,11 @@ from examples import (
     picture,
     pushforward,
     rejection_and_importance,
-    three_views,
 )
 
 EXAMPLES = (*demo.NETS, *demo.FIGURES)
 #: run twice: exact, sampled, filtered and swept ones that take little time; all of them in a thorough run
-TWICE = (
-    EXAMPLES
-    if testing.session.is_thorough()
-    else (old_faithful, pushforward, ising_denoising, three_views)
-)
+TWICE = EXAMPLES if testing.session.is_thorough() else (old_faithful, ising_denoising)
 
 
 @pytest.fixture(autouse=True)

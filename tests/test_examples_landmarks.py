@@ -156,6 +156,7 @@ def test_a_bias_that_is_denied_costs_the_position(
 # ---- the real logs --------------------------------------------------------------------------------
 
 
+@pytest.mark.thorough
 def test_mrclam_as_well_as_the_reference(reference_data: Path) -> None:
     """One robot; the others and the particles by `figures`."""
     folder = reference_data / "robot" / "mrclam6"

@@ -170,6 +170,7 @@ def test_slice_by_slice_is_the_same_filter(log: Log) -> None:
     np.testing.assert_array_equal(whole, steps)
 
 
+@pytest.mark.thorough
 def test_sonars_are_learned_and_localise(sonar: Log) -> None:
     """Measured: 8 of 8 seeds, .04 to .12 m."""
     table = RayTable(sonar.grid, sonar.reach, sonar_localization.HEADINGS)

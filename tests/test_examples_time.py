@@ -122,6 +122,7 @@ def test_stochastic_volatility_has_the_reference_likelihood(
     assert abs(found - volatility.LOG_LIKELIHOOD) < 3 * error
 
 
+@pytest.mark.thorough
 def test_simulated_volatility_goes_the_same_way(monkeypatch: pytest.MonkeyPatch) -> None:
     """Particles beside the grid, within 4.5 standard errors (false alarms below 1e-4)."""
     monkeypatch.delenv("BAYESMC_DATA", raising=False)

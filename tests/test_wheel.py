@@ -141,6 +141,7 @@ def test_extras_are_absent_and_said_so(stranger: Path, tmp_path: Path) -> None:
     assert "pip install 'bayesmc[plot]'" in ran.stderr.splitlines()[-1]
 
 
+@pytest.mark.thorough
 def test_pytest_finds_the_plugin_of_the_wheel(stranger: Path, tmp_path: Path) -> None:
     # beside the environment, which other tests want without; it is pure Python, and here already
     found = tmp_path / "pytest"

@@ -378,6 +378,7 @@ def test_data_whose_support_depends_on_the_state(name: str) -> None:
     assert rank_test(engine, net, observed="y", replications=60, alpha=1e-5, rng=0)
 
 
+@pytest.mark.thorough
 def test_rare_states_raise_no_alarm() -> None:
     """A state that hardly comes has no normal limit: 30 runs at .01, of which 4 or more once in 1e4."""
     net = bmc.BayesNet()
