@@ -6,9 +6,7 @@ package index; without one it is skipped, except where ``CI`` is set.
 
 from __future__ import annotations
 
-import importlib.metadata
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -142,14 +140,14 @@ def test_extras_are_absent_and_said_so(stranger: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.thorough
-def test_pytest_finds_the_plugin_of_the_wheel(stranger: Path, tmp_path: Path) -> None:
-    # beside the environment, which other tests want without; it is pure Python, and here already
-    found = tmp_path / "pytest"
-    for name in ("pytest", "pluggy", "iniconfig", "packaging", "pygments"):
-        for file in importlib.metadata.files(name) or ():
-            if file.suffix == ".py" or "dist-info" in file.parts[0]:
-                (found / file).parent.mkdir(parents=True, exist_ok=True)
-                shutil.copy(file.locate(), found / file)
+def test_pytest_finds_the_plugin_of_the_wheel(
+    stranger: Path, tmp_path_factory: pytest.TempPathFactory, tmp_path: Path
+) -> None:
+    def install(folder: Path) -> None:  # beside the environment, which other tests want without
+        into = ("--python", str(stranger), "install", "--no-compile", "--target", str(folder))
+        _pip(sys.executable, *into, "pytest>=8.2")
+
+    found = _once(tmp_path_factory, "pytest", install)
     (tmp_path / "test_mine.py").write_text(
         "from bayesmc.testing import session\n"
         "from bayesmc.testing.verdict import Verdict, counted\n"

@@ -15,14 +15,13 @@ import scipy.special
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.testing.densities.masses import Element, Table, Volume, line_of, volume_of
 from bayesmc.testing.densities.moments import (
-    average_of,
     check_moments,
     check_scores,
     check_table_scores,
 )
 from bayesmc.testing.densities.reports import Report
 from bayesmc.testing.kernels.uniformity import uniformity_p_value
-from bayesmc.testing.posteriors.samples import energy_comparison
+from bayesmc.testing.posteriors.samples import Average, energy_comparison
 
 #: an integral is one within this, or within what the rule itself doubts
 _ROUNDING = 1e-6
@@ -250,7 +249,7 @@ def check_volume(element: Element, samples: np.ndarray | None, report: Report) -
                 column = flat[:, k] if what == "mean" else (flat[:, k] - flat[:, k].mean()) ** 2
                 label = f"{what} of component {k}, from draws"
                 if np.ptp(column) > 1e-12 * max(1.0, abs(exact)):
-                    report.average(label, average_of(column), exact, abs(exact) + 1.0)
+                    report.average(label, Average.of(column), exact, abs(exact) + 1.0)
                 else:
                     report.agree(label, float(column.mean()), exact, 1e-9, f"{label}: not {exact}")
 

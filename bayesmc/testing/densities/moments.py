@@ -56,7 +56,7 @@ def check_table_scores(
     for what, power in (("mean", 1), ("mean square", 2)):
         column = scores[at] ** power
         exact = float(scores**power @ probs)
-        drawn = average_of(column)
+        drawn = Average.of(column)
         if drawn.support >= _SUPPORT:  # else the chi-square has the last word
             report.average(f"{what} of the draws' normal scores", drawn, exact, 1.0)
 
@@ -84,7 +84,7 @@ def check_moments(element: Element, samples: np.ndarray, volume: Volume, report:
             what = _label(names, i, j) + where
             found = [_integral(rule, _moment(features, i, j)) for rule, features in integrated]
             best = next((f for f in found if f is not None), None)
-            own = average_of(column)
+            own = Average.of(column)
             if best is None or own.support < _SUPPORT:
                 undecided = True
                 continue
@@ -95,17 +95,6 @@ def check_moments(element: Element, samples: np.ndarray, volume: Volume, report:
         report.remark(
             "some moments of the draws: too few draws decide them, or no rule integrates them"
         )
-
-
-def average_of(column: np.ndarray) -> Average:
-    """Mean of independent draws."""
-    value, n = float(column.mean()), len(column)
-    off = column - value
-    second, third, fourth = (float((off**k).mean()) for k in (2, 3, 4))
-    if not second > 0 or not fourth > 0:
-        return Average(value, 0.0, 0.0, 0.0)
-    skewness = third / second**1.5 / math.sqrt(n)
-    return Average(value, math.sqrt(second / n), skewness, n * second**2 / fourth)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -154,7 +143,7 @@ def _integral(rule: Rule, column: np.ndarray) -> tuple[Average, float] | None:
         off = abs(float(rule.coarse @ column) / again - value) if again > 0 else math.inf
         return (Average(value, 0.0, 0.0, math.inf), off + 1e-9) if off < _DOUBT else None
     pulls = rule.masses * (column - value) * (len(column) / total)
-    drawn = average_of(pulls)
+    drawn = Average.of(pulls)
     if drawn.support < _SUPPORT:
         return None
     return Average(value, drawn.error, drawn.skewness, drawn.support), 0.0

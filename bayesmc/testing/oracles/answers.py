@@ -283,6 +283,7 @@ def exact(
     }
     passed_over: dict[str, str] = {}
     partial: dict[str, Enumerated | GaussianAnswer] = {}
+    about: dict[str, Any] = {"steps": steps, "observed": observed, "log_static": log_static}
     wanted = [n for n, node in problem.model.nodes.items() if node.kind != "input"]
     for method, oracle in oracles.items():
         try:
@@ -292,13 +293,13 @@ def exact(
             continue
         left_out = [name for name in wanted if name not in answer.names]
         if not left_out:
-            return ExactAnswer(method, answer, steps, passed_over, observed, log_static)
+            return ExactAnswer(method, answer, passed_over=passed_over, **about)
         partial[method] = answer
         passed_over[method] = f"it leaves out {', '.join(map(repr, left_out))}"
     if partial:  # what nothing observed depends on, and no oracle can say
         method = max(partial, key=lambda m: len(partial[m].names))
         others = {m: why for m, why in passed_over.items() if m != method}
-        return ExactAnswer(method, partial[method], steps, others, observed, log_static)
+        return ExactAnswer(method, partial[method], passed_over=others, **about)
     reasons = "".join(f"\n  {method}: {why}" for method, why in passed_over.items())
     raise UnsupportedError(
         f"exact: no oracle answers this net:{reasons}\nObserve more, take fewer elements or steps, or "

@@ -155,6 +155,17 @@ class Average:
     skewness: float
     support: float
 
+    @classmethod
+    def of(cls, column: np.ndarray) -> Average:
+        """Mean of independent draws."""
+        value, n = float(column.mean()), len(column)
+        off = column - value
+        second, third, fourth = (float((off**k).mean()) for k in (2, 3, 4))
+        if not second > 0 or not fourth > 0:
+            return cls(value, 0.0, 0.0, 0.0)
+        skewness = third / second**1.5 / math.sqrt(n)
+        return cls(value, math.sqrt(second / n), skewness, n * second**2 / fourth)
+
     def p_value(self, exact: float, tolerance: float = 0.0) -> tuple[float, float]:
         """Distance in standard errors, and its two-sided p-value corrected for skewness.
 

@@ -102,11 +102,11 @@ class SlicePosterior:
 
     def _check(self, test: str, series: SeriesPosterior) -> None:
         """The exact answer is about the same nodes and slices."""
-        mine = [n for n, node in series.model.nodes.items() if node.is_stochastic]
-        theirs = {_of_slice(name) for name in _stochastic(self.model)}
-        unknown = [n for n in (*mine, *series.names) if indexed(n, 0) not in self.model.nodes]
-        unknown = [n for n in unknown if n not in self.model.nodes]
-        unknown += [name for name in theirs if name not in series.model.nodes]
+        theirs = dict.fromkeys(map(_of_slice, self.model.nodes))
+        mine = (*_stochastic(series.model), *series.names)
+        unknown = [name for name in mine if name not in theirs]
+        stochastic = map(_of_slice, _stochastic(self.model))
+        unknown += [name for name in stochastic if name not in series.model.nodes]
         if unknown:
             raise UnknownNodeError(
                 f"{test}: only one of the two knows a node {unknown[0]!r}; give beliefs and an exact answer "
