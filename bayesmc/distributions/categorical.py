@@ -173,12 +173,13 @@ class Categorical(Distribution):
         rows, totals, bad = normalise_rows(table)
         if bad is not None and (seen := self._by_row(bad)).any():
             row = self._first_row(seen)
+            least = table[row].min()
+            fault = f"holds {least:.8g}" if least < 0 else f"sums to {totals[row]:.8g}"
             self._reject(
                 self._probs_name,
                 table[row],
                 seen,
-                f"nonnegative and sum to 1 within {TOLERANCE:g} "
-                f"(this row sums to {totals[row]:.8g})",
+                f"nonnegative and sum to 1 within {TOLERANCE:g} (this row {fault})",
             )
         return rows
 

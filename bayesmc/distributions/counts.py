@@ -57,7 +57,7 @@ class Geometric(_Odds):
     --------
     >>> import bayesmc as bmc
     >>> dist = bmc.Geometric(0.25)
-    >>> float(dist.log_prob(0).round(4)), float(dist.mean), float(dist.cdf(1))
+    >>> float(dist.log_prob(0).round(4)), float(dist.mean), float(dist.cdf(1).round(4))
     (-1.3863, 3.0, 0.4375)
     """
 

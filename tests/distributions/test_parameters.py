@@ -119,7 +119,11 @@ FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
         "Categorical: probs must be nonnegative and sum to 1 within 1e-06 (this row sums to 0.9); "
         "got [0.5 0.4] at index 1",
     ),
-    (lambda: d.Categorical([1.5, -0.5]), (), "nonnegative and sum to 1"),
+    (
+        lambda: d.Categorical([1.5, -0.5]),
+        (),
+        "sum to 1 within 1e-06 (this row holds -0.5); got [ 1",
+    ),
     (lambda: d.Categorical([[[0.5, 0.5], [NAN, 0.5]]]), (0, 1), "at index (0, 1)"),
     (
         lambda: d.Categorical(logits=[[0.0, 0.0], [-INF, -INF]]),

@@ -404,5 +404,5 @@ def test_rare_states_raise_no_alarm() -> None:
 def test_words_for_what_is_no_joint_law() -> None:
     net = labelled()
     expecting(UnsupportedError, "arguments are .kernel, net.", net, sweep)
-    expecting(ValueError, "give a dict of name -> function", sweep, net, statistics=["a"])
+    expecting(TypeError, "give a dict of name -> function", sweep, net, statistics=["a"])
     expecting(ValueError, "replications=3", sweep, net, replications=3)

@@ -7,7 +7,6 @@ what comes back to `inspect`.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -115,7 +114,7 @@ def check_cpd(
         _own_fault(error, name, report)
         if isinstance(error, ParameterError):
             report.comparisons.pop()
-            report.fault(_with_parents(family, name, inputs, report) or _in_words(error))
+            report.fault(_with_parents(family, name, inputs, report) or str(error))
     else:
         try:
             family.validate(inputs)
@@ -148,18 +147,10 @@ def _with_parents(
             except ParameterError as error:
                 if f"node {name!r}" in str(error):
                     told = ", ".join(f"{p}={_in_short(v)}" for p, v in values.items())
-                    return (f"at {told}: " if told else "") + _in_words(error)
+                    return (f"at {told}: " if told else "") + str(error)
     except BayesmcError:
         return None
     return None
-
-
-def _in_words(error: BayesmcError) -> str:
-    """What a parameter's fault is; a row of probabilities that sums to 1 has something negative."""
-    text = str(error)
-    # the error of a model has lost the row, but for what the message shows
-    negative = re.search(r"sum to 1 .*got .*?(-[0-9][0-9.e+-]*)", text, re.DOTALL)
-    return f"a probability is negative, {negative[1]}: {text}" if negative else text
 
 
 def _own_fault(error: BayesmcError, name: str, report: Report) -> None:
@@ -248,8 +239,7 @@ def _check_parameters(
         problem = alone.problem
     except BayesmcError as error:
         problem = error
-    words = _in_words(problem) if isinstance(problem, BayesmcError) else problem
-    report.fault(f"{_told(model, node, values, row)}{words}{share}")
+    report.fault(f"{_told(model, node, values, row)}{problem}{share}")
     return bad
 
 

@@ -360,16 +360,9 @@ def _importance(
     if not math.isfinite(top):
         return Average(0.0, 0.0, 0.0, 0.0), u[:0], Rule(u[:0], np.empty(0), None)
     weights = np.exp(log_weight - top)
-    off = weights - weights.mean()
-    second, third, fourth = ((off**k).mean() for k in (2, 3, 4))
-    scale, root_n = math.exp(min(top, 700.0)), math.sqrt(_DRAWS)
-    if second > 0:
-        error, skewness = math.sqrt(second) / root_n, third / second**1.5 / root_n
-        average = Average(
-            weights.mean() * scale, error * scale, skewness, _DRAWS * second**2 / fourth
-        )
-    else:
-        average = Average(scale, 0.0, 0.0, float(_DRAWS))
+    found, scale = Average.of(weights), math.exp(min(top, 700.0))
+    support = found.support if found.error > 0 else float(_DRAWS)
+    average = Average(found.value * scale, found.error * scale, found.skewness, support)
     accepted = rng.random(_DRAWS) < weights
     accepted[weights.argmax()] = False  # given the largest weight, the others are independent
     return average, u[accepted], Rule(u, weights, None)

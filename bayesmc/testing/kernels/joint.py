@@ -67,6 +67,23 @@ class JointModel:
     statistics: Statistics
 
 
+def check_statistics(call: str, statistics: Any, functions: str) -> None:
+    """Raise unless these are functions by name; ``functions`` says in words of what."""
+    fix = f"give a dict of name -> {functions}"
+    if not isinstance(statistics, Mapping):
+        kind = type(statistics).__name__
+        raise TypeError(f"{call}: statistics is a {kind}, not a dict; {fix}")
+    if not statistics:
+        raise ValueError(f"{call}: no statistics; {fix}")
+    for name, function in statistics.items():
+        if not isinstance(name, str):
+            raise TypeError(f"{call}: the name {name!r} of a statistic is not a string; {fix}")
+        if isinstance(function, type) or not callable(function):
+            raise TypeError(
+                f"{call}: statistics[{name!r}] is {function!r}, which is not a function; {fix}"
+            )
+
+
 class NetStates:
     """Which nodes of a compiled net are the state, and what their values say of all others.
 
@@ -184,13 +201,9 @@ class NetJoint(NetStates):
         """Log densities of the joint law: all stochastic nodes are in the chain."""
         return target_of(pose(self.net, None, self.user_inputs), also=self.stochastic)
 
-    def read(self, statistics: Mapping[str, Callable[..., Any]]) -> Statistics:
+    def read(self, call: str, statistics: Mapping[str, Callable[..., Any]]) -> Statistics:
         """Users' statistics, functions whose argument names are nodes, as functions of state and data."""
-        if not isinstance(statistics, Mapping) or not all(map(callable, statistics.values())):
-            raise ValueError(
-                f"statistics={statistics!r}: give a dict of name -> function whose arguments are nodes, as "
-                "{'x squared': lambda x: x**2}"
-            )
+        check_statistics(call, statistics, "function of nodes, {'x squared': lambda x: x**2}")
         return {name: self._reading(name, f) for name, f in statistics.items()}
 
     # ---- private -------------------------------------------------------------------------------

@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import ModelError, UnsupportedError
-from bayesmc.testing.kernels.joint import JointModel, Move, NetJoint, Statistics
+from bayesmc.testing.kernels.joint import (
+    JointModel,
+    Move,
+    NetJoint,
+    Statistics,
+    check_statistics,
+)
 from bayesmc.testing.kernels.machines import Machine
 from bayesmc.testing.kernels.statistics import default_statistics
 from bayesmc.testing.kernels.steps import StepFunction, is_step
@@ -64,12 +70,10 @@ def moves_of(
     rows: int,
 ) -> Moves:
     """A kernel of any kind on a net or `JointModel`, with the joint law it is held against."""
-    if statistics is not None and not statistics:
-        raise ValueError(f"{call}: no statistics; give a dict of name -> function")
     if isinstance(net, JointModel):
         return _of_model(call, kernel, net, reverse, observed, inputs, statistics)
     joint = NetJoint(net, observed, inputs)
-    found = joint.read(statistics) if statistics else default_statistics(joint)
+    found = default_statistics(joint) if statistics is None else joint.read(call, statistics)
     if is_step(kernel):
         forward = _of_function(call, kernel, joint, batched)
         backward = forward if reverse is None else _of_function(call, reverse, joint, batched)
@@ -107,13 +111,10 @@ def _of_model(
             raise UnsupportedError(
                 f"{call}: with a JointModel give kernel(state, data, rng) -> state, not {move!r}"
             )
-    wrong = [n for n in ("prior", "simulate") if not callable(getattr(model, n))]
-    if wrong or not isinstance(model.statistics, Mapping):
-        raise ModelError(
-            f"{call}: JointModel({(wrong or ['statistics'])[0]}=...) is no {'function' if wrong else 'dict'}"
-        )
-    if not model.statistics:
-        raise ValueError(f"{call}: no statistics; give a dict of name -> statistic(state, data)")
+    for name in ("prior", "simulate"):
+        if not callable(getattr(model, name)):
+            raise ModelError(f"{call}: JointModel({name}=...) is no function")
+    check_statistics(call, model.statistics, "statistic(state, data)")
     return Moves(
         model.prior,
         model.simulate,

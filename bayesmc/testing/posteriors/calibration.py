@@ -25,7 +25,7 @@ from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
 from bayesmc.testing.kernels.joint import JointModel, NetJoint, Rows, check_sizes
 from bayesmc.testing.posteriors.bands import Uniformity, ecdf_band, ecdf_points, ecdf_uniformity
-from bayesmc.testing.posteriors.quantities import Quantities, is_default
+from bayesmc.testing.posteriors.quantities import Quantities
 from bayesmc.testing.posteriors.shares import Draws, posterior_draws, share_below, users_draws
 from bayesmc.testing.verdict import Comparison, Verdict, counted
 
@@ -62,6 +62,8 @@ class CalibrationResult(Verdict):
         Kind of warning -> runs that gave it.
     uncertain : int
         Runs whose weights are worth too few draws for the uniform law of their ranks to be relied upon.
+    of_nodes : bool
+        Whether the statistics are those taken by default, not a user's own.
     """
 
     ranks: Mapping[str, np.ndarray]
@@ -71,6 +73,7 @@ class CalibrationResult(Verdict):
     high: np.ndarray
     warned: Mapping[str, int]
     uncertain: int
+    of_nodes: bool
 
     @property
     def deviating(self) -> tuple[str, ...]:
@@ -155,7 +158,9 @@ class CalibrationResult(Verdict):
             ax.figure.suptitle(title, fontsize="medium")
 
     def _remarks(self) -> list[str]:
-        lines = [f"  {name}: {_in_words(name, self.ranks[name])}" for name in self.deviating]
+        lines = [
+            f"  {name}: {_in_words(self.ranks[name], self.of_nodes)}" for name in self.deviating
+        ]
         runs = len(next(iter(self.ranks.values())))
         lines += [f"  {count} of {runs} runs warned: {kind}" for kind, count in self.warned.items()]
         if self.uncertain:
@@ -296,6 +301,7 @@ def simulation_based_calibration(
             high=high,
             warned=dict(warned),
             uncertain=sum(uncertain),
+            of_nodes=statistics is None,
         )
     )
 
@@ -411,10 +417,11 @@ def _comparison(name: str, found: Uniformity, count: int) -> Comparison:
     return Comparison(what, found.share, found.point, abs(found.excess) / error, found.p_value)
 
 
-def _in_words(name: str, ranks: np.ndarray) -> str:
-    """What is wrong with the draws, as far as mean and spread of the ranks show it."""
-    # a user's statistic takes the draws elsewhere, and says nothing of where they lie themselves
-    default = is_default(name)
+def _in_words(ranks: np.ndarray, of_nodes: bool) -> str:
+    """What is wrong with the draws, as far as mean and spread of the ranks show it.
+
+    A user's statistic takes the draws elsewhere, and says nothing of where they lie themselves.
+    """
     count = len(ranks)
     shift = (ranks.mean() - 0.5) * math.sqrt(12 * count)
     spread = (((ranks - 0.5) ** 2).mean() - 1 / 12) * math.sqrt(180 * count)
@@ -422,11 +429,11 @@ def _in_words(name: str, ranks: np.ndarray) -> str:
         return "neither shifted nor of a wrong spread: look at plot()"
     if abs(shift) > abs(spread):
         side = "low" if shift > 0 else "high"
-        draws = "draws" if default else "its values at the draws"
+        draws = "draws" if of_nodes else "its values at the draws"
         return f"{draws} lie too {side} (ranks of the truth average {ranks.mean():.3f}, not 0.5)"
     tails = (np.abs(ranks - 0.5) > 0.4).mean()
     width = "draws are too " + ("narrow" if spread > 0 else "wide")
-    if not default:
+    if not of_nodes:
         width = "its values at the draws spread too " + ("little" if spread > 0 else "far")
     return f"{width} ({tails:.0%} of truths in their outer fifth, not 20%)"
 

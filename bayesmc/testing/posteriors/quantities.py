@@ -22,8 +22,6 @@ from bayesmc.errors import DensityError
 from bayesmc.network.joint import node_log_prob
 from bayesmc.testing.kernels.joint import NetJoint, Rows
 
-#: how the names of statistics that are taken by default begin
-_DEFAULTS = ("node '", "mean of node '", "log density of the data", "joint log density")
 #: elements of a node that are ranked by default, at most
 _ELEMENTS = 32
 
@@ -48,7 +46,7 @@ class Quantities:
         self, call: str, joint: NetJoint, statistics: Mapping[str, Callable[..., Any]] | None
     ) -> None:
         self.call, self.joint = call, joint
-        self.asked = None if statistics is None else joint.read(_checked(call, statistics))
+        self.asked = None if statistics is None else joint.read(call, statistics)
         self.names = list(self._own()) if self.asked is None else list(self.asked)
 
     def __call__(self, state: Rows, data: Rows) -> tuple[np.ndarray, np.ndarray]:
@@ -103,29 +101,7 @@ class Quantities:
         return likelihood, total
 
 
-def is_default(name: str) -> bool:
-    """Whether a statistic of this name is one that is taken by default."""
-    return name.startswith(_DEFAULTS)
-
-
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _checked(call: str, statistics: Any) -> Mapping[str, Callable[..., Any]]:
-    fix = "give a dict of name -> function of nodes, {'x squared': lambda x: x**2}"
-    if not isinstance(statistics, Mapping):
-        kind = type(statistics).__name__
-        raise TypeError(f"{call}: statistics is a {kind}, not a dict; {fix}")
-    if not statistics:
-        raise ValueError(f"{call}: no statistics; {fix}")
-    for name, function in statistics.items():
-        if not isinstance(name, str):
-            raise TypeError(f"{call}: the name {name!r} of a statistic is not a string; {fix}")
-        if isinstance(function, type) or not callable(function):
-            raise TypeError(
-                f"{call}: statistics[{name!r}] is {function!r}, which is not a function; {fix}"
-            )
-    return statistics
 
 
 def _element(name: str, at: tuple[int, ...], values: Rows, *_: Any) -> np.ndarray:

@@ -156,15 +156,28 @@ class Average:
     support: float
 
     @classmethod
-    def of(cls, column: np.ndarray) -> Average:
-        """Mean of independent draws."""
-        value, n = float(column.mean()), len(column)
-        off = column - value
-        second, third, fourth = (float((off**k).mean()) for k in (2, 3, 4))
-        if not second > 0 or not fourth > 0:
-            return cls(value, 0.0, 0.0, 0.0)
-        skewness = third / second**1.5 / math.sqrt(n)
-        return cls(value, math.sqrt(second / n), skewness, n * second**2 / fourth)
+    def of(cls, draws: np.ndarray, ess: float | None = None) -> Average:
+        """Mean of draws that are worth ``ess`` independent ones, by default all of them."""
+        value, n = float(draws.mean()), float(draws.size if ess is None else ess)
+        off = draws - value
+        return cls._of_sums(value, *((off**k).mean() / n ** (k - 1) for k in (2, 3, 4)))
+
+    @classmethod
+    def weighted(cls, draws: np.ndarray, weights: np.ndarray) -> Average:
+        """Mean of draws with weights that sum to 1."""
+        used = weights > 0
+        w, x = weights[used], np.broadcast_to(draws, weights.shape)[used]
+        value = float(w @ x)
+        terms = w * (x - value)
+        return cls._of_sums(value, *((terms**k).sum() for k in (2, 3, 4)))
+
+    @classmethod
+    def _of_sums(cls, value: float, second: float, third: float, fourth: float) -> Average:
+        """Of the sums of powers of what each draw adds to the mean's error."""
+        if not 0 < second < math.inf or not 0 < fourth < math.inf:
+            return cls(value, 0.0 if second == 0 else math.nan, 0.0, 0.0)
+        error = math.sqrt(second)
+        return cls(value, error, float(third) / error**3, float(second**2 / fourth))
 
     def p_value(self, exact: float, tolerance: float = 0.0) -> tuple[float, float]:
         """Distance in standard errors, and its two-sided p-value corrected for skewness.
@@ -213,15 +226,8 @@ class Draws:
         """Mean of one scalar, shape ``(chain, draw)``."""
         values = values.astype(float)
         if self.weights is not None:
-            return self._weighted(values, self.weights)
-        mean, count = float(values.mean()), values.size
-        off = values - mean
-        second, third, fourth = ((off**k).mean() for k in (2, 3, 4))
-        if not 0 < second < np.inf or not np.isfinite(fourth):
-            return Average(mean, 0.0 if second == 0 else math.nan, 0.0, 0.0)
-        ess = float(count) if self.block == 0 else self._chain_ess(values)
-        error = math.sqrt(second / ess)
-        return Average(mean, error, third / second**1.5 / math.sqrt(ess), ess * second**2 / fourth)
+            return Average.weighted(values, self.weights)
+        return Average.of(values, None if self.block == 0 else self._chain_ess(values))
 
     def share(self, indicator: np.ndarray, p: float) -> tuple[float, float]:
         """Share of draws where the indicator holds, and its effective number of draws were it ``p``."""
@@ -264,16 +270,6 @@ class Draws:
         else:
             at = self._apart(full, most)
         return {n: v.reshape(chains * draws, *v.shape[2:])[at] for n, v in full.items()}
-
-    def _weighted(self, values: np.ndarray, weights: np.ndarray) -> Average:
-        used = weights > 0
-        w, x = weights[used], np.broadcast_to(values, weights.shape)[used]
-        mean = float(w @ x)
-        terms = w * (x - mean)
-        second, third, fourth = ((terms**k).sum() for k in (2, 3, 4))
-        if not 0 < second < np.inf or not fourth > 0:
-            return Average(mean, 0.0 if second == 0 else math.nan, 0.0, 0.0)
-        return Average(mean, math.sqrt(second), third / second**1.5, second**2 / fourth)
 
     def _chain_ess(self, values: np.ndarray) -> float:
         ess = float(diagnostics.chain_statistic("mean_ess", values, self.block))
