@@ -267,14 +267,21 @@ def joint_nets(kind: str, count: int) -> Iterator[tuple[int, bmc.BayesNet]]:
             return
 
 
+def of_leaves(net: bmc.BayesNet, seed: int) -> dict[str, Any]:
+    """Evidence on all leaves, so that what is above them moves; none where nothing is above them."""
+    joint, rng = NetJoint(net), np.random.default_rng(seed)
+    return joint.evidence(joint.simulate(joint.prior(rng, 1), rng)) if joint.observed else {}
+
+
 @pytest.mark.parametrize("kind", ["discrete", "plates"])
 @pytest.mark.parametrize("engine", CHAIN_ENGINES)
 def test_sweeps_keep_finite_posteriors(engine: str, kind: str) -> None:
     """Exactly: the matrices are read from the code that draws."""
     asked = 0
-    for seed in range(SHIFT, SHIFT + session.scaled(40 if kind == "discrete" else 4)):
-        net = random_net(seed, nodes=(2, 4), configurations=256, **KINDS[kind])
-        evidence = random_evidence(net, seed)
+    count, configurations = {"discrete": (40, 256), "plates": (10, 16)}[kind]
+    for seed in range(SHIFT, SHIFT + session.scaled(count)):
+        net = random_net(seed, nodes=(2, 4), configurations=configurations, **KINDS[kind])
+        evidence = random_evidence(net, seed) if kind == "discrete" else of_leaves(net, seed)
         try:
             found = invariant(CHAIN_ENGINES[engine], net, evidence)
             balanced = detailed_balance(CHAIN_ENGINES[engine], net, evidence)
@@ -286,7 +293,7 @@ def test_sweeps_keep_finite_posteriors(engine: str, kind: str) -> None:
         assert found, (seed, found)
         assert balanced, (seed, balanced)
         asked += 1
-    assert asked >= (5 if kind == "discrete" else 1)
+    assert asked >= 2
 
 
 @pytest.mark.parametrize("kind", [*SCALARS, pytest.param("gaussian", marks=pytest.mark.thorough)])
@@ -346,7 +353,8 @@ CALIBRATED = [
 def test_engines_are_calibrated(engine: str, kind: str) -> None:
     """At 1e-5 each."""
     asked, chains = 0, engine in CHAIN_ENGINES
-    for seed, net in joint_nets(kind, session.scaled(1 if chains else 2, 10)):
+    wanted = session.scaled(1 if chains else 2, 10)
+    for seed, net in joint_nets(kind, 12 * wanted):
         evidence = {n: net.sample(1, rng=seed)[n][0] for n in NetJoint(net).observed}
         asks = calibrated(engine, net)
         if not callable(asks) and asks.unsupported(net, evidence):
@@ -356,7 +364,9 @@ def test_engines_are_calibrated(engine: str, kind: str) -> None:
         )
         assert found, (seed, net.name, found)
         asked += 1
-    assert asked or (engine, kind) in (("Exact", "hybrid"), ("Rejection", "hybrid"))
+        if asked == wanted:
+            break
+    assert asked
 
 
 # ---- shrinking counterexamples ------------------------------------------------------------------
