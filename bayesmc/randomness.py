@@ -43,6 +43,7 @@ class Purpose(IntEnum):
     PREDICT = 3
     FILTER = 4
     SMOOTH = 5
+    TEST = 6
 
 
 def stream(seed: np.random.SeedSequence, purpose: Purpose, unit: int = 0) -> np.random.Generator:

@@ -31,7 +31,7 @@ def total_of(net: bmc.BayesNet, name: str) -> Callable[[Any], Any]:
 
 @pytest.mark.parametrize("kind", ["discrete", "plates", "hybrid plates"])
 def test_exact_queries_agree_with_enumeration(kind: str) -> None:
-    asked = 0
+    asked = tables = 0
     for net, posterior, found in answered_by_tables(kind):
         finite = [n for n in found.names if found.model[n].domain is not None]
         numeric = [n for n in found.names if not _is_labelled(found.model[n])]
@@ -40,7 +40,7 @@ def test_exact_queries_agree_with_enumeration(kind: str) -> None:
                 np.testing.assert_allclose(
                     posterior.probabilities(a, b), found.probabilities(a, b), atol=1e-9
                 )
-                asked += 1
+                tables += 1
         for a in numeric[:2]:
             np.testing.assert_allclose(posterior.var(a), found.var(a), atol=1e-9)
             for b in numeric[-2:]:
@@ -64,7 +64,7 @@ def test_exact_queries_agree_with_enumeration(kind: str) -> None:
         both = [n for n in numeric if n in finite][:3]
         if both:
             np.testing.assert_allclose(posterior.cov(*both), _cov(found, both), atol=1e-9)
-    assert asked > 40
+    assert asked > 20 and tables > 20
 
 
 @pytest.mark.parametrize("kind", ["plates", "hybrid plates"])

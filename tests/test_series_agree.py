@@ -92,7 +92,7 @@ def test_particle_chains_match_exact_answers(engine: str, kind: str) -> None:
             asked += 1
         if asked == FEW:
             break
-    assert asked
+    assert asked >= FEW / 2
 
 
 def jumping() -> bmc.DynamicBayesNet:

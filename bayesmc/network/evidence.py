@@ -150,6 +150,10 @@ def plate_sizes(
     source: dict[str, str] = {}
     fixed = {n: d.value for n, d in declarations.items() if d.value is not None}
     for values in (fixed, *data):
+        if values is not None and not isinstance(values, Mapping):
+            raise EvidenceError(
+                f"evidence or inputs are a {type(values).__name__}; give a dict of node -> value"
+            )
         for name, value in (values or {}).items():
             declaration = declarations.get(name)
             if declaration is None or value is None or not declaration.plates:

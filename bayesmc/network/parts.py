@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import BayesNet
 from bayesmc.network.node import Declaration
 
@@ -34,3 +35,12 @@ def ancestral(net: BayesNet, names: Iterable[str]) -> BayesNet:
 def with_nodes(net: BayesNet, declarations: Mapping[str, Declaration]) -> BayesNet:
     """The net with more nodes, or others in their place; nothing is compiled."""
     return BayesNet.of(net.name, {**net.declarations, **declarations}, net._plates)
+
+
+def without_idle_plates(net: BayesNet) -> BayesNet:
+    """The net without the plates that no node is on."""
+    used = {plate for declared in net.declarations.values() for plate in declared.plates}
+    plates = {plate: size for plate, size in net._plates.sizes.items() if plate in used}
+    return BayesNet.of(
+        net.name, net.declarations, DeclaredPlates.read("BayesNet", net.name, plates)
+    )

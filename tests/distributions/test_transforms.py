@@ -169,8 +169,6 @@ def exported() -> list[str]:
 
 
 def made(name: str, k: int) -> d.Distribution:
-    if getattr(d, name).__doc__ == "Being written.":
-        pytest.skip(f"{name} is a stub")
     return EXAMPLES[name][k]()
 
 
@@ -302,11 +300,11 @@ def test_the_map_of_a_family(name: str, k: int) -> None:
         assert (dist.log_prob(dist.constrain(u)) > -INF).all()
 
 
-@pytest.mark.parametrize(("name", "k"), CASES, ids=CASE_IDS)
+@pytest.mark.parametrize(
+    ("name", "k"), [case for case in CASES if not made(*case).is_discrete], ids=str
+)
 def test_far_out_nothing_is_nan(name: str, k: int) -> None:
     dist = made(name, k)
-    if dist.is_discrete:
-        return
     transform = dist.transform
     for far in (700.0, -700.0, 745.0, -1e4, 1e4):
         u = np.full(dist.batch_shape + transform.unconstrained_shape, far)

@@ -16,6 +16,7 @@ from bayesmc.errors import (
     ReducibleWarning,
     ZeroProbabilityError,
 )
+from bayesmc.network import pose
 
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
 
@@ -122,6 +123,15 @@ def test_debug_runs_on_every_closed_form() -> None:
         net, evidence = build()
         engine = bmc.Gibbs(draws=20, warmup=20, chains=3, debug=True)
         bmc.infer(net, evidence, engine=engine, rng=0)
+
+
+@pytest.mark.parametrize("debug", [True, False])
+def test_debug_reaches_the_kernels(debug: bool) -> None:
+    """What they do with it is tested with them."""
+    sampler = bmc.Gibbs(debug=debug).sampler(pose(*mixture()))
+    told = {name: k.debug for k in sampler.kernels if hasattr(k, "debug") for name in k.names}
+    assert {"weights", "mean", "precision", "label"} <= told.keys()
+    assert set(told.values()) == {debug}
 
 
 # ---- going on -----------------------------------------------------------------------------------

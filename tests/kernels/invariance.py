@@ -335,18 +335,20 @@ def each_fault(cases: Mapping[str, Case]) -> list[tuple[str, str]]:
 def each_test(cases: Mapping[str, Case]) -> list[tuple[str, str, str]]:
     """Names, faults and tests: all with both tests in a thorough run.
 
-    In an ordinary run the tests take turns at kernels and faults: either is seen to fail in every file.
+    In an ordinary run the tests take turns at kernels, whose faults the same test has to see.
     """
     return in_turn(each_fault(cases))
 
 
 def in_turn(kernels: Sequence[tuple[T, str]]) -> list[tuple[T, str, str]]:
     """The same of pairs of a name, or what else is meant, and a fault."""
-    found, turn = [], itertools.cycle(TESTS)
-    for name, fault in kernels:
-        tests = TESTS if session.is_thorough() else (next(turn),)
-        found += [(name, fault, test) for test in tests]
-    return found
+    turn = itertools.cycle(TESTS)
+    own = {name: next(turn) for name in dict.fromkeys(name for name, _ in kernels)}
+    return [
+        (name, fault, test)
+        for name, fault in kernels
+        for test in (TESTS if session.is_thorough() else (own[name],))
+    ]
 
 
 def backwards(make: Make, target: Target, memory: Memory) -> tuple[Kernel, Memory]:

@@ -292,7 +292,7 @@ def ranks(make: Callable[[Blanket], Kernel], name: str, statistic: Any, seed: in
              "label": np.zeros((1000, 4), np.uint8)}  # fmt: skip
     statistics = {"one": statistic, "fit": lambda s, y: (y * s["mean"][:, :1]).sum(axis=1)}
     model = JointModel(prior, simulate, statistics)
-    return rank_test(move, model, rng=seed)
+    return rank_test(move, model, thinning=3, rng=seed)
 
 
 KERNELS: dict[str, tuple[Any, str, Any]] = {

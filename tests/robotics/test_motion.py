@@ -229,10 +229,12 @@ def test_moments_are_those_of_draws(name: str) -> None:
     # covariance times that, exactly where both are normal and nearly where turns are small
     cosine = np.cos(off[:, 2])
     assert abs(cosine.mean() - np.exp(-0.5 * dist.var[2])) < 6 * cosine.std() / np.sqrt(count)
-    if dist.var[2] < 0.15:
+    # of arcs the derivatives hold it, and wild turns are not normal
+    if isinstance(dist, OdometryMotion) and dist.var[2] < 1.0:
         for i in (0, 1):
-            product = spread[:, i] * off[:, 2]
-            assert abs(product.mean() - dist.cov[i, 2]) < 6 * product.std() / np.sqrt(count)
+            product = spread[:, i] * np.sin(off[:, 2])
+            expected = dist.cov[i, 2] * np.exp(-0.5 * dist.var[2])
+            assert abs(product.mean() - expected) < 6 * product.std() / np.sqrt(count)
     np.testing.assert_allclose(dist.cov_root @ dist.cov_root.T, dist.cov, atol=1e-12)
 
 

@@ -178,7 +178,12 @@ def test_exact_and_counted_agree() -> None:
             now = of[tuple(state[n] for n in names)]
             return dict(zip(names, s[rng.choice(len(s), p=p[now])], strict=True))
 
+        def mixed(state: dict, rng: Any, right: Any = step, first: Any = states[0],
+                  names: Any = hidden) -> dict:  # fmt: skip
+            return right(state, rng) if rng.random() < 0.7 else dict(zip(names, first, strict=True))
+
         assert invariant(step, net, evidence, draws=2000, alpha=1e-5, rng=seed)
+        assert not invariant(mixed, net, evidence, draws=2000, alpha=1e-5, rng=seed)
         asked += 1
     assert asked > 5
 

@@ -238,10 +238,15 @@ def sampler(mean: float, sd: float, slope: float = 0.5) -> Any:
         (sampler(0.0, 0.5), "too narrow"),  # the variance for the standard deviation
         (sampler(0.0, 1.5), "too wide"),
         (sampler(0.4, 0.5**0.5), "too high"),
+        (
+            sampler(3.0, 0.5**0.5),
+            "node 'x': draws lie too high",
+        ),  # one tail holds nearly all truths
+        (sampler(-10.0, 0.5**0.5), "node 'x': draws lie too low"),
         (sampler(0.0, 1.0, 1.0), "too low"),  # the prior ignored
         (sampler(0.0, 1.0, 0.0), "too low"),  # the data ignored
     ],
-    ids=["narrow", "wide", "shifted", "no prior", "no data"],
+    ids=["narrow", "wide", "shifted", "far up", "far down", "no prior", "no data"],
 )
 def test_wrong_samplers_are_caught(wrong: Any, words: str) -> None:
     found = simulation_based_calibration(wrong, normal_net(), replications=120, rng=0)

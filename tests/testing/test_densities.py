@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from bayesmc.errors import BroadcastError, UnknownNodeError, UnsupportedError
 from bayesmc.testing.densities.conditionals import check_cpd
 from bayesmc.testing.densities.density import check_density
 from bayesmc.testing.densities.masses import Element, table_of, volume_of
+from bayesmc.testing.verdict import uncounted
 
 HALF = 0.5 * math.log(2 * math.pi)
 D = bmc.Density
@@ -122,6 +124,14 @@ class Wrong(bmc.Normal):
         return super().ppf(q) + 0.01
 
 
+def counted(rate: float) -> Any:
+    return lambda k: k * np.log(rate) - rate - scipy.special.gammaln(k + 1.0)
+
+
+def zeta_like(k: Any) -> Any:
+    return -1.5 * np.log(k + 1.0) - np.log(scipy.special.zeta(1.5))
+
+
 FAULTS = {
     "not normalised": (D(lambda x: gauss(x) + 0.1), "integrates to 1.105"),
     "no logarithm": (D(lambda x: np.exp(gauss(x)), support="positive"), "the LOG density"),
@@ -160,6 +170,23 @@ FAULTS = {
           "nonnegative integer"),
         "draws against the probabilities",
     ),
+    "half numbers for whole ones": (
+        D(counted(2.0), lambda r, s: r.poisson(2.0, s) + 0.5, (), "nonnegative integer"),
+        "sample gives 3.5, off the support",
+    ),
+    "millions, twice as many": (
+        D(counted(1e6), lambda r, s: r.poisson(2e6, s), (), "nonnegative integer"),
+        "share of the draws from",
+    ),
+    "millions, of a few": (
+        D(counted(2.0), lambda r, s: r.poisson(2.0, s) + 10**7, (), "nonnegative integer"),
+        "share of the draws from",
+    ),
+    "a tail too light": (
+        D(zeta_like, lambda r, s: np.minimum(r.zipf(1.7, s), 2**50) - 1.0, (), "nonnegative integer"),
+        "draws against the probabilities",
+    ),
+    "complex numbers": (D(gauss, lambda r, s: r.normal(size=s) + 1j), "return real ones"),
     "whole numbers not normalised": (
         D(lambda k: k * np.log(0.5), support="nonnegative integer"),
         "probabilities sum to 2",
@@ -177,6 +204,16 @@ def test_every_fault_is_told_in_words(kind: str) -> None:
     check = check_density(density, draws=2000, rng=0)
     assert not check
     assert any(words in fault for fault in check.faults), check
+    assert "log_prob is -2.4" not in repr(check)  # at a point of the support
+
+
+def test_whole_numbers_in_the_millions_are_summed() -> None:
+    def right(rng: Any, shape: Any) -> Any:
+        return rng.poisson(1e6, shape)
+
+    check = check_density(D(counted(1e6), right, (), "nonnegative integer"), draws=2000, rng=0)
+    assert check
+    assert "draws against the probabilities" in str([c.what for c in check.comparisons])
 
 
 def test_a_density_off_its_support_is_heard_of() -> None:
@@ -247,12 +284,22 @@ def test_volumes_are_found_without_the_sampler(dist: bmc.Distribution) -> None:
 def test_sums_reach_far_and_say_when_they_do_not() -> None:
     table = table_of(Element(bmc.Poisson(5000.0), ()), np.array([3.0]))
     assert table.is_whole and abs(table.probs.sum() - 1) < 1e-10
-    heavy = D(
-        lambda k: -1.5 * np.log(k + 1.0) - np.log(scipy.special.zeta(1.5)),
-        support="nonnegative integer",
-    )
+    heavy = D(zeta_like, support="nonnegative integer")
     assert not table_of(Element(heavy, ()), np.array([0.0])).is_whole
     assert "tail is too long" in repr(check_density(heavy, rng=0))
+
+
+def test_draws_of_a_tail_that_is_not_summed_are_held_against_it() -> None:
+    """Half of the draws choose a range, in which the others come as often as they should; at 0.01."""
+
+    def right(rng: Any, shape: Any) -> Any:
+        return np.minimum(rng.zipf(1.5, shape), 2**50) - 1.0
+
+    heavy = D(zeta_like, right, (), "nonnegative integer")
+    with uncounted():
+        found = [check_density(heavy, draws=1000, alpha=0.01, rng=s) for s in range(8)]
+    assert sum(not check for check in found) <= 1
+    assert "share of the draws" in str([c.what for c in found[0].comparisons])
 
 
 # ---- nodes --------------------------------------------------------------------------------------

@@ -347,6 +347,11 @@ def test_what_has_no_draws_says_so() -> None:
         ({"names": "x"}, "sequence of names"),
         ({"names": []}, None),
         ({"draws": 3}, "30 or more"),
+        ({"quantiles": 0.5}, "a sequence of levels"),
+        ({"rtol": -1.0}, "rtol=-1.0.: give a finite number, 0 or more"),
+        ({"rtol": np.nan}, "rtol=nan"),
+        ({"rtol": "a"}, "rtol='a'"),
+        ({"min_count": -1}, "min_count=-1"),
     ],
 )
 def test_wrong_options_are_named(options: dict, words: str | None) -> None:

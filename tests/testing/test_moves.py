@@ -13,7 +13,13 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import BayesmcError, EvidenceError, ModelError, UnsupportedError
+from bayesmc.errors import (
+    BayesmcError,
+    DensityError,
+    EvidenceError,
+    ModelError,
+    UnsupportedError,
+)
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.factor_slice import FactorSlice
@@ -21,7 +27,15 @@ from bayesmc.kernels.proposed import Proposed
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
-from bayesmc.testing import Verdict, geweke_test, random_net, rank_test, uncounted
+from bayesmc.testing import (
+    JointModel,
+    Verdict,
+    geweke_test,
+    random_net,
+    rank_test,
+    simulation_based_calibration,
+    uncounted,
+)
 from bayesmc.testing.kernels.joint import NetJoint
 from bayesmc.testing.kernels.machines import Machine
 from bayesmc.testing.kernels.moves import moves_of
@@ -85,7 +99,7 @@ def only_moved(step: Callable) -> Callable:
 @pytest.mark.parametrize("batched", [False, True])
 def test_functions_of_one_state_and_of_many(batched: bool) -> None:
     sizes = {"batched": batched, "alpha": ALPHA, "rng": 3}
-    draws, count = (200, 1000) if batched else (40, 300)
+    draws, count = (200, 1000) if batched else (40, 900)
     assert rank_test(sweep, labelled(), back, replications=count, **sizes)
     assert geweke_test(only_moved(sweep), labelled(), draws=draws, **sizes)
     assert not rank_test(faulty, labelled(), faulty_back, replications=count, **sizes)
@@ -95,7 +109,7 @@ def test_functions_of_one_state_and_of_many(batched: bool) -> None:
 
 
 def test_a_step_in_one_order_is_not_its_own_reverse() -> None:
-    found = rank_test(sweep, labelled(), batched=True, replications=20_000, rng=0)
+    found = rank_test(sweep, labelled(), batched=True, replications=60_000, rng=0)
     assert not found
     assert "keeps no detailed balance" in repr(found)
     assert rank_test(draw_z, labelled(), batched=True, replications=20_000, rng=0, alpha=ALPHA)
@@ -399,6 +413,72 @@ def test_rare_states_raise_no_alarm() -> None:
     assert sum(not f for f in found) < 4
     often = geweke_test(lambda s, rng: {"a": 1}, net, statistics=statistics, draws=20, rng=0)
     assert not often  # what finds the rare state all the time does
+
+
+def pair() -> bmc.BayesNet:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    return net
+
+
+@pytest.mark.parametrize("test", [rank_test, geweke_test])
+def test_a_kernel_that_pays_the_data_no_heed_is_caught(test: Any) -> None:
+    """It keeps the joint law where new data are drawn after its move."""
+    assert not test(lambda state, rng: {"x": rng.normal()}, pair(), rng=0)
+
+
+@pytest.mark.parametrize("test", [rank_test, geweke_test, simulation_based_calibration])
+def test_random_numbers_of_the_users_own_may_have_the_same_seed(test: Any) -> None:
+    """Of a test's generator and one beside it, both made from 0."""
+    own = np.random.default_rng(0)
+
+    def step(state: dict, rng: Any) -> dict:
+        return {
+            "x": own.normal(
+                state["y"] / 2, 0.5**0.5, *([9] * (test is simulation_based_calibration))
+            )
+        }
+
+    assert test(step, pair(), alpha=ALPHA, rng=0)
+
+
+def test_figures_of_geweke_are_told_to_be_scaled() -> None:
+    def high(state: dict, rng: Any) -> dict:
+        return {"x": rng.normal(state["y"] / 2 + 1.0, 0.5**0.5)}
+
+    found = geweke_test(high, pair(), draws=50, rng=0)
+    assert found.is_scaled and "less their median under the joint law" in repr(found)
+    own = geweke_test(high, pair(), draws=50, statistics={"x": lambda x: x}, rng=0)
+    assert not own.is_scaled and "median" not in repr(own)
+
+
+@pytest.mark.parametrize("test", [rank_test, geweke_test])
+@pytest.mark.parametrize(
+    ("kernel", "words"),
+    [
+        (lambda x, y, rng: None, r"kernel\(state, data, rng\) of the JointModel returned None"),
+        (lambda x, rng: x, r"takes \(state, data, rng\), but this one wants 2 arguments"),
+    ],
+)
+def test_kernels_of_models_that_are_no_nets(test: Any, kernel: Any, words: str) -> None:
+    statistics = {"x": lambda x, y: x}
+    model = JointModel(lambda rng, n: rng.normal(size=n), lambda x, rng: None, statistics)
+    with pytest.raises(ModelError, match=words):
+        test(kernel, model)
+
+
+def test_words_for_numbers_that_are_none() -> None:
+    step = draw_a
+    expecting(EvidenceError, "returned NaN for 'x'", lambda s, rng: {"x": np.nan}, pair())
+    complex_ = {"c": lambda x: 1j * x}
+    with pytest.raises(TypeError, match="'c' returned complex128; return real numbers"):
+        geweke_test(lambda s, rng: s, pair(), statistics=complex_)
+    with pytest.raises(DensityError, match="NaN among the draws of 'x'"):
+        simulation_based_calibration(lambda e, rng: {"x": np.full(9, np.nan)}, pair())
+    expecting(TypeError, "observed=3: give the name of a node", step, pair(), observed=3)
+    expecting(EvidenceError, "are a list; give a dict", step, pair(), inputs=[1])
+    expecting(UnsupportedError, "moves no states", lambda s, *, rng: s, pair())
 
 
 def test_words_for_what_is_no_joint_law() -> None:

@@ -59,6 +59,13 @@ def test_the_smallest_net_is_that_of_the_fault() -> None:
     )
 
 
+def test_plates_that_nothing_is_on_are_dropped() -> None:
+    net = smallest(bayes_nets(plates=True, nodes=(1, 3)), lambda net: True)
+    assert as_code(net).splitlines()[0] == "net = bmc.BayesNet()"
+    one = smallest(bayes_nets(plates=True), lambda net: any(net[n].plates for n in net))
+    assert len(one.plates) == 1
+
+
 def test_the_smallest_of_the_others() -> None:
     case = smallest(dbns(), lambda case: case.steps > 1)
     assert case.steps == 2 and len(case.dbn.template.later) == 1
@@ -337,6 +344,9 @@ def test_evidence_is_that_of_the_net() -> None:
         (lambda: bayes_nets(parents=-1), ValueError, "parents=-1"),
         (lambda: bayes_nets(coupling=-1.0), ValueError, "coupling=-1.0: give a factor"),
         (lambda: bayes_nets(coupling=np.nan), ValueError, "coupling=nan"),
+        (lambda: bayes_nets(coupling="a"), TypeError, "coupling='a'.: give a number"),
+        (lambda: bayes_nets(plates=2), TypeError, "plates=2.: give True or False"),
+        (lambda: log_weights(huge=3), TypeError, "huge=3.: give True or False"),
         (lambda: bayes_nets(continuous=True, hybrid=True), ValueError, "give one"),
         (lambda: bayes_nets(continuous=True, nodes=(4, 4)), ValueError, r"32\*\*4 = 1048576; allow"),
         (lambda: dbns(steps=(0, 2)), ValueError, "dbns: steps="),
@@ -352,6 +362,7 @@ def test_evidence_is_that_of_the_net() -> None:
         (lambda: log_weights(zeros=False, all_zero=True), ValueError, "needs zeros=True"),
         (lambda: evidence_for(bmc.Normal(0.0, 1.0)), TypeError, "give a BayesNet, not Normal"),
         (lambda: evidence_for(random_net(1), 40), ValueError, "chance=40"),
+        (lambda: evidence_for(random_net(1), "a"), ValueError, "chance='a'"),  # type: ignore[arg-type]
     ],
 )  # fmt: skip
 def test_wrong_options_are_told(ask: Callable[[], Any], error: type, words: str) -> None:

@@ -103,7 +103,7 @@ def check_cpd(
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ValueError(f"{call}: {key}={value!r}; give a whole number, {least} or more")
     Verdict("check_cpd", alpha, ())
-    if name not in net:
+    if not isinstance(name, str) or name not in net:
         raise UnknownNodeError(f"{call}: no node {name!r}; there are {', '.join(net.nodes)}")
     report = Report(alpha, np.random.default_rng(seed_sequence(rng)))
     # faults elsewhere are no faults of its

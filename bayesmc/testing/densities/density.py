@@ -179,6 +179,8 @@ def _samples(dist: Distribution, report: Report, draws: int) -> np.ndarray | Non
     except UnsupportedError as error:
         report.remark(f"draws: {error}")
         return None
+    if samples.dtype.kind not in "biuf":
+        raise TypeError(f"sample gives {samples.dtype} numbers; return real ones")
     event = dist.batch_shape + dist.event_shape
     for lead in ((), (3,), (2, 3)):
         shape = np.shape(dist.sample(seed, lead))
@@ -352,7 +354,7 @@ def _outer(element: Element, points: np.ndarray) -> Iterator[np.ndarray]:
         ends = [(support.low, -step), (support.high, step)]
         numbers = [b + s * max(1.0, abs(b) * 1e-6) for b, s in ends if np.isfinite(b)]
         if kind == "integers":
-            numbers.append(float(np.ravel(points)[0]) + 0.5)
+            numbers.append(float(np.floor(np.ravel(points)[0])) + 0.5)
         for number in numbers:
             value = np.array(points[0], dtype=float)
             value[(0,) * len(shape)] = number

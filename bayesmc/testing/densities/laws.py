@@ -172,6 +172,8 @@ def check_table(element: Element, samples: np.ndarray | None, table: Table, repo
     total = float(table.probs.sum())
     if not table.is_whole and not total > 1 + _ROUNDING:
         report.remark("sum of the probabilities: its tail is too long to be summed")
+        if samples is not None:
+            _check_window(samples, table, report)
         return
     words = f"the probabilities sum to {total:.6g}, not to 1"
     report.agree("sum", total, 1.0, _ROUNDING, words)
@@ -189,6 +191,26 @@ def check_table(element: Element, samples: np.ndarray | None, table: Table, repo
     heavy = heavy[np.linspace(0, len(heavy) - 1, min(7, len(heavy))).astype(int)]
     normal = Table(table.values, probs, True)
     _check_cdf(element, table.values[heavy], below[heavy] - probs[heavy] / 2, normal.cdf, report)
+
+
+def _check_window(samples: np.ndarray, table: Table, report: Report) -> None:
+    """Half of the draws choose a range of values; how many of the others fall in it is binomial."""
+    from scipy.stats import binomtest
+
+    first, second = np.array_split(samples, 2)
+    values, probs = table.values, table.probs
+    inside = (values >= first.min()) & (values <= first.max())
+    if not inside.any():
+        return
+    low, high, p = values[inside][0], values[inside][-1], min(float(probs[inside].sum()), 1.0)
+    kept = second[(second >= low) & (second <= high)]
+    n = len(second)
+    z = abs(len(kept) - n * p) / math.sqrt(max(n * p * (1 - p), 1.0))
+    what = f"share of the draws from {low:.0f} to {high:.0f}"
+    p_value = float(binomtest(len(kept), n, p).pvalue)
+    report.judge(what, len(kept) / n, p, z, p_value)
+    if p > 0 and len(kept):
+        _check_counts(kept, values[inside], probs[inside] / probs[inside].sum(), report)
 
 
 def _check_counts(

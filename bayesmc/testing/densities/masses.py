@@ -156,7 +156,7 @@ def line_of(element: Element, points: np.ndarray) -> InverseCdf:
 def table_of(element: Element, points: np.ndarray) -> Table:
     """Probabilities of a variable on whole numbers, summed outwards from ``points`` until none counts."""
     low, high = float(element.support.low), float(element.support.high)
-    inside = points[(points >= low) & (points <= high)]
+    inside = points[(points >= low) & (points <= high) & (points == np.floor(points))]
     if len(inside):
         start, stop = float(inside.min()), float(inside.max())
     else:
@@ -167,12 +167,13 @@ def table_of(element: Element, points: np.ndarray) -> Table:
     for side in (-1, 1):
         end = low if side < 0 else high
         edge, width, before = (start if side < 0 else last), 64.0, math.inf
+        taken = 0
         while edge != end:
             room = abs(end - edge)
             more = edge + side * np.arange(1, min(width, room) + 1)
             added = np.exp(element.log_prob(more))
             values, probs = np.append(values, more), np.append(probs, added)
-            edge, width = float(more[-1]), width * 2
+            edge, width, taken = float(more[-1]), width * 2, taken + len(more)
             found = float(probs.sum())
             share = float(added.sum()) / found if found > 0 else math.inf
             if np.isfinite(end) and abs(end - start) < _MOST_VALUES:
@@ -180,7 +181,7 @@ def table_of(element: Element, points: np.ndarray) -> Table:
             if share < _NEGLIGIBLE and before < _NEGLIGIBLE:
                 break
             before = share
-            if len(values) > _MOST_VALUES or math.isnan(share):
+            if taken > _MOST_VALUES or math.isnan(share):
                 is_whole = False
                 break
     order = np.argsort(values)

@@ -16,7 +16,7 @@ import numpy as np
 import scipy.special
 
 from bayesmc.network import BayesNet
-from bayesmc.randomness import seed_sequence
+from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.testing.kernels.joint import JointModel, check_sizes, values_of
 from bayesmc.testing.kernels.moves import moves_of
 from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
@@ -35,10 +35,21 @@ class GewekeResult(Verdict):
     ----------
     p_values, ess : dict
         Statistic -> two-sided p-value; effective number of draws under the kernel.
+    is_scaled : bool
+        Whether the statistics are those taken by default, which are scaled and bounded.
     """
 
     p_values: Mapping[str, float] = field(default_factory=dict)
     ess: Mapping[str, float] = field(default_factory=dict)
+    is_scaled: bool = False
+
+    def _remarks(self) -> list[str]:
+        if not (self.is_scaled and self.rejected):
+            return []
+        return [
+            "  (numbers here are those of nodes less their median under the joint law, over their spread; of "
+            "what is above zero, of its logarithm)"
+        ]
 
 
 def geweke_test(
@@ -60,9 +71,9 @@ def geweke_test(
 
     Two simulators of the joint law of state and data are compared. The marginal-conditional one draws the
     state from the prior and data given the state. The successive-conditional one starts there too, and
-    then alternates: the kernel moves the state given the data, and new data are drawn given the state.
+    then alternates: new data are drawn given the state, and the kernel moves the state given the data.
     If the kernel leaves the posterior invariant for all data, both have the same law, and so the same mean
-    of every statistic.
+    of every statistic. Statistics are read from the state with the data that it was moved by.
 
     A difference of means is judged by its standard error: the variance of the first simulator, whose draws
     are independent, over the number of those and the effective number of the second's (all chains
@@ -147,7 +158,7 @@ def geweke_test(
     check_level("geweke_test", alpha)
     check_sizes("geweke_test", draws=(10 if draws is None else draws, 10), chains=(chains, 8),
                 thinning=(thinning, 1))  # fmt: skip
-    generator = np.random.default_rng(seed_sequence(rng))
+    generator = stream(seed_sequence(rng), Purpose.TEST)
     moves = moves_of(
         "geweke_test", kernel, net, observed=observed, inputs=inputs, statistics=statistics,
         batched=batched, warmup=warmup, rows=chains,
@@ -161,11 +172,11 @@ def geweke_test(
         data = moves.simulate(state, generator)
         joint[t] = values_of("geweke_test", moves.statistics, state, data, chains)
     state = moves.prior(generator, chains)
-    data = moves.simulate(state, generator)
     for t in range(draws):
         for _ in range(thinning):
-            state = moves.forward(state, data, generator)
             data = moves.simulate(state, generator)
+            state = moves.forward(state, data, generator)
+        # with the data that it was moved by: new ones would hide a kernel that pays them no heed
         successive[t] = values_of("geweke_test", moves.statistics, state, data, chains)
     found = [_compare_means(name, joint[:, s], successive[:, s].T) for s, name in enumerate(names)]
     judged = [c for c, _ in found if c is not None]
@@ -173,7 +184,15 @@ def geweke_test(
     ess = {name: size for name, (_, size) in zip(names, found, strict=True)}
     p_values = MappingProxyType({c.what: c.p_value for c in judged})
     return counted(
-        GewekeResult("geweke_test", alpha, comparisons, len(names) - len(judged), p_values, ess)
+        GewekeResult(
+            "geweke_test",
+            alpha,
+            comparisons,
+            len(names) - len(judged),
+            p_values,
+            ess,
+            statistics is None and not isinstance(net, JointModel),
+        )
     )
 
 

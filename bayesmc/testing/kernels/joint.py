@@ -7,7 +7,7 @@ known here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -217,6 +217,8 @@ class NetJoint(NetStates):
         if observed is None:
             leaves = tuple(n for n in self.stochastic if n not in above)
             return leaves if len(leaves) < len(self.stochastic) else ()
+        if not isinstance(observed, (str, Sequence, Set)):
+            raise TypeError(f"observed={observed!r}: give the name of a node, or a list of names")
         chosen = (observed,) if isinstance(observed, str) else tuple(observed)
         for name in chosen:
             if name not in nodes:
@@ -253,6 +255,7 @@ class NetJoint(NetStates):
                     f"statistic {name!r} returned shape {value.shape} for {rows} rows; return one number for "
                     "each: keep the leading axis and reduce the others (axis=-1)"
                 )
+            _check_real(name, np.asarray(value))
             return np.asarray(value, dtype=float)
 
         return statistic
@@ -271,9 +274,10 @@ def values_of(call: str, statistics: Statistics, state: Any, data: Any, rows: in
         value = np.asarray(statistic(state, data))
         if value.shape != (rows,):
             raise ShapeError(
-                f"{call}: statistic {name!r} returned shape {value.shape} for {rows} rows; "
-                f"return one number for each row, shape ({rows},)"
+                f"{call}: statistic {name!r} returned shape {value.shape} for {rows} rows; return one number "
+                f"for each row, shape ({rows},), and let states and data of a JointModel have as many rows"
             )
+        _check_real(name, value)
         out[i] = value
         if not np.isfinite(out[i]).all():
             row = int(np.flatnonzero(~np.isfinite(out[i]))[0])
@@ -289,6 +293,11 @@ def check_sizes(call: str, **sizes: tuple[Any, int]) -> None:
     for name, (size, least) in sizes.items():
         if not isinstance(size, (int, np.integer)) or size < least:
             raise ValueError(f"{call}({name}={size!r}): give a whole number, at least {least}")
+
+
+def _check_real(name: str, value: np.ndarray) -> None:
+    if value.dtype.kind not in "biuf":
+        raise TypeError(f"statistic {name!r} returned {value.dtype}; return real numbers")
 
 
 def _count(state: Rows) -> int:

@@ -22,7 +22,7 @@ from bayesmc.testing.kernels.joint import (
 )
 from bayesmc.testing.kernels.machines import Machine
 from bayesmc.testing.kernels.statistics import default_statistics
-from bayesmc.testing.kernels.steps import StepFunction, is_step
+from bayesmc.testing.kernels.steps import StepFunction, is_step, positional
 from bayesmc.testing.verdict import Comparison
 
 
@@ -114,15 +114,36 @@ def _of_model(
     for name in ("prior", "simulate"):
         if not callable(getattr(model, name)):
             raise ModelError(f"{call}: JointModel({name}=...) is no function")
+    for move in (kernel, reverse):
+        if move is not None and positional(move) not in (3, None):
+            raise ModelError(
+                f"{call}: the kernel of a JointModel takes (state, data, rng), but this one wants "
+                f"{positional(move)} arguments"
+            )
     check_statistics(call, model.statistics, "statistic(state, data)")
+    forward = _returning(call, "kernel(state, data, rng)", kernel)
     return Moves(
-        model.prior,
-        model.simulate,
+        _returning(call, "prior(rng, n)", model.prior),
+        model.simulate,  # data may be None
         model.statistics,
-        kernel,
-        kernel if reverse is None else reverse,
+        forward,
+        forward if reverse is None else _returning(call, "reverse(state, data, rng)", reverse),
         is_own_reverse=reverse is None,
     )
+
+
+def _returning(call: str, what: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function, which must not forget to return something."""
+
+    def checked(*arguments: Any) -> Any:
+        found = function(*arguments)
+        if found is None:
+            raise ModelError(
+                f"{call}: {what} of the JointModel returned None; return arrays of rows"
+            )
+        return found
+
+    return checked
 
 
 def _of_function(call: str, step: Any, joint: NetJoint, batched: bool) -> Move:

@@ -17,7 +17,7 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet
-from bayesmc.randomness import seed_sequence
+from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.testing.kernels.joint import JointModel, Move, Statistics, check_sizes, values_of
 from bayesmc.testing.kernels.moves import moves_of
 from bayesmc.testing.kernels.uniformity import uniformity_p_value
@@ -172,7 +172,7 @@ def rank_test(
     check_level("rank_test", alpha)
     check_sizes("rank_test", steps=(steps, 1), replications=(replications, 20),
                 thinning=(thinning, 1), stages=(stages, 1), growth=(growth, 1))  # fmt: skip
-    generator = np.random.default_rng(seed_sequence(rng))
+    generator = stream(seed_sequence(rng), Purpose.TEST)
     moves = moves_of(
         "rank_test", kernel, net, reverse=reverse, observed=observed, inputs=inputs,
         statistics=statistics, batched=batched, warmup=warmup, rows=replications,

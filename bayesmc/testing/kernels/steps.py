@@ -33,6 +33,8 @@ def positional(function: Any) -> int | None:
         parameters = inspect.signature(function).parameters.values()
     except (TypeError, ValueError):
         return None
+    if any(p.kind is p.KEYWORD_ONLY and p.default is p.empty for p in parameters):
+        return 0  # what is asked for by name is not given here
     kinds = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return sum(p.kind in kinds and p.default is inspect.Parameter.empty for p in parameters)
 
@@ -99,6 +101,11 @@ class StepFunction:
                 raise EvidenceError(
                     f"{self.call}: step(state, rng) returned what is no value: {said}"
                 ) from None
+            if np.isnan(stored).any():
+                raise EvidenceError(
+                    f"{self.call}: step(state, rng) returned NaN for {name!r}; look for a logarithm or a "
+                    "root of something negative"
+                )
             if stored.shape != batch + node.value_shape:
                 lead = 0 if self.batched else 1  # of one state no rows are seen
                 raise EvidenceError(

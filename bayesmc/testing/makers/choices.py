@@ -86,6 +86,12 @@ def read_options(call: str, kind: type[T], options: Mapping[str, Any]) -> T:
     unknown = [name for name in options if name not in names]
     if unknown:
         raise TypeError(f"{call}({unknown[0]}=...): no such option; it takes {', '.join(names)}")
+    for field in fields(kind):  # type: ignore[arg-type]
+        given = options.get(field.name, field.default)
+        if field.type == "bool" and not isinstance(given, (bool, np.bool_)):
+            raise TypeError(f"{call}({field.name}={given!r}): give True or False")
+        if field.type == "float" and not isinstance(given, (int, float, np.number)):
+            raise TypeError(f"{call}({field.name}={given!r}): give a number")
     try:
         return kind(**options)
     except ValueError as error:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.network import BayesNet
+from bayesmc.network.parts import without_idle_plates
 from bayesmc.testing.makers.choices import Choices, read_options, read_range, seeded
 from bayesmc.testing.makers.spelling import (
     affine,
@@ -413,7 +414,7 @@ def build_net(choices: Choices, options: NetOptions) -> BayesNet:
             break
         choices.group(lambda inner, n=number: builder.add(n, inner))  # type: ignore[misc]
     builder.net.name = "; ".join(builder.story)
-    return builder.net
+    return without_idle_plates(builder.net)
 
 
 _CONTINUOUS = ("normal", "student", "gamma", "beta", "exponential", "uniform")

@@ -86,8 +86,8 @@ def evidence_for(net: BayesNet, chance: float = 0.4) -> SearchStrategy[dict[str,
     """
     if not isinstance(net, BayesNet):
         raise TypeError(f"evidence_for({net!r}): give a BayesNet, not {type(net).__name__}")
-    if not 0.0 <= chance <= 1.0:
-        raise ValueError(f"evidence_for(chance={chance}): give a probability")
+    if not isinstance(chance, (int, float, np.number)) or not 0.0 <= chance <= 1.0:
+        raise ValueError(f"evidence_for(chance={chance!r}): give a probability")
     return _strategy(lambda choices: build_evidence(net, choices, chance))
 
 

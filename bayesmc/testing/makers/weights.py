@@ -26,7 +26,7 @@ class WeightOptions:
     size : int or (int, int)
         How many, or fewest and most.
     ties : bool
-        Many equal values.
+        Often of two values alone. Without it few values may still be equal.
     zeros : bool
         Weights of zero, minus infinity.
     huge : bool

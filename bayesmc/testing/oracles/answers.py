@@ -19,7 +19,7 @@ import scipy.special
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.dbn.unroll import indexed
 from bayesmc.distributions import marking_invalid
-from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import BudgetError, ModelError, ShapeError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, Model, Problem, pose
 from bayesmc.network.joint import node_log_prob
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
@@ -133,7 +133,7 @@ class ExactAnswer:
 
         The nodes are ``names``, or the function's arguments. Under Gaussians the function is integrated
         by Gauss-Hermite rules over at most three scalars: exact for polynomials of degree below 48,
-        good for smooth functions, and poor for those that jump.
+        good for smooth functions, and poor (off by some 0.05) for those that jump: ask ``cdf`` for chances.
 
         Raises
         ------
@@ -445,4 +445,9 @@ def _hermite(
         stored = np.stack(columns, axis=-1).reshape(len(kept), *node.plate_shape)
         arguments.append(node.decode(np.repeat(stored, len(grid), axis=0)))
     result = np.asarray(function(*arguments), dtype=float)
+    if result.shape[:1] != (len(flat),):
+        raise ShapeError(
+            f"expectation: the function returned shape {result.shape} for {len(flat)} rows; keep the leading "
+            "axis: one value for each row"
+        )
     return np.tensordot(joint, result, axes=(0, 0))

@@ -32,7 +32,7 @@ from bayesmc.randomness import seed_sequence
 from bayesmc.testing.kernels.joint import check_sizes
 from bayesmc.testing.oracles.answers import exact as exact_answer
 from bayesmc.testing.posteriors.skewed import mean_p_value
-from bayesmc.testing.verdict import Comparison, Verdict, counted
+from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 
 _CALL = "unbiased_evidence_test"
 #: shape of the tail of the ratios from which on their variance may be infinite
@@ -194,8 +194,7 @@ def unbiased_evidence_test(
     False
     """
     check_sizes(_CALL, replications=(replications, 100))
-    if not 0.0 < alpha < 1.0:
-        raise ValueError(f"{_CALL}(alpha={alpha}): give a probability strictly between 0 and 1")
+    check_level(_CALL, alpha)
     log_exact, accuracy = _exact(engine, net, evidence, inputs, exact)
     estimate = _estimator(engine, net, evidence, inputs)
     seeds = seed_sequence(rng).spawn(replications)
@@ -290,7 +289,7 @@ def _one(estimate: Callable[[np.random.SeedSequence], Any], seed: np.random.Seed
     if found is None:
         raise UnsupportedError(
             f"{_CALL}: the engine gives no log evidence; LikelihoodWeighting, Importance, Rejection and "
-            "ParticleFilter do"
+            "ParticleFilter do, and a function estimate(rng) returns the log of its estimate"
         )
     if np.ndim(found) != 0 or np.asarray(found).dtype.kind not in "iuf":
         raise TypeError(

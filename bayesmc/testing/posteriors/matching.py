@@ -33,7 +33,7 @@ from bayesmc.testing.posteriors.figures import (
 )
 from bayesmc.testing.posteriors.samples import Draws, energy_comparison
 from bayesmc.testing.posteriors.slices import SlicePosterior
-from bayesmc.testing.verdict import Verdict, counted
+from bayesmc.testing.verdict import Verdict, check_level, counted
 
 #: rows of a joint sample below which it is not judged
 _MIN_ROWS = 30
@@ -128,7 +128,8 @@ def compare(
     quantiles : sequence of float
         Compare these; none where empty.
     draws : int
-        Joint draws to compare, of each side, at most; a few hundred tell a lot, 1000 are used at most.
+        Joint draws to compare, of each side, at most: 0, or 30 and more. A few hundred tell a lot, 1000 are
+        used at most.
     rng : seed, Generator or None
         For ``draws``.
 
@@ -240,11 +241,17 @@ def _match(
     draws: int,
     rng: Any,
 ) -> Match:
-    if not all(0 < q < 1 for q in quantiles):
-        raise ValueError(f"{test}(quantiles={quantiles!r}): give levels strictly between 0 and 1")
+    levels = np.asarray(quantiles)
+    if levels.ndim != 1 or not (levels.size == 0 or np.all((levels > 0) & (levels < 1))):
+        raise ValueError(
+            f"{test}(quantiles={quantiles!r}): give a sequence of levels strictly between 0 and 1"
+        )
+    for what, number in (("rtol", rtol), ("min_count", min_count)):
+        if not isinstance(number, (int, float, np.number)) or not 0.0 <= number < np.inf:
+            raise ValueError(f"{test}({what}={number!r}): give a finite number, 0 or more")
     if isinstance(names, str):
         raise ValueError(f"{test}(names={names!r}): give a sequence of names, as in [{names!r}]")
-    Verdict(test, alpha, ())  # says what is wrong with alpha before work is done
+    check_level(test, alpha)  # before work is done
     posterior = _read(test, posterior, exact)
     table = Table(rtol + getattr(exact, "accuracy", 0.0), min_count)
     sample = Draws(posterior) if isinstance(posterior, DrawsPosterior) else None

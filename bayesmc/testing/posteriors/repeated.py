@@ -17,7 +17,7 @@ from bayesmc.errors import ShapeError
 from bayesmc.randomness import seed_sequence
 from bayesmc.testing.kernels.joint import check_sizes
 from bayesmc.testing.posteriors.skewed import mean_p_value
-from bayesmc.testing.verdict import Comparison, Verdict, counted
+from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
 
 _CALL = "repeated_test"
 #: relative difference of figures without chance in them
@@ -94,17 +94,21 @@ def repeated_test(
     >>> bool(repeated_test(offspring, weights, rng=0))
     True
     """
+    if not callable(estimate):
+        raise TypeError(f"{_CALL}: estimate={estimate!r}; give a function estimate(rng)")
     check_sizes(_CALL, replications=(replications, 2))
     if not (math.isfinite(accuracy) and accuracy >= 0.0):
         raise ValueError(f"{_CALL}(accuracy={accuracy!r}): give a number, 0 or more")
-    Verdict(_CALL, alpha, ())  # says what is wrong with alpha before work is done
-    wanted = _named(exact)
+    check_level(_CALL, alpha)
+    wanted = _named("exact", exact)
+    if not sum(value.size for value in wanted.values()):
+        raise ValueError(f"{_CALL}: exact={exact!r} holds no figure; give one number or more")
     for name, value in wanted.items():
         if not np.isfinite(value).all():
             raise ValueError(f"{_CALL}: exact{_of(name)} holds what is no number: {value}")
     runs: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
     for child in seed_sequence(rng).spawn(replications):
-        found = _named(estimate(np.random.default_rng(child)))
+        found = _named("estimate(rng)", estimate(np.random.default_rng(child)))
         _check(found, wanted)
         for name, value in found.items():
             runs[name].append(value)
@@ -120,9 +124,17 @@ def repeated_test(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _named(answer: Any) -> dict[str, np.ndarray]:
+def _named(what: str, answer: Any) -> dict[str, np.ndarray]:
     named = answer if isinstance(answer, Mapping) else {"": answer}
-    return {name: np.asarray(value, dtype=float) for name, value in named.items()}
+    found = {name: np.asarray(value) for name, value in named.items()}
+    for name, value in found.items():
+        if value.dtype.kind not in "biuf":
+            given = f"{named[name]!r}"[:60]
+            raise TypeError(
+                f"{_CALL}: {what}{_of(name)} is {given}; give numbers, or a dict of name -> numbers, as in "
+                f"{_CALL}(estimate, exact) with a function estimate(rng)"
+            )
+    return {name: value.astype(float) for name, value in found.items()}
 
 
 def _of(name: str) -> str:

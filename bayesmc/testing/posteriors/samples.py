@@ -160,6 +160,8 @@ class Average:
         """Mean of draws that are worth ``ess`` independent ones, by default all of them."""
         value, n = float(draws.mean()), float(draws.size if ess is None else ess)
         off = draws - value
+        if not off.any():
+            return cls(value, 0.0, 0.0, 0.0)
         return cls._of_sums(value, *((off**k).mean() / n ** (k - 1) for k in (2, 3, 4)))
 
     @classmethod

@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.diagnostics import chain_statistic, weight_ess
 from bayesmc.engines.weighting import LikelihoodWeighting
-from bayesmc.errors import ShapeError, UnknownNodeError
+from bayesmc.errors import DensityError, ShapeError, UnknownNodeError
 from bayesmc.network import Model
 from bayesmc.network.evidence import store
 from bayesmc.results import ChainsPosterior, DrawsPosterior
@@ -91,6 +91,9 @@ def users_draws(call: str, found: Any, model: Model, names: tuple[str, ...]) -> 
             f"{call}: the sampler returned no draws of {lacking[0]!r}; return all hidden nodes, {list(names)}"
         )
     values = {n: store(model[n], found[n]) for n in names}
+    undefined = [n for n, v in values.items() if np.isnan(v).any()]
+    if undefined:
+        raise DensityError(f"{call}: the sampler returned NaN among the draws of {undefined[0]!r}")
     counts = {n: v.shape[: v.ndim - len(model[n].value_shape)] for n, v in values.items()}
     first = counts[names[0]]
     for name, batch in counts.items():
