@@ -121,11 +121,16 @@ def test_particle_chains_are_calibrated(engine: str) -> None:
             warnings.simplefilter("ignore", ConvergenceWarning)
             return bmc.infer(dbn, {"y": [evidence[n] for n in rows]}, engine=short, rng=rng)
 
-    found = simulation_based_calibration(
-        ask, dbn.unroll(steps), observed=rows, replications=session.scaled(20, 8), alpha=ALPHA,
-        rng=session.seed(),
-    )  # fmt: skip
+    def pay_no_heed(evidence: dict[str, Any], rng: Any) -> Any:
+        drawn = dbn.unroll(steps).sample(200, rng=rng)
+        return {n: v for n, v in drawn.items() if n not in rows}
+
+    options: dict[str, Any] = {"observed": rows, "replications": session.scaled(20, 8),
+                               "alpha": ALPHA, "rng": session.seed()}  # fmt: skip
+    found = simulation_based_calibration(ask, dbn.unroll(steps), **options)
     assert found, found
+    with uncounted():
+        assert not simulation_based_calibration(pay_no_heed, dbn.unroll(steps), **options)
 
 
 # ---- negative controls --------------------------------------------------------------------------

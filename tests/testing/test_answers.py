@@ -13,6 +13,7 @@ from bayesmc.errors import (
     BudgetError,
     ModelError,
     ParameterError,
+    ShapeError,
     UnknownNodeError,
     UnsupportedError,
     ZeroProbabilityError,
@@ -374,3 +375,14 @@ def test_what_cannot_be_known_finely_is_known_roughly() -> None:
     assert abs(rough.log_marginal_likelihood - fine.log_marginal_likelihood) < rough.accuracy
     with pytest.raises(BudgetError, match="is asked for"):
         quadrature_posterior(net, evidence, max_evaluations=40_000, rtol=1e-7)
+
+
+def test_slices_that_are_not_there_and_functions_of_all_rows_are_told() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    answer = exact(dbn, {"y": [1.0, 2.0]})
+    with pytest.raises(UnknownNodeError, match=r"'x\[7\]' is no node"):
+        answer.mean("x[7]")
+    with pytest.raises(ShapeError, match=r"returned shape \(\) for .* keep the leading axis"):
+        answer.expectation(lambda x: 1.0, "x[0]")

@@ -18,6 +18,7 @@ from bayesmc.errors import (
     DensityError,
     EvidenceError,
     ModelError,
+    UnknownNodeError,
     UnsupportedError,
 )
 from bayesmc.kernels.base import Kernel
@@ -202,12 +203,15 @@ def test_single_kernels(name: str, test: str) -> None:
 
 def test_a_sampler_of_finite_nets_is_posed_or_given_but_never_taken_for_the_other() -> None:
     """Tables are worked out of the evidence: kernels whose placeholder must not stand for all data."""
+    asked = 0
     for seed in range(24):
         net = random_net(seed, nodes=(2, 4))
         joint = NetJoint(net)
         if joint.observed:
             found = rank_test(bmc.Gibbs(), net, replications=100, alpha=1e-5, rng=seed)
             assert found, (seed, found)
+            asked += 1
+    assert asked >= 8
 
 
 class Restless(AdaptiveWalk):
@@ -476,6 +480,10 @@ def test_words_for_numbers_that_are_none() -> None:
         geweke_test(lambda s, rng: s, pair(), statistics=complex_)
     with pytest.raises(DensityError, match="NaN among the draws of 'x'"):
         simulation_based_calibration(lambda e, rng: {"x": np.full(9, np.nan)}, pair())
+    unknown = {"z": lambda zz: zz}
+    expecting(UnknownNodeError, "rank_test: statistic 'z': argument 'zz' is not a node; the net has x, y",
+              step, pair(), statistics=unknown)  # fmt: skip
+    expecting(ValueError, r"warmup=-1\): give", bmc.Gibbs(), pair(), warmup=-1)
     expecting(TypeError, "observed=3: give the name of a node", step, pair(), observed=3)
     expecting(EvidenceError, "are a list; give a dict", step, pair(), inputs=[1])
     expecting(UnsupportedError, "moves no states", lambda s, *, rng: s, pair())

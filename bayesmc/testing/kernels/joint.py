@@ -204,7 +204,7 @@ class NetJoint(NetStates):
     def read(self, call: str, statistics: Mapping[str, Callable[..., Any]]) -> Statistics:
         """Users' statistics, functions whose argument names are nodes, as functions of state and data."""
         check_statistics(call, statistics, "function of nodes, {'x squared': lambda x: x**2}")
-        return {name: self._reading(name, f) for name, f in statistics.items()}
+        return {name: self._reading(call, name, f) for name, f in statistics.items()}
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -240,8 +240,16 @@ class NetJoint(NetStates):
                 below.add(name)
         return tuple(n for n in self.stochastic if n in chosen)
 
-    def _reading(self, name: str, function: Callable[..., Any]) -> Callable[[Rows, Rows], Any]:
-        query = Query(self.model, function)
+    def _reading(
+        self, call: str, name: str, function: Callable[..., Any]
+    ) -> Callable[[Rows, Rows], Any]:
+        try:
+            query = Query(self.model, function)
+        except UnknownNodeError as error:
+            unknown = str(error).split(";")[0].removeprefix("query: ")
+            raise UnknownNodeError(
+                f"{call}: statistic {name!r}: {unknown}; the net has {', '.join(self.model.nodes)}"
+            ) from None
 
         def statistic(state: Rows, data: Rows) -> np.ndarray:
             rows = _count(state)

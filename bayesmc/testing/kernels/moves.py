@@ -18,6 +18,7 @@ from bayesmc.testing.kernels.joint import (
     Move,
     NetJoint,
     Statistics,
+    check_sizes,
     check_statistics,
 )
 from bayesmc.testing.kernels.machines import Machine
@@ -72,6 +73,8 @@ def moves_of(
     """A kernel of any kind on a net or `JointModel`, with the joint law it is held against."""
     if isinstance(net, JointModel):
         return _of_model(call, kernel, net, reverse, observed, inputs, statistics)
+    if warmup is not None:
+        check_sizes(call, warmup=(warmup, 0))
     joint = NetJoint(net, observed, inputs)
     found = default_statistics(joint) if statistics is None else joint.read(call, statistics)
     if is_step(kernel):

@@ -180,6 +180,7 @@ class ExactAnswer:
         if self.steps is None or all(name in self.names for name in names):
             self._known(*names)
             return ask(*names)
+        self._known(*(n for n in names if indexed(n, 0) not in self.names))
         slices = [
             tuple(n if n in self.names else indexed(n, t) for n in names) for t in range(self.steps)
         ]
