@@ -16,6 +16,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Any, TypeVar
 
 import numpy as np
@@ -140,6 +141,16 @@ def check_level(call: str, alpha: Any) -> None:
     """Raise ValueError unless alpha is a probability strictly between 0 and 1."""
     if not isinstance(alpha, (int, float, np.number)) or not 0.0 < alpha < 1.0:
         raise ValueError(f"{call}(alpha={alpha!r}): give a probability strictly between 0 and 1")
+
+
+def as_real(what: str, value: Any) -> np.ndarray:
+    """Numbers as floats; raises TypeError, in which ``what`` names them, where they are none."""
+    found = np.asarray(value)
+    exact = found.dtype.kind == "O" and all(isinstance(v, Real) for v in found.flat)
+    if found.dtype.kind not in "biuf" and not exact:
+        shown = f"{value!r}"[:60] if found.ndim == 0 else f"of type {found.dtype}"
+        raise TypeError(f"{what} is {shown}; give real numbers")
+    return found.astype(float)
 
 
 def holm(p_values: Sequence[float], alpha: float) -> int:

@@ -386,3 +386,7 @@ def test_slices_that_are_not_there_and_functions_of_all_rows_are_told() -> None:
         answer.mean("x[7]")
     with pytest.raises(ShapeError, match=r"returned shape \(\) for .* keep the leading axis"):
         answer.expectation(lambda x: 1.0, "x[0]")
+    net = bmc.BayesNet()
+    net.add("z", bmc.Bernoulli(0.3))
+    with pytest.raises(ShapeError, match="keep the leading axis"):
+        exact(net).expectation(lambda z: 1.0)

@@ -23,7 +23,7 @@ from bayesmc.errors import (
 )
 from bayesmc.testing.kernels.joint import JointModel
 from bayesmc.testing.posteriors.bands import _chance_of, ecdf_band, ecdf_points, ecdf_uniformity
-from bayesmc.testing.posteriors.calibration import simulation_based_calibration
+from bayesmc.testing.posteriors.calibration import _in_words, simulation_based_calibration
 from bayesmc.testing.posteriors.shares import Draws, posterior_draws, share_below
 from bayesmc.testing.verdict import BUDGET
 
@@ -253,6 +253,11 @@ def test_wrong_samplers_are_caught(wrong: Any, words: str) -> None:
     assert not found
     assert words in repr(found)
     assert "standard errors" in repr(found)
+
+
+def test_ranks_in_two_heaps_are_no_shift() -> None:
+    words = _in_words(np.repeat([0.15, 0.85], 200), True)
+    assert "lie too" not in words
 
 
 def test_ranks_of_a_node_do_not_see_that_data_are_ignored() -> None:

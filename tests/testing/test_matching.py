@@ -348,6 +348,8 @@ def test_what_has_no_draws_says_so() -> None:
         ({"names": []}, None),
         ({"draws": 3}, "30 or more"),
         ({"quantiles": 0.5}, "a sequence of levels"),
+        ({"quantiles": ["a"]}, "a sequence of levels"),
+        ({"rtol": 1j}, "rtol=1j"),
         ({"rtol": -1.0}, "rtol=-1.0.: give a finite number, 0 or more"),
         ({"rtol": np.nan}, "rtol=nan"),
         ({"rtol": "a"}, "rtol='a'"),

@@ -462,7 +462,8 @@ def test_figures_of_geweke_are_told_to_be_scaled() -> None:
     ("kernel", "words"),
     [
         (lambda x, y, rng: None, r"kernel\(state, data, rng\) of the JointModel returned None"),
-        (lambda x, rng: x, r"takes \(state, data, rng\), but this one wants 2 arguments"),
+        (lambda x, rng: x, r"kernel is called with .state, data, rng., which .x, rng. does not"),
+        (lambda x, y, *, rng: x, r"which .x, y, \*, rng. does not take"),
     ],
 )
 def test_kernels_of_models_that_are_no_nets(test: Any, kernel: Any, words: str) -> None:
@@ -472,11 +473,26 @@ def test_kernels_of_models_that_are_no_nets(test: Any, kernel: Any, words: str) 
         test(kernel, model)
 
 
+@pytest.mark.parametrize(
+    "kernel",
+    [lambda x, y, rng=None: x, lambda *a: a[0], lambda x, *rest: x, lambda x, y, rng, by=1.0: x],
+)
+def test_kernels_that_can_be_called_with_three_arguments(kernel: Any) -> None:
+    statistics = {"x": lambda x, y: x, "whole": lambda x, y: np.array([*map(int, x)], dtype=object)}
+    model = JointModel(lambda rng, n: rng.normal(size=n), lambda x, rng: None, statistics)
+    assert rank_test(kernel, model, replications=20)
+
+
+@pytest.mark.parametrize("observed", [np.array(["y"]), {"y": 1.0}, {"y"}, ("y",), iter(["y"])])
+def test_names_of_data_in_any_container(observed: Any) -> None:
+    assert NetJoint(pair(), observed).observed == ("y",)
+
+
 def test_words_for_numbers_that_are_none() -> None:
     step = draw_a
     expecting(EvidenceError, "returned NaN for 'x'", lambda s, rng: {"x": np.nan}, pair())
     complex_ = {"c": lambda x: 1j * x}
-    with pytest.raises(TypeError, match="'c' returned complex128; return real numbers"):
+    with pytest.raises(TypeError, match="statistic 'c' is of type complex128; give real numbers"):
         geweke_test(lambda s, rng: s, pair(), statistics=complex_)
     with pytest.raises(DensityError, match="NaN among the draws of 'x'"):
         simulation_based_calibration(lambda e, rng: {"x": np.full(9, np.nan)}, pair())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy.stats import binom
@@ -46,6 +48,11 @@ def test_figures_without_chance_must_agree() -> None:
     assert not repeated_test(lambda rng: np.nan, 0.3, replications=2)
 
 
+def test_figures_of_any_exact_type() -> None:
+    assert repeated_test(lambda rng: Fraction(1, 3), Fraction(1, 3), replications=5, rng=0)
+    assert repeated_test(lambda rng: [2**70, 1.0], [2**70, 1.0], replications=5, rng=0)
+
+
 def test_allowed_error() -> None:
     def biased(rng: np.random.Generator) -> float:
         return rng.normal(0.05, 0.1)
@@ -68,9 +75,9 @@ def test_allowed_error() -> None:
         (lambda rng: 1.0, np.nan, {}, ValueError, "no number"),
         (lambda rng: {}, {}, {}, ValueError, "exact={} holds no figure"),
         (lambda rng: [], [], {}, ValueError, "holds no figure"),
-        (lambda rng: None, 0.0, {}, TypeError, r"estimate\(rng\) is None; give numbers"),
-        (lambda rng: 1j, 0.0, {}, TypeError, "is 1j; give numbers"),
-        (lambda rng: 1.0, "a", {}, TypeError, "exact is 'a'; give numbers"),
+        (lambda rng: None, 0.0, {}, TypeError, r"estimate\(rng\) is None; give real numbers"),
+        (lambda rng: 1j, 0.0, {}, TypeError, "is 1j; give real numbers"),
+        (lambda rng: 1.0, "a", {}, TypeError, "exact is 'a'; give real numbers"),
         (0.0, lambda rng: 1.0, {}, TypeError, "estimate=0.0; give a function"),
         (lambda rng: 1.0, 1.0, {"accuracy": -1.0}, ValueError, "0 or more"),
         (lambda rng: 1.0, 1.0, {"replications": 1}, ValueError, "at least 2"),

@@ -20,7 +20,7 @@ from bayesmc.randomness import seed_sequence
 from bayesmc.shapes import first_index
 from bayesmc.testing.densities.density import DensityCheck, inspect
 from bayesmc.testing.densities.reports import Report
-from bayesmc.testing.verdict import Verdict, counted
+from bayesmc.testing.verdict import check_level, counted
 
 #: configurations of the parents that are evaluated together
 _BATCH = 64
@@ -102,7 +102,7 @@ def check_cpd(
     for key, value, least in (("parents", parents, 1), ("draws", draws, 100)):
         if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
             raise ValueError(f"{call}: {key}={value!r}; give a whole number, {least} or more")
-    Verdict("check_cpd", alpha, ())
+    check_level("check_cpd", alpha)
     if not isinstance(name, str) or name not in net:
         raise UnknownNodeError(f"{call}: no node {name!r}; there are {', '.join(net.nodes)}")
     report = Report(alpha, np.random.default_rng(seed_sequence(rng)))

@@ -20,9 +20,9 @@ from bayesmc.errors import BayesmcError, ShapeError, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.shapes import nearly_equal
 from bayesmc.testing.densities.laws import check_line, check_table, check_volume
-from bayesmc.testing.densities.masses import Element, table_of
+from bayesmc.testing.densities.masses import WHOLE, Element, table_of
 from bayesmc.testing.densities.reports import Fault, Report
-from bayesmc.testing.verdict import Verdict, counted
+from bayesmc.testing.verdict import Verdict, check_level, counted
 
 #: batch elements that are looked at
 _ELEMENTS = 3
@@ -126,7 +126,7 @@ def check_density(
         )
     if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 100:
         raise ValueError(f"check_density(draws={draws!r}): give a whole number, 100 or more")
-    Verdict("check_density", alpha, ())  # says what is wrong with alpha before work is done
+    check_level("check_density", alpha)
     report = Report(alpha, np.random.default_rng(seed_sequence(rng)))
     inspect(dist, report, int(draws), gaps)
     found = report.comparisons
@@ -353,8 +353,9 @@ def _outer(element: Element, points: np.ndarray) -> Iterator[np.ndarray]:
         step = 1.0 if kind == "integers" else 0.5
         ends = [(support.low, -step), (support.high, step)]
         numbers = [b + s * max(1.0, abs(b) * 1e-6) for b, s in ends if np.isfinite(b)]
-        if kind == "integers":
-            numbers.append(float(np.floor(np.ravel(points)[0])) + 0.5)
+        first = float(np.ravel(points)[0])
+        if kind == "integers" and abs(first) < WHOLE:
+            numbers.append(math.floor(first) + 0.5)
         for number in numbers:
             value = np.array(points[0], dtype=float)
             value[(0,) * len(shape)] = number

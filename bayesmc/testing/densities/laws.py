@@ -169,6 +169,10 @@ def _check_cdf(
 
 def check_table(element: Element, samples: np.ndarray | None, table: Table, report: Report) -> None:
     """Probabilities of whole numbers."""
+    bad = np.isnan(table.probs)
+    if bad.any():
+        report.fault(f"log_prob is nan at {table.values[bad][0]:.0f}")
+        return
     total = float(table.probs.sum())
     if not table.is_whole and not total > 1 + _ROUNDING:
         report.remark("sum of the probabilities: its tail is too long to be summed")

@@ -28,6 +28,8 @@ _GRID = {1: 401, 2: 141, 3: 61}
 _REACH = 3.2
 #: values of a discrete variable that are summed at most
 _MOST_VALUES = 1 << 20
+#: whole numbers below this have neighbours, and halves between them
+WHOLE = 2.0**52
 #: a term so small beside the sum ends it
 _NEGLIGIBLE = 1e-14
 #: degrees of freedom of the importance sampler's t distributions
@@ -156,7 +158,8 @@ def line_of(element: Element, points: np.ndarray) -> InverseCdf:
 def table_of(element: Element, points: np.ndarray) -> Table:
     """Probabilities of a variable on whole numbers, summed outwards from ``points`` until none counts."""
     low, high = float(element.support.low), float(element.support.high)
-    inside = points[(points >= low) & (points <= high) & (points == np.floor(points))]
+    inside = points[(points >= low) & (points <= high) & (np.abs(points) < WHOLE)]
+    inside = inside[inside == np.floor(inside)]
     if len(inside):
         start, stop = float(inside.min()), float(inside.max())
     else:

@@ -36,7 +36,7 @@ class GewekeResult(Verdict):
     p_values, ess : dict
         Statistic -> two-sided p-value; effective number of draws under the kernel.
     is_scaled : bool
-        Whether the statistics are those taken by default, which are scaled and bounded.
+        Whether the statistics are those taken by default: scaled and bounded, but for shares of states.
     """
 
     p_values: Mapping[str, float] = field(default_factory=dict)
@@ -47,8 +47,8 @@ class GewekeResult(Verdict):
         if not (self.is_scaled and self.rejected):
             return []
         return [
-            "  (numbers here are those of nodes less their median under the joint law, over their spread; of "
-            "what is above zero, of its logarithm)"
+            "  (shares of states are as they are; other numbers of nodes less their median under the joint "
+            "law, over their spread; of what is above zero, of its logarithm)"
         ]
 
 

@@ -7,7 +7,7 @@ known here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,6 +19,7 @@ from bayesmc.network import BayesNet, FactorGraph, Model, pose
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.results.query import Query
 from bayesmc.structure.target import Target, target_of
+from bayesmc.testing.verdict import as_real
 
 #: stored values, a row for each draw: ``(rows, *plates, *event)``
 Rows = dict[str, np.ndarray]
@@ -217,7 +218,7 @@ class NetJoint(NetStates):
         if observed is None:
             leaves = tuple(n for n in self.stochastic if n not in above)
             return leaves if len(leaves) < len(self.stochastic) else ()
-        if not isinstance(observed, (str, Sequence, Set)):
+        if not isinstance(observed, Iterable):
             raise TypeError(f"observed={observed!r}: give the name of a node, or a list of names")
         chosen = (observed,) if isinstance(observed, str) else tuple(observed)
         for name in chosen:
@@ -263,8 +264,7 @@ class NetJoint(NetStates):
                     f"statistic {name!r} returned shape {value.shape} for {rows} rows; return one number for "
                     "each: keep the leading axis and reduce the others (axis=-1)"
                 )
-            _check_real(name, np.asarray(value))
-            return np.asarray(value, dtype=float)
+            return as_real(f"{call}: statistic {name!r}", value)
 
         return statistic
 
@@ -285,8 +285,7 @@ def values_of(call: str, statistics: Statistics, state: Any, data: Any, rows: in
                 f"{call}: statistic {name!r} returned shape {value.shape} for {rows} rows; return one number "
                 f"for each row, shape ({rows},), and let states and data of a JointModel have as many rows"
             )
-        _check_real(name, value)
-        out[i] = value
+        out[i] = as_real(f"{call}: statistic {name!r}", value)
         if not np.isfinite(out[i]).all():
             row = int(np.flatnonzero(~np.isfinite(out[i]))[0])
             raise DensityError(
@@ -299,13 +298,8 @@ def values_of(call: str, statistics: Statistics, state: Any, data: Any, rows: in
 def check_sizes(call: str, **sizes: tuple[Any, int]) -> None:
     """Raise ValueError unless every size is a whole number that is large enough."""
     for name, (size, least) in sizes.items():
-        if not isinstance(size, (int, np.integer)) or size < least:
+        if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < least:
             raise ValueError(f"{call}({name}={size!r}): give a whole number, at least {least}")
-
-
-def _check_real(name: str, value: np.ndarray) -> None:
-    if value.dtype.kind not in "biuf":
-        raise TypeError(f"statistic {name!r} returned {value.dtype}; return real numbers")
 
 
 def _count(state: Rows) -> int:

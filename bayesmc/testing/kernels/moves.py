@@ -6,6 +6,7 @@ are no nets. What a test makes of a move is not known here.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +24,7 @@ from bayesmc.testing.kernels.joint import (
 )
 from bayesmc.testing.kernels.machines import Machine
 from bayesmc.testing.kernels.statistics import default_statistics
-from bayesmc.testing.kernels.steps import StepFunction, is_step, positional
+from bayesmc.testing.kernels.steps import StepFunction, is_step
 from bayesmc.testing.verdict import Comparison
 
 
@@ -117,11 +118,11 @@ def _of_model(
     for name in ("prior", "simulate"):
         if not callable(getattr(model, name)):
             raise ModelError(f"{call}: JointModel({name}=...) is no function")
-    for move in (kernel, reverse):
-        if move is not None and positional(move) not in (3, None):
+    for name, move in (("kernel", kernel), ("reverse", reverse)):
+        if move is not None and not _takes(move, 3):
             raise ModelError(
-                f"{call}: the kernel of a JointModel takes (state, data, rng), but this one wants "
-                f"{positional(move)} arguments"
+                f"{call}: with a JointModel the {name} is called with (state, data, rng), which "
+                f"{inspect.signature(move)} does not take"
             )
     check_statistics(call, model.statistics, "statistic(state, data)")
     forward = _returning(call, "kernel(state, data, rng)", kernel)
@@ -133,6 +134,19 @@ def _of_model(
         forward if reverse is None else _returning(call, "reverse(state, data, rng)", reverse),
         is_own_reverse=reverse is None,
     )
+
+
+def _takes(function: Callable[..., Any], count: int) -> bool:
+    """Whether a function can be called with so many arguments, as far as that can be seen."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return True
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return False
+    return True
 
 
 def _returning(call: str, what: str, function: Callable[..., Any]) -> Callable[..., Any]:

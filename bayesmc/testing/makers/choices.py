@@ -90,7 +90,7 @@ def read_options(call: str, kind: type[T], options: Mapping[str, Any]) -> T:
         given = options.get(field.name, field.default)
         if field.type == "bool" and not isinstance(given, (bool, np.bool_)):
             raise TypeError(f"{call}({field.name}={given!r}): give True or False")
-        if field.type == "float" and not isinstance(given, (int, float, np.number)):
+        if field.type == "float" and not isinstance(given, (int, float, np.integer, np.floating)):
             raise TypeError(f"{call}({field.name}={given!r}): give a number")
     try:
         return kind(**options)

@@ -19,11 +19,11 @@ import scipy.special
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.dbn.unroll import indexed
 from bayesmc.distributions import marking_invalid
-from bayesmc.errors import BudgetError, ModelError, ShapeError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, Model, Problem, pose
 from bayesmc.network.joint import node_log_prob
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
-from bayesmc.testing.oracles.enumeration import Enumerated, enumerate_posterior
+from bayesmc.testing.oracles.enumeration import Enumerated, averaged, enumerate_posterior
 from bayesmc.testing.oracles.linear import linear_posterior
 from bayesmc.testing.oracles.quadrature import (
     Quadrature,
@@ -446,9 +446,4 @@ def _hermite(
         stored = np.stack(columns, axis=-1).reshape(len(kept), *node.plate_shape)
         arguments.append(node.decode(np.repeat(stored, len(grid), axis=0)))
     result = np.asarray(function(*arguments), dtype=float)
-    if result.shape[:1] != (len(flat),):
-        raise ShapeError(
-            f"expectation: the function returned shape {result.shape} for {len(flat)} rows; keep the leading "
-            "axis: one value for each row"
-        )
-    return np.tensordot(joint, result, axes=(0, 0))
+    return averaged(result, joint)

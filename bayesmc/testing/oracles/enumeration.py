@@ -19,6 +19,7 @@ from bayesmc.distributions import Distribution, marking_invalid
 from bayesmc.errors import (
     BudgetError,
     ParameterError,
+    ShapeError,
     UnknownNodeError,
     UnsupportedError,
     ZeroProbabilityError,
@@ -121,7 +122,7 @@ class Enumerated:
     def expectation(self, function: Callable[..., Any], *names: str) -> np.ndarray:
         """Posterior mean of a function of the named nodes, which keeps the leading axis."""
         result = np.asarray(function(*(self.values(n) for n in names)), dtype=float)
-        return np.tensordot(self.weights, result, axes=(0, 0))
+        return averaged(result, self.weights)
 
     def _of(self, name: str) -> np.ndarray:
         if name not in self.stored:
@@ -130,6 +131,16 @@ class Enumerated:
                 "nothing depends on and that was left out"
             )
         return self.stored[name]
+
+
+def averaged(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Mean over the leading axis of what a user's function returned."""
+    if values.shape[:1] != weights.shape:
+        raise ShapeError(
+            f"expectation: the function returned shape {values.shape} for {len(weights)} rows; keep the "
+            "leading axis: one value for each row"
+        )
+    return np.tensordot(weights, values, axes=(0, 0))
 
 
 def enumerate_posterior(

@@ -428,7 +428,8 @@ def _in_words(ranks: np.ndarray, is_default: bool) -> str:
     if max(abs(shift), abs(spread)) < 3.0:
         return "neither shifted nor of a wrong spread: look at plot()"
     low, high = (ranks < 0.1).mean(), (ranks > 0.9).mean()
-    if abs(shift) > abs(spread) or (spread > 0 and min(low, high) < 0.1):  # one tail alone: moved
+    one_tail = spread > 0 and min(low, high) < 0.1 and abs(shift) >= 3.0
+    if abs(shift) > abs(spread) or one_tail:
         side = "low" if shift > 0 else "high"
         draws = "draws" if is_default else "its values at the draws"
         return f"{draws} lie too {side} (ranks of the truth average {ranks.mean():.3f}, not 0.5)"

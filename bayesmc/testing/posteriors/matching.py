@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -242,12 +243,13 @@ def _match(
     rng: Any,
 ) -> Match:
     levels = np.asarray(quantiles)
-    if levels.ndim != 1 or not (levels.size == 0 or np.all((levels > 0) & (levels < 1))):
+    is_real = levels.dtype.kind in "iuf" or not levels.size
+    if levels.ndim != 1 or not is_real or not np.all((levels > 0) & (levels < 1)):
         raise ValueError(
             f"{test}(quantiles={quantiles!r}): give a sequence of levels strictly between 0 and 1"
         )
     for what, number in (("rtol", rtol), ("min_count", min_count)):
-        if not isinstance(number, (int, float, np.number)) or not 0.0 <= number < np.inf:
+        if np.ndim(number) or not isinstance(number, Real) or not 0.0 <= number < np.inf:
             raise ValueError(f"{test}({what}={number!r}): give a finite number, 0 or more")
     if isinstance(names, str):
         raise ValueError(f"{test}(names={names!r}): give a sequence of names, as in [{names!r}]")

@@ -17,7 +17,7 @@ from bayesmc.errors import ShapeError
 from bayesmc.randomness import seed_sequence
 from bayesmc.testing.kernels.joint import check_sizes
 from bayesmc.testing.posteriors.skewed import mean_p_value
-from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
+from bayesmc.testing.verdict import Comparison, Verdict, as_real, check_level, counted
 
 _CALL = "repeated_test"
 #: relative difference of figures without chance in them
@@ -126,15 +126,13 @@ def repeated_test(
 
 def _named(what: str, answer: Any) -> dict[str, np.ndarray]:
     named = answer if isinstance(answer, Mapping) else {"": answer}
-    found = {name: np.asarray(value) for name, value in named.items()}
-    for name, value in found.items():
-        if value.dtype.kind not in "biuf":
-            given = f"{named[name]!r}"[:60]
-            raise TypeError(
-                f"{_CALL}: {what}{_of(name)} is {given}; give numbers, or a dict of name -> numbers, as in "
-                f"{_CALL}(estimate, exact) with a function estimate(rng)"
-            )
-    return {name: value.astype(float) for name, value in found.items()}
+    try:
+        return {name: as_real(f"{what}{_of(name)}", value) for name, value in named.items()}
+    except TypeError as error:
+        raise TypeError(
+            f"{_CALL}: {error}, or a dict of name -> numbers, as in {_CALL}(estimate, exact) with a function "
+            "estimate(rng)"
+        ) from None
 
 
 def _of(name: str) -> str:

@@ -159,9 +159,9 @@ class Average:
     def of(cls, draws: np.ndarray, ess: float | None = None) -> Average:
         """Mean of draws that are worth ``ess`` independent ones, by default all of them."""
         value, n = float(draws.mean()), float(draws.size if ess is None else ess)
+        if draws.min() == draws.max():  # the mean of equal numbers is off by a rounding error
+            return cls(float(draws.flat[0]), 0.0, 0.0, 0.0)
         off = draws - value
-        if not off.any():
-            return cls(value, 0.0, 0.0, 0.0)
         return cls._of_sums(value, *((off**k).mean() / n ** (k - 1) for k in (2, 3, 4)))
 
     @classmethod
