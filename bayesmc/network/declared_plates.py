@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -76,6 +76,12 @@ class DeclaredPlates:
         if len(set(names)) != len(names):
             raise PlateError(f"{what}: plates={names} names a plate twice")
         return names
+
+    def only(self, names: Collection[str]) -> DeclaredPlates:
+        """Those of some names."""
+        sizes = {plate: size for plate, size in self.sizes.items() if plate in names}
+        labels = {plate: own for plate, own in self.labels.items() if plate in names}
+        return DeclaredPlates(self.owner, sizes, labels)
 
     def copy(self) -> DeclaredPlates:
         return DeclaredPlates(self.owner, dict(self.sizes), dict(self.labels))

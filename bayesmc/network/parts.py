@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import BayesNet
 from bayesmc.network.node import Declaration
 
@@ -40,7 +39,4 @@ def with_nodes(net: BayesNet, declarations: Mapping[str, Declaration]) -> BayesN
 def without_idle_plates(net: BayesNet) -> BayesNet:
     """The net without the plates that no node is on."""
     used = {plate for declared in net.declarations.values() for plate in declared.plates}
-    plates = {plate: size for plate, size in net._plates.sizes.items() if plate in used}
-    return BayesNet.of(
-        net.name, net.declarations, DeclaredPlates.read("BayesNet", net.name, plates)
-    )
+    return BayesNet.of(net.name, net.declarations, net._plates.only(used))

@@ -20,6 +20,7 @@ from bayesmc.testing import (
     quadrature_posterior,
     repeated_test,
 )
+from bayesmc.testing.posteriors.samples import Average
 from bayesmc.testing.verdict import BUDGET
 
 
@@ -306,6 +307,14 @@ class Uncoupled(DrawsPosterior):
             for n in right.names
         }
         super().__init__(right.problem, right.engine, stored, right._shape, independent=True)
+
+
+def test_averages_of_equal_draws_have_no_error() -> None:
+    """Whatever their weights: the mean of equal numbers is off by a rounding error."""
+    weights = np.random.default_rng(0).dirichlet(np.ones(1000))[None]
+    equal = np.full((1, 1000), 0.1)
+    for average in (Average.of(equal), Average.weighted(equal, weights)):
+        assert (average.value, average.error, average.support) == (0.1, 0.0, 0.0)
 
 
 def test_wrong_coupling_shows_in_joint_draws_only() -> None:

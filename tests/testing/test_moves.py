@@ -452,9 +452,9 @@ def test_figures_of_geweke_are_told_to_be_scaled() -> None:
         return {"x": rng.normal(state["y"] / 2 + 1.0, 0.5**0.5)}
 
     found = geweke_test(high, pair(), draws=50, rng=0)
-    assert found.is_scaled and "less their median under the joint law" in repr(found)
+    assert found.is_default and "less their median under the joint law" in repr(found)
     own = geweke_test(high, pair(), draws=50, statistics={"x": lambda x: x}, rng=0)
-    assert not own.is_scaled and "median" not in repr(own)
+    assert not own.is_default and "median" not in repr(own)
 
 
 @pytest.mark.parametrize("test", [rank_test, geweke_test])

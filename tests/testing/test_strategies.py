@@ -15,6 +15,7 @@ from hypothesis import HealthCheck, Phase, find, given, settings
 import bayesmc as bmc
 from bayesmc.diagnostics import log_sum_exp, normalised, weight_ess
 from bayesmc.errors import MissingExtraError, UnsupportedError
+from bayesmc.network.parts import without_idle_plates
 from bayesmc.resampling import SCHEMES
 from bayesmc.testing import enumerate_posterior, random_evidence, random_net, session
 from bayesmc.testing.makers.families import _FAMILIES, random_distribution
@@ -64,6 +65,10 @@ def test_plates_that_nothing_is_on_are_dropped() -> None:
     assert as_code(net).splitlines()[0] == "net = bmc.BayesNet()"
     one = smallest(bayes_nets(plates=True), lambda net: any(net[n].plates for n in net))
     assert len(one.plates) == 1
+    labelled = bmc.BayesNet(plates={"city": ["Ulm", "Bonn"], "idle": ["a", "b"]})
+    labelled.add("x", bmc.Normal(0.0, 1.0), plates="city")
+    kept = without_idle_plates(labelled)._plates
+    assert kept.sizes == {"city": 2} and kept.labels == {"city": ("Ulm", "Bonn")}
 
 
 def test_the_smallest_of_the_others() -> None:

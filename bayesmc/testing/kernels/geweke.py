@@ -35,16 +35,16 @@ class GewekeResult(Verdict):
     ----------
     p_values, ess : dict
         Statistic -> two-sided p-value; effective number of draws under the kernel.
-    is_scaled : bool
+    is_default : bool
         Whether the statistics are those taken by default: scaled and bounded, but for shares of states.
     """
 
     p_values: Mapping[str, float] = field(default_factory=dict)
     ess: Mapping[str, float] = field(default_factory=dict)
-    is_scaled: bool = False
+    is_default: bool = False
 
     def _remarks(self) -> list[str]:
-        if not (self.is_scaled and self.rejected):
+        if not (self.is_default and self.rejected):
             return []
         return [
             "  (shares of states are as they are; other numbers of nodes less their median under the joint "

@@ -24,7 +24,7 @@ from bayesmc.testing.kernels.joint import (
 )
 from bayesmc.testing.kernels.machines import Machine
 from bayesmc.testing.kernels.statistics import default_statistics
-from bayesmc.testing.kernels.steps import StepFunction, is_step
+from bayesmc.testing.kernels.steps import StepFunction, is_step, takes
 from bayesmc.testing.verdict import Comparison
 
 
@@ -119,7 +119,7 @@ def _of_model(
         if not callable(getattr(model, name)):
             raise ModelError(f"{call}: JointModel({name}=...) is no function")
     for name, move in (("kernel", kernel), ("reverse", reverse)):
-        if move is not None and not _takes(move, 3):
+        if move is not None and not takes(move, 3):
             raise ModelError(
                 f"{call}: with a JointModel the {name} is called with (state, data, rng), which "
                 f"{inspect.signature(move)} does not take"
@@ -134,19 +134,6 @@ def _of_model(
         forward if reverse is None else _returning(call, "reverse(state, data, rng)", reverse),
         is_own_reverse=reverse is None,
     )
-
-
-def _takes(function: Callable[..., Any], count: int) -> bool:
-    """Whether a function can be called with so many arguments, as far as that can be seen."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):
-        return True
-    try:
-        signature.bind(*[None] * count)
-    except TypeError:
-        return False
-    return True
 
 
 def _returning(call: str, what: str, function: Callable[..., Any]) -> Callable[..., Any]:

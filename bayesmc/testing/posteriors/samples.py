@@ -159,10 +159,8 @@ class Average:
     def of(cls, draws: np.ndarray, ess: float | None = None) -> Average:
         """Mean of draws that are worth ``ess`` independent ones, by default all of them."""
         value, n = float(draws.mean()), float(draws.size if ess is None else ess)
-        if draws.min() == draws.max():  # the mean of equal numbers is off by a rounding error
-            return cls(float(draws.flat[0]), 0.0, 0.0, 0.0)
         off = draws - value
-        return cls._of_sums(value, *((off**k).mean() / n ** (k - 1) for k in (2, 3, 4)))
+        return cls._of_sums(draws, value, *((off**k).mean() / n ** (k - 1) for k in (2, 3, 4)))
 
     @classmethod
     def weighted(cls, draws: np.ndarray, weights: np.ndarray) -> Average:
@@ -171,11 +169,15 @@ class Average:
         w, x = weights[used], np.broadcast_to(draws, weights.shape)[used]
         value = float(w @ x)
         terms = w * (x - value)
-        return cls._of_sums(value, *((terms**k).sum() for k in (2, 3, 4)))
+        return cls._of_sums(x, value, *((terms**k).sum() for k in (2, 3, 4)))
 
     @classmethod
-    def _of_sums(cls, value: float, second: float, third: float, fourth: float) -> Average:
+    def _of_sums(
+        cls, draws: np.ndarray, value: float, second: float, third: float, fourth: float
+    ) -> Average:
         """Of the sums of powers of what each draw adds to the mean's error."""
+        if draws.min() == draws.max():  # the mean of equal numbers is off by a rounding error
+            return cls(float(draws.flat[0]), 0.0, 0.0, 0.0)
         if not 0 < second < math.inf or not 0 < fourth < math.inf:
             return cls(value, 0.0 if second == 0 else math.nan, 0.0, 0.0)
         error = math.sqrt(second)
