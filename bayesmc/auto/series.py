@@ -23,14 +23,14 @@ from bayesmc.results import SeriesPosterior
 _CANDIDATES: tuple[type[FilterEngine], ...] = (
     DiscreteFilter,
     KalmanFilter,
-    ParticleFilter,
     GridFilter,
+    ParticleFilter,
 )
 _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
     "ParticleFilter": "every hidden node can be sampled given its parents",
-    "GridFilter": "every hidden node is finite, an angle, or on a bounded interval",
+    "GridFilter": "every hidden node is finite, an angle, on a bounded interval, or the one number of a slice",
 }
 _QUESTIONS = ("filter", "smooth", "fixed-lag", "forecast", "most_likely")
 
@@ -224,14 +224,23 @@ def _choose(
     problem: SeriesProblem, asked: Asked
 ) -> tuple[FilterEngine, tuple[str, ...], dict[str, str]]:
     refused: dict[str, str] = {}
+    late: list[FilterEngine] = []
     for candidate in _CANDIDATES:
         engine, name = candidate(), candidate.__name__
         reason = _why_not(engine, problem, asked)
         if reason is None and (silent := engine.unanswered(problem)):
             reason = f"it would not answer for {', '.join(map(repr, silent))}"
         if reason is None:
-            return engine, (_WHY[name],), refused
+            reason = engine.unasked(problem, asked)
+            if reason is not None:
+                late.append(engine)
+        if reason is None:
+            return engine, engine.reasons(problem) or (_WHY[name],), refused
         refused[name] = reason
+    if late:  # nothing that is better can answer
+        engine = late[0]
+        del refused[type(engine).__name__]
+        return engine, (_WHY[type(engine).__name__],), refused
     whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
 

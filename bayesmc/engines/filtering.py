@@ -81,6 +81,14 @@ class FilterEngine:
         """Hidden nodes that its answers would leave out."""
         return ()
 
+    def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        """Why this engine is not taken where the user names none, though it can answer; or None."""
+        return None
+
+    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        """Why this engine is taken where the user names none, if there is more to say than of its kind."""
+        return ()
+
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         """What the engine does to each node of a slice."""
         raise NotImplementedError

@@ -32,6 +32,10 @@ class SeriesPosterior:
         Log density of all rows; one for each element of the plates that are filtered separately.
     log_marginal_increments : ndarray, shape (time,) or (time, *plates)
         Log density of each row given those before; they add up to the above.
+    log_marginal_likelihood_mcse : float or ndarray
+        Its error: the Monte Carlo standard error of filters that draw, a bound for a grid that was found
+        (NaN for one that was given), 0 where it is computed; what tangents and sigma points leave out is no
+        part of it.
     weight_ess : ndarray or None, shape (time,) or (time, *plates)
         Equally weighted particles that those of each slice are worth, before they are resampled.
     resampled : ndarray of bool or None
@@ -54,6 +58,7 @@ class SeriesPosterior:
     [[0.182, 0.818], [0.117, 0.883]]
     """
 
+    log_marginal_likelihood_mcse: Any = 0.0
     weight_ess: np.ndarray | None = None
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None

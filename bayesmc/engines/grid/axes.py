@@ -17,6 +17,8 @@ from bayesmc.dbn import Slices
 from bayesmc.network import CompiledNode
 from bayesmc.shapes import owned
 
+#: cells of bounded nodes where nothing is said of them
+CELLS = 200
 #: rules that turn an interval into points and widths
 RULES = ("midpoint", "trapezoid", "simpson", "gauss-legendre")
 #: supports on which a product of intervals has a volume

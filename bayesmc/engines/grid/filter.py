@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections import deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -15,16 +16,18 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.exact import readable_bytes
-from bayesmc.engines.filtering import FilterEngine, Queries, answer_so_far, pass_slices
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
-from bayesmc.engines.grid.axes import check_rule, read_axes
+from bayesmc.engines.grid.automatic import TARGET, FoundGrid, find_grid
+from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief
+from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
-from bayesmc.errors import BayesmcError, BudgetError
+from bayesmc.errors import BayesmcError, BudgetError, GridWarning, UnsupportedError
 from bayesmc.progress import Progress
 
 
@@ -41,9 +44,11 @@ class GridFilter(FilterEngine):
     grid : dict
         Node -> the tuple ``(low, high, cells)``, or an increasing list or array of points; for a vector one
         for all components, or a list of one each; for counts the values. Finite nodes need none (their
-        states are their cells), nor do nodes on a bounded interval or circle.
-    cells : int
-        Cells of bounded nodes without a grid.
+        states are their cells), nor do nodes on a bounded interval or circle. Where a slice has one hidden
+        number, its range and its cells are found from the model and the data.
+    cells : int, optional
+        Cells of nodes without a grid. None finds how many one hidden number needs, and takes 200 where there
+        are several.
     quadrature : str
         ``"midpoint"``; or ``"trapezoid"``, ``"simpson"``, ``"gauss-legendre"``, for which ``(low, high, n)``
         are n points. Points given as an array stand for what is nearest to them.
@@ -85,7 +90,7 @@ class GridFilter(FilterEngine):
     """
 
     grid: Mapping[str, Any] = field(default_factory=dict)
-    cells: int = 200
+    cells: int | None = None
     quadrature: str = "midpoint"
     max_bytes: float = float(2**30)
     tolerance: float = 0.01
@@ -99,7 +104,7 @@ class GridFilter(FilterEngine):
                 f"GridFilter(grid={type(self.grid).__name__}): give a dict from node to (low, high, cells) "
                 "or an array of points"
             )
-        cells = self.cells
+        cells = CELLS if self.cells is None else self.cells
         if isinstance(cells, bool) or not isinstance(cells, (int, np.integer)) or cells < 2:
             raise ValueError(f"GridFilter(cells={cells!r}): give a number of cells, 2 or more")
         check_rule(self.quadrature)
@@ -120,13 +125,66 @@ class GridFilter(FilterEngine):
                 model = self._model(problem.slices, _static(problem))
         except BayesmcError as error:
             return str(error)
+        name = self._automatic(problem)
+        if name is not None:
+            return _without_density(problem)
         for name in problem.hidden:
             if name in model.own and name not in model.leaves and name not in model.axes.of:
                 return f"GridFilter: {model.axes.missing[name]}"
         return self._too_large(model, problem) or _without_density(problem)
 
+    def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
+        """Hidden nodes that are integrated out and have no closed moments."""
+        found = []
+        model = self._model(problem.slices, _static(problem))
+        for name in problem.hidden:
+            node = problem.model[name]
+            if name not in model.leaves or node.domain is not None:
+                continue
+            with _quiet():
+                try:
+                    later = problem.slices.later
+                    _ = later.evaluate(name, later.probe)[0].var
+                except (BayesmcError, NotImplementedError):
+                    found.append(name)
+        return tuple(found)
+
+    def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        """A grid is taken unasked where a slice has one hidden number and its error is small."""
+        if self._automatic(problem) is None:
+            return "a grid is taken unasked where one number of a slice is hidden, and here it is not one"
+        try:
+            found = self._found(problem)
+        except BayesmcError as error:
+            return str(error)
+        except Exception as error:  # a function of the user's that fails at points of the grid
+            return f"a function fails on the grid: {error!r}"
+        assert found is not None
+        error = float(np.max(found.error))
+        if not error <= TARGET:
+            return (
+                f"a grid of {found.described} for {found.name!r} has an error of {error:.2g} in the log "
+                f"evidence, above {TARGET}"
+            )
+        each = found.axis.size * math.prod(found.mover.model.lead)
+        if 16 * problem.steps * each > self.max_bytes:
+            return f"the beliefs of {problem.steps} slices on {found.axis.size} cells do not fit max_bytes"
+        return None
+
+    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        found = self._found(problem)
+        if found is None:
+            return ()
+        return (
+            f"{found.name!r} is the one hidden number of a slice: {found.described}, found from the model and "
+            f"the data, give the log evidence to within {float(np.max(found.error)):.1g}",
+        )
+
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         model = self._model(problem.slices, _static(problem))
+        grid = self._found(problem)
+        if grid is not None:
+            model = grid.mover.model
         found = {}
         for name in problem.slices.template.later:
             seen = problem.series.observed.get(name)
@@ -165,14 +223,14 @@ class GridFilter(FilterEngine):
                 f'keep={keep!r}: a grid has no particles; give "summaries" for answers of constant size, or '
                 "None, which keeps densities, too"
             )
-        mover = self._mover(problem)
+        mover, kept = self._start(problem)
         record = GridRecord(problem, mover.model, queries or {}, keep is None)
         increments = np.empty((problem.steps, *mover.model.lead))
         before: Cells | None = None
 
         def move(k: int) -> None:
             nonlocal before
-            cells = mover.move(before, problem.series.row(k))
+            cells = kept[k] if kept else mover.move(before, problem.series.row(k))
             increments[k] = cells.increment
             record.add(k, _answers(mover, before, cells, cells.probs))
             before = cells
@@ -183,7 +241,7 @@ class GridFilter(FilterEngine):
                 pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
         except KeyboardInterrupt as stop:
             return answer_so_far(stop, self)
-        return so_far()
+        return self._with_error(problem, so_far())
 
     def smooth(
         self,
@@ -195,7 +253,7 @@ class GridFilter(FilterEngine):
         progress: bool | None = None,
     ) -> GridPosterior:
         """Every slice given all rows by one pass forwards and one back, or ``lag`` back from every slice."""
-        mover = self._mover(problem)
+        mover, kept = self._start(problem)
         record = GridRecord(problem, mover.model, queries or {}, True)
         steps = problem.steps
         increments = np.empty((steps, *mover.model.lead))
@@ -203,7 +261,8 @@ class GridFilter(FilterEngine):
         held: deque[Cells] = deque(maxlen=reach + 2)
 
         def move(k: int) -> None:
-            cells = mover.move(held[-1] if held else None, problem.series.row(k))
+            before = held[-1] if held else None
+            cells = kept[k] if kept else mover.move(before, problem.series.row(k))
             increments[k] = cells.increment
             held.append(cells)
             if k == 0:
@@ -214,7 +273,8 @@ class GridFilter(FilterEngine):
         with Progress(steps, self.label, progress) as bar, _quiet():
             pass_slices(problem.series.start, steps, move, None, bar.advance)
             self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
-        return record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
+        found = record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
+        return self._with_error(problem, found)
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
@@ -225,7 +285,9 @@ class GridFilter(FilterEngine):
         """
         static = _static(problem)
         with _quiet(), Progress(problem.steps, self.label, progress) as bar:
-            model = self._model(problem.slices, static, logs=True)
+            found_grid = self._found(problem)
+            axis = None if found_grid is None else (found_grid.name, found_grid.axis)
+            model = self._model(problem.slices, static, logs=True, axis=axis)
             mover = GridMover(model, self.tolerance)
             rows = [problem.series.row(k) for k in range(problem.steps)]
             path = mover.best(rows, bar.advance)
@@ -260,14 +322,93 @@ class GridFilter(FilterEngine):
     # ---- private -------------------------------------------------------------------------------
 
     def _model(
-        self, slices: Slices, static: Mapping[str, np.ndarray], logs: bool = False
+        self,
+        slices: Slices,
+        static: Mapping[str, np.ndarray],
+        logs: bool = False,
+        axis: tuple[str, Axis] | None = None,
     ) -> GridModel:
-        axes = read_axes(slices, self.grid, self.cells, self.quadrature)
+        """The template on its grid; ``axis`` is a node's that was found."""
+        cells = CELLS if self.cells is None else self.cells
+        axes = read_axes(slices, self.grid, cells, self.quadrature)
+        if axis is not None:
+            name, own = axis
+            missing = {n: why for n, why in axes.missing.items() if n != name}
+            axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
         return GridModel(slices, axes, static, self.max_bytes, logs)
 
-    def _mover(self, problem: SeriesProblem) -> GridMover:
+    def _automatic(self, problem: SeriesProblem) -> str | None:
+        """The one hidden number of a slice, whose grid is found; None where there is none."""
+        if self.quadrature != "midpoint":
+            return None
+        model = self._model(problem.slices, _static(problem))
+        numbers = [
+            n
+            for n in problem.hidden
+            if n in model.own and n not in model.leaves and problem.model[n].domain is None
+        ]
+        if len(numbers) != 1 or numbers[0] in self.grid:
+            return None
+        name = numbers[0]
+        if problem.model[name].event_shape or model.elements(name) != 1:
+            return None
+        bounded = name in model.axes.of
+        return None if line_of(problem.slices, name) is None or (bounded and self.cells) else name
+
+    def _found(self, problem: SeriesProblem) -> FoundGrid | None:
+        """The grid of the one hidden number, found once for a problem; None where there is none to find."""
+        key = f"grid {self!r}"
+        if key not in problem.cache:
+            with _quiet():
+                problem.cache[key] = self._sought(problem)
+        return problem.cache[key]
+
+    def _sought(self, problem: SeriesProblem) -> FoundGrid | None:
+        name = self._automatic(problem)
+        line = None if name is None else line_of(problem.slices, name)
+        if name is None or line is None:
+            return None
+        static = _static(problem)
+        rows = [problem.series.row(k) for k in range(problem.steps)]
+
+        def make(axis: Axis) -> GridModel:
+            return self._model(problem.slices, static, axis=(name, axis))
+
+        try:
+            return find_grid(name, line, make, rows, self.cells)
+        except UnsupportedError as error:
+            raise UnsupportedError(
+                f"GridFilter: {error}; give it one, grid={{{name!r}: (low, high, cells)}}, or use "
+                "ParticleFilter(particles)"
+            ) from None
+
+    def _start(self, problem: SeriesProblem) -> tuple[GridMover, list[Cells] | None]:
+        """What moves beliefs, and the beliefs of all slices where a search for the grid left them."""
+        found = self._found(problem)
+        if found is not None:
+            return found.mover, found.kept
         with _quiet():
-            return GridMover(self._model(problem.slices, _static(problem)), self.tolerance)
+            model = self._model(problem.slices, _static(problem))
+            return GridMover(model, self.tolerance), None
+
+    def _with_error(self, problem: SeriesProblem, posterior: GridPosterior) -> GridPosterior:
+        """With the error of the log evidence, which is not known of a grid that was given."""
+        found = self._found(problem)
+        if found is not None:
+            error = found.error
+            posterior.log_marginal_likelihood_mcse = error if error.ndim else float(error)
+            if not np.max(error) <= TARGET and np.isfinite(self.tolerance):
+                warnings.warn(
+                    f"GridFilter: {found.described} for {found.name!r} have an error of "
+                    f"{float(np.max(error)):.2g} in the log evidence; give a grid of your own, "
+                    f"grid={{{found.name!r}: (low, high, cells)}}, or use ParticleFilter(particles)",
+                    GridWarning,
+                    stacklevel=4,
+                )
+        elif any(problem.model[n].domain is None for n in posterior.gridded):
+            nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
+            posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
+        return posterior
 
     def _smoothed(
         self,

@@ -122,6 +122,11 @@ class GridPosterior(SeriesPosterior):
         super().__init__(model, engine, kind, increments, **answers)
         self._grids, self._densities = grids, densities
 
+    @property
+    def gridded(self) -> tuple[str, ...]:
+        """Nodes whose densities were kept."""
+        return tuple(self._grids)
+
     def density(self, name: str) -> np.ndarray:
         """Densities at the points of the grid, shape ``(time, *plates, *cells)``.
 

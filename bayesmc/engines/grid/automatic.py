@@ -1,0 +1,340 @@
+"""Grids that are found: range and cells for the one hidden number of a slice, from the model and its data.
+
+A first pass with wide cells lets the grid grow wherever a belief reaches over its ends and refines it where
+one stands on few cells. A second pass has cells half as wide, or narrower until the log evidence settles: what
+the last halving changed, and what may lie beyond the ends, is the stated error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import Row
+from bayesmc.engines.filtering import in_slice
+from bayesmc.engines.grid.axes import Axis
+from bayesmc.engines.grid.lattice import Lattice, Line
+from bayesmc.engines.grid.moves import Cells, GridMover
+from bayesmc.engines.grid.tables import GridModel
+from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+
+#: error of the log evidence (of each series that is filtered by itself) that a grid is made for
+TARGET = 0.01
+#: cells up to which a grid is found, and entries of tables that a pass may take
+MOST_CELLS, MOST_ENTRIES = 2000, 6e9
+#: an entry that is evaluated anew in every slice costs as much as so many that are kept
+ANEW = 20
+#: probability of one cell from which on cells are too wide for a belief
+_TOP = 0.5
+#: bytes of beliefs that are kept for the answers, which are worked out again otherwise
+_KEPT = float(2**27)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundGrid:
+    """A grid, and what it is worth.
+
+    Attributes
+    ----------
+    name : str
+    axis : Axis
+    error : ndarray, shape (*apart,)
+        Of the log evidence, in absolute value.
+    mover : GridMover
+    kept : list of Cells or None
+        Beliefs of all slices, where they are few.
+    """
+
+    name: str
+    axis: Axis
+    error: np.ndarray
+    mover: GridMover
+    kept: list[Cells] | None
+
+    @property
+    def described(self) -> str:
+        """What to say of it."""
+        low, high = self.axis.points[0], self.axis.points[-1]
+        return f"{self.axis.size} cells from {low:.4g} to {high:.4g}"
+
+
+def find_grid(
+    name: str,
+    line: Line,
+    make: Callable[[Axis], GridModel],
+    rows: Sequence[Row],
+    cells: int | None = None,
+) -> FoundGrid:
+    """The grid of one hidden number.
+
+    Parameters
+    ----------
+    name : str
+    line : Line
+    make : callable
+        The template on a grid with this axis for the number.
+    rows : sequence of Row
+    cells : int, optional
+        As many as the caller wants; None finds how many.
+
+    Raises
+    ------
+    UnsupportedError
+        No grid of a bounded size holds the beliefs.
+    """
+    search = _Search(name, make, rows)
+    lattice = search.first(line)
+    lattice, before = search.pilot(lattice, cells)
+    if cells is not None:
+        before = search.passed(lattice.cut(max(cells // 2, 2))).increments
+        return search.answer(search.passed(lattice.cut(cells)), before)
+    while True:
+        finer = lattice.cut(2 * lattice.cells)
+        search.check_price(finer)
+        found = search.passed(finer)
+        done = search.answer(found, before)
+        last = 2 * finer.cells > MOST_CELLS or line.kind == "integers"
+        if last or np.max(done.error) <= TARGET or search.price(finer.cut(2 * finer.cells)) > 1:
+            return done
+        lattice, before = finer, found.increments
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Passed:
+    """One pass over the data."""
+
+    axis: Axis
+    mover: GridMover
+    increments: np.ndarray
+    beyond: np.ndarray
+    kept: list[Cells] | None
+
+
+class _Search:
+    """Passes over the rows of a series on one lattice after the other."""
+
+    def __init__(
+        self, name: str, make: Callable[[Axis], GridModel], rows: Sequence[Row]
+    ) -> None:
+        self.name, self.make, self.rows = name, make, rows
+        self.limit = TARGET / (4 * len(rows))
+
+    # ---- where to begin -------------------------------------------------------------------------
+
+    def first(self, line: Line) -> Lattice:
+        """A lattice that holds the belief about the first slice, about as fine as densities are wide."""
+        low, high = self._guess(line)
+        lattice = Lattice(line, low, high, 256)
+        if line.kind == "integers":
+            lattice = Lattice(line, low, high, round(high - low))
+        width = np.inf
+        for _ in range(80):
+            found = self._tried(self._mover(lattice), None, self.rows[0])
+            share = None if found is None else self._shares(found)
+            if found is not None and share is None:  # it is seen there
+                break
+            reached = (True, True) if share is None else self._reached(share, lattice)
+            if any(reached):
+                span = lattice.high - lattice.low
+                wider = lattice.to(
+                    lattice.low - span * reached[0], lattice.high + span * reached[1]
+                )
+                lattice = wider.cut(256)
+                continue
+            assert share is not None
+            tops = share.max(axis=0)
+            left = np.cumsum(share, axis=0), np.cumsum(share[::-1], axis=0)[::-1]
+            inside = np.minimum(*left) > self.limit / 10
+            some = np.flatnonzero(inside.reshape(len(share), -1).any(axis=1))
+            width = lattice.step / (2.51 * float(tops.max()))
+            if line.kind in ("interval", "integers") or np.ptp(some) >= lattice.cells // 4:
+                break
+            ends = lattice.low + lattice.step * np.array([some[0] - 2, some[-1] + 3])
+            lattice = Lattice(line, float(ends[0]), float(ends[1]), 256)
+        else:
+            raise self._refused("no range was found that holds the belief about its first slice")
+        if line.kind == "integers":
+            return lattice
+        width = min(width, self._narrowest(lattice))
+        return self._cut(lattice, (lattice.high - lattice.low) / width)
+
+    def _guess(self, line: Line) -> tuple[float, float]:
+        """Coordinates between which slice 0 may lie: draws from its density, and what was seen."""
+        if line.kind == "interval":
+            return line.low, line.high
+        start = 1.0 if line.kind == "real" else float(np.clip(1.0, line.low + 1, line.high - 1))
+        point = float(line.number(np.asarray(0.0))) if line.kind in ("above", "below") else start
+        kind = np.int64 if line.kind == "integers" else float
+        axis = Axis(np.array([point], dtype=kind), np.ones(1))
+        model, row = self.make(axis), self.rows[0]
+        placed = model.place(row)
+        dist = model.evaluate(True, self.name, model.base(None, placed))
+        draws = [np.ravel(dist.sample(np.random.default_rng(0), (400,))).astype(float)]
+        for k in {0, len(self.rows) // 2, len(self.rows) - 1}:
+            seen = self.rows[k].seen.get(self.name)
+            if seen is not None:
+                values = np.asarray(seen.value, dtype=float)
+                draws.append(np.ravel(values if seen.mask is None else values[seen.mask]))
+        u = line.coordinate(np.concatenate(draws))
+        u = u[np.isfinite(u)]
+        if not len(u):
+            raise self._refused("draws from its first density are no numbers")
+        low, high = np.quantile(u, [0.01, 0.99])
+        if line.kind == "integers":
+            low, high = np.floor(low), np.ceil(high) + 1
+            span = high - low
+            return max(low - span, line.low), min(high + span, line.high + 1)
+        span = max(high - low, 1e-9 * max(abs(low), abs(high)), 1e-300)
+        return float(low - span), float(high + span)
+
+    def _narrowest(self, lattice: Lattice) -> float:
+        """How wide the densities are that lead on from there, in the coordinate."""
+        if len(self.rows) < 2:
+            return np.inf
+        model = self.make(lattice.cut(64).axis())
+        before, now = model.place(self.rows[0]), model.place(self.rows[1])
+        dist = model.evaluate(False, self.name, model.base(before, now))
+        centre: Any = None
+        with suppress(UnsupportedError, NotImplementedError):
+            centre, width = np.asarray(dist.mean), np.sqrt(np.asarray(dist.var))
+        if centre is None or not np.isfinite(width).any():
+            draws = dist.sample(np.random.default_rng(0), (64,))
+            low, centre, high = np.quantile(draws, [0.25, 0.5, 0.75], axis=0)
+            width = (high - low) / 1.35
+        width = width / lattice.line.stretch(lattice.line.coordinate(centre))
+        width = width[np.isfinite(width) & (width > 0)]
+        return float(np.quantile(width, 0.1)) if len(width) else np.inf
+
+    # ---- passes ---------------------------------------------------------------------------------
+
+    def pilot(self, lattice: Lattice, cells: int | None) -> tuple[Lattice, np.ndarray]:
+        """A pass in which the lattice becomes as wide and as fine as beliefs want; the last one, and logs."""
+        mover, before = self._mover(lattice), None
+        increments, k, impossible = [], 0, 0
+        grows = any(lattice.line.grows)
+        while k < len(self.rows):
+            with in_slice(self.rows[k].t):
+                found = self._tried(mover, before, self.rows[k])
+            share = None if found is None else self._shares(found)
+            changed = lattice
+            if found is None:
+                impossible += 1
+                if not grows or impossible > 12:
+                    mover.move(before, self.rows[k])  # says what is wrong
+                changed = lattice.widened(True, True)
+            elif share is not None:
+                changed = lattice.widened(*self._reached(share, lattice))
+                fixed = cells is not None or lattice.line.kind == "integers"
+                if changed.cells == lattice.cells and share.max() > _TOP and not fixed:
+                    changed = self._cut(lattice, 2 * lattice.cells)
+            if changed != lattice:
+                lattice = changed
+                self.check_price(lattice.cut(2 * lattice.cells))
+                mover = self._mover(lattice)
+                continue
+            assert found is not None
+            increments.append(found.increment)
+            before, k = found, k + 1
+        return lattice, np.array(increments)
+
+    def passed(self, lattice: Lattice) -> _Passed:
+        """A pass on one lattice."""
+        mover, before = self._mover(lattice), None
+        increments, kept = [], []
+        beyond: Any = 0.0
+        few = True
+        for row in self.rows:
+            with in_slice(row.t):
+                before = mover.move(before, row)
+            increments.append(before.increment)
+            share = self._shares(before)
+            if share is not None:
+                ends = np.where(self._open(lattice), share[[0, -1]].T, 0.0).T
+                beyond = beyond + len(share) * ends.sum(axis=0)
+            few = few and 2 * before.probs.nbytes * len(self.rows) <= _KEPT
+            if few:
+                kept.append(before)
+        whole = np.array(increments)
+        return _Passed(
+            lattice.axis(), mover, whole, beyond * np.ones(whole.shape[1:]), kept if few else None
+        )
+
+    def answer(self, found: _Passed, before: np.ndarray) -> FoundGrid:
+        """A grid with its error: what the last halving changed, and what may lie beyond the ends."""
+        off = np.abs(found.increments.sum(axis=0) - before.sum(axis=0))
+        rounding = 1e-15 * np.abs(found.increments).sum(axis=0)
+        error = off + found.beyond + rounding
+        return FoundGrid(self.name, found.axis, error, found.mover, found.kept)
+
+    def price(self, lattice: Lattice) -> float:
+        """What a pass takes, over what it may."""
+        model = self._mover(lattice.cut(8)).model
+        others = [n for n in model.own if n not in model.leaves and n != self.name]
+        domains = [model.slices.first[n].domain for n in others]
+        states = np.prod([float(d.size) for d in domains if d is not None], initial=1.0)
+        entries = (lattice.cells * states) ** 2 * np.prod(model.lead, initial=1.0)
+        anew = ANEW if model.sources(False, self.name).timed else 1
+        return float(entries * anew * len(self.rows) / MOST_ENTRIES)
+
+    def check_price(self, lattice: Lattice) -> None:
+        """Refuse a lattice that is too large."""
+        if lattice.cells > MOST_CELLS:
+            raise self._refused(
+                f"beliefs range from {lattice.line.number(np.float64(lattice.low)):.4g} to "
+                f"{lattice.line.number(np.float64(lattice.high)):.4g}, and some are so narrow that this takes "
+                f"more than {MOST_CELLS} cells"
+            )
+        if self.price(lattice) > 1:
+            raise self._refused(
+                f"{lattice.cells} cells in each of {len(self.rows)} slices take too long"
+            )
+
+    # ---- private --------------------------------------------------------------------------------
+
+    def _mover(self, lattice: Lattice) -> GridMover:
+        return GridMover(self.make(lattice.axis()), np.inf)
+
+    def _tried(self, mover: GridMover, before: Cells | None, row: Row) -> Cells | None:
+        try:
+            return mover.move(before, row)
+        except ZeroProbabilityError:
+            return None
+
+    def _shares(self, cells: Cells) -> np.ndarray | None:
+        """Probabilities of the cells of the number, shape (n, *apart); zero where it is seen."""
+        for k, scalar in enumerate(cells.placed.scalars):
+            if scalar.label[0] == self.name:  # type: ignore[index]
+                others = tuple(j for j in range(len(cells.placed.scalars)) if j != k)
+                share = cells.probs.sum(axis=others)
+                return np.where(scalar.widths[-1] > 0, share, 0.0)
+        return None
+
+    def _open(self, lattice: Lattice) -> np.ndarray:
+        """Whether the low and the high end may be moved out."""
+        line = lattice.line
+        low, high = line.grows
+        if line.kind == "integers":
+            low, high = lattice.low > line.low, lattice.high < line.high + 1
+        return np.array([low, high])
+
+    def _reached(self, share: np.ndarray, lattice: Lattice) -> tuple[bool, bool]:
+        """Whether too much may lie beyond the low and the high end: density there times the whole range."""
+        beyond = len(share) * share[[0, -1]].reshape(2, -1).max(axis=1)
+        low, high = self._open(lattice) & (beyond > self.limit)
+        return bool(low), bool(high)
+
+    def _cut(self, lattice: Lattice, cells: float) -> Lattice:
+        """So many cells, unless they are too many."""
+        finer = lattice.cut(int(min(max(np.ceil(cells), 32), 2 * MOST_CELLS)))
+        self.check_price(finer.cut(2 * finer.cells))
+        return finer
+
+    def _refused(self, why: str) -> UnsupportedError:
+        return UnsupportedError(f"no grid was found for {self.name!r}: {why}")
