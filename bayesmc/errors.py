@@ -204,6 +204,10 @@ class SupportWarning(BayesmcWarning):
     """A proposal that cannot reach values that have mass."""
 
 
+class ProposalWarning(BayesmcWarning):
+    """A proposal that is asked to look at what is seen and does not, for some nodes."""
+
+
 class GridWarning(BayesmcWarning):
     """A grid that is too small or too coarse for the densities on it."""
 

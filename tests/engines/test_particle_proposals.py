@@ -18,7 +18,8 @@ import bayesmc as bmc
 from bayesmc.dbn import pose_series
 from bayesmc.engines.particles import lookahead, stages
 from bayesmc.engines.particles.lookahead import Guarded, LookAhead
-from bayesmc.engines.particles.optimal import groups_of, has_moments, is_affine, order_of
+from bayesmc.engines.particles.looking import has_moments
+from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
 from bayesmc.engines.particles.stages import PluggedIn
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.network.forward import Pass

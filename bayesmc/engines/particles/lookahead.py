@@ -1,8 +1,10 @@
 """A block of hidden numbers as a Gaussian, given the slice before and what was seen below the block.
 
 Means are made linear where the block is expected (central differences) and moments are taken there: an
-extended Kalman update from a known start, one for every particle. It gives a density to draw the block from
-and the density of what was seen. Which nodes make a block is not decided here (``optimal``).
+extended Kalman update from a known start, one for every particle. What is seen and is not Gaussian (a count,
+a failure time) corrects that by the derivatives of its log density (``curved``). It gives a density to draw
+the block from and the density of what was seen. Mixtures of Gaussians make a block a mixture, of one such
+belief for each combination of components. Which nodes make a block is not decided here (``optimal``).
 
 Nodes on a circle count differences the short way round.
 
@@ -16,14 +18,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.distributions import WrappedNormal
 from bayesmc.distributions.circular import wrap_angle
+from bayesmc.engines.particles.curved import corrected
+from bayesmc.engines.particles.looking import (
+    NUMBERS,
+    by_moments,
+    density_at,
+    has_moments,
+    moments,
+    numbers_of,
+    once,
+    spreads,
+)
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.forward import Pass, Step, run
+from bayesmc.network.forward import Pass, Step, run, summed
 
 #: balances the rounding of a central difference against its curvature
 _STEP = float(np.finfo(float).eps ** (1 / 3))
@@ -70,6 +84,8 @@ class LookAhead:
         Plates whose elements have blocks of their own.
     affine : bool
         Whether all means are affine in the block: differences may take long steps, which lose no digits.
+    choices : dict, optional
+        Mixture of Gaussians -> the component that stands for it.
     """
 
     def __init__(
@@ -80,12 +96,14 @@ class LookAhead:
         order: Sequence[str],
         apart: tuple[str, ...],
         affine: bool = False,
+        choices: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
         self.model, self.block, self.seen = model, list(block), dict(seen)
+        self.choices = choices
         self.apart, self.affine = apart, affine
         self.share = 1.0 if affine else _STEP
         self.lead = tuple(model.sizes[p] for p in apart)
-        self.sizes = [self._numbers(model[n]) for n in self.block]
+        self.sizes = [numbers_of(model, n, apart) for n in self.block]
         self.total = sum(self.sizes)
         self.between = {n: _between(model, order, block, n) for n in (*self.block, *self.seen)}
         self.masks = {
@@ -95,6 +113,19 @@ class LookAhead:
             for n, m in self.seen.items()
             if m is not None
         }
+        self.straight = [
+            n
+            for n in self.seen
+            if n in choices
+            or (by_moments(model, n) and (affine or not spread_varies(model, order, block, n)))
+        ]
+        self.curved = [n for n in self.seen if n not in self.straight]
+        self.within = self._within(self.curved)
+        if len(self.within) > NUMBERS:  # too many for derivatives: what has moments is taken by them
+            self.straight += [n for n in self.curved if has_moments(model, n)]
+            self.curved = []
+        #: what is seen and tells nothing all the same
+        self.ignored = [n for n in self.seen if n not in (*self.straight, *self.curved)]
 
     def __call__(self, state: Pass) -> None:
         state.weigh(-self.draw(state, self.believed(state)))
@@ -116,12 +147,15 @@ class LookAhead:
             cov[..., :at, own] = np.swapaxes(cross, -1, -2)
             cov[..., own, own] = _times(cross, np.swapaxes(slopes, -1, -2)) + noise
             at += size
-        start = belief = Belief(mean, cov, np.zeros(shape))
-        for turn in range(1 if self.affine else _TURNS):
+        mean, cov = _where_finite(mean), _where_finite(cov)
+        start = belief = Belief(mean, cov, self._log_choices(state, mean))
+        for turn in range(1 if self.affine or not self.straight else _TURNS):
             at_mean, belief = belief.mean, start
-            for name in self.seen:
+            for name in self.straight:
                 point = belief.mean if turn == 0 else at_mean
                 belief = self._updated(state, name, belief, point)
+            if self.curved:
+                belief = self._corrected(state, belief, at_mean if turn else None)
             moved = np.abs(belief.mean - at_mean)
             spread = np.sqrt(np.diagonal(belief.cov, axis1=-2, axis2=-1))
             if not (moved > _STILL * spread).any():
@@ -161,11 +195,71 @@ class LookAhead:
         found: np.ndarray = log - np.log(np.diagonal(root, axis1=-2, axis2=-1)).sum(axis=-1)
         return found
 
+    def _within(self, names: Sequence[str]) -> np.ndarray:
+        """Positions in the block of the numbers that some nodes depend on."""
+        read = {p for n in names for m in (n, *self.between[n]) for p in self.model[m].parents}
+        ends = np.cumsum([0, *self.sizes])
+        parts = zip(self.block, ends, ends[1:], strict=False)
+        found = [np.arange(low, high) for name, low, high in parts if name in read]
+        return np.concatenate(found) if found else np.arange(0)
+
+    def _log_choices(self, state: Pass, mean: np.ndarray) -> np.ndarray:
+        """Log weights of the components that stand for mixtures, where the block is expected."""
+        total = np.zeros(mean.shape[:-1])
+        for name, choice in self.choices.items():
+            node = self.model[name]
+            dist, _ = self.model.evaluate(name, self._computed(state, name, mean))
+            weights = np.broadcast_to(dist.weights, (*dist.batch_shape, dist.weights.shape[-1]))
+            with np.errstate(divide="ignore"):
+                log = np.log(weights[..., choice])
+            if name in self.masks:
+                log = np.where(self.seen[name], log, 0.0)
+            total = total + summed(
+                np.broadcast_to(log, (*state.batch, *node.plate_shape)), node, self.apart
+            )
+        return total
+
+    def _computed(self, state: Pass, name: str, block: np.ndarray) -> dict[str, np.ndarray]:
+        """Values with the block's, and what is computed from them on the way to a node."""
+        values = {**state.values, **self._split(block)}
+        for other in self.between[name]:
+            found, _ = self.model.evaluate(other, values)
+            values[other] = np.asarray(found)
+        return values
+
+    def _corrected(self, state: Pass, belief: Belief, at: np.ndarray | None) -> Belief:
+        """The belief given what is seen and not Gaussian, by derivatives of its log density."""
+        mean, cov, log_before = belief
+        inner = self.within
+        block = cov[..., inner[:, None], inner]
+
+        def log_density(points: np.ndarray) -> np.ndarray:
+            full = np.broadcast_to(mean, (len(points), *mean.shape)).copy()
+            full[..., inner] = points
+            total = np.zeros(points.shape[:-1])
+            batch = (len(points), *state.batch)
+            for name in self.curved:
+                values = self._computed(state, name, full)
+                log = density_at(self.model, name, values, self.seen[name])
+                node = self.model[name]
+                log = np.broadcast_to(log, batch + node.plate_shape)
+                total = total + summed(log, node, self.apart)
+            return total
+
+        start = None if at is None else at[..., inner]
+        mode, spread, log = corrected(log_density, mean[..., inner], _root(block), start)
+        if len(inner) == self.total:
+            return Belief(mode, spread, log_before + log)
+        gain = np.swapaxes(np.linalg.solve(_settled(block), cov[..., inner, :]), -1, -2)
+        moved = mean + _applied(gain, mode - mean[..., inner])
+        cov = cov - _times(_times(gain, block - spread), np.swapaxes(gain, -1, -2))
+        return Belief(moved, cov, log_before + log)
+
     def _updated(self, state: Pass, name: str, belief: Belief, point: np.ndarray) -> Belief:
         """The belief given the value of one seen node, made linear at a point."""
         mean, cov, log_density = belief
         node = self.model[name]
-        size = self._numbers(node)
+        size = numbers_of(self.model, name, self.apart)
         centre, slopes, noise = self._linear(state, name, size, point, cov, self.total)
         off = self._flat(node, np.asarray(state.values[name], dtype=float)) - centre
         off = wrap_angle(off) if node.angles is not None else off
@@ -213,28 +307,25 @@ class LookAhead:
         for k in range(count):
             points[1 + k, ..., k] += steps[..., k]
             points[1 + count + k, ..., k] -= steps[..., k]
-        values = {**state.values, **self._split(points)}
-        for other in self.between[name]:
-            found, _ = self.model.evaluate(other, values)
-            values[other] = np.asarray(found)
-        dist, _ = self.model.evaluate(name, values)
+        dist, _ = self.model.evaluate(name, self._computed(state, name, points))
         node = self.model[name]
+        centre, noise = moments(dist, len(node.event_shape), self.choices.get(name))
         lead = (len(points), *mean.shape[:-1])
-        loc = self._spread_out(
-            node, np.asarray(dist.mean, dtype=float), lead, len(node.event_shape)
-        )
+        loc = self._spread_out(node, np.asarray(centre, dtype=float), lead, len(node.event_shape))
         loc = loc.reshape(*lead, size)
         slopes = np.zeros((*mean.shape[:-1], size, count))
         for k in range(count):
             rise = loc[1 + k] - loc[1 + count + k]
             rise = wrap_angle(rise) if node.angles is not None else rise
             slopes[..., k] = rise / (2 * steps[..., k, None])
-        return loc[0], slopes, self._noise(node, dist, lead, size)
+        return loc[0], slopes, self._noise(node, noise, lead, size)
 
-    def _noise(self, node: CompiledNode, dist: Any, lead: tuple[int, ...], size: int) -> np.ndarray:
+    def _noise(
+        self, node: CompiledNode, noise: Any, lead: tuple[int, ...], size: int
+    ) -> np.ndarray:
         """Covariance of a node given the block where that is expected."""
         if node.event_shape:
-            cov = self._spread_out(node, np.asarray(dist.cov, dtype=float), lead, 2)
+            cov = self._spread_out(node, np.asarray(noise, dtype=float), lead, 2)
             inner = node.event_shape[-1]
             cov = cov.reshape(*lead, size // inner, inner, inner)[0]
             full = np.zeros((*cov.shape[:-3], size, size))
@@ -242,16 +333,11 @@ class LookAhead:
                 part = slice(k * inner, (k + 1) * inner)
                 full[..., part, part] = cov[..., k, :, :]
             return full
-        var = self._spread_out(node, np.asarray(dist.var, dtype=float), lead, 0)
+        var = self._spread_out(node, np.asarray(noise, dtype=float), lead, 0)
         full = np.zeros((*lead[1:], size, size))
         index = np.arange(size)
         full[..., index, index] = var.reshape(*lead, size)[0]
         return full
-
-    def _numbers(self, node: CompiledNode) -> int:
-        """How many numbers a node has, plates apart not counted."""
-        sizes = zip(node.plates, node.plate_shape, strict=True)
-        return math.prod(n for p, n in sizes if p not in self.apart) * math.prod(node.event_shape)
 
     def _spread_out(
         self, node: CompiledNode, array: np.ndarray, lead: tuple[int, ...], event_ndim: int
@@ -306,14 +392,14 @@ class Guarded:
 
     Parameters
     ----------
-    look : LookAhead
+    look : LookAhead or ByCase
     own : sequence of steps
         Draw the block from its own densities, and compute what lies between.
     factors : sequence of steps
         Compute what lies between, and weigh by the block's own densities.
     """
 
-    def __init__(self, look: LookAhead, own: Sequence[Step], factors: Sequence[Step]) -> None:
+    def __init__(self, look: Any, own: Sequence[Step], factors: Sequence[Step]) -> None:
         self.look, self.own, self.factors = look, own, factors
 
     def __call__(self, state: Pass) -> None:
@@ -324,6 +410,7 @@ class Guarded:
         dead = np.where(alive, 0.0, -np.inf)  # bad parameters are excused there
         plain = run(self.own, Pass(state.rng, state.batch, dict(state.values), dead))
         look.draw(state, belief)
+        valid: dict[str, np.ndarray] = {}
         plainly = state.rng.random(shape) < SHARE
         for name in look.block:
             at = look.along(plainly, look.model[name])
@@ -332,9 +419,33 @@ class Guarded:
             state.values[name] = mixed
         drawn = run(self.factors, Pass(state.rng, state.batch, dict(state.values), dead))
         log_p = np.broadcast_to(drawn.log_weight, shape)
+        lost = log_p == -np.inf
+        if lost.any():  # such as below zero: without weight, but what comes later has to stand them
+            for name in look.block:
+                at = look.along(lost, look.model[name])
+                kept = np.where(at, plain.values[name], state.values[name])
+                kept.flags.writeable = False
+                valid[name] = kept
         log_q = look.log_density(state.values, belief)
         mixture = np.logaddexp(math.log1p(-SHARE) + log_q, math.log(SHARE) + log_p)
-        state.weigh(log_p - mixture)
+        state.weigh(np.where(lost, -np.inf, log_p - mixture))
+        state.values.update(valid)
+
+
+def spread_varies(model: Model, order: Sequence[str], block: Sequence[str], name: str) -> bool:
+    """Whether a block moves the variance of what is seen: then moments at one point do not describe it."""
+
+    def find() -> bool:
+        moved = dict(model.probe)
+        for other in block:
+            moved[other] = np.asarray(moved[other]) + 0.1 * (1 + np.abs(moved[other]))
+        for other in _between(model, order, block, name):
+            moved[other] = np.asarray(model.evaluate(other, moved)[0])
+        dists = [model.evaluate(name, values)[0] for values in (model.probe, moved)]
+        each = [spreads(dist, len(model[name].event_shape)) for dist in dists]
+        return not all(np.allclose(a, b, equal_nan=True) for a, b in zip(*each, strict=True))
+
+    return once(model, ("spread", name, tuple(block)), find)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -362,6 +473,18 @@ def _times(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _applied(a: np.ndarray, x: np.ndarray) -> np.ndarray:
     return a[..., 0] * x if a.shape[-1] == 1 else np.matvec(a, x)
+
+
+def _where_finite(values: np.ndarray) -> np.ndarray:
+    """Zero where a moment is none: the weight makes up for whatever is drawn there."""
+    good = np.isfinite(values)
+    return values if good.all() else np.where(good, values, 0.0)
+
+
+def _settled(cov: np.ndarray) -> np.ndarray:
+    """A covariance that can be divided by."""
+    spread = np.diagonal(cov, axis1=-2, axis2=-1)
+    return cov + np.maximum(1e-14 * spread, 1e-300)[..., None] * np.eye(cov.shape[-1])
 
 
 def _over_events(mask: np.ndarray, node: CompiledNode) -> np.ndarray:

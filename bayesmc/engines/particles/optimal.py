@@ -1,13 +1,15 @@
 """The proposal that looks at the row, derived from the declared densities: ``proposal="optimal"``.
 
 For every particle the hidden numbers of a slice are taken as jointly Gaussian given the slice before, and
-what was seen as Gaussian given them (``lookahead``). Where transitions are Normal and means of what is seen
+what was seen as Gaussian given them (``lookahead``), or by the curvature of its log density (``curved``);
+mixtures of Gaussians by their components (``cases``). Where transitions are Normal and means of what is seen
 are affine this is exactly p(x_t | x_{t-1}, y_t), the proposal of least variance; elsewhere weights p/q make
 up for the difference.
 
-A slice is cut into *groups*: a hidden node that is no Gaussian (a finite one, say) and depends on numbers of
+A slice is cut into *groups*: a hidden node that is no number (a finite one, say) and depends on numbers of
 a group is drawn once these are, and what depends on it makes the next group. Numbers that nothing seen
-depends on within their group are drawn from their own densities.
+depends on within their group are drawn from their own densities. What became of each node is told by
+``guidance``.
 
 References
 ----------
@@ -24,16 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import Row, Slices
-from bayesmc.distributions import Distribution, MvNormal, Normal
-from bayesmc.engines.particles.lookahead import Guarded, LookAhead
+from bayesmc.engines.particles.cases import look_ahead
+from bayesmc.engines.particles.lookahead import Guarded
+from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
 from bayesmc.engines.slice_steps import SlicePlan
-from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.forward import Step
 from bayesmc.structure.affine import why_not_linear
-
-#: states of a finite node that a mean and a variance describe
-_TWO = 2
 
 
 class OptimalPlan(SlicePlan):
@@ -42,7 +41,7 @@ class OptimalPlan(SlicePlan):
     def _build(self, row: Row) -> list[Step]:
         model = self.slices.model(row.t)
         order = order_of(model, self.slices)
-        groups = groups_of(model, order, row.seen, lambda name: has_moments(model, name))
+        groups = groups_of(model, order, row.seen, lambda n: why_not_looked_at(model, n) is None)
         if not any(group.block for group in groups):
             return super()._build(row)
         steps: list[Step] = []
@@ -58,7 +57,7 @@ class OptimalPlan(SlicePlan):
         model = self.slices.model(row.t)
         seen = {n: row.seen[n].mask for n in group.seen}
         affine = is_affine(model, group)
-        look = LookAhead(model, group.block, seen, order, self.apart, affine)
+        look = look_ahead(model, group.block, seen, order, self.apart, affine)
         between = {n for name in group.block for n in look.between[name]}
         inside = [n for n in order if n in between or n in group.block]
         own = [self.step(row, n) for n in inside]
@@ -103,7 +102,7 @@ def groups_of(
     order : sequence of str
         Nodes of the slice, parents first.
     looks : callable
-        Whether a seen node has moments to look at.
+        Whether a seen node tells anything.
     """
     at: dict[str, int] = {}  # the group in which a step is taken
     below: dict[str, bool] = {}  # whether it depends on numbers of its group
@@ -145,65 +144,104 @@ def order_of(model: Model, slices: Slices) -> list[str]:
     return [n for n in model.nodes if n in slices.dynamic]
 
 
-def has_moments(model: Model, name: str) -> bool:
-    """Whether a node has a mean and a variance that say where its value is."""
-
-    def find() -> bool:
-        node = model[name]
-        if node.domain is not None and node.domain.size > _TWO:
-            return False
-        try:
-            dist, _ = model.evaluate(name, model.probe)
-            spread = dist.cov if node.event_shape else dist.var
-            return bool(np.isfinite(np.asarray(dist.mean)).all() and np.isfinite(spread).all())
-        except (BayesmcError, AttributeError, NotImplementedError):
-            return False
-
-    return _once(model, ("moments", name), find)
-
-
-def family_of(model: Model, name: str) -> type[Distribution]:
-    """The family that a node's function returns."""
-    return _once(model, ("family", name), lambda: type(model.evaluate(name, model.probe)[0]))
-
-
 def is_affine(model: Model, group: Group) -> bool:
     """Whether a group is proved linear-Gaussian in its block, all else being known."""
-    return _once(model, (group.block, group.seen), lambda: _prove_affine(model, group))
+    return once(model, (group.block, group.seen), lambda: _prove_affine(model, group))
 
 
-def why_not_optimal(slices: Slices, observed: Collection[str]) -> str | None:
-    """Why no such proposal can be derived, or None."""
-    for model in (slices.first, slices.later):
-        informed: set[str] = set()
-        for name in reversed(order_of(model, slices)):
-            node = model[name]
-            if name in observed or name in informed:
-                informed |= set(node.parents)
-            hidden = node.is_stochastic and not node.is_discrete and name not in observed
-            if not hidden or name not in informed or _is_gaussian(model, name):
-                continue
-            family = family_of(model, name).__name__
-            return (
-                f'ParticleFilter(proposal="optimal"): {name!r} is {family}, and such a '
-                "proposal is derived for Normal and MvNormal nodes only; give proposal={...} yourself"
-            )
-    return None
+class Guidance(NamedTuple):
+    """What the row does for the nodes of a slice.
+
+    Attributes
+    ----------
+    guided : dict
+        Hidden node -> seen nodes with a look at which it is drawn.
+    unguided : dict
+        Hidden node that something seen depends on -> why it is drawn from its own density all the same.
+    unheard : dict
+        Seen node that depends on hidden ones -> why it guides none.
+    finite : frozenset of str
+        Hidden nodes without a number to guide.
+    """
+
+    guided: dict[str, tuple[str, ...]]
+    unguided: dict[str, str]
+    unheard: dict[str, str]
+    finite: frozenset[str]
+
+    def missing(self) -> str | None:
+        """What one would expect to be guided and is not, or None; finite nodes beside guided ones may be."""
+        if not self.unguided and not self.unheard:
+            return None
+        told = {n: why for n, why in self.unguided.items() if n not in self.finite}
+        told |= {n: why for n, why in self.unheard.items() if why != _NO_NUMBER}
+        if not self.guided:
+            told = {**self.unguided, **told}
+        return "; ".join(f"{n!r}: {why}" for n, why in told.items()) or None
+
+
+def guidance(
+    slices: Slices, observed: Collection[str], apart: tuple[str, ...], t: int = 1
+) -> Guidance:
+    """What a row with these nodes seen does for each node of slice ``t``.
+
+    Parameters
+    ----------
+    observed : collection of str
+    apart : tuple of str
+        Plates that are filtered separately.
+    t : int
+        0 for the first slice; all others are alike.
+    """
+    model = slices.model(t)
+    order = order_of(model, slices)
+    seen = {n: Observed(np.asarray(model.probe[n])) for n in order if n in observed}
+    groups = groups_of(model, order, seen, lambda n: why_not_looked_at(model, n) is None)
+    below, informed = _reach(model, order, seen)
+    heard: dict[str, list[str]] = {}
+    for group in (g for g in groups if g.block):
+        look = look_ahead(model, group.block, dict.fromkeys(group.seen), order, apart)
+        for name in group.seen:
+            if name not in look.ignored:
+                heard[name] = [n for n in group.block if n in below[name]]
+    guided = {n: tuple(s for s in seen if n in heard.get(s, ())) for n in order}
+    guided = {n: by for n, by in guided.items() if by}
+    hidden = [n for n in informed if model[n].is_stochastic and n not in guided]
+    unguided = {n: why_not_drawn(model, n) or _LATER for n in hidden}
+    finite = frozenset(n for n in hidden if model[n].is_discrete or model[n].domain is not None)
+    unheard = {}
+    for name in (n for n in seen if below[n] and not heard.get(n)):
+        numbers = [n for n in below[name] if why_not_drawn(model, n) is None]
+        looked = any(name in g.seen for g in groups)
+        why = why_not_looked_at(model, name) if numbers else _NO_NUMBER
+        unheard[name] = why or (_MANY if looked else _BEHIND)
+    return Guidance(guided, unguided, unheard, finite)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
+_NO_NUMBER = "it depends on no hidden number"
+_BEHIND = "it depends on no number but through nodes that are drawn from their own densities"
+_LATER = "what is seen of it hangs on a node between that is drawn after it"
+_MANY = f"it depends on more than {NUMBERS} hidden numbers, too many for derivatives of its density"
 
-def _is_gaussian(model: Model, name: str) -> bool:
-    return issubclass(family_of(model, name), (Normal, MvNormal))
+
+def _reach(
+    model: Model, order: Sequence[str], seen: Mapping[str, Observed]
+) -> tuple[dict[str, set[str]], list[str]]:
+    """For each node the hidden nodes of its slice that it depends on, and those that any seen one does."""
+    below: dict[str, set[str]] = {}
+    for name in order:
+        below[name] = set()
+        for parent in (p for p in model[name].parents if p in below and p not in seen):
+            below[name] |= below[parent] | ({parent} if model[parent].is_stochastic else set())
+    told = {n for name in seen for n in below[name]}
+    return below, [n for n in order if n in told]
 
 
 def _is_number(model: Model, name: str, seen: Mapping[str, Observed]) -> bool:
     """Whether a node is a hidden number that a block may hold."""
-    node: CompiledNode = model[name]
-    if name in seen or not node.is_stochastic or node.is_discrete or node.domain is not None:
-        return False
-    return _is_gaussian(model, name)
+    return name not in seen and model[name].is_stochastic and why_not_drawn(model, name) is None
 
 
 def _in_full(seen: Mapping[str, Observed], name: str) -> bool:
@@ -233,11 +271,3 @@ def _prove_affine(model: Model, group: Group) -> bool:
     inputs = {n: model.probe[n] for n in ordered if model[n].kind in ("input", "fixed")}
     part = replace(model, nodes=ordered, potentials={}, cache={})
     return why_not_linear(part, known, inputs) is None
-
-
-def _once(model: Model, key: Any, find: Callable[[], Any]) -> Any:
-    """What was found of a model before, or is found now: rows with gaps have their steps built anew."""
-    kept = model.cache.setdefault("looking ahead", {})
-    if key not in kept:
-        kept[key] = find()
-    return kept[key]

@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import Row
-from bayesmc.distributions import MvNormal, Normal, VonMises, WrappedNormal
+from bayesmc.engines.particles.cases import ByCase, look_ahead
 from bayesmc.engines.particles.lookahead import LookAhead
-from bayesmc.engines.particles.optimal import family_of, groups_of, is_affine, order_of
+from bayesmc.engines.particles.looking import why_not_looked_at
+from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.network import CompiledNode
@@ -39,7 +40,6 @@ _DRAWS = 8
 _CASES = 16
 #: numbers of the largest node in a block of particles
 _BLOCK = 8192
-_GAUSSIAN = (Normal, MvNormal, VonMises, WrappedNormal)
 
 
 class PluggedIn:
@@ -78,6 +78,10 @@ class PluggedIn:
             count = part.stop - low
             log[part] = predictive.log_density({**known, **values}, count, rng)
         return _floored(log) if predictive.exact else _shared(_floored(log))
+
+    def treated(self, row: Row) -> dict[str, str]:
+        """What the look ahead does to each hidden node of a row's slice; those that it leaves out are not in."""
+        return self._predictive(row).treated()
 
     def _predictive(self, row: Row) -> _Predictive:
         if any(o.mask is not None for o in row.seen.values()):
@@ -140,7 +144,7 @@ class _Predictive:
         self.order = order_of(self.model, plan.slices)
         self.groups = groups_of(self.model, self.order, row.seen, self._looks)
         self.looks = [
-            LookAhead(
+            look_ahead(
                 self.model, g.block, {n: row.seen[n].mask for n in g.seen}, self.order, plan.apart,
                 is_affine(self.model, g),
             )
@@ -171,12 +175,19 @@ class _Predictive:
             total = np.logaddexp(total, np.where(np.isnan(log), -np.inf, log) + self.each)
         return total
 
+    def treated(self) -> dict[str, str]:
+        """What is done to each hidden node that matters."""
+        found = {n: "integrated out" for g in self.groups for n in g.block if g.seen}
+        drawn = [n for n in self.wanted if self.model[n].is_stochastic and not self._known(n)]
+        how = "summed over" if self.cases is not None else f"drawn {_DRAWS} times"
+        return found | dict.fromkeys(drawn, how)
+
     def _looks(self, name: str) -> bool:
-        """Whether a node that depends on hidden numbers is integrated as a Gaussian."""
+        """Whether a node that depends on hidden numbers is integrated over these."""
         seen = self.row.seen[name]
         if seen.mask is not None and any(name in self.model[n].parents for n in self.order):
             return False  # its missing elements are needed
-        return issubclass(family_of(self.model, name), _GAUSSIAN)
+        return why_not_looked_at(self.model, name) is None
 
     def _known(self, name: str) -> bool:
         return name in self.row.seen and self.row.seen[name].mask is None
@@ -230,14 +241,15 @@ class _Predictive:
 class _Integrated:
     """A block integrated out; drawn, too, where something else depends on it."""
 
-    def __init__(self, look: LookAhead, drawn: bool) -> None:
+    def __init__(self, look: LookAhead | ByCase, drawn: bool) -> None:
         self.look, self.drawn = look, drawn
 
     def __call__(self, state: Pass) -> None:
-        belief = self.look.believed(state)
+        look: Any = self.look
+        belief = look.believed(state)
         state.weigh(belief.log_density)
         if self.drawn:
-            self.look.draw(state, belief)
+            look.draw(state, belief)
 
 
 def _type(node: CompiledNode) -> Any:
