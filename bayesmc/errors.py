@@ -212,6 +212,10 @@ class GridWarning(BayesmcWarning):
     """A grid that is too small or too coarse for the densities on it."""
 
 
+class ModelMisfitWarning(BayesmcWarning):
+    """Rows of a series are, as a whole, far less likely than the model says that rows are."""
+
+
 class LogWarning(BayesmcWarning):
     """Lines of a log were skipped, since they do not read."""
 

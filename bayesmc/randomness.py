@@ -44,6 +44,7 @@ class Purpose(IntEnum):
     FILTER = 4
     SMOOTH = 5
     TEST = 6
+    CHECK = 7
 
 
 def stream(seed: np.random.SeedSequence, purpose: Purpose, unit: int = 0) -> np.random.Generator:

@@ -14,6 +14,7 @@ import numpy as np
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import table_variance
+from bayesmc.results.predictive import Predictive
 
 
 class SeriesPosterior:
@@ -46,6 +47,13 @@ class SeriesPosterior:
         Whether particles were drawn anew, since no weight was left; evidence and answers are biased then.
     queries : dict
         Name -> expectation of a function in every slice, time first.
+    row_ranks : ndarray or None, shape (time,) or (time, *plates)
+        Share of the rows that the filter expected which are less likely than the one that came: uniform where
+        the model is right, near 0 where rows surprise it. NaN where nothing was seen or compared: Gaussian
+        filters compare all rows, particle filters 64 or a fourth of them, with a few rows drawn from their
+        particles. None from other engines.
+    row_deficits : ndarray or None, shape (time,) or (time, *plates)
+        By how many nats per observed number each row is less likely than expected; 0 on average.
 
     Examples
     --------
@@ -63,6 +71,7 @@ class SeriesPosterior:
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None
     rejuvenated: np.ndarray | None = None
+    predictive: Predictive | None = None
 
     def __init__(
         self,
@@ -134,6 +143,66 @@ class SeriesPosterior:
                 "queries={name: function} to the call"
             )
         return self._tables[name].copy()
+
+    @property
+    def row_ranks(self) -> np.ndarray | None:
+        return None if self.predictive is None else self.predictive.row_ranks.copy()
+
+    @property
+    def row_deficits(self) -> np.ndarray | None:
+        return None if self.predictive is None else self.predictive.row_deficits.copy()
+
+    def predictive_ranks(self, name: str) -> np.ndarray:
+        """Where an observed node's values lie among what was expected of them, given the rows before.
+
+        The probability, before the row came, of a smaller value (the probability integral transform): uniform
+        on (0, 1) where the model is right, heaped at both ends where its spread is too small, at one end
+        where it is off to one side. Particle filters count among 19 draws, and break ties by chance, so that
+        ranks of discrete nodes are uniform, too.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        ndarray, shape (time, *plates, *event)
+            NaN where it was not seen or not compared (``row_ranks``).
+
+        Raises
+        ------
+        UnknownNodeError, QueryError
+        UnsupportedError
+            The engine does not compare rows with what it expected.
+
+        References
+        ----------
+        Dawid (1984), Statistical theory: the prequential approach, JRSS A 147; Czado, Gneiting and Held
+        (2009), Predictive model assessment for count data, Biometrics 65, for ties.
+
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> dbn = bmc.DynamicBayesNet()
+        >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+        >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+        >>> filtered = bmc.filter(dbn, {"y": [0.0, 4.0, 4.5]}, engine=bmc.KalmanFilter())
+        >>> filtered.predictive_ranks("y").round(3).tolist()
+        [0.5, 0.993, 0.872]
+        """
+        if name not in self.model.nodes:
+            raise UnknownNodeError(f"there is no node {name!r}; there are {list(self.model.nodes)}")
+        if self.predictive is None:
+            raise UnsupportedError(
+                f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare rows "
+                "with what was expected of them; ask the result of filter by a KalmanFilter, an "
+                "ExtendedKalmanFilter, an UnscentedKalmanFilter or a ParticleFilter, with some rows observed"
+            )
+        if name not in self.predictive.ranks:
+            raise QueryError(
+                f"predictive_ranks({name!r}): the node is not observed; ask of one that is"
+            )
+        return self.predictive.ranks[name].copy()
 
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""

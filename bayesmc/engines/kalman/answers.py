@@ -75,4 +75,6 @@ def _answers(
         variances=answers.variances, start=problem.series.start,
     )  # fmt: skip
     found.layout, found.spreads = layout, spreads
+    found.normalised = filtered.innovations
+    found.predictive = filtered.innovations.predictive()
     return found

@@ -23,6 +23,7 @@ from bayesmc.engines.kalman.rows import Memory, RowTaker
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
 from bayesmc.progress import Progress
+from bayesmc.results.predictive import warn_of_misfit
 
 
 class GaussianFilter(FilterEngine):
@@ -87,7 +88,9 @@ class GaussianFilter(FilterEngine):
             found = self._passed(problem, data, False, progress)
         except KeyboardInterrupt as stop:
             return answer_so_far(stop, self)
-        return filter_answers(self, problem, data, found)
+        answers = filter_answers(self, problem, data, found)
+        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 4)
+        return answers
 
     def smooth(
         self,
@@ -103,7 +106,9 @@ class GaussianFilter(FilterEngine):
         found = self._passed(problem, data, True, progress)
         smoothed = backward(data.layouts[0], found, lag)
         kind = "smooth" if lag is None else "fixed-lag"
-        return smooth_answers(self, problem, data, found, smoothed, kind)
+        answers = smooth_answers(self, problem, data, found, smoothed, kind)
+        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 4)
+        return answers
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None

@@ -22,6 +22,7 @@ from bayesmc.engines.kalman.covariances import (
     stacked_fields,
 )
 from bayesmc.engines.kalman.data import Pattern, SeriesData
+from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.kernels.kalman import Conditioned, log_densities, multiplied, standardised
 
@@ -42,11 +43,13 @@ class Means(NamedTuple):
         Log densities of rows.
     shifts : ndarray, shape (time, *lead, carried), or None
         What the innovations of a slice tell of the noise of the one before; for smoothers.
+    innovations : Innovations
     """
 
     means: np.ndarray
     increments: np.ndarray
     shifts: np.ndarray | None
+    innovations: Innovations
 
 
 def all_means(data: SeriesData, chosen: Chosen, covariances: Covariances, smoothing: bool) -> Means:
@@ -54,7 +57,8 @@ def all_means(data: SeriesData, chosen: Chosen, covariances: Covariances, smooth
     layout, steps = data.layouts[0], data.steps
     shape = (steps, *layout.lead)
     shifts = np.zeros((*shape, layout.carried)) if smoothing else None
-    found = Means(np.empty((*shape, layout.n)), data.certain(), shifts)
+    innovations = Innovations(layout, data.series.observed, steps)
+    found = Means(np.empty((*shape, layout.n)), data.certain(), shifts, innovations)
     work = _Work(data, chosen, covariances, found)
     mean = work.first()
     for low, high in work.stretches():
@@ -126,7 +130,8 @@ class _Work:
         given = None if self.data.given is None else self.data.given[0][0]
         made = self.covariances.conditioned[self.covariances.which[0]]
         row = self._row(layout, pattern, np.zeros(1, dtype=np.intp))[0]
-        after, _, log = absorbed(layout, pattern, made, mean, row, given)
+        after, eta, log = absorbed(layout, pattern, made, mean, row, given)
+        self.found.innovations.put(0, layout, pattern, made.root, eta)
         self.found.means[0] = after
         self.found.increments[0] += log
         return after[..., : layout.carried]
@@ -218,6 +223,7 @@ class _Work:
         after = expected[..., p:] + _times(part.gain, eta)
         self.found.means[part.slices] = _placed(layout, part.pattern, after, part.given)
         self.found.increments[part.slices] += log_densities(part.root, eta, seen)
+        self.found.innovations.put(part.slices, layout, part.pattern, part.root, eta)
         if self.found.shifts is not None:
             records = [self.covariances.conditioned[k] for k in part.kinds]
             inverse = np.searchsorted(part.kinds, self.covariances.which[part.slices])

@@ -13,6 +13,7 @@ from bayesmc.engines.kalman.answers import filter_answers
 from bayesmc.engines.kalman.base import GaussianFilter
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.levels import Level, Made, Plan, expected_slice, why_not_matched
 from bayesmc.engines.kalman.passes import Filtered, State, Turns
 from bayesmc.engines.kalman.posterior import GaussianSeries
@@ -102,7 +103,8 @@ class NonlinearFilter(GaussianFilter):
             square = (*shape, c, c)
             turns = Turns(np.zeros(square), np.zeros(square), np.zeros((*shape, c)))
         found = Filtered(
-            np.empty((*shape, n)), np.zeros((*shape, n, n)), np.arange(steps), np.empty(shape), turns
+            np.empty((*shape, n)), np.zeros((*shape, n, n)), np.arange(steps), np.empty(shape), turns,
+            Innovations(whole, data.series.observed, steps),
         )  # fmt: skip
         taker = RowTaker(self, problem.slices, data.static)
         before: Taken | None = None
@@ -129,6 +131,7 @@ def _write(found: Filtered, k: int, whole: Layout, taken: Taken) -> None:
     """A slice's mean and root in the layout of the series; what is known there has no spread."""
     own = taken.layout
     found.increments[k] = taken.log_density
+    found.innovations.put(k, own, taken.pattern, taken.made.root, taken.eta)
     for name, place in whole.rows.items():
         if name in own.rows:
             found.means[k][..., place] = taken.mean[..., own.rows[name]]

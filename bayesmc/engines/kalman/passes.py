@@ -21,6 +21,7 @@ from bayesmc.engines.kalman.covariances import (
     worked_out,
 )
 from bayesmc.engines.kalman.data import SeriesData
+from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.means import all_means
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
@@ -64,6 +65,7 @@ class Filtered:
     increments : ndarray, shape (time, *lead)
     turns : Turns or None
         None where no smoother asks.
+    innovations : Innovations
     """
 
     means: np.ndarray
@@ -71,12 +73,14 @@ class Filtered:
     which: np.ndarray
     increments: np.ndarray
     turns: Turns | None
+    innovations: Innovations
 
     def first(self, steps: int) -> Filtered:
         """The first so many slices, for answers; they carry no smoother."""
         return Filtered(
-            self.means[:steps], self.factors, self.which[:steps], self.increments[:steps], None
-        )
+            self.means[:steps], self.factors, self.which[:steps], self.increments[:steps], None,
+            self.innovations.first(steps),
+        )  # fmt: skip
 
 
 def forward(
@@ -96,7 +100,8 @@ def forward(
     if found.shifts is not None:
         turns = Turns(*_turns(data.layouts[0], covariances), found.shifts)
     factors = _factors(data, chosen, covariances)
-    return Filtered(found.means, factors, covariances.which, found.increments, turns)
+    which, increments = covariances.which, found.increments
+    return Filtered(found.means, factors, which, increments, turns, found.innovations)
 
 
 def start_state(layout: Layout) -> State:

@@ -11,6 +11,7 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.filtering import refuse_forecast
+from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.rows import RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
@@ -69,7 +70,20 @@ class Spreads:
 class GaussianSeries(SeriesPosterior):
     """Gaussian beliefs about every slice.
 
-    Answers what ``SeriesPosterior`` does, and ``cov``.
+    Answers what ``SeriesPosterior`` does, ``cov``, and by how much rows were off what was expected of them.
+
+    Attributes
+    ----------
+    nis : ndarray, shape (time, *plates)
+        Normalised innovations squared: each row's squared distance from what was expected of it, in units of
+        its covariance; chi-square with ``nis_df`` degrees of freedom where the model is right, so that their
+        sums should be about alike. 0 where nothing was seen. Plates are those filtered separately.
+    nis_df : ndarray of int, shape (time, *plates)
+        How many numbers were observed in each slice, of nodes that depend on hidden ones.
+
+    References
+    ----------
+    Bar-Shalom, Li and Kirubarajan (2001), Estimation with Applications to Tracking and Navigation, sec. 5.4.
 
     Examples
     --------
@@ -82,10 +96,53 @@ class GaussianSeries(SeriesPosterior):
     >>> filtered = bmc.filter(dbn, {"y": [0.1, 1.2, 1.9]}, engine=KalmanFilter())
     >>> filtered.cov("x", "v").shape
     (3, 2, 2)
+    >>> filtered.nis.shape, filtered.nis_df.tolist(), filtered.innovations("y").shape
+    ((3,), [1, 1, 1], (3,))
     """
 
     layout: Layout
     spreads: Spreads
+    normalised: Innovations | None = None
+
+    @property
+    def nis(self) -> np.ndarray:
+        return self._innovations("nis").nis.copy()
+
+    @property
+    def nis_df(self) -> np.ndarray:
+        return self._innovations("nis_df").df.copy()
+
+    def innovations(self, name: str) -> np.ndarray:
+        """What an observed node was off, in standard deviations of what was expected of it.
+
+        Each number by its own standard deviation given the rows before; angles the short way round. Where the
+        model is right they are standard normal, independent from slice to slice.
+
+        Parameters
+        ----------
+        name : str
+
+        Returns
+        -------
+        ndarray, shape (time, *plates, *event)
+            NaN where it was not seen, and for nodes that depend on nothing hidden.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError
+        """
+        normalised = self._innovations(f"innovations({name!r})")
+        if name not in self.model.nodes:
+            raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
+        found = normalised.of(name)
+        if found is None:
+            raise QueryError(f"innovations({name!r}): the node is not observed; ask of one that is")
+        return found
+
+    def _innovations(self, what: str) -> Innovations:
+        if self.normalised is None:
+            raise QueryError(f"{what}: slices ahead of the data have no rows to compare; ask a filter's result")
+        return self.normalised
 
     def cov(self, *names: str) -> np.ndarray:
         """Joint covariances of nodes in every slice.

@@ -73,6 +73,7 @@ class Taken(NamedTuple):
         Of the row given those before.
     known : dict
         Values of the nodes that are known.
+    pattern : Pattern
     """
 
     layout: Layout
@@ -82,6 +83,7 @@ class Taken(NamedTuple):
     eta: np.ndarray
     log_density: np.ndarray
     known: dict[str, np.ndarray]
+    pattern: Pattern
 
 
 class RowTaker:
@@ -127,7 +129,7 @@ class RowTaker:
         known = {n: o.value for n, o in row.seen.items() if o.mask is None}
         known |= {n: values[n] for n in layout.computed}
         return Taken(
-            layout, after, full_factor(layout, pattern, made.factor), made, eta, log, known
+            layout, after, full_factor(layout, pattern, made.factor), made, eta, log, known, pattern
         )
 
     # ---- private -------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ from bayesmc.engines.particles.mover import Mover
 from bayesmc.engines.particles.optimal import OptimalPlan, guidance
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.particles.smoothing import Backward, carried, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
@@ -35,6 +36,7 @@ from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
+from bayesmc.results.predictive import warn_of_misfit
 
 #: options that hold functions by node
 _FUNCTIONS = ("proposal", "initial_proposal", "rejuvenation")
@@ -282,6 +284,7 @@ class ParticleFilter(FilterEngine):
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
         self._warn_of_collapse(found)
+        warn_of_misfit(found.predictive, type(self).__name__, found.start, 4)
         return found
 
     def smooth(
@@ -303,6 +306,7 @@ class ParticleFilter(FilterEngine):
             raise UnsupportedError(_not_backwards(sums[0]))
         filtered = self._passed(problem, seed, True, {}, progress)
         self._warn_of_collapse(filtered)
+        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 4)
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
@@ -332,11 +336,13 @@ class ParticleFilter(FilterEngine):
         filtered = Record(problem, mover.layout, {}, False)
         window: deque[Cloud] = deque(maxlen=lag + 1)
         rng, rows, last = stream(seed, Purpose.FILTER), problem.series, problem.steps - 1
+        looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK))
         cloud: Cloud | None = None
 
         def move(k: int) -> None:
             nonlocal cloud
             row = rows.row(k)
+            looks.look(k, cloud, row)
             cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
             filtered.add(k, cloud)
             window.append(cloud)
@@ -349,7 +355,9 @@ class ParticleFilter(FilterEngine):
             so_far = partial(filtered.posterior, self, "filter")
             pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         whole = filtered.posterior(self)
+        whole.predictive = looks.found()
         self._warn_of_collapse(whole)
+        warn_of_misfit(whole.predictive, type(self).__name__, whole.start, 4)
         return self._given_filtered(record.posterior(self, "fixed-lag"), whole)
 
     def _given_filtered(
@@ -360,7 +368,7 @@ class ParticleFilter(FilterEngine):
         found.log_marginal_likelihood = filtered.log_marginal_likelihood
         found.weight_ess, found.resampled = filtered.weight_ess, filtered.resampled
         found.unique_ancestors = filtered.unique_ancestors
-        found.rejuvenated = filtered.rejuvenated
+        found.rejuvenated, found.predictive = filtered.rejuvenated, filtered.predictive
         return found
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
@@ -401,11 +409,13 @@ class ParticleFilter(FilterEngine):
         mover = self._mover(problem.slices, static, None if keep else [*problem.hidden, *asked])
         record = Record(problem, mover.layout, queries, keep)
         rng, rows = stream(seed, Purpose.FILTER), problem.series
+        looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK))
         cloud: Cloud | None = None
 
         def move(k: int) -> None:
             nonlocal cloud
             row, old = rows.row(k), cloud
+            looks.look(k, old, row)
             cloud = mover.first(row, rng) if old is None else mover.next(old, row, rng)
             record.add(k, cloud)
             if old is not None and not keep:
@@ -414,7 +424,9 @@ class ParticleFilter(FilterEngine):
         with Progress(problem.steps, self.label, progress) as bar, _quiet():
             so_far = partial(record.posterior, self, "filter")
             pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
-        return record.posterior(self)
+        found = record.posterior(self)
+        found.predictive = looks.found()
+        return found
 
     def _described_looks(self, problem: SeriesProblem, found: dict[str, str]) -> dict[str, str]:
         """What is done to each node, with what looking at the row does for it."""

@@ -2,7 +2,7 @@
 
 CARMEN, UTIAS MRCLAM, Wean Hall, Plaza and Freiburg's course; faults are reported with their line,
 and skipped or raised, as asked. Maps are in ``bayesmc.robotics.mapfile``; nothing here filters or
-corrects what a log says.
+corrects what a log says, but for Plaza's headings that point backwards (``Plaza.turned``).
 """
 
 from bayesmc.robotics.logs.carmen import read_carmen, sick_angles, write_carmen
@@ -40,13 +40,20 @@ from bayesmc.robotics.logs.records import (
     Timed,
     Velocity,
 )
-from bayesmc.robotics.logs.tracks import Keyframe, keyframes, merge, pose_at, stack
+from bayesmc.robotics.logs.tracks import (
+    Keyframe,
+    heading_offset,
+    keyframes,
+    merge,
+    pose_at,
+    stack,
+)
 from bayesmc.robotics.logs.wean import read_wean
 
 __all__ = [
     "MAX_RANGE", "UNKNOWN_SUBJECT", "Barcode", "GroundTruth", "Increment", "Keyframe", "Landmark",
     "Laser", "LogFault", "Measurement", "Mrclam", "MrclamRobot", "Odometry", "Plaza", "RangeOnly",
-    "Reading", "Record", "RotTransRot", "Timed", "Velocity", "keyframes", "merge", "pose_at",
+    "Reading", "Record", "RotTransRot", "Timed", "Velocity", "heading_offset", "keyframes", "merge", "pose_at",
     "read_carmen", "read_freiburg", "read_freiburg_world", "read_mrclam", "read_mrclam_barcodes",
     "read_mrclam_landmarks", "read_mrclam_measurements", "read_mrclam_truth",
     "read_mrclam_velocities", "read_plaza", "read_plaza_increments", "read_plaza_ranges",

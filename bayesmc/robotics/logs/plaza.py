@@ -2,7 +2,9 @@
 
 A folder holds, by example, ``Plaza1_DR.txt`` (time, distance and turn by dead reckoning),
 ``Plaza1_TD.txt`` (time, the robot's radio, beacon, range) and ``Plaza1_.mat`` with the beacons'
-places and the truth. Ranges come with a bias of nearly 3 m, which is left to the model.
+places and the truth. Ranges come with a bias of nearly 3 m, which is left to the model. The headings
+that stand beside the surveyed positions of Plaza 2 are turned by pi against the way the robot drives;
+they are turned back (``Plaza.turned``).
 
 Djugash, Hamner and Roth (2009), Navigating with ranging radios: five data sets with ground truth,
 Journal of Field Robotics 26(9).
@@ -30,7 +32,13 @@ from bayesmc.robotics.logs.reading import (
 )
 from bayesmc.robotics.logs.records import GroundTruth, Increment, RangeOnly, read_only
 from bayesmc.robotics.logs.sources import Source
-from bayesmc.robotics.logs.tracks import merge
+from bayesmc.robotics.logs.tracks import heading_offset, merge
+from bayesmc.robotics.poses import wrap
+
+#: how far from pi, in rad, headings may be off and count as turned round
+_BACKWARDS = 0.5
+#: metres that must have been driven for that to be said
+_FAR = 5.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,9 +54,12 @@ class Plaza:
     beacons : mapping of int to ndarray, shape (2,)
         Where each beacon stands, in m.
     truth : tuple of GroundTruth
-        By GPS. The heading is the file's, which in Plaza 2 is off by pi.
+        By GPS. Headings point the way the robot drives: those of a file that point backwards throughout, as
+        in Plaza 2, are turned by pi.
     faults : mapping of str to tuple of LogFault
         The lines left out, by file; files without any are not named.
+    turned : float
+        What was added to the file's headings, in rad: 0, or pi where they pointed backwards.
     """
 
     increments: tuple[Increment, ...]
@@ -56,12 +67,16 @@ class Plaza:
     beacons: Mapping[int, np.ndarray]
     truth: tuple[GroundTruth, ...]
     faults: Mapping[str, tuple[LogFault, ...]]
+    turned: float = 0.0
 
 
 def read_plaza(
     folder: str | os.PathLike[str], name: str = "Plaza1", *, on_error: OnError = "raise"
 ) -> Plaza:
     """A whole drive out of its folder.
+
+    Headings of the truth that point backwards throughout, by the surveyed positions and the sign of the
+    distances driven, are turned by pi; ``turned`` of the result says so.
 
     Parameters
     ----------
@@ -84,7 +99,8 @@ def read_plaza(
     beacons, truth = _tables(folder / f"{name}_.mat")
     steps, seen = tuple(increments), merge(readings)
     by_file = {Path(r.name).name: r.faults for r in (increments, readings) if r.faults}
-    return Plaza(steps, seen, beacons, truth, MappingProxyType(by_file))
+    truth, turned = _forwards(truth, steps)
+    return Plaza(steps, seen, beacons, truth, MappingProxyType(by_file), turned)
 
 
 def read_plaza_increments(
@@ -151,6 +167,21 @@ def _range(line: str) -> RangeOnly | Ignored:
     if distance < 0.0:
         raise FileFormatError(f"the range is negative ({fields[3]})")
     return RangeOnly(t, int(beacon), distance)
+
+
+def _forwards(
+    truth: tuple[GroundTruth, ...], steps: tuple[Increment, ...]
+) -> tuple[tuple[GroundTruth, ...], float]:
+    """The truth with headings that point forwards, and by how much they were turned."""
+    if sum(step.distance for step in steps) < _FAR:
+        return truth, 0.0  # driven in reverse, or hardly at all: nothing can be said
+    offset = heading_offset(truth)
+    if not abs(offset) > math.pi - _BACKWARDS:  # NaN, too
+        return truth, 0.0
+    turn = np.array([0.0, 0.0, math.pi])
+    return tuple(
+        GroundTruth(r.t, np.append(r.pose[:2], wrap((r.pose + turn)[2]))) for r in truth
+    ), math.pi
 
 
 def _tables(path: Path) -> tuple[Mapping[int, np.ndarray], tuple[GroundTruth, ...]]:

@@ -19,6 +19,9 @@ from bayesmc.robotics.poses import angle_between, between, wrap
 
 T = TypeVar("T", bound=Timed)
 
+#: mean resultant length from which on directions are one direction with noise
+_AGREES = 0.8
+
 
 @dataclass(frozen=True, eq=False)
 class Keyframe:
@@ -134,6 +137,55 @@ def pose_at(
     is_known = (times >= known[0]) & (times <= known[-1]) & ((gap <= max_gap) | is_exact)
     found[~is_known] = np.nan
     return found
+
+
+def heading_offset(track: Iterable[GroundTruth | Odometry], distance: float = 0.5) -> float:
+    """By how much a robot's direction of travel is off its recorded headings, in rad.
+
+    Nearly 0 for headings that belong to the positions; pi for those that point backwards (or a robot that
+    drives in reverse), a quarter turn for a compass taken for a heading. Look at it before a filter is
+    started at a recorded pose.
+
+    Parameters
+    ----------
+    track : iterable of records with a pose
+        `GroundTruth` or `Odometry`, in order of time.
+    distance : float
+        Pieces of this length, in m, say where the robot goes: longer than positions are uncertain, shorter
+        than its curves.
+
+    Returns
+    -------
+    float
+        Direction of travel less heading, averaged on the circle, in [-pi, pi). NaN where it never gets so
+        far, and where the pieces do not agree (mean resultant length below 0.8): recorded headings then have
+        no offset that is one number.
+
+    Raises
+    ------
+    ShapeError
+        For a track without records.
+    ValueError
+        ``distance`` is not positive.
+
+    Examples
+    --------
+    >>> from bayesmc.robotics.logs import GroundTruth, heading_offset
+    >>> backwards = [GroundTruth(float(k), [0.5 * k, 0.0, 3.0]) for k in range(9)]
+    >>> round(heading_offset(backwards), 3)  # drives along +x, and is said to look almost along -x
+    -3.0
+    """
+    if not distance > 0.0:
+        raise ValueError(f"heading_offset(distance={distance!r}): give a length in m above 0")
+    poses = stack(track)["pose"]
+    offsets, start = [], 0
+    for k in range(1, len(poses)):
+        dx, dy = poses[k, :2] - poses[start, :2]
+        if math.hypot(dx, dy) >= distance:
+            offsets.append(math.atan2(dy, dx) - poses[(start + k) // 2, 2])
+            start = k
+    mean = np.mean(np.exp(1j * np.array(offsets))) if offsets else 0.0
+    return float(wrap(np.angle(mean))) if abs(mean) >= _AGREES else math.nan
 
 
 def merge(*streams: Iterable[T]) -> tuple[T, ...]:

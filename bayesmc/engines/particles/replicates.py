@@ -1,0 +1,183 @@
+"""Rows that a particle filter expects, drawn from a few of its particles and held against those that come.
+
+In some slices (all of a short series) a few particles of the slice before are moved on without looking at the
+row, and draw rows of their own. Other particles then say how likely the row that came is, and each of those
+drawn. Where the model is right and the particles are draws from the belief, the row is one of the lot,
+whatever the family, so its rank is uniform. Nothing here touches the particles or the numbers that they are
+drawn with.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, Row, SeriesProblem
+from bayesmc.engines.particles.cloud import Cloud, along_plates
+from bayesmc.engines.slice_steps import SlicePlan
+from bayesmc.network import Observed
+from bayesmc.network.forward import Pass
+from bayesmc.network.forward import run as passed
+from bayesmc.results.predictive import Predictive
+
+#: rows drawn in a slice, and particles that say how likely they are
+ROWS, JUDGES = 19, 20
+#: slices that are looked at: so many of a series, and every so manieth of a long one
+LOOKS, EVERY = 64, 4
+#: and rows below which none is: too few for any conclusion
+_FEW = 5
+
+
+class Replicates:
+    """What is compared, written as the slices pass.
+
+    Parameters
+    ----------
+    problem : SeriesProblem
+    plan : SlicePlan
+        Its proposals, if any, are not used.
+    rng : Generator
+        Of its own.
+    """
+
+    def __init__(self, problem: SeriesProblem, plan: SlicePlan, rng: np.random.Generator) -> None:
+        self.slices, self.rng, self.steps = problem.slices, rng, problem.steps
+        self.plan = SlicePlan(problem.slices, plan.apart, plan.static)
+        self.lead = tuple(problem.slices.first.sizes[p] for p in plan.apart)
+        self.names = tuple(problem.series.observed)
+        self._looked = _chosen(problem, rng)
+        self._failed = False
+        lead = (problem.steps, *self.lead)
+        self._rows, self._deficits = np.full(lead, np.nan), np.full(lead, np.nan)
+        shapes = {n: problem.slices.first[n].value_shape for n in self.names}
+        self._ranks = {n: np.full((problem.steps, *shapes[n]), np.nan) for n in self.names}
+
+    def look(self, k: int, before: Cloud | None, row: Row) -> None:
+        """Compare the k-th row, whose slice follows that of a cloud."""
+        if k not in self._looked or self._failed or not row.seen:
+            return
+        try:
+            values = self._taken(before)
+            drawn = self._drawn(row, {n: v[0] for n, v in values.items()})
+            log = self._judged(row, drawn, {n: v[1] for n, v in values.items()})
+        except Exception:  # functions that break on rows that never came: nothing is said then
+            self._failed = True
+            return
+        self._write(k, row, drawn, log)
+
+    def found(self, steps: int | None = None) -> Predictive | None:
+        """What came of it; None where nothing was compared."""
+        if self._failed or not self._looked:
+            return None
+        whole = Predictive(self._rows, self._deficits, self._ranks)
+        return whole if steps is None else whole.first(steps)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _taken(self, before: Cloud | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Values of the slice before, of the particles that draw rows and of those that judge them."""
+        if before is None:
+            return {}
+        chosen = self._ancestors(before, ROWS + JUDGES)
+        found = {}
+        for name in self.slices.interface:
+            value = before.values[name]
+            node = self.slices.later[name]
+            if value.ndim == len(node.value_shape):
+                found[name + PREVIOUS] = value, value
+                continue
+            if self.lead:
+                taken = along_plates(value, chosen, node.plates, self.plan.apart)
+            else:
+                taken = value[chosen]
+            judges = np.tile(taken[ROWS:], (ROWS + 1, *(1,) * (taken.ndim - 1)))
+            found[name + PREVIOUS] = taken[:ROWS], judges
+        return found
+
+    def _ancestors(self, cloud: Cloud, count: int) -> np.ndarray:
+        """Particles drawn in proportion to their weights, shape (count, *lead)."""
+        weights = cloud.weights.reshape(len(cloud.weights), -1)
+        found = np.empty((count, weights.shape[1]), dtype=np.intp)
+        for k, column in enumerate(weights.T):
+            sums = column.cumsum()
+            found[:, k] = sums.searchsorted(self.rng.random(count) * sums[-1], side="right")
+        return np.minimum(found, len(weights) - 1).reshape(count, *self.lead)
+
+    def _drawn(self, row: Row, before: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Rows drawn without looking at the one that came, shape (rows, *plates, *event) by node."""
+        unseen = Row(row.t, {}, row.inputs)
+        state = Pass(self.rng, (ROWS,), {**self.plan.known(unseen), **before})
+        values = passed(self.plan.steps(unseen), state).values
+        shapes = {n: (ROWS, *self.slices.first[n].value_shape) for n in row.seen}
+        return {n: np.broadcast_to(values[n], shape) for n, shape in shapes.items()}
+
+    def _judged(
+        self, row: Row, drawn: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]
+    ) -> np.ndarray:
+        """Log densities of the row that came, first, and of those drawn, shape (1 + rows, *lead)."""
+        seen = {}
+        for name, own in row.seen.items():
+            each = np.concatenate([np.broadcast_to(own.value, drawn[name].shape[1:])[None], drawn[name]])
+            seen[name] = Observed(np.repeat(each, JUDGES, axis=0), own.mask)
+        judged = Row(row.t, seen, row.inputs)
+        count = (1 + ROWS) * JUDGES
+        state = Pass(self.rng, (count,), {**self.plan.known(judged), **before})
+        log = passed(self.plan.steps(judged), state).log_weight
+        log = np.broadcast_to(np.asarray(log, dtype=float), (count, *self.lead))
+        log = log.reshape(1 + ROWS, JUDGES, *self.lead)
+        level = np.maximum(log.max(axis=1, keepdims=True), _LEAST)
+        return np.log(np.exp(log - level).mean(axis=1)) + level[:, 0]
+
+    def _write(self, k: int, row: Row, drawn: Mapping[str, np.ndarray], log: np.ndarray) -> None:
+        self._rows[k] = self._rank(log[0], log[1:])
+        log = np.maximum(log, _LEAST)
+        self._deficits[k] = (log[1:].mean(axis=0) - log[0]) / np.maximum(self._numbers(row), 1)
+        for name, own in row.seen.items():
+            node = self.slices.first[name]
+            ranks = self._rank(own.value, drawn[name])
+            if own.mask is not None:
+                mask = own.mask.reshape(own.mask.shape + (1,) * len(node.event_shape))
+                ranks = np.where(mask, ranks, np.nan)
+            self._ranks[name][k] = ranks
+
+    def _rank(self, value: Any, others: np.ndarray) -> np.ndarray:
+        """Where values lie among others, along the first axis; ties are broken by chance."""
+        less = (others < value).sum(axis=0)
+        equal = (others == value).sum(axis=0)
+        return (less + self.rng.random(less.shape) * (equal + 1)) / (ROWS + 1)
+
+    def _numbers(self, row: Row) -> np.ndarray:
+        """How many numbers a row has, shape (*lead)."""
+        total = np.zeros(self.lead)
+        for name, own in row.seen.items():
+            node = self.slices.first[name]
+            mask = np.ones(node.plate_shape) if own.mask is None else own.mask
+            each = mask * float(np.prod(node.event_shape, dtype=float))
+            apart = [node.plates.index(p) for p in self.plan.apart]
+            rest = tuple(i for i in range(len(node.plates)) if i not in apart)
+            left = [p for p in node.plates if p in self.plan.apart]
+            total = total + each.sum(axis=rest).transpose([left.index(p) for p in self.plan.apart])
+        return total
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+#: log densities below this one are this one: of rows that no particle explains
+_LEAST = -1e12
+
+
+def _chosen(problem: SeriesProblem, rng: np.random.Generator) -> frozenset[int]:
+    """The slices that are looked at: one of each stretch, at random, among those with something seen."""
+    some = np.zeros(problem.steps, dtype=bool)
+    for seen in problem.series.observed.values():
+        some |= True if seen.mask is None else seen.mask.reshape(problem.steps, -1).any(axis=1)
+    rows = np.flatnonzero(some)
+    if len(rows) < _FEW:
+        return frozenset()
+    if len(rows) <= LOOKS:
+        return frozenset(rows.tolist())
+    edges = np.linspace(0, len(rows), max(LOOKS, len(rows) // EVERY) + 1)
+    at = edges[:-1] + rng.random(len(edges) - 1) * np.diff(edges)
+    return frozenset(rows[np.minimum(at.astype(np.intp), len(rows) - 1)].tolist())
