@@ -118,10 +118,9 @@ def share_mcse(error: Any, count: Any, step: Any = 1.0) -> np.ndarray:
     """Standard error of a share, never zero: ``sqrt(error**2 + (2 * step / count)**2)``.
 
     What draws show of a share has no spread where all of them agree, and too little of it where few differ.
-    As Agresti and Coull (1998) add ``z**2`` draws, half of them successes, this adds ``z**2 / count**2`` to the
-    variance, with z = 2. So two standard errors about a share of independent draws hold the truth in 95 % of
-    all cases and more, whatever it is and how many draws there are (the least is 95.1 %, near shares of
-    ``10 / count``); two about a share that was never seen reach to ``4 / count``, where the exact bound at
+    As Agresti and Coull (1998) add ``z**2`` draws, half of them successes, this adds ``z**2 / count**2`` to
+    the variance, with z = 2. So two standard errors about a share of independent draws hold the truth in 95 %
+    of all cases and more, whatever it is and how many draws there are (95.1 % at the least); two about a share that was never seen reach to ``4 / count``, where the exact bound at
     that level is ``3.7 / count`` (Clopper and Pearson 1934).
 
     Parameters
@@ -152,9 +151,10 @@ def share_mcse(error: Any, count: Any, step: Any = 1.0) -> np.ndarray:
 def weighted_share_count(share: Any, squares: Any, heaviest: float, all_squares: float) -> Any:
     """Effective draws behind shares of weighted draws, as far as what was not seen is concerned.
 
-    What one more draw of the smaller side would weigh is guessed from those that are there: their mean weight,
-    by weight; or the heaviest of all draws, where there are none, and with a chance of ``exp(-k)`` where there
-    are k effective ones. (Draws proposed where an event is rare and their weights tiny leave little room.)
+    What one more draw of the smaller side would weigh is guessed from those that are there: their mean
+    weight, by weight; or the heaviest of all draws, where there are none, and with a chance of ``exp(-k)``
+    where there are k effective ones. (Draws that a proposal makes of a rare event, with tiny weights, leave
+    little room.)
 
     Parameters
     ----------

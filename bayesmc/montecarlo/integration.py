@@ -293,8 +293,8 @@ def _not_certain(
     size = 1.0 if normalised else float(np.exp(log_weight.max()) * weight.mean())
     count = float(weight.sum() ** 2 / (weight**2).sum())  # effective draws
     # what a proposal was made to find is seen often, with weights however small
-    count = np.where(equal | (weight == 1.0).all(), count, np.inf)
-    error = share_mcse(found.standard_error / size, count)
+    counts = np.where(equal | (weight == 1.0).all(), count, np.inf)
+    error = share_mcse(found.standard_error / size, counts)
     return Estimate(found.value, size * error, found.draws)
 
 
