@@ -16,6 +16,8 @@ import scipy.special
 MIN_WEIGHT_ESS = 100.0
 #: above this the weights' variance may be infinite (Vehtari et al. 2024, sec. 3.2.4)
 MAX_PARETO_K = 0.7
+#: failures and successes that are added to the variance of a share, z**2 for z = 2
+_ADDED = 4.0
 
 
 def log_sum_exp(log_values: np.ndarray, axis: Any = None) -> Any:
@@ -110,6 +112,67 @@ def weighted_ess(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
         variance = weighted_sum(centred**2, weights)
         error = weighted_sum(centred**2, weights**2)
         return np.where(error > 0, variance / error, 1.0 / np.sum(weights**2))
+
+
+def share_mcse(error: Any, count: Any, step: Any = 1.0) -> np.ndarray:
+    """Standard error of a share, never zero: ``sqrt(error**2 + (2 * step / count)**2)``.
+
+    What draws show of a share has no spread where all of them agree, and too little of it where few differ.
+    As Agresti and Coull (1998) add ``z**2`` draws, half of them successes, this adds ``z**2 / count**2`` to
+    the variance, with z = 2. So two standard errors about a share of independent draws hold the truth in 95 %
+    of all cases and more, whatever it is and how many draws there are (95.1 % at the least); two about a share that was never seen reach to ``4 / count``, where the exact bound at
+    that level is ``3.7 / count`` (Clopper and Pearson 1934).
+
+    Parameters
+    ----------
+    error : array_like
+        Standard error as the draws show it.
+    count : array_like
+        Effective number of draws.
+    step : array_like
+        By how much the figure changes with one unseen state; 0 where it is no share.
+
+    References
+    ----------
+    Agresti and Coull (1998), The American Statistician 52; Brown, Cai and DasGupta (2001), Statistical
+    Science 16.
+
+    Examples
+    --------
+    >>> from bayesmc.diagnostics import share_mcse
+    >>> float(share_mcse(0.0, 1000))
+    0.002
+    """
+    # an error of 1 / 2 leaves nothing out
+    unseen = np.sqrt(_ADDED) / np.maximum(count, 2.0 * np.sqrt(_ADDED))
+    return np.hypot(error, np.multiply(step, unseen))
+
+
+def weighted_share_count(share: Any, squares: Any, heaviest: float, all_squares: float) -> Any:
+    """Effective draws behind shares of weighted draws, as far as what was not seen is concerned.
+
+    What one more draw of the smaller side would weigh is guessed from those that are there: their mean
+    weight, by weight; or the heaviest of all draws, where there are none, and with a chance of ``exp(-k)``
+    where there are k effective ones. (Draws that a proposal makes of a rare event, with tiny weights, leave
+    little room.)
+
+    Parameters
+    ----------
+    share, squares : array_like
+        Sum of the weights on one side, and of their squares; all weights sum to 1.
+    heaviest, all_squares : float
+        The largest weight, and the sum of all squares.
+    """
+    flipped = np.asarray(share) > 0.5
+    mine = np.clip(np.where(flipped, 1.0 - share, share), 0.0, 1.0)
+    heavy = np.maximum(np.where(flipped, all_squares - squares, squares), 0.0)
+    seen = (mine > 1e-300) & (heavy > 1e-300)
+    if np.any(flipped):  # what is left of a difference may be rounding
+        seen &= ~flipped | ((mine > 1e-13) & (heavy > 1e-13 * all_squares))
+    mine, heavy = np.where(seen, mine, 1.0), np.where(seen, heavy, 1.0)
+    typical = np.where(seen, np.minimum(heavy / mine, heaviest), heaviest)
+    missed = np.where(seen, heaviest**2 * np.exp(-(mine**2) / heavy), 0.0)
+    return 1.0 / np.sqrt(typical**2 + missed)
 
 
 def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray:

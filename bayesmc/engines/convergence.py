@@ -193,7 +193,8 @@ def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
     for name, node in posterior.model.nodes.items():
         if name in forward or not posterior._running.is_batched(name):
             continue
-        moves, rhat, ess = posterior.mcse(name) != 0, posterior.rhat(name), posterior.ess(name)
+        rhat, ess = posterior.rhat(name), posterior.ess(name)
+        moves = posterior.moves(name)
         for index in _spread(moves.shape, _SCALARS):
             if moves[index]:
                 scalar = _scalar(posterior.model, name, index[: len(node.value_shape)])

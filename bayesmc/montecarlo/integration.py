@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.diagnostics import MIN_WEIGHT_ESS, weight_ess
+from bayesmc.diagnostics import MIN_WEIGHT_ESS, share_mcse, weight_ess
 from bayesmc.errors import (
     EnvelopeError,
     LowEssWarning,
@@ -64,8 +64,8 @@ def integrate(
     -------
     Estimate
         The integral of function times p; its error is the values' standard deviation over
-        ``sqrt(draws)``, or the delta method's where ``normalised``. Where booleans came out all
-        equal, the error is that of a rate of ``1 / (draws + 2)``, as in ``hit_or_miss``.
+        ``sqrt(draws)``, or the delta method's where ``normalised``. Of booleans it is never
+        zero (``diagnostics.share_mcse``).
 
     Raises
     ------
@@ -158,8 +158,8 @@ def hit_or_miss(
     Returns
     -------
     Estimate
-        With the binomial standard error at a hit rate of ``(hits + 1) / (draws + 2)``, so that no
-        hit at all is not taken for certainty.
+        With the binomial standard error of the hit rate, to which ``diagnostics.share_mcse`` adds, so that
+        no hit at all is not taken for certainty.
 
     Raises
     ------
@@ -197,7 +197,9 @@ def hit_or_miss(
             )
         hits += int(np.count_nonzero(_hit(value, points, height, generator)))
     volume = float(np.prod(high - low)) * (1.0 if height is None else float(height))
-    return Estimate(volume * hits / count, volume * _binomial_error(hits, count), count)
+    rate = hits / count
+    error = float(share_mcse(np.sqrt(rate * (1.0 - rate) / count), count))
+    return Estimate(volume * rate, volume * error, count)
 
 
 def _hit(
@@ -284,20 +286,16 @@ def _ratio(value: np.ndarray, log_weight: np.ndarray) -> Estimate:
 def _not_certain(
     found: Estimate, value: np.ndarray, log_weight: np.ndarray, normalised: bool
 ) -> Estimate:
-    """Booleans that came out all equal (where they have weight) leave the error of a rare event."""
+    """Booleans that came out all equal, or nearly so, leave the error of an unseen one."""
     used = value[log_weight > -np.inf]
     equal = (used == used[:1]).all(axis=0)
     weight = np.exp(log_weight - log_weight.max())
     size = 1.0 if normalised else float(np.exp(log_weight.max()) * weight.mean())
     count = float(weight.sum() ** 2 / (weight**2).sum())  # effective draws
-    error = np.where(equal, size * _binomial_error(0, count), 0.0)
-    return Estimate(found.value, np.maximum(found.standard_error, error), found.draws)
-
-
-def _binomial_error(hits: float, count: float) -> float:
-    """Standard error of a share of hits, never zero (Laplace's rule of succession for the rate)."""
-    rate = (hits + 1) / (count + 2)
-    return float(np.sqrt(rate * (1 - rate) / count))
+    # what a proposal was made to find is seen often, with weights however small
+    counts = np.where(equal | (weight == 1.0).all(), count, np.inf)
+    error = share_mcse(found.standard_error / size, counts)
+    return Estimate(found.value, size * error, found.draws)
 
 
 def _warn(value: np.ndarray, log_weight: np.ndarray, normalised: bool) -> None:

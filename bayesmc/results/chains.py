@@ -10,11 +10,11 @@ import copy
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.network import CompiledNode, Model, Observed, Problem
 from bayesmc.results.draws import DrawsPosterior
@@ -147,15 +147,6 @@ class ChainsPosterior(_Chains, DrawsPosterior):
         super().__init__(problem, engine, stored, shape)
         self._describe(shape, acceptance or {}, ensemble_size, warmup, checkpoint)
 
-    def mcse(self, what: Any) -> np.ndarray:
-        return diagnostics.chain_statistic("mcse", self._scalars(what), self.ensemble_size)
-
-    def ess(self, what: Any) -> np.ndarray:
-        return diagnostics.chain_statistic("ess", self._scalars(what), self.ensemble_size)
-
-    def rhat(self, what: Any) -> np.ndarray:
-        return diagnostics.chain_statistic("rhat", self._scalars(what), self.ensemble_size)
-
     def _predict(self, *arguments: Any) -> DrawsPosterior:
         drawn = super()._predict(*arguments)
         assert drawn.problem is not None
@@ -196,8 +187,8 @@ class ChainsSums(_Chains, SumsPosterior):
         shape = (running.chains, running.draws)
         self._describe(shape, acceptance, running.ensemble, warmup, checkpoint)
 
-    def mcse(self, what: Any) -> np.ndarray:
-        independent = super().mcse(what)
+    def _error(self, what: Any) -> np.ndarray:
+        independent = super()._error(what)
         series = self._batch_means(what)
         if series is None:
             return np.where(independent == 0, 0.0, np.nan)
@@ -205,14 +196,38 @@ class ChainsSums(_Chains, SumsPosterior):
         error = np.sqrt(series.var(axis=(0, 1), ddof=1) / (batches * chains))
         return np.maximum(error, independent)
 
+    def _share_count(self, what: str, error: np.ndarray) -> Any:
+        """Effective draws behind shares; of those that never changed, of the slowest scalar that did."""
+        found = self._moved(what)
+        return np.where(np.isnan(found), self._slowest, found)
+
     def ess(self, what: Any) -> np.ndarray:
-        error, independent = self.mcse(what), super().mcse(what)
-        with np.errstate(invalid="ignore"):
-            share = np.where(independent == 0, 1.0, independent / error)
+        found = self._moved(what)
+        still = np.where(np.asarray(self._step(what)) > 0, self._slowest, self._sums.draws)
+        missing = np.isnan(self._error(what))
+        return np.where(np.isnan(found) & ~missing, still, found)
+
+    def moves(self, name: str) -> np.ndarray:
+        """Whether each figure of a node ever changed, as far as is known."""
+        return self._error(name) != 0
+
+    def _moved(self, what: Any) -> np.ndarray:
+        """Effective draws of what ever changed; NaN for all else."""
+        error, independent = self._error(what), super()._error(what)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(independent > 0, independent / error, np.nan)
         return self._sums.draws * share**2
 
+    @cached_property
+    def _slowest(self) -> float:
+        """Effective draws of the scalar that moves slowest in these chains; the chains where none does."""
+        names = [n for n in self._running.names if self._running.is_batched(n)]
+        sizes = np.concatenate([np.zeros(0), *(self._moved(n).ravel() for n in names)])
+        sizes = sizes[np.isfinite(sizes)]
+        return float(sizes.min()) if sizes.size else float(self._running.chains)
+
     def rhat(self, what: Any) -> np.ndarray:
-        variance = self._sums.draws * super().mcse(what) ** 2
+        variance = self._sums.draws * super()._error(what) ** 2
         series = self._batch_means(what)
         if series is None:
             return np.full(variance.shape, np.nan)

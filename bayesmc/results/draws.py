@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -15,14 +16,15 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.errors import UnknownNodeError, UnsupportedError, missing_extra
-from bayesmc.network import Model, Observed, Problem, forward, read_inputs
+from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.network import Model, Problem, forward, read_inputs
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
+from bayesmc.results.datatree import datatree
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Plates, Posterior, circular_variance, whole_draws
 from bayesmc.results.query import Query
-from bayesmc.states import StateArray
+from bayesmc.results.shares import chain_count, is_share, slowest, steps, weighted_count
 
 
 class DrawsPosterior(Posterior):
@@ -45,6 +47,9 @@ class DrawsPosterior(Posterior):
     independent, ancestors, streams
         As given.
     """
+
+    #: members that a chain's draws come from in turn; 1 for an ordinary chain
+    ensemble_size: int = 1
 
     def __init__(
         self,
@@ -187,34 +192,28 @@ class DrawsPosterior(Posterior):
         return self._average(values.astype(float))
 
     def mcse(self, what: Any) -> np.ndarray:
-        values = self._scalars(what)
-        if self.ancestors is not None:
-            return diagnostics.weighted_mcse(*self._distinct(values))
-        if self.weights is not None:
-            return diagnostics.weighted_mcse(values, self.weights)
-        if self.independent:
-            count = math.prod(self._shape)
-            spread = (
-                values.std(axis=(0, 1), ddof=1) if count > 1 else np.full(values.shape[2:], np.nan)
-            )
-            return spread / np.sqrt(count)
-        return diagnostics.chain_statistic("mcse", values)
+        values, step = self._scalars_and_step(what)
+        return diagnostics.share_mcse(self._error(values), self._share_count(values, step), step)
 
     def ess(self, what: Any) -> np.ndarray:
-        values = self._scalars(what)
+        values, step = self._scalars_and_step(what)
         if self.ancestors is not None:
             return diagnostics.weighted_ess(*self._distinct(values))
         if self.weights is not None:
             return diagnostics.weighted_ess(values, self.weights)
         if self.independent:
             return np.full(values.shape[2:], float(math.prod(self._shape)))
-        return diagnostics.chain_statistic("ess", values)
+        found = diagnostics.chain_statistic("ess", values, self.ensemble_size)
+        still = (values == values[:1, :1]).all(axis=(0, 1)) & (np.asarray(step) > 0)
+        if still.any():  # chains that never saw another state do not know how soon they would
+            return np.where(still, np.fmin(found, self._slowest), found)
+        return found
 
     def rhat(self, what: Any) -> np.ndarray:
         values = self._scalars(what)
         if self.weights is not None or self.independent or self.ancestors is not None:
             return np.full(values.shape[2:], np.nan)
-        return diagnostics.chain_statistic("rhat", values)
+        return diagnostics.chain_statistic("rhat", values, self.ensemble_size)
 
     # ---- distributions -----------------------------------------------------------------------
 
@@ -339,26 +338,53 @@ class DrawsPosterior(Posterior):
             )
         if resample is not None:
             return self.resample(resample, rng).to_datatree()
-        try:
-            import arviz_base
-        except ImportError:
-            raise missing_extra("arviz-base", "arviz") from None
-        free = [n for n in self.names if self._is_free(n)]
-        groups = {"posterior": {n: _labelled(self[n]) for n in free}}
-        seen = {
-            n: _with_gaps(self.model[n].decode(o.value), o)
-            for n, o in self._live("to_datatree").observed.items()
-        }
-        if seen:
-            groups["observed_data"] = {n: _labelled(v) for n, v in seen.items()}
-        dims = {n: [*self.model[n].plates, *self._event_dims(n)] for n in [*free, *seen]}
-        coords = {p: list(self.model.labels.get(p, range(n))) for p, n in self.model.sizes.items()}
-        return arviz_base.from_dict(groups, dims=dims, coords=coords)
+        return datatree(self)
 
     # ---- private -----------------------------------------------------------------------------
 
-    def _event_dims(self, name: str) -> list[str]:
-        return [f"{name}_dim_{i}" for i in range(len(self.model[name].event_shape))]
+    def _error(self, values: np.ndarray) -> np.ndarray:
+        """Standard error of means as the draws show it."""
+        if self.ancestors is not None:
+            return diagnostics.weighted_mcse(*self._distinct(values))
+        if self.weights is not None:
+            return diagnostics.weighted_mcse(values, self.weights)
+        if self.independent:
+            count = math.prod(self._shape)
+            spread = (
+                values.std(axis=(0, 1), ddof=1) if count > 1 else np.full(values.shape[2:], np.nan)
+            )
+            return spread / np.sqrt(count)
+        return diagnostics.chain_statistic("mcse", values, self.ensemble_size)
+
+    def _share_count(self, values: np.ndarray, step: Any) -> Any:
+        """Effective draws behind shares (`shares`)."""
+        if not np.any(step):
+            return 1.0
+        weights = self.weights
+        if self.ancestors is not None:
+            values, weights = self._distinct(values)
+        if weights is not None:
+            return weighted_count(values, weights)
+        if self.independent:
+            return float(math.prod(self._shape))
+        moving = self._slowest if (values == values[:1, :1]).all(axis=(0, 1)).any() else np.inf
+        return chain_count(values, moving, self.ensemble_size, step)
+
+    @cached_property
+    def _slowest(self) -> float:
+        """Effective draws of the scalar that moves slowest in these chains."""
+        free = (n for n in self._stored if n not in self._observed)
+        return slowest(self._stored, free, self.ensemble_size)
+
+    def _scalars_and_step(self, what: Any) -> tuple[np.ndarray, Any]:
+        """What the answers are means of, and by how much an unseen state may move each (`shares`)."""
+        if not callable(what):
+            exact = self._of(what).shape[:2] == (1, 1) and self._shape != (1, 1)
+            return self._scalars(what), steps(self._node(what), self._seen.get(what), exact)
+        values = self._evaluate(what, (), None)
+        nodes = Query(self.model, what).nodes
+        known = all(self._of(n).shape[:2] == (1, 1) for n in nodes) and self._shape != (1, 1)
+        return values.astype(float), float(is_share(values) and not known)
 
     def _distinct(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Each resampled draw once, weighted by its copies."""
@@ -443,21 +469,3 @@ def _refuse_potentials(model: Model, wanted: Sequence[str]) -> None:
                 f"predict({hit[0]!r}): the potential {name!r} reweights it, which drawing it given its "
                 "parents would ignore"
             )
-
-
-def _labelled(values: np.ndarray) -> np.ndarray:
-    """Plain values: labels where there are labels."""
-    return values.labels if isinstance(values, StateArray) else np.asarray(values)
-
-
-def _with_gaps(values: np.ndarray, seen: Observed) -> np.ndarray:
-    """Observed values with NaN (None for labels) where nothing was observed."""
-    if seen.mask is None:
-        return values
-    if isinstance(values, StateArray):
-        labels = values.labels.astype(object)
-        labels[~seen.mask] = None
-        return labels
-    numbers = np.array(values, dtype=float)
-    numbers[~seen.mask] = np.nan
-    return numbers

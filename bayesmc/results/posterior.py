@@ -56,7 +56,8 @@ class Posterior:
         self.problem: Problem | None = problem
         self.model = problem.model
         self.engine = engine
-        self._observed = frozenset(n for n, o in problem.observed.items() if o.mask is None)
+        self._seen = dict(problem.observed)
+        self._observed = frozenset(n for n, o in self._seen.items() if o.mask is None)
 
     # ---- what every subclass answers ---------------------------------------------------------
 
@@ -126,7 +127,12 @@ class Posterior:
 
     def mcse(self, what: Any) -> np.ndarray:
         """Monte Carlo standard error of the mean of a node (of each state's probability, for labels)
-        or of the expectation of a function."""
+        or of the expectation of a function.
+
+        Of a share (a state's probability, an event) it is never 0 unless the answer is exact: what no draw
+        has shown may have a probability of some draws' (``diagnostics.share_mcse``), so that two errors about
+        a share of independent draws hold the truth 95 times in 100.
+        """
         raise self._cannot("mcse")
 
     def ess(self, what: Any) -> np.ndarray:

@@ -26,7 +26,10 @@ from bayesmc.results.running import (
     Turns,
     turns,
 )
+from bayesmc.results.shares import steps
 
+#: share of a variance that is rounding
+_NONE = 1e-20
 #: joint states up to which scalar finite nodes share one histogram, so that it stays in cache
 _GROUP_STATES = 2048
 
@@ -75,6 +78,11 @@ class Sums:
             for name, turned in self._turned.items():
                 turned.add(values[name], weights)
         self.weight += weights[0].sum(), weights[0] @ weights[0]
+
+    @property
+    def constant(self) -> frozenset[str]:
+        """Nodes whose value was no part of the sampling."""
+        return frozenset(self._constant)
 
     def counts(self, name: str) -> np.ndarray:
         """Weight of each state of a finite node by w and by w**2, shape ``(2, *plates, states)``."""
@@ -186,6 +194,11 @@ class SumsPosterior(Posterior):
         return self._sums.counts(names[0])[0] / self._sums.weight[0]
 
     def mcse(self, what: Any) -> np.ndarray:
+        error = self._error(what)
+        return diagnostics.share_mcse(error, self._share_count(what, error), self._step(what))
+
+    def _error(self, what: Any) -> np.ndarray:
+        """Standard error of independent draws, as they show it."""
         if not isinstance(what, str):
             raise self._cannot("mcse of a function")
         node = self._node(what)
@@ -202,6 +215,24 @@ class SumsPosterior(Posterior):
         centred = numbers - (p @ numbers)[..., None]
         return np.sqrt((heavy * centred**2).sum(axis=-1)) / total
 
+    def _share_count(self, what: str, error: np.ndarray) -> Any:
+        """Effective draws behind shares (`shares`)."""
+        node, (total, squares) = self._node(what), self._sums.weight
+        if node.domain is None:  # weights are in units of the heaviest
+            return np.where(error**2 <= _NONE * squares / total**2, total, total**2 / squares)
+        share, heavy = self._sums.counts(what)
+        found = diagnostics.weighted_share_count(
+            share / total, heavy / total**2, 1.0 / total, squares / total**2
+        )
+        if node.domain.labels is not None:
+            return found
+        several = (share > 0).sum(axis=-1) > 2
+        return np.where(several, total**2 / squares, found.max(axis=-1))
+
+    def _step(self, what: str) -> Any:
+        exact = what in self._sums.constant
+        return steps(self._node(what), self._seen.get(what), exact)
+
     def ess(self, what: Any) -> np.ndarray:
         if not isinstance(what, str):
             raise self._cannot("ess of a function")
@@ -209,13 +240,13 @@ class SumsPosterior(Posterior):
         labelled = node.domain is not None and node.domain.labels is not None
         p = self.probabilities(what) if labelled else None
         variance = p * (1 - p) if p is not None else self.var(what)
-        error = self.mcse(what) ** 2
+        error = self._error(what) ** 2
         total, squares = self._sums.weight
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(error > 0, variance / error, total**2 / squares)
 
     def rhat(self, what: Any) -> np.ndarray:
-        return np.full(np.shape(self.mcse(what)), np.nan)
+        return np.full(np.shape(self._error(what)), np.nan)
 
     def _plain_mean(self, name: str) -> np.ndarray:
         centre, first, _ = self._sums.powers(name)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.special
 
 import bayesmc as bmc
 from bayesmc.resampling import multinomial, residual, systematic
 from bayesmc.testing.oracles.answers import exact
 from bayesmc.testing.posteriors.calibration import simulation_based_calibration
+from bayesmc.testing.verdict import Comparison, Verdict, counted
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
 from tests.mutants.tests_of import estimated, evidence_of, matched
@@ -39,6 +41,18 @@ def sprinkler() -> bmc.BayesNet:
     net.table("b", parents=["a"], probs=[[0.7, 0.2, 0.1], [0.1, 0.3, 0.6], [0.3, 0.3, 0.4]])
     net.table("c", parents=["b"], probs=[[0.9, 0.1], [0.5, 0.5], [0.2, 0.8]])
     return net
+
+
+def held(seed: int) -> Verdict:
+    """Whether two errors about a rare event's share hold it 95 times in 100, at 2000 elements of a plate."""
+    net, share = bmc.BayesNet(plates={"i": 2000}), 0.02
+    net.add("a", bmc.Bernoulli(share), plates="i")
+    p = bmc.infer(net, engine=bmc.LikelihoodWeighting(100), rng=seed)
+    missed = int((np.abs(p.mean("a") - share) > 2.0 * p.mcse("a")).sum())
+    p_value = float(scipy.special.bdtrc(missed - 1, 2000, 0.05)) if missed else 1.0
+    errors = (missed - 100.0) / np.sqrt(95.0)
+    found = Comparison("intervals that miss", missed / 2000, 0.05, errors, p_value)
+    return counted(Verdict("held", ALPHA, [found]))
 
 
 def offspring(scheme: object) -> object:
@@ -105,6 +119,19 @@ MUTANTS = [
               "np.quantile(flat, levels, axis=0)"),),
         estimated(median, MEDIAN, 40),
         "repeated_test, 40 runs of 2000 draws",
+    ),
+    Mutant(
+        "the error of a share that was never seen is zero",
+        (Edit("bayesmc.diagnostics:share_mcse",
+              "np.multiply(step, unseen)", "0.0 * np.multiply(step, unseen)"),),
+        held,
+        "two errors about 2000 shares, 100 draws",
+    ),
+    Mutant(
+        "what was never seen weighs half a draw",
+        (Edit("bayesmc.diagnostics:share_mcse", "np.sqrt(_ADDED) /", "0.5 /"),),
+        held,
+        "two errors about 2000 shares, 100 draws",
     ),
     Mutant(
         "the evidence is averaged over one draw too many",
