@@ -93,6 +93,15 @@ class ParameterError(BayesmcError, ValueError):
             return False
         return all(v in (math.inf, -math.inf, 0) for v in _numbers(self.value))
 
+    @property
+    def has_grown(self) -> bool:
+        """Whether the value is infinite, zero or NaN, as arithmetic that over- or underflows leaves it."""
+        if self.is_overflow:
+            return True
+        if not isinstance(self.value, (int, float)) and not hasattr(self.value, "dtype"):
+            return False
+        return all(v in (math.inf, -math.inf, 0) or v != v for v in _numbers(self.value))
+
 
 def _numbers(value: Any) -> list[Any]:
     flat = value.ravel().tolist() if hasattr(value, "ravel") else [value]

@@ -291,6 +291,14 @@ _NAMED = {
 }
 
 
+
+def is_half_line(support: Support) -> bool:
+    """Whether a support is everything above one constant."""
+    if support.kind != "interval" or not support.is_single:
+        return False
+    return bool(np.isfinite(support.low).all() and np.all(support.high == np.inf))
+
+
 def _constant(bound: Any) -> bool:
     array = np.asarray(bound)
     return array.ndim == 0 or array.size <= 1 or bool((array == array.flat[0]).all())

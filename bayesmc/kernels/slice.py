@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.support import Support
+from bayesmc.distributions.support import Support, is_half_line
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
@@ -116,13 +116,6 @@ def _shrink(
         "slice sampling found no point at least as likely as the chain's own; the log density changes "
         "from call to call, or is NaN nearby"
     )
-
-
-def is_half_line(support: Support) -> bool:
-    """Whether a support is everything above one constant."""
-    if support.kind != "interval" or not support.is_single:
-        return False
-    return bool(np.isfinite(support.low).all() and np.all(support.high == np.inf))
 
 
 class Slice(Kernel):

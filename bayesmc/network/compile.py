@@ -35,6 +35,7 @@ from bayesmc.network.model import (
     lookup,
 )
 from bayesmc.network.node import Declaration, Potential
+from bayesmc.network.probing import made_possible
 from bayesmc.shapes import Shape, read_only, unused_sizes
 from bayesmc.states import StateArray
 
@@ -66,9 +67,7 @@ def compile_model(
             plates = tuple(sizes[p] for p in declaration.plates)
             if declaration.source == "table":
                 _check_table_parents(declaration, links, nodes)
-            node, value = _discover(
-                declaration, links, plates, model.probe, shape, count, rng, inputs
-            )
+            node, value = _discover(declaration, links, plates, model, shape, count, rng, inputs)
             nodes[key] = node
             model.probe[key] = value
     for key, potential in potentials.items():
@@ -122,13 +121,14 @@ def _discover(
     declaration: Declaration,
     links: tuple[tuple[str, Aligner], ...],
     plates: Shape,
-    probe: Mapping[str, np.ndarray],
+    model: Model,
     shape: Shape,
     count: int,
     rng: np.random.Generator,
     inputs: Mapping[str, np.ndarray],
 ) -> tuple[CompiledNode, np.ndarray]:
     """The compiled node, and reachable values of it for its children to be tried on."""
+    probe = model.probe
     if declaration.source == "input":
         value = inputs.get(declaration.name)
         if value is None:
@@ -142,15 +142,21 @@ def _discover(
             declaration, links, plates, declaration.event_shape, discrete, False, declaration.domain
         )
         return node, declaration.value
-    arguments, batch = arguments_of(links, probe)
+    _, batch = arguments_of(links, probe)
     result = _call_batched(declaration, links, probe, shape, batch + plates)
+    possible = made_possible(declaration, links, plates, result, batch, model)
+    if possible:
+        result = _call_batched(declaration, links, probe, shape, batch + plates)
     if isinstance(result, Distribution):
         node, value = _discover_stochastic(
             declaration, links, plates, result, batch, shape, count, rng
         )
-        _refuse_parameters(node, result, probe, batch)
+        if not possible:
+            _refuse_parameters(node, result, probe, batch)
         return node, value
-    return _discover_deterministic(declaration, links, plates, result, batch, probe, shape)
+    return _discover_deterministic(
+        declaration, links, plates, result, batch, probe, shape, possible
+    )
 
 
 def _call_batched(
@@ -232,26 +238,35 @@ def _refuse_parameters(
     node: CompiledNode, dist: Distribution, probe: Mapping[str, np.ndarray], batch: Shape
 ) -> None:
     """Raise for parameters out of range, unless they over- or underflowed, as vague priors make them:
-    for some draws of the parents, or for all of those tried where the arithmetic says so itself.
+    for some draws of the parents, or for all of those tried where the arithmetic says so itself (then they
+    may be NaN as well).
     """
     bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
     if bad is None:
         return
     assert dist.invalid is not None and dist.problem is not None
     full = np.broadcast_to(dist.invalid, batch + node.plate_shape).reshape(math.prod(batch), -1)
-    by_parents = not full.all(axis=0).any() or _overflows(node, probe, batch)
-    if not (dist.problem.is_overflow and by_parents):
+    if dist.problem.is_overflow and not full.all(axis=0).any():
+        return
+    if not dist.problem.has_grown or not _overflows(
+        node.declaration, node.links, probe, batch + node.plate_shape
+    ):
         raise bad
 
 
-def _overflows(node: CompiledNode, probe: Mapping[str, np.ndarray], batch: Shape) -> bool:
+def _overflows(
+    declaration: Declaration,
+    links: tuple[tuple[str, Aligner], ...],
+    probe: Mapping[str, np.ndarray],
+    lead: Shape,
+) -> bool:
     """Whether a parent is infinite already, or the function's arithmetic over- or underflows on them."""
-    if any(np.isinf(probe[name].astype(float)).any() for name, _ in node.links):
+    if any(np.isinf(probe[name].astype(float)).any() for name, _ in links):
         return True
-    arguments, _ = arguments_of(node.links, probe)
+    arguments, _ = arguments_of(links, probe)
     try:
         with np.errstate(over="raise", under="raise"):
-            call(node.declaration, arguments, batch + node.plate_shape, node.links)
+            call(declaration, arguments, lead, links)
     except BayesmcError as error:
         return isinstance(error.__cause__, FloatingPointError)
     return False
@@ -298,6 +313,7 @@ def _discover_deterministic(
     batch: Shape,
     probe: Mapping[str, np.ndarray],
     shape: Shape,
+    possible: bool = False,
 ) -> tuple[CompiledNode, np.ndarray]:
     """Event shape from one unbatched call; a table where all parents are finite."""
     single, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
@@ -305,7 +321,8 @@ def _discover_deterministic(
     event = one.shape[len(plates) :]
     full = batch + plates + event
     value = deterministic_fit(declaration, result, batch, plates, full)
-    if value.dtype.kind == "f" and np.isnan(value).any():
+    undefined = not possible and value.dtype.kind == "f" and np.isnan(value).any()
+    if undefined and not _overflows(declaration, links, probe, batch + plates):
         raise DensityError(
             f"node {declaration.name!r}: the function returns NaN on reachable values"
         )

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
+from bayesmc.errors import ParameterError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
+from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape
 
 #: the log weight of draws that nothing was asked of yet
@@ -207,8 +209,19 @@ def current_distribution(model: Model, node: CompiledNode, state: Pass) -> Distr
     if dist.invalid is not None:
         error = invalid_error(node, dist, state.alive, state.batch)
         if error is not None:
-            raise error
+            raise _advised(error, node, model)
     return dist
+
+
+def _advised(error: ParameterError, node: CompiledNode, model: Model) -> ParameterError:
+    """The error with what to do where a prior allows what a function does not."""
+    if depends_on_numbers(node.links, model.nodes):
+        error.args = (
+            f"{error}; draws of its parents may be out of range: give those a prior that cannot be "
+            "(HalfNormal, LogNormal, Truncated), or use Gibbs or MetropolisHastings, which reject such "
+            "points",
+        )
+    return error
 
 
 def summed(log: np.ndarray, node: CompiledNode, apart: tuple[str, ...]) -> np.ndarray:

@@ -17,6 +17,7 @@ from bayesmc.engines.slice_steps import SlicePlan, plates_apart
 from bayesmc.errors import ParameterError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.forward import Compute, Pass, Step, summed
+from bayesmc.network.probing import depends_on_numbers
 from bayesmc.structure.target import Target, Values
 
 #: what becomes of a node of a slice
@@ -170,9 +171,9 @@ class Trellis:
 
 
 class Tolerant:
-    """A step that takes parameters which over- or underflow for what they are: a density of zero.
+    """A step that takes parameters which over- or underflow, or are out of range: a density of zero.
 
-    Parameters that are wrong for what they are still raise.
+    Parameters that are wrong at configurations of finite parents still raise.
     """
 
     def __init__(
@@ -185,7 +186,11 @@ class Tolerant:
             self.step(state)
         except ParameterError:
             dist, batch = self.model.evaluate(self.node.name, state.values)
-            if dist.invalid is None or dist.problem is None or not dist.problem.is_overflow:
+            if dist.invalid is None or dist.problem is None:
+                raise
+            if not dist.problem.is_overflow and not depends_on_numbers(
+                self.node.links, self.model.nodes
+            ):
                 raise
             full = np.broadcast_to(dist.invalid, batch + self.node.plate_shape)
             state.weigh(summed(np.where(full, -np.inf, 0.0), self.node, self.apart))

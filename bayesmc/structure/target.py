@@ -19,6 +19,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, DensityError
 from bayesmc.network import Model, Observed, Problem
 from bayesmc.network.model import invalid_error
+from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
 from bayesmc.structure.like_functions import Signatures
 from bayesmc.structure.like_links import FEWEST, LinkSteps
@@ -55,6 +56,11 @@ class Term:
         """The nodes it reads directly, its own among them."""
         return self.parents if self.is_potential else (*self.parents, self.name)
 
+    @cached_property
+    def rejects(self) -> bool:
+        """Whether its parameters depend on numbers: points where they are out of range are rejected."""
+        return depends_on_numbers(self.model[self.name].links, self.model.nodes)
+
     def distribution(self, values: Mapping[str, np.ndarray]) -> tuple[Distribution, Shape]:
         """A node's distribution given its parents, and the batch shape of those."""
         return self.model.evaluate(self.name, values)
@@ -87,8 +93,8 @@ class Term:
     def log_of(self, dist: Distribution, batch: Shape, value: np.ndarray) -> np.ndarray:
         """Log density of stored values under a distribution that was evaluated before.
 
-        Parameters that over- or underflowed have density zero; those out of their range are the model's
-        fault and raise.
+        Parameters that over- or underflowed have density zero, and so have those out of their range where
+        they depend on numbers that a chain moves; of finite parents they are the model's fault and raise.
         """
         node = self.model[self.name]
         if dist.invalid is None:  # the short way, for the innermost of all loops
@@ -99,7 +105,8 @@ class Term:
         result = self.model.log_density(self.name, dist, value)
         if dist.invalid is not None:
             lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
-            if dist.problem is None or not dist.problem.is_overflow:
+            tolerated = self.rejects or (dist.problem is not None and dist.problem.is_overflow)
+            if not tolerated:
                 error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
                 if error is not None:
                     raise error

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from collections import ChainMap
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import ParameterError
 from bayesmc.network.model import arguments_of
 from bayesmc.plates import Lookups, PlateArray
 from bayesmc.structure.target import Target, Term
 from bayesmc.tracing import TracedCall, Tracer, is_traced
+
+#: what holds no stand-in; an error is a mark of bad parameters
+_PLAIN = (np.ndarray, np.generic, np.dtype, np.ufunc, float, int, str, bytes, ParameterError)
+#: how deep distributions may hold others
+_DEPTH = 12
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +109,43 @@ def _call(target: Target, names: tuple[str, ...], term: Term) -> tuple[Any, list
         if vectorize or function is None:
             raise Untraceable(f"{term.name!r} is called element by element")
         result, _ = _made(links, values, function, keys)
+    _refuse_hidden(result, term)
     return result, keys
+
+
+def _refuse_hidden(result: Any, term: Term) -> None:
+    """Refuse results in which a stand-in may stand unseen: in a closure, or in another library's object."""
+    if is_traced(result) or isinstance(result, (np.ndarray, np.generic, float, int, bool)):
+        return
+    if not isinstance(result, Distribution):
+        what = type(result).__module__.partition(".")[0]
+        raise Untraceable(f"{term.name!r} is an object of {what}, which shows no parameters")
+    if not _is_open(result):
+        raise Untraceable(f"{term.name!r} is {type(result).__name__}, given by a function")
+
+
+def _is_open(value: Any, depth: int = 0) -> bool:
+    """Whether an object holds numbers only, at most inside of our own objects and lists."""
+    if value is None or isinstance(value, _PLAIN):
+        return True
+    if depth > _DEPTH:
+        return False
+    if isinstance(value, (list, tuple)):
+        return all(_is_open(v, depth + 1) for v in value)
+    if isinstance(value, Mapping):
+        return all(_is_open(v, depth + 1) for v in value.values())
+    if type(value).__module__.startswith("bayesmc."):
+        return all(_is_open(v, depth + 1) for v in _attributes(value))
+    return False
+
+
+def _attributes(value: Any) -> Iterator[Any]:
+    """What an object keeps, in its dict and in slots."""
+    yield from getattr(value, "__dict__", {}).values()
+    for family in type(value).__mro__:
+        for name in getattr(family, "__slots__", ()):
+            if hasattr(value, name):
+                yield getattr(value, name)
 
 
 def _made(links: Any, values: Mapping[str, Any], function: Any, keys: list[Any]) -> tuple[Any, Any]:

@@ -12,7 +12,6 @@ import bayesmc as bmc
 from bayesmc.errors import (
     ConvergenceWarning,
     DensityError,
-    ParameterError,
     ReducibleWarning,
     ZeroProbabilityError,
 )
@@ -249,14 +248,6 @@ def test_a_nan_density_names_node_values_and_iteration() -> None:
     )
     with pytest.raises(DensityError, match=r"'y'.*nan.*x = [3-9].*y = 40.*iteration"):
         bmc.infer(net, {"y": 40.0}, engine=bmc.Gibbs(), rng=0)
-
-
-def test_a_scale_that_turns_negative_is_the_models_fault() -> None:
-    net = bmc.BayesNet()
-    net.add("scale", bmc.Normal(1.0, 1.0))
-    net.add("y", lambda scale: bmc.Laplace(0.0, scale))
-    with pytest.raises(ParameterError, match=r"'y'.*scale must be positive"):
-        bmc.infer(net, {"y": 0.01}, engine=bmc.Gibbs(), rng=0)
 
 
 def test_chains_that_zeros_may_hold_are_told_of() -> None:

@@ -1,0 +1,200 @@
+"""Reachable values at which a node's function makes sense: ancestors drawn anew, nearer to their middle.
+
+What overflows, or is out of range, at some draws of vague priors says nothing about the model; what is so at
+all of them is the model's fault, and the caller raises it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution
+from bayesmc.errors import BayesmcError
+from bayesmc.network.align import Aligner
+from bayesmc.network.model import CompiledNode, Model, arguments_of, call
+from bayesmc.network.nearer import nearer
+from bayesmc.network.node import Declaration
+from bayesmc.shapes import Shape, broadcasts_to, read_only
+
+#: how far draws go from the prior's middle, one after the other
+_SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3)
+#: draws of all ancestors at each of them
+_DRAWS = 64
+#: how often the nodes of one net are drawn anew, at most
+_MOST = 16
+
+Links = tuple[tuple[str, Aligner], ...]
+
+
+def made_possible(
+    declaration: Declaration,
+    links: Links,
+    plates: Shape,
+    result: Any,
+    batch: Shape,
+    model: Model,
+) -> bool:
+    """Whether, where a function goes wrong on the probe, it does not at other draws, which take their place.
+
+    Configurations of finite parents that are out of range stay the model's fault.
+    """
+    if not batch or not depends_on_numbers(links, model.nodes):
+        return False
+    if isinstance(result, Distribution) and not broadcasts_to(result.batch_shape, batch + plates):
+        return False
+    try:
+        wrong = wrong_elements(result, batch, plates).any()
+    except ValueError:  # a shape that does not fit is refused in its own words
+        return False
+    if not wrong or (isinstance(result, Distribution) and result.problem.is_overflow):  # type: ignore[union-attr]
+        return False
+    anew = model.cache["drawn anew"] = model.cache.get("drawn anew", 0) + 1
+    rng = np.random.default_rng([20, anew])
+    if anew > _MOST:
+        return not wrong_elements(result, batch, plates).all(axis=tuple(range(len(batch)))).any()
+    return _drawn_anew(model, declaration, links, plates, result, batch, rng)
+
+
+def depends_on_numbers(links: Links, nodes: Mapping[str, CompiledNode]) -> bool:
+    """Whether a function depends, through deterministic nodes as well, on a node that is not finite."""
+    todo, reached = [name for name, _ in links], set()
+    while todo:
+        name = todo.pop()
+        if name in reached:
+            continue
+        reached.add(name)
+        node = nodes[name]
+        if node.is_stochastic and node.domain is None:
+            return True
+        if node.kind == "deterministic":
+            todo += node.parents
+    return False
+
+
+def wrong_elements(result: Any, batch: Shape, plates: Shape) -> np.ndarray:
+    """Where a function's result has parameters out of range, or is NaN, shape ``batch + plates``."""
+    shape = batch + plates
+    if isinstance(result, Distribution):
+        invalid = False if result.invalid is None else result.invalid
+        return np.broadcast_to(invalid, shape)
+    array = np.asarray(result)
+    if array.dtype.kind != "f":
+        return np.zeros(shape, dtype=bool)
+    axes = tuple(range(len(shape), array.ndim))
+    return np.broadcast_to(np.isnan(array).any(axis=axes), shape)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _drawn_anew(
+    model: Model,
+    declaration: Declaration,
+    links: Links,
+    plates: Shape,
+    result: Any,
+    batch: Shape,
+    rng: np.random.Generator,
+) -> bool:
+    """Replace, in the probe, what a function cannot take by other draws; whether it can take any at all.
+
+    Parameters
+    ----------
+    model : Model
+        All nodes before this one; its ``probe`` is changed.
+    result : object
+        What the function made of the probe.
+    batch : tuple of int
+        Batch of its parents.
+
+    Returns
+    -------
+    bool
+        For every plate element some draw is in range.
+    """
+    lead = tuple(range(len(batch)))
+    wrong = wrong_elements(result, batch, plates)
+    fine = ~wrong.all(axis=lead)
+    rows = wrong.any(axis=tuple(range(len(batch), wrong.ndim)))
+    bad = np.broadcast_to(rows, model.probe_shape).copy()
+    for pool, sound in _pools(model, rng):
+        found = _tried(declaration, links, pool, plates)
+        if found is None:
+            continue
+        fine = fine | ~found.all(axis=0)
+        good = np.flatnonzero(sound & ~found.reshape(_DRAWS, -1).any(axis=1))
+        at = np.argwhere(bad)[: len(good)]
+        if len(at):
+            _replaced(model, pool, good[: len(at)], tuple(at.T))
+            bad[tuple(at.T)] = False
+        if not bad.any():
+            break
+    return bool(fine.all())
+
+
+def _pools(
+    model: Model, rng: np.random.Generator
+) -> Iterator[tuple[dict[str, np.ndarray], np.ndarray]]:
+    """Joint draws of all nodes so far, ``(_DRAWS, *plates, *event)``, nearer and nearer to the middle.
+
+    With each, which of the draws are such that nothing above them is out of range.
+    """
+    for spread in _SPREADS:
+        values: dict[str, np.ndarray] = {}
+        sound = np.ones(_DRAWS, dtype=bool)
+        try:
+            for name, node in model.nodes.items():
+                if node.kind in ("input", "fixed"):
+                    values[name] = model.probe[name]
+                    continue
+                result, batch = model.evaluate(name, values)
+                wrong = wrong_elements(result, batch, node.plate_shape)
+                sound = sound & ~wrong.any(axis=tuple(range(len(batch), wrong.ndim)))
+                values[name] = _value(model, node, result, spread, rng)
+        except BayesmcError:
+            continue
+        yield values, sound
+
+
+def _value(
+    model: Model, node: CompiledNode, result: Any, spread: float, rng: np.random.Generator
+) -> np.ndarray:
+    if not node.is_stochastic:
+        return np.asarray(result)
+    if node.unsampled:  # some of the values that it was tried on
+        old = model.probe[node.name].reshape(-1, *node.value_shape)
+        return old[rng.integers(len(old), size=_DRAWS)]
+    draws = model.sample_stored(node.name, result, rng, (_DRAWS,))
+    if node.domain is not None or node.is_discrete:
+        return draws
+    return nearer(result, draws, spread, (_DRAWS, *node.value_shape), len(node.event_shape))
+
+
+def _tried(
+    declaration: Declaration, links: Links, pool: Mapping[str, np.ndarray], plates: Shape
+) -> np.ndarray | None:
+    """Where a function goes wrong on a pool, shape ``(_DRAWS, *plates)``; None where it fails."""
+    try:
+        arguments, batch = arguments_of(links, pool)
+        found = wrong_elements(call(declaration, arguments, batch + plates, links), batch, plates)
+    except (BayesmcError, ValueError):
+        return None
+    return np.broadcast_to(found, (_DRAWS, *plates))
+
+
+def _replaced(
+    model: Model, pool: Mapping[str, np.ndarray], rows: np.ndarray, at: tuple[np.ndarray, ...]
+) -> None:
+    """Put rows of a pool into the probe; computed nodes follow."""
+    for name, node in model.nodes.items():
+        old = model.probe[name]
+        if node.is_stochastic:
+            new = np.array(old)
+            new[at] = np.broadcast_to(pool[name], (_DRAWS, *node.value_shape))[rows]
+            model.probe[name] = read_only(new)
+        elif node.kind == "deterministic":
+            value, _ = model.evaluate(name, model.probe)
+            model.probe[name] = read_only(np.broadcast_to(value, old.shape))
