@@ -35,6 +35,11 @@ class Forest:
     ValueError
         The edges make a cycle.
 
+    Attributes
+    ----------
+    tables : int
+        Tables that are read and made: those of the edges, then others.
+
     References
     ----------
     Miller and Reif (1985), FOCS 26, 478-489 (rake and compress); Scott (2002), JASA 97, 337-351 (filtering
@@ -47,10 +52,10 @@ class Forest:
     >>> import numpy as np
     >>> from bayesmc.kernels.forest import Forest
     >>> forest = Forest(2, [(0, 1)])
-    >>> with np.errstate(divide="ignore"):
-    ...     equal = np.log(np.eye(2))[:, :, None, None]
     >>> single = np.log([[0.5, 0.1], [0.5, 0.9]])[:, :, None]
-    >>> states, log_normaliser = forest.draw(single, equal, np.random.default_rng(0))
+    >>> tables = np.zeros((2, 2, forest.tables, 1))
+    >>> tables[[0, 1], [1, 0], 0] = -np.inf
+    >>> states, log_normaliser = forest.draw(single, tables, np.random.default_rng(0))
     >>> states.tolist(), np.exp(log_normaliser).round(6).tolist()
     ([[1], [1]], [0.5])
     """
@@ -77,16 +82,17 @@ class Forest:
         self.tables = len(first)
 
     def draw(
-        self, single: np.ndarray, pairs: np.ndarray, rng: np.random.Generator, what: str = "forest"
+        self, single: np.ndarray, tables: np.ndarray, rng: np.random.Generator, what: str = "forest"
     ) -> tuple[np.ndarray, np.ndarray]:
         """States of all variables, drawn jointly, and the log normaliser.
 
         Parameters
         ----------
         single : ndarray, shape (states, variables, rows)
-            Log factors on single variables; ``-inf`` at states that a variable does not have.
-        pairs : ndarray, shape (states, states, edges, rows or 1)
-            Log factors on pairs, the first of an edge on the first axis.
+            Log factors on single variables; ``-inf`` at states that a variable does not have. Overwritten.
+        tables : ndarray, shape (states, states, tables, rows)
+            Log factors on pairs, the first of an edge on the first axis; what comes after the edges, and all
+            in the end, is overwritten.
         what : str
             Whose draws these are, for errors.
 
@@ -100,15 +106,11 @@ class Forest:
         ZeroProbabilityError
             All joint states of some row are impossible.
         """
-        states, _, rows = single.shape
-        single = single.copy()
-        tables = np.empty((states, states, self.tables, rows))
-        tables[:, :, : self.edges] = pairs
-        total = np.zeros(rows)
+        total = np.zeros(single.shape[-1])
         with np.errstate(divide="ignore"):
             for step in self.rounds:
                 total += step.sum_out(single, tables)
-        drawn = np.zeros((self.count, rows), dtype=np.intp)
+        drawn = np.zeros(single.shape[1:], dtype=np.intp)
         for step in reversed(self.rounds):
             step.draw(single, tables, drawn, rng, what)
         return drawn, total

@@ -104,11 +104,10 @@ class ForestBlock(Kernel):
         """
         chains = len(values[self.names[0]])
         rows = chains * math.prod(self.plate_shape)
-        start = np.broadcast_to(
-            self.possible[:, :, None], (*self.possible.shape[:2], chains, *self.plate_shape)
-        )
-        single = start.reshape(self.states, len(self.names), rows).copy()
-        pairs = np.zeros((self.states, self.states, self.forest.edges, rows))
+        single = np.empty((self.states, len(self.names), chains, *self.plate_shape))
+        single[:] = self.possible[:, :, None]
+        single = single.reshape(self.states, len(self.names), rows)
+        pairs = np.zeros((self.states, self.states, self.forest.tables, rows))
         state = {**values, **self.candidates}
         self.target.compute(state, self.below)
         proper = True
@@ -127,17 +126,21 @@ class ForestBlock(Kernel):
     ) -> tuple[Values, Memory]:
         single, pairs, proper = self.log_factors(values)
         drawn, _ = self.forest.draw(single, pairs, rng, self._shown())
-        shape = (len(values[self.names[0]]), *self.plate_shape)
-        if len(set(self.dtypes)) == 1:
-            drawn = drawn.astype(self.dtypes[0])
-        drawn.flags.writeable = False
-        new = {
-            n: row.astype(t, copy=False).reshape(shape)
-            for n, row, t in zip(self.names, drawn, self.dtypes, strict=True)
-        }
+        new = self._spread(drawn)
         if not proper:
             self._check({**values, **new})
         return new, memory
+
+    def _spread(self, drawn: np.ndarray) -> Values:
+        """The values of each node, from positions ``(nodes, rows)``."""
+        alike = len(set(self.dtypes)) == 1
+        stored = drawn.astype(self.dtypes[0]) if alike else drawn
+        if self.plate_shape:
+            stored = stored.reshape(len(self.names), -1, *self.plate_shape)
+        stored.flags.writeable = False
+        if alike:
+            return dict(zip(self.names, stored, strict=True))
+        return {n: v.astype(t) for n, v, t in zip(self.names, stored, self.dtypes, strict=True)}
 
     def _check(self, values: Values) -> None:
         """Raise where what was drawn has parameters that are wrong."""
