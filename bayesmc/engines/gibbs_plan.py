@@ -17,6 +17,7 @@ from bayesmc.kernels.conjugate import conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
+from bayesmc.kernels.forest_search import forest_blocks
 from bayesmc.kernels.gaussian_block import gaussian_blocks
 from bayesmc.kernels.joint_states import joint_states
 from bayesmc.kernels.jump import Jump
@@ -199,8 +200,13 @@ def _finite(
     if len(lattices) == len(names):
         return kernels, tight
     terms = FiniteTerms(target)
-    blocks = [b for b in coupled_blocks(target, terms) if blankets.keys() >= set(b)]
-    wanted = [(n,) for n in names if n not in lattices] + blocks
+    forests = forest_blocks(target, blankets, [n for n in names if n not in lattices], terms)
+    kernels += forests
+    joined = [f.names for f in forests]
+    blocks = coupled_blocks(target, terms, joined)
+    blocks = [b for b in blocks if blankets.keys() >= set(b)]
+    drawn = {n for f in forests for n in f.names}
+    wanted = [(n,) for n in names if n not in lattices and n not in drawn] + blocks
     tabulated, left = table_kernels(target, wanted, terms)
     kernels += tabulated
     alone = []
@@ -216,7 +222,7 @@ def _finite(
     groups, alone = stacks(target, blankets, alone)
     kernels += [Stacked(group, Enumerate) for group in groups]
     kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
-    tied = deterministic_constraints(target, blocks, terms)
+    tied = deterministic_constraints(target, [*joined, *blocks], terms)
     return kernels, (*tight, *(n for n in tied if n in blankets))
 
 

@@ -30,12 +30,17 @@ _ELEMENTS = 64
 
 
 def coupled_blocks(
-    target: Target, terms: FiniteTerms | None = None, largest: int = _STATES
+    target: Target,
+    terms: FiniteTerms | None = None,
+    joined: Sequence[Sequence[str]] = (),
+    largest: int = _STATES,
 ) -> list[tuple[str, ...]]:
     """Small blocks of finite nodes that should be drawn jointly, so that chains can move.
 
     Parameters
     ----------
+    joined : sequence of sequence of str
+        What is drawn jointly already.
     largest : int
         Joint states of a block.
 
@@ -65,7 +70,7 @@ def coupled_blocks(
     supports = _supports(target, terms, _TINY)
     blocks: list[tuple[str, ...]] = []
     for grow in (False, True):
-        stuck = _stuck(supports, _moves(target, blocks))
+        stuck = _stuck(supports, _moves(target, [*joined, *blocks]))
         for component in stuck:
             for block in _proposed(target, supports, component, largest, grow):
                 if block not in blocks and _alike(target, block):
@@ -209,7 +214,9 @@ def _connected(
     supports: Sequence[_Support],
     moves: Sequence[frozenset[_Variable]],
 ) -> bool:
-    """Whether moves lead from every possible joint state to every other, by enumeration."""
+    """Whether moves lead from every possible joint state to every other, by enumeration if need be."""
+    if any(move.issuperset(scope) for move in moves):
+        return True
     cards = _cards(scope, supports)
     if math.prod(cards) > _ENUMERATED:
         return False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -90,7 +90,7 @@ class TermSum:
     def __init__(self, target: Target, terms: Iterable[Term]) -> None:
         self.target = target
         self.terms = tuple(terms)
-        self.groups = tuple(_groups(target, self.terms))
+        self.groups = tuple(like_groups(target, self.terms))
         taken = {n for g in self.groups for n in g.names}
         self.alone = tuple(t for t in self.terms if t.name not in taken)
 
@@ -123,21 +123,23 @@ def like_terms(target: Target, terms: Sequence[Term], states: Values) -> LikeTer
     return LikeTerms(term, alike.names, slots)
 
 
-def repeated(scope: Sequence[str]) -> tuple[int, ...]:
-    """Which places of a scope hold the same name: those of a group must do so alike."""
-    return tuple(scope.index(n) for n in scope)
+def like_groups(
+    target: Target, terms: Sequence[Term], also: Callable[[Term], Hashable] | None = None
+) -> list[LikeTerms]:
+    """Terms that can be evaluated as one, where there are many; all others are left out.
 
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _groups(target: Target, terms: Sequence[Term]) -> list[LikeTerms]:
+    Parameters
+    ----------
+    also : callable, optional
+        What else must be equal within a group.
+    """
     signatures = target.signatures
     alike: dict[Hashable, list[Term]] = {}
     for term in terms:
         signature = signatures.of(term.name)
         if signature is not None:
-            alike.setdefault((signature.key, repeated(signature.scope)), []).append(term)
+            key = signature.key, repeated(signature.scope), None if also is None else also(term)
+            alike.setdefault(key, []).append(term)
     many = [g for g in alike.values() if len(g) >= FEWEST]
     states = target.states if many else None
     if states is None:
@@ -148,6 +150,14 @@ def _groups(target: Target, terms: Sequence[Term]) -> list[LikeTerms]:
         if made is not None and _agrees(made, group, states):
             found.append(made)
     return found
+
+
+def repeated(scope: Sequence[str]) -> tuple[int, ...]:
+    """Which places of a scope hold the same name: those of a group must do so alike."""
+    return tuple(scope.index(n) for n in scope)
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _agrees(made: LikeTerms, terms: Sequence[Term], states: Values) -> bool:
