@@ -19,6 +19,7 @@ from bayesmc.errors import (
     PlateError,
     UnknownNodeError,
 )
+from bayesmc.network.captured import captured
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.evidence import plate_sizes, read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
@@ -261,7 +262,11 @@ class BayesNet:
         if name in self._declarations or name in self._potentials:
             raise DuplicateNodeError(f"potential {name!r}: the name is declared already")
         self._potentials[name] = Potential(
-            name, names, bound, self._plates.of(f"node {name!r}", plates)
+            name,
+            names,
+            bound,
+            self._plates.of(f"node {name!r}", plates),
+            captured=captured(function),
         )
         self._changed()
 
@@ -524,7 +529,13 @@ class BayesNet:
             )
         labels = None if states is None else plain_states(states)
         own = self._plates.of(f"node {name!r}", plates)
-        self._declare(Declaration(name, "function", names, own, labels, bound, vectorize), replace_)
+        around = captured(function)
+        self._declare(
+            Declaration(
+                name, "function", names, own, labels, bound, vectorize, captured=around
+            ),
+            replace_,
+        )
 
     def _declare(self, declaration: Declaration, replace_: bool) -> None:
         name = declaration.name
