@@ -18,6 +18,7 @@ from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.errors import EvidenceError, PlateError
 from bayesmc.network import Observed
 from bayesmc.network.evidence import observe
+from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
 from bayesmc.network.store import unknown
@@ -120,7 +121,14 @@ def read_series(
     given = {n: v for n, v in (observations or {}).items() if v is not None}
     for name in given:
         _check_observed(template, name)
-    timed = {n: _rows(n, v) for n, v in given.items() if n not in template.static}
+    timed = {n: _rows(template, n, v) for n, v in given.items() if n not in template.static}
+    timely = {**{n: v for n, v in given.items() if n not in template.static}, **(inputs or {})}
+    known = template.later
+    refuse_crossed(
+        [(n, v, known[n].plates) for n, v in timely.items() if n in known],
+        template.plates.labels,
+        timed=True,
+    )
     if ahead:
         check_steps("forecast", ahead)
     count = _count(timed, _input_rows(template, inputs), steps, ahead)
@@ -133,7 +141,11 @@ def read_series(
         n: _padded(_observed(slices.later[n], v, count - ahead), slices.later[n], ahead)
         for n, v in timed.items()
     }
-    static = {n: observe(slices.first[n], v) for n, v in given.items() if n in template.static}
+    static = {
+        n: observe(slices.first[n], _by_label(template, n, v))
+        for n, v in given.items()
+        if n in template.static
+    }
     return slices, Series(
         count,
         {n: o for n, o in observed.items() if o is not None},
@@ -169,8 +181,12 @@ def read_row(
             raise EvidenceError(
                 f"{what} is a {type(given).__name__}; give a dict from name to the value in this slice"
             )
-    rows = {n: _in_time(v) for n, v in (observations or {}).items() if v is not None}
-    given = {n: [v] for n, v in (inputs or {}).items()}
+    rows = {
+        n: _in_time(_by_label(template, n, v))
+        for n, v in (observations or {}).items()
+        if v is not None
+    }
+    given = {n: [_by_label(template, n, v)] for n, v in (inputs or {}).items()}
     if slices is None:
         slices, series = read_series(dbn, rows, given, steps=1)
     else:
@@ -178,7 +194,7 @@ def read_row(
             _check_observed(template, name)
         sizes = slices.later.sizes
         values = read_input_rows(template, sizes, given, 1)
-        seen = {n: _observed(slices.later[n], _rows(n, v), 1) for n, v in rows.items()}
+        seen = {n: _observed(slices.later[n], _rows(template, n, v), 1) for n, v in rows.items()}
         series = Series(1, {n: o for n, o in seen.items() if o is not None}, values)
     row = series.row(0)
     row.inputs[TIME] = np.asarray(t)
@@ -200,7 +216,9 @@ def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarr
         node = slices.first[name]
         if not node.is_stochastic:
             continue
-        seen = observe(node, values[name]) if values.get(name) is not None else None
+        given = values.get(name)
+        labelled = by_label(f"static {name!r}", given, node.plates, slices.first.labels)
+        seen = observe(node, labelled) if given is not None else None
         if seen is None or seen.mask is not None:
             raise EvidenceError(
                 f"static node {name!r} has no value; pass static={{{name!r}: value}}"
@@ -292,11 +310,11 @@ def unrolled(template: Template, observations: Mapping[str, Any]) -> dict[str, A
     for name, value in observations.items():
         _check_observed(template, name)
         if name in template.static:
-            evidence[name] = value
+            evidence[name] = _by_label(template, name, value)
             continue
         if value is None:
             continue
-        for t, row in enumerate(_rows(name, value)):
+        for t, row in enumerate(_rows(template, name, value)):
             if not _is_missing(row):
                 evidence[f"{name}[{t}]"] = row
     return evidence
@@ -323,10 +341,18 @@ def _check_observed(template: Template, name: str) -> None:
         raise EvidenceError(f"observations of {name!r}: {unknown(template.later, name)}")
 
 
+def _by_label(template: Template, name: str, value: Any, ahead: int = 0) -> Any:
+    """What is labelled in the order of the plates; ``ahead`` counts the axis of time."""
+    if name not in template.later:
+        return value
+    plates = template.later[name].plates
+    return by_label(f"data of {name!r}", value, plates, template.plates.labels, ahead)
+
+
 def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
     if inputs is not None and not isinstance(inputs, Mapping):
         raise EvidenceError(f"inputs is a {type(inputs).__name__}; give a dict from name to rows")
-    inputs = inputs or {}
+    inputs = {n: _by_label(template, n, v, 1) for n, v in (inputs or {}).items()}
     for name in inputs:
         if name not in template.inputs:
             raise EvidenceError(
@@ -341,8 +367,10 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
     return dict(inputs)
 
 
-def _rows(name: str, value: Any) -> Any:
+def _rows(template: Template, name: str, value: Any) -> Any:
     """A series with None rows of vectors filled, so that it is an array."""
+    refuse_backwards(f"observations of {name!r}", value)
+    value = _by_label(template, name, value, 1)
     if isinstance(value, (list, tuple)) and any(v is None for v in value):
         shapes = {np.shape(v) for v in value if v is not None}
         if len(shapes) == 1 and (shape := shapes.pop()):

@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model, Node
+from bayesmc.network.captured import check_captured
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.domain import Domain
 from bayesmc.network.node import Declaration
@@ -120,9 +121,17 @@ class Template:
         """Pickles travel without functions."""
 
         def bare(declarations: Mapping[str, Declaration]) -> dict[str, Declaration]:
-            return {n: replace(d, function=None) for n, d in declarations.items()}
+            return {n: replace(d, function=None, captured=()) for n, d in declarations.items()}
 
         return {**self.__dict__, "later": bare(self.later), "first": bare(self.first)}
+
+    def check_captured(self) -> None:
+        """Refuse functions that read a name which has changed since they were declared."""
+        check_captured(self._around)
+
+    @cached_property
+    def _around(self) -> list[Declaration]:
+        return [d for d in (*self.later.values(), *self.first.values()) if d.captured]
 
     def slice_zero(self) -> dict[str, Declaration]:
         """Declarations of slice 0."""
@@ -210,6 +219,7 @@ class SliceStore:
 
     def slices(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Slices:
         """Both models for these plate sizes; ``inputs`` hold ``u`` and ``u_prev`` of two slices in a row."""
+        self.template.check_captured()
         now = {n: inputs[n] for n in inputs if n in self.template.inputs}
         at_zero = {n: inputs.get(n + PREVIOUS, v) for n, v in now.items()}
         for _ in range(_ROUNDS):

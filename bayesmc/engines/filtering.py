@@ -190,6 +190,7 @@ class FilterEngine:
                 f"{type(self).__name__}().step: the belief is a {type(belief).__name__}; give what start or "
                 "step of this kind of filter returned"
             )
+        belief.dbn.template.check_captured()
         slices, row = read_row(
             belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
         )

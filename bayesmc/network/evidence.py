@@ -9,11 +9,13 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.network.labelled import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration
 from bayesmc.shapes import Shape, first_index
@@ -55,7 +57,8 @@ def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str,
             )
         if value is None:
             continue
-        found = observe(node, value)
+        ordered = by_label(f"evidence on {name!r}", value, node.plates, model.labels)
+        found = observe(node, ordered)
         if found is not None:
             observed[name] = found
     return observed
@@ -98,7 +101,8 @@ def read_question(
     """A snapshot of a net, its model for the data, and evidence and inputs as stored values."""
     model = net.model(evidence if isinstance(evidence, Mapping) else None, inputs)
     observed = read_evidence(model, evidence)
-    given = read_inputs({n: c.declaration for n, c in model.nodes.items()}, model.sizes, inputs)
+    declarations = {n: c.declaration for n, c in model.nodes.items()}
+    given = read_inputs(declarations, model.sizes, inputs, model.labels)
     return net.snapshot(), model, observed, given
 
 
@@ -106,6 +110,7 @@ def read_inputs(
     declarations: Mapping[str, Declaration],
     sizes: Mapping[str, int],
     inputs: Mapping[str, Any] | None,
+    labels: Mapping[str, tuple[Any, ...]],
 ) -> dict[str, np.ndarray]:
     """Check the values of input nodes; all that are declared must be given."""
     if inputs is not None and not isinstance(inputs, Mapping):
@@ -121,9 +126,10 @@ def read_inputs(
     for name, declaration in wanted.items():
         if name not in given:
             raise EvidenceError(f"input {name!r} has no value; pass inputs={{{name!r}: value}}")
-        value = np.array(given[name])
+        what = f"input {name!r}"
+        value = np.array(by_label(what, given[name], declaration.plates, labels))
         if value.dtype.kind not in "biuf":
-            raise EvidenceError(f"input {name!r} has dtype {value.dtype}; give numbers")
+            raise EvidenceError(f"{what} has dtype {value.dtype}; give numbers")
         if value.dtype.kind == "f" and not np.isfinite(value).all():
             at = first_index(~np.isfinite(value))
             raise EvidenceError(
@@ -144,8 +150,12 @@ def plate_sizes(
     plates: Mapping[str, int | None],
     declarations: Mapping[str, Declaration],
     *data: Mapping[str, Any] | None,
+    labels: Mapping[str, tuple[Any, ...]] = MappingProxyType({}),
 ) -> dict[str, int | None]:
-    """Sizes of all plates: declared ones, else read off the leading axes of the data."""
+    """Sizes of all plates: declared ones, else read off the leading axes of the data.
+
+    Data that bring labels of their own must agree on them, but for plates that declare ``labels``.
+    """
     sizes = dict(plates)
     source: dict[str, str] = {}
     fixed = {n: d.value for n, d in declarations.items() if d.value is not None}
@@ -169,6 +179,8 @@ def plate_sizes(
                         f"plate {plate!r} has size {sizes[plate]} in the data of {source[plate]!r} but "
                         f"{size} in that of {name!r}"
                     )
+    known = [(n, v) for values in data for n, v in (values or {}).items() if n in declarations]
+    refuse_crossed([(n, v, declarations[n].plates) for n, v in known], labels)
     return sizes
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from bayesmc.distributions import Density
 from bayesmc.distributions.support import Support, as_support, integers
 from bayesmc.errors import BayesmcError, DensityError, ModelError, ShapeError, UnknownNodeError
+from bayesmc.network.captured import captured
 from bayesmc.network.domain import Domain, domain_with_states
 from bayesmc.network.node import Declaration, Potential, bind, plain_states
 from bayesmc.shapes import Shape, as_shape, first_index, owned
@@ -83,7 +84,8 @@ def read_factor(
         function = _LogTable(*_read_table(name, log_potential, names, lead, variables))
     else:
         _, function = bind(name, log_potential, names)
-    return Potential(name, names, function, own, rows, is_table)
+    around = () if is_table else captured(log_potential)
+    return Potential(name, names, function, own, rows, is_table, around)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -386,7 +386,7 @@ class FactorGraph:
             )
         if self._question is not None:
             return self._question[1]
-        read_inputs({}, self.plates, inputs)
+        read_inputs({}, self.plates, inputs, {})
         model = self._store.model(self.plates, {})
         self._store.validate(model)
         return model

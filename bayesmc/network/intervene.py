@@ -9,6 +9,7 @@ import numpy as np
 
 from bayesmc.errors import EvidenceError
 from bayesmc.network.evidence import store
+from bayesmc.network.labelled import by_label
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration
 from bayesmc.network.ordering import ancestors
@@ -21,6 +22,7 @@ def fixed(name: str, node: CompiledNode, value: Any, model: Model) -> Declaratio
         raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")
     above = ancestors({n: c.parents for n, c in model.nodes.items()}, [name])
     has_inputs = any(model.nodes[n].kind == "input" for n in above)
+    value = by_label(f"do({name}=...)", value, node.plates, model.labels)
     node = _widened(node, value, has_inputs)
     try:
         stored = store(node, value)

@@ -11,6 +11,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, EvidenceError, UnsupportedError
 from bayesmc.network import forward
 from bayesmc.network.evidence import store
+from bayesmc.network.labelled import by_label
 from bayesmc.network.model import CompiledNode, Model, invalid_error
 
 
@@ -33,7 +34,11 @@ def joint_log_prob(
                 raise EvidenceError(
                     f"log_prob: node {name!r} has no value; give all stochastic nodes"
                 )
-            stored_value = store(node, values[name])
+            ahead = max(np.ndim(values[name]) - len(node.value_shape), 0)
+            stored_value = store(
+                node,
+                by_label(f"log_prob: {name!r}", values[name], node.plates, model.labels, ahead),
+            )
             try:
                 total = total + node_log_prob(model, name, stored_value, stored, total)
             except ValueError as error:

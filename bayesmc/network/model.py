@@ -141,7 +141,7 @@ class Model:
     def without_functions(self) -> Model:
         """The same model for results that are stored: it describes nodes but evaluates none."""
         nodes = {
-            name: replace(node, declaration=replace(node.declaration, function=None))
+            name: replace(node, declaration=replace(node.declaration, function=None, captured=()))
             for name, node in self.nodes.items()
         }
         return replace(self, nodes=nodes, potentials={}, probe={}, cache={})

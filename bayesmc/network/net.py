@@ -19,6 +19,7 @@ from bayesmc.errors import (
     PlateError,
     UnknownNodeError,
 )
+from bayesmc.network.captured import captured
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.evidence import plate_sizes, read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
@@ -261,7 +262,11 @@ class BayesNet:
         if name in self._declarations or name in self._potentials:
             raise DuplicateNodeError(f"potential {name!r}: the name is declared already")
         self._potentials[name] = Potential(
-            name, names, bound, self._plates.of(f"node {name!r}", plates)
+            name,
+            names,
+            bound,
+            self._plates.of(f"node {name!r}", plates),
+            captured=captured(function),
         )
         self._changed()
 
@@ -413,7 +418,7 @@ class BayesNet:
         strange = [n for n in values if n not in model.nodes]
         if strange:
             raise EvidenceError(f"log_prob: {unknown(self._declarations, strange[0])}")
-        given = read_inputs(self._declarations, model.sizes, inputs)
+        given = read_inputs(self._declarations, model.sizes, inputs, self._fitting(model.sizes))
         return joint_log_prob(model, values, given)
 
     def sample(
@@ -447,7 +452,7 @@ class BayesNet:
         if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 0:
             raise ValueError(f"sample(draws={draws!r}): draws is a number of draws, 0 or more")
         model = self.model(None, inputs, plates)
-        given = read_inputs(self._declarations, model.sizes, inputs)
+        given = read_inputs(self._declarations, model.sizes, inputs, self._fitting(model.sizes))
         return joint_sample(model, int(draws), stream(seed_sequence(rng), Purpose.SAMPLE), given)
 
     def model(
@@ -465,8 +470,9 @@ class BayesNet:
             if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
                 raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
         sizes = plate_sizes(
-            {**self._plates.sizes, **(plates or {})}, self._declarations, evidence, inputs
-        )
+            {**self._plates.sizes, **(plates or {})}, self._declarations, evidence, inputs,
+            labels=self._plates.labels,
+        )  # fmt: skip
         open_plates = [p for p, n in sizes.items() if n is None and self._uses(p)]
         if open_plates:
             raise PlateError(
@@ -474,7 +480,7 @@ class BayesNet:
                 f"plates={{{open_plates[0]!r}: size}}"
             )
         settled = {p: n if n is not None else 0 for p, n in sizes.items()}
-        given = read_inputs(self._declarations, settled, inputs)
+        given = read_inputs(self._declarations, settled, inputs, self._fitting(settled))
         model = self._store.model(settled, given)
         self._store.validate(model)
         return model
@@ -524,7 +530,11 @@ class BayesNet:
             )
         labels = None if states is None else plain_states(states)
         own = self._plates.of(f"node {name!r}", plates)
-        self._declare(Declaration(name, "function", names, own, labels, bound, vectorize), replace_)
+        around = captured(function)
+        self._declare(
+            Declaration(name, "function", names, own, labels, bound, vectorize, captured=around),
+            replace_,
+        )
 
     def _declare(self, declaration: Declaration, replace_: bool) -> None:
         name = declaration.name
@@ -547,6 +557,10 @@ class BayesNet:
                 self.name, self._declarations, self._potentials, self._plates.labels
             )
         return self._kept_store
+
+    def _fitting(self, sizes: Mapping[str, int]) -> dict[str, tuple[Any, ...]]:
+        """Labels of plates that have the size they were declared with."""
+        return {p: names for p, names in self._plates.labels.items() if len(names) == sizes[p]}
 
     def _uses(self, plate: str) -> bool:
         return any(plate in d.plates for d in self._declarations.values())

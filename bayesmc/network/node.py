@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import ModelError, ParameterError
+from bayesmc.network.captured import Captured
 from bayesmc.network.domain import Domain
 from bayesmc.shapes import Shape, first_index
 
@@ -48,7 +49,8 @@ class Declaration:
 
     ``source`` is "function", "table", "input", "fixed", or "variable" (of a factor graph: its function
     returns a flat density, log 1 on all of its support); ``function`` takes the parents in order. ``domain``
-    is that of a fixed node; of a computed one the values that it shall have (of size 0: none are counted).
+    is that of a fixed node; of a computed one the values that it shall have (of size 0: none are counted);
+    ``captured`` what the function reads from around it, as it stood when it was declared.
     """
 
     name: str
@@ -62,6 +64,7 @@ class Declaration:
     event_shape: Shape = ()
     value: np.ndarray | None = None
     domain: Domain | None = None
+    captured: tuple[Captured, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +84,8 @@ class Potential:
         the elements of the variable's plates in C order (all zeros for a variable without plates).
     is_table : bool
         The function takes positions of finite nodes instead of their values.
+    captured : tuple of Captured
+        What the function reads from around it, as it stood when it was declared.
     """
 
     name: str
@@ -89,6 +94,7 @@ class Potential:
     plates: tuple[str, ...] = field(default=())
     index: tuple[np.ndarray, ...] | None = None
     is_table: bool = False
+    captured: tuple[Captured, ...] = ()
 
     @property
     def scope(self) -> tuple[str, ...]:

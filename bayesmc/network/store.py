@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import DensityError, ModelError, ParameterError, UnknownNodeError
+from bayesmc.network.captured import check_captured
 from bayesmc.network.compile import compile_model
 from bayesmc.network.model import Model
 from bayesmc.network.node import Declaration, Potential
@@ -41,9 +42,11 @@ class ModelStore:
         self.labels = dict(labels)
         self._models: dict[Any, Model] = {}
         self._valid = False
+        self._around = [d for d in declarations.values() if d.captured]
 
     def model(self, sizes: Mapping[str, int], inputs: Mapping[str, np.ndarray]) -> Model:
         """The net compiled for these plate sizes and inputs."""
+        self.check_captured()
         small = sum(v.nbytes for v in inputs.values()) <= _KEEP_INPUTS
         key = (tuple(sizes.items()), tuple((n, v.tobytes()) for n, v in inputs.items() if small))
         model = self._models.get(key) if small else None
@@ -54,6 +57,11 @@ class ModelStore:
                     self._models.pop(next(iter(self._models)), None)
                 self._models[key] = model
         return model
+
+    def check_captured(self) -> None:
+        """Refuse functions that read a name which has changed since they were declared."""
+        check_captured(self._around)
+        check_captured(self.potentials.values(), "factor")
 
     def probe(self, sizes: Mapping[str, int | None]) -> Model:
         """A model when nobody has given data: open plates and inputs get stand-ins."""

@@ -293,7 +293,8 @@ class DrawsPosterior(Posterior):
         given = problem.inputs if inputs is None else inputs
         model = problem.net.model(None, given, sizes)
         _refuse_potentials(model, wanted)
-        known = read_inputs({n: c.declaration for n, c in model.nodes.items()}, sizes, given)
+        declarations = {n: c.declaration for n, c in model.nodes.items()}
+        known = read_inputs(declarations, sizes, given, model.labels)
         values: dict[str, np.ndarray] = {}
         anew: set[str] = set()
         steps: list[forward.Step] = []

@@ -1,0 +1,198 @@
+"""Data that bring labels of their own: a pandas Series or DataFrame, an xarray DataArray.
+
+Their labels, not their order, say which element of a plate a number belongs to. What has no labels, or the
+default ones 0, 1, 2, ..., goes by position. Nothing here imports those packages; what looks like them is
+taken as such.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import EvidenceError
+
+Labels = Mapping[str, tuple[Any, ...]]
+
+
+def by_label(what: str, value: Any, plates: Sequence[str], labels: Labels, ahead: int = 0) -> Any:
+    """The numbers of labelled data in the order of the plates; other values as they are.
+
+    Parameters
+    ----------
+    what : str
+        Whose data they are, for messages.
+    value : Any
+    plates : sequence of str
+        Of the node or input.
+    labels : dict
+        Plate -> labels, of those that have some.
+    ahead : int
+        How many axes stand before those of the plates (1: time).
+
+    Raises
+    ------
+    EvidenceError
+        A label stands twice, is none of the plate's, or is missing.
+    """
+    found = _labelled(value, plates, ahead)
+    if found is None:
+        return value
+    array, own = found
+    for k, plate in enumerate(plates):
+        axis = k + ahead
+        here = own[axis] if axis < len(own) else None
+        if plate in labels and here is not None:
+            order = _order(what, plate, here, labels[plate])
+            if order is not None:
+                array = np.take(array, order, axis=axis)
+    return array
+
+
+def refuse_crossed(
+    data: Sequence[tuple[str, Any, Sequence[str]]], labels: Labels, timed: bool = False
+) -> None:
+    """Refuse data whose labels of one plate without declared labels (or of time) are not the same.
+
+    Parameters
+    ----------
+    data : sequence of (str, Any, sequence of str)
+        Name, value and plates.
+    timed : bool
+        The first axis is time.
+
+    Raises
+    ------
+    EvidenceError
+    """
+    seen: dict[str, tuple[str, list[Any]]] = {}
+    for name, value, plates in data:
+        ahead = 1 if timed else 0
+        found = _labelled(value, plates, ahead)
+        if found is None:
+            continue
+        for plate, own in zip([*(["time"] * ahead), *plates], found[1], strict=False):
+            if own is None or _is_default(own) or (plate in labels):
+                continue
+            other, before = seen.setdefault(plate, (name, own))
+            if _differ(own, before, timed and plate == "time"):
+                raise EvidenceError(
+                    f"{name!r} and {other!r} are labelled unlike along {plate!r}: "
+                    f"{_some(own)} and {_some(before)}; {_remedy(plate)}"
+                )
+
+
+def refuse_backwards(what: str, value: Any) -> None:
+    """Refuse rows over time whose index says that they are not in the order of time.
+
+    Raises
+    ------
+    EvidenceError
+    """
+    found = _labelled(value, (), 1)
+    own = None if found is None else found[1][0]
+    if not own or isinstance(own[0], str):
+        return
+    try:
+        at = next((k for k in range(1, len(own)) if own[k] < own[k - 1]), None)
+    except TypeError:
+        return
+    if at is not None:
+        raise EvidenceError(
+            f"{what}: row {at} is labelled {own[at]!r}, before {own[at - 1]!r} of row {at - 1}; row k "
+            "belongs to slice k, so sort the rows by time (sort_index()), or give .to_numpy() if they are"
+        )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _labelled(
+    value: Any, plates: Sequence[str], ahead: int
+) -> tuple[np.ndarray, list[list[Any] | None]] | None:
+    """Numbers and labels along each axis; None for what has no labels."""
+    if isinstance(value, (np.ndarray, list, tuple, str, int, float, dict)) or value is None:
+        return None
+    if hasattr(value, "dims") and hasattr(value, "coords") and hasattr(value, "transpose"):
+        return _of_dims(value, plates, ahead)
+    index = getattr(value, "index", None)
+    if index is None or callable(index) or not hasattr(value, "to_numpy"):
+        return None
+    array = np.asarray(value)
+    own: list[list[Any] | None] = [list(index)]
+    columns = getattr(value, "columns", None)
+    own += [] if columns is None else [list(columns)]
+    return array, own + [None] * (array.ndim - len(own))
+
+
+def _of_dims(
+    value: Any, plates: Sequence[str], ahead: int
+) -> tuple[np.ndarray, list[list[Any] | None]]:
+    """Of an array with named axes, those called like plates are put where they belong."""
+    dims = list(value.dims)
+    if plates and all(p in dims for p in plates):
+        rest = [d for d in dims if d not in plates]
+        dims = [*rest[:ahead], *plates, *rest[ahead:]]
+        value = value.transpose(*dims)
+    own = [np.asarray(value.coords[d]).tolist() if d in value.coords else None for d in dims]
+    return np.asarray(value), own
+
+
+def _order(what: str, plate: str, own: list[Any], wanted: tuple[Any, ...]) -> list[int] | None:
+    """Places of a plate's labels among the data's own; None where those go by position."""
+    if own == list(wanted):
+        return None
+    where = {label: k for k, label in enumerate(own)}
+    if _is_default(own):
+        if set(own) != set(wanted):
+            return None
+        raise EvidenceError(
+            f"{what}: its index 0..{len(own) - 1} may mean positions or the labels of plate {plate!r}, which "
+            f"are in another order ({_some(list(wanted))}); give .to_numpy() for positions, or "
+            ".loc[labels].to_numpy()"
+        )
+    if len(where) < len(own):
+        twice = next(label for k, label in enumerate(own) if where[label] != k)
+        raise EvidenceError(f"{what}: the label {twice!r} of plate {plate!r} stands twice")
+    known = set(wanted)
+    strange = [label for label in own if label not in known]
+    if strange:
+        near = difflib.get_close_matches(str(strange[0]), map(str, wanted), n=1)
+        hint = f"did you mean {near[0]!r}?" if near else f"its labels are {_some(list(wanted))}"
+        raise EvidenceError(
+            f"{what}: plate {plate!r} has no element labelled {strange[0]!r} ({hint}); what is labelled goes "
+            "by label, .to_numpy() by position"
+        )
+    missing = [label for label in wanted if label not in where]
+    if missing:
+        raise EvidenceError(
+            f"{what}: nothing is labelled {missing[0]!r} of plate {plate!r}"
+            f"{f' and {len(missing) - 1} more' if len(missing) > 1 else ''}; unobserved elements are NaN "
+            "(reindex(labels))"
+        )
+    return [where[label] for label in wanted]
+
+
+def _is_default(own: list[Any]) -> bool:
+    """Whether labels are 0, 1, 2, ..., which say nothing."""
+    return all(type(x) is not bool and x == k for k, x in enumerate(own))
+
+
+def _differ(own: list[Any], before: list[Any], timed: bool) -> bool:
+    """Whether labels differ; over time inputs may go on longer than observations."""
+    shared = min(len(own), len(before)) if timed else None
+    return own[:shared] != before[:shared]
+
+
+def _remedy(plate: str) -> str:
+    if plate == "time":
+        return "row k belongs to slice k, so bring them to the same index (reindex), or give .to_numpy()"
+    return f"declare plates={{{plate!r}: labels}} to have them lined up, or give .to_numpy()"
+
+
+def _some(labels: list[Any]) -> str:
+    shown = ", ".join(map(repr, labels[:4]))
+    return shown + (", ..." if len(labels) > 4 else "")
