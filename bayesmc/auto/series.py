@@ -30,7 +30,7 @@ _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
     "ParticleFilter": "every hidden node can be sampled given its parents",
-    "GridFilter": "every hidden node is finite, an angle, on a bounded interval, or the one number of a slice",
+    "GridFilter": "hidden nodes are finite, angles, on bounded intervals, or the one number of a slice",
 }
 _QUESTIONS = ("filter", "smooth", "fixed-lag", "forecast", "most_likely")
 

@@ -1,8 +1,8 @@
 """Grids that are found: range and cells for the one hidden number of a slice, from the model and its data.
 
 A first pass with wide cells lets the grid grow wherever a belief reaches over its ends and refines it where
-one stands on few cells. A second pass has cells half as wide, or narrower until the log evidence settles: what
-the last halving changed, and what may lie beyond the ends, is the stated error.
+one stands on few cells. A second pass has cells half as wide, or narrower until the log evidence settles:
+what the last halving changed, and what may lie beyond the ends, is the stated error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from bayesmc.errors import UnsupportedError, ZeroProbabilityError
 #: error of the log evidence (of each series that is filtered by itself) that a grid is made for
 TARGET = 0.01
 #: cells up to which a grid is found, and entries of tables that a pass may take
-MOST_CELLS, MOST_ENTRIES = 2000, 6e9
+MOST_CELLS, MOST_ENTRIES = 4000, 6e9
 #: an entry that is evaluated anew in every slice costs as much as so many that are kept
 ANEW = 20
 #: probability of one cell from which on cells are too wide for a belief
@@ -120,9 +120,7 @@ class _Passed:
 class _Search:
     """Passes over the rows of a series on one lattice after the other."""
 
-    def __init__(
-        self, name: str, make: Callable[[Axis], GridModel], rows: Sequence[Row]
-    ) -> None:
+    def __init__(self, name: str, make: Callable[[Axis], GridModel], rows: Sequence[Row]) -> None:
         self.name, self.make, self.rows = name, make, rows
         self.limit = TARGET / (4 * len(rows))
 
@@ -150,11 +148,10 @@ class _Search:
                 continue
             assert share is not None
             tops = share.max(axis=0)
-            left = np.cumsum(share, axis=0), np.cumsum(share[::-1], axis=0)[::-1]
-            inside = np.minimum(*left) > self.limit / 10
+            inside = len(share) * share > self.limit / 2  # as ``_reached`` judges ends
             some = np.flatnonzero(inside.reshape(len(share), -1).any(axis=1))
             width = lattice.step / (2.51 * float(tops.max()))
-            if line.kind in ("interval", "integers") or np.ptp(some) >= lattice.cells // 4:
+            if line.kind in ("interval", "integers") or np.ptp(some) >= 0.7 * lattice.cells:
                 break
             ends = lattice.low + lattice.step * np.array([some[0] - 2, some[-1] + 3])
             lattice = Lattice(line, float(ends[0]), float(ends[1]), 256)
@@ -286,10 +283,10 @@ class _Search:
     def check_price(self, lattice: Lattice) -> None:
         """Refuse a lattice that is too large."""
         if lattice.cells > MOST_CELLS:
+            low, high = lattice.line.number(np.array([lattice.low, lattice.high]))
             raise self._refused(
-                f"beliefs range from {lattice.line.number(np.float64(lattice.low)):.4g} to "
-                f"{lattice.line.number(np.float64(lattice.high)):.4g}, and some are so narrow that this takes "
-                f"more than {MOST_CELLS} cells"
+                f"beliefs range from {low:.4g} to {high:.4g}, and some are so narrow that this takes more "
+                f"than {MOST_CELLS} cells"
             )
         if self.price(lattice) > 1:
             raise self._refused(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections import deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -14,25 +12,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.exact import readable_bytes
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
+from bayesmc.engines.filtering import Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
-from bayesmc.engines.grid.automatic import TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief
-from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
+from bayesmc.engines.grid.search import GridSearch, known_static, quiet
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
-from bayesmc.errors import BayesmcError, BudgetError, GridWarning, UnsupportedError
+from bayesmc.errors import BayesmcError, BudgetError
 from bayesmc.progress import Progress
 
 
 @dataclass(frozen=True)
-class GridFilter(FilterEngine):
+class GridFilter(GridSearch):
     """Histogram filter (Markov localisation): beliefs as probabilities of the cells of a grid.
 
     Exact but for the grid: sums over points stand for integrals. With points closer than the narrowest
@@ -121,11 +117,11 @@ class GridFilter(FilterEngine):
         if common is not None:
             return common
         try:
-            with _quiet():
-                model = self._model(problem.slices, _static(problem))
+            with quiet():
+                model = self.model_on_grid(problem.slices, known_static(problem))
         except BayesmcError as error:
             return str(error)
-        name = self._automatic(problem)
+        name = self.automatic(problem)
         if name is not None:
             return _without_density(problem)
         for name in problem.hidden:
@@ -136,12 +132,12 @@ class GridFilter(FilterEngine):
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         """Hidden nodes that are integrated out and have no closed moments."""
         found = []
-        model = self._model(problem.slices, _static(problem))
+        model = self.model_on_grid(problem.slices, known_static(problem))
         for name in problem.hidden:
             node = problem.model[name]
             if name not in model.leaves or node.domain is not None:
                 continue
-            with _quiet():
+            with quiet():
                 try:
                     later = problem.slices.later
                     _ = later.evaluate(name, later.probe)[0].var
@@ -149,40 +145,9 @@ class GridFilter(FilterEngine):
                     found.append(name)
         return tuple(found)
 
-    def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
-        """A grid is taken unasked where a slice has one hidden number and its error is small."""
-        if self._automatic(problem) is None:
-            return "a grid is taken unasked where one number of a slice is hidden, and here it is not one"
-        try:
-            found = self._found(problem)
-        except BayesmcError as error:
-            return str(error)
-        except Exception as error:  # a function of the user's that fails at points of the grid
-            return f"a function fails on the grid: {error!r}"
-        assert found is not None
-        error = float(np.max(found.error))
-        if not error <= TARGET:
-            return (
-                f"a grid of {found.described} for {found.name!r} has an error of {error:.2g} in the log "
-                f"evidence, above {TARGET}"
-            )
-        each = found.axis.size * math.prod(found.mover.model.lead)
-        if 16 * problem.steps * each > self.max_bytes:
-            return f"the beliefs of {problem.steps} slices on {found.axis.size} cells do not fit max_bytes"
-        return None
-
-    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
-        found = self._found(problem)
-        if found is None:
-            return ()
-        return (
-            f"{found.name!r} is the one hidden number of a slice: {found.described}, found from the model and "
-            f"the data, give the log evidence to within {float(np.max(found.error)):.1g}",
-        )
-
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
-        model = self._model(problem.slices, _static(problem))
-        grid = self._found(problem)
+        model = self.model_on_grid(problem.slices, known_static(problem))
+        grid = self.found(problem)
         if grid is not None:
             model = grid.mover.model
         found = {}
@@ -237,11 +202,11 @@ class GridFilter(FilterEngine):
 
         so_far = partial(record.posterior, self, "filter", increments)
         try:
-            with Progress(problem.steps, self.label, progress) as bar, _quiet():
+            with Progress(problem.steps, self.label, progress) as bar, quiet():
                 pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
         except KeyboardInterrupt as stop:
             return answer_so_far(stop, self)
-        return self._with_error(problem, so_far())
+        return self.with_error(problem, so_far())
 
     def smooth(
         self,
@@ -270,11 +235,11 @@ class GridFilter(FilterEngine):
             if k >= reach and k < steps - 1:
                 self._smoothed(mover, record, held, k, k - reach, k - reach)
 
-        with Progress(steps, self.label, progress) as bar, _quiet():
+        with Progress(steps, self.label, progress) as bar, quiet():
             pass_slices(problem.series.start, steps, move, None, bar.advance)
             self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
         found = record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
-        return self._with_error(problem, found)
+        return self.with_error(problem, found)
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
@@ -283,11 +248,11 @@ class GridFilter(FilterEngine):
 
         Hidden nodes that nothing reads and that have no grid are integrated out and left out.
         """
-        static = _static(problem)
-        with _quiet(), Progress(problem.steps, self.label, progress) as bar:
-            found_grid = self._found(problem)
+        static = known_static(problem)
+        with quiet(), Progress(problem.steps, self.label, progress) as bar:
+            found_grid = self.found(problem)
             axis = None if found_grid is None else (found_grid.name, found_grid.axis)
-            model = self._model(problem.slices, static, logs=True, axis=axis)
+            model = self.model_on_grid(problem.slices, static, logs=True, axis=axis)
             mover = GridMover(model, self.tolerance)
             rows = [problem.series.row(k) for k in range(problem.steps)]
             path = mover.best(rows, bar.advance)
@@ -303,25 +268,25 @@ class GridFilter(FilterEngine):
     # ---- one slice at a time ----------------------------------------------------------------
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
-        return GridBelief(dbn, static, _quiet)
+        return GridBelief(dbn, static, quiet)
 
     def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
         mover = belief.mover
-        with _quiet():
+        with quiet():
             if mover is None:
-                model = self._model(slices, read_static(slices, belief.static))
+                model = self.model_on_grid(slices, read_static(slices, belief.static))
                 mover = GridMover(model, self.tolerance)
             cells = mover.move(belief.cells, row)
         total = belief.log_marginal_likelihood + cells.increment
         return GridBelief(
-            belief.dbn, belief.static, _quiet, mover, cells, belief.cells,
+            belief.dbn, belief.static, quiet, mover, cells, belief.cells,
             total if np.ndim(total) else float(total),
             {n: row.inputs[n] for n in slices.template.inputs},
         )  # fmt: skip
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _model(
+    def model_on_grid(
         self,
         slices: Slices,
         static: Mapping[str, np.ndarray],
@@ -337,78 +302,14 @@ class GridFilter(FilterEngine):
             axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
         return GridModel(slices, axes, static, self.max_bytes, logs)
 
-    def _automatic(self, problem: SeriesProblem) -> str | None:
-        """The one hidden number of a slice, whose grid is found; None where there is none."""
-        if self.quadrature != "midpoint":
-            return None
-        model = self._model(problem.slices, _static(problem))
-        numbers = [
-            n
-            for n in problem.hidden
-            if n in model.own and n not in model.leaves and problem.model[n].domain is None
-        ]
-        if len(numbers) != 1 or numbers[0] in self.grid:
-            return None
-        name = numbers[0]
-        if problem.model[name].event_shape or model.elements(name) != 1:
-            return None
-        bounded = name in model.axes.of
-        return None if line_of(problem.slices, name) is None or (bounded and self.cells) else name
-
-    def _found(self, problem: SeriesProblem) -> FoundGrid | None:
-        """The grid of the one hidden number, found once for a problem; None where there is none to find."""
-        key = f"grid {self!r}"
-        if key not in problem.cache:
-            with _quiet():
-                problem.cache[key] = self._sought(problem)
-        return problem.cache[key]
-
-    def _sought(self, problem: SeriesProblem) -> FoundGrid | None:
-        name = self._automatic(problem)
-        line = None if name is None else line_of(problem.slices, name)
-        if name is None or line is None:
-            return None
-        static = _static(problem)
-        rows = [problem.series.row(k) for k in range(problem.steps)]
-
-        def make(axis: Axis) -> GridModel:
-            return self._model(problem.slices, static, axis=(name, axis))
-
-        try:
-            return find_grid(name, line, make, rows, self.cells)
-        except UnsupportedError as error:
-            raise UnsupportedError(
-                f"GridFilter: {error}; give it one, grid={{{name!r}: (low, high, cells)}}, or use "
-                "ParticleFilter(particles)"
-            ) from None
-
     def _start(self, problem: SeriesProblem) -> tuple[GridMover, list[Cells] | None]:
         """What moves beliefs, and the beliefs of all slices where a search for the grid left them."""
-        found = self._found(problem)
+        found = self.found(problem)
         if found is not None:
             return found.mover, found.kept
-        with _quiet():
-            model = self._model(problem.slices, _static(problem))
+        with quiet():
+            model = self.model_on_grid(problem.slices, known_static(problem))
             return GridMover(model, self.tolerance), None
-
-    def _with_error(self, problem: SeriesProblem, posterior: GridPosterior) -> GridPosterior:
-        """With the error of the log evidence, which is not known of a grid that was given."""
-        found = self._found(problem)
-        if found is not None:
-            error = found.error
-            posterior.log_marginal_likelihood_mcse = error if error.ndim else float(error)
-            if not np.max(error) <= TARGET and np.isfinite(self.tolerance):
-                warnings.warn(
-                    f"GridFilter: {found.described} for {found.name!r} have an error of "
-                    f"{float(np.max(error)):.2g} in the log evidence; give a grid of your own, "
-                    f"grid={{{found.name!r}: (low, high, cells)}}, or use ParticleFilter(particles)",
-                    GridWarning,
-                    stacklevel=4,
-                )
-        elif any(problem.model[n].domain is None for n in posterior.gridded):
-            nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
-            posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
-        return posterior
 
     def _smoothed(
         self,
@@ -475,16 +376,6 @@ class GridFilter(FilterEngine):
 # ---- private ------------------------------------------------------------------------------------
 
 
-@contextmanager
-def _quiet() -> Iterator[None]:
-    with marking_invalid(), np.errstate(all="ignore"):
-        yield
-
-
-def _static(problem: SeriesProblem) -> dict[str, np.ndarray]:
-    return {n: o.value for n, o in problem.series.static.items()}
-
-
 def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.ndarray) -> Answers:
     def pair() -> Any:
         assert before is not None
@@ -499,7 +390,7 @@ def _without_density(problem: SeriesProblem) -> str | None:
     for model in (problem.slices.first, problem.slices.later):
         for name in problem.slices.stochastic:
             try:
-                with _quiet():
+                with quiet():
                     dist, _ = model.evaluate(name, model.probe)
                     model.log_density(name, dist, model.probe[name])
             except (BayesmcError, NotImplementedError) as error:
