@@ -121,7 +121,9 @@ class LookAhead:
         ]
         self.curved = [n for n in self.seen if n not in self.straight]
         self.within = self._within(self.curved)
-        if len(self.within) > NUMBERS:  # too many for derivatives: what has moments is taken by them
+        if (
+            len(self.within) > NUMBERS
+        ):  # too many for derivatives: what has moments is taken by them
             self.straight += [n for n in self.curved if has_moments(model, n)]
             self.curved = []
         #: what is seen and tells nothing all the same
@@ -212,8 +214,9 @@ class LookAhead:
             weights = np.broadcast_to(dist.weights, (*dist.batch_shape, dist.weights.shape[-1]))
             with np.errstate(divide="ignore"):
                 log = np.log(weights[..., choice])
-            if name in self.masks:
-                log = np.where(self.seen[name], log, 0.0)
+            mask = self.seen.get(name)
+            if mask is not None:
+                log = np.where(mask, log, 0.0)
             total = total + summed(
                 np.broadcast_to(log, (*state.batch, *node.plate_shape)), node, self.apart
             )
