@@ -16,8 +16,9 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines.particles import lookahead, stages
-from bayesmc.engines.particles.lookahead import Guarded, LookAhead
+from bayesmc.engines.particles import guarded, lookahead, stages
+from bayesmc.engines.particles.guarded import Guarded
+from bayesmc.engines.particles.lookahead import LookAhead
 from bayesmc.engines.particles.looking import has_moments
 from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
 from bayesmc.engines.particles.stages import PluggedIn
@@ -548,7 +549,7 @@ def test_a_bend_that_is_wide_beside_the_noise_is_followed(monkeypatch: pytest.Mo
     guarded = bmc.filter(bent(), rows, engine=engine, rng=0)
     assert abs(guarded.log_marginal_likelihood - exact) < 0.5
     monkeypatch.setattr(lookahead, "_TURNS", 1)
-    monkeypatch.setattr(lookahead, "SHARE", 1e-12)
+    monkeypatch.setattr(guarded, "SHARE", 1e-12)
     assert bmc.filter(bent(), rows, engine=engine, rng=0).log_marginal_likelihood < exact - 1
 
 

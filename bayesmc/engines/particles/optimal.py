@@ -27,7 +27,7 @@ import numpy as np
 
 from bayesmc.dbn import Row, Slices
 from bayesmc.engines.particles.cases import look_ahead
-from bayesmc.engines.particles.lookahead import Guarded
+from bayesmc.engines.particles.guarded import Guarded
 from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import CompiledNode, Model, Observed
