@@ -16,7 +16,8 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines.particles import guarded, lookahead, stages
+from bayesmc.engines.particles import guarded as guarding
+from bayesmc.engines.particles import lookahead, stages
 from bayesmc.engines.particles.guarded import Guarded
 from bayesmc.engines.particles.lookahead import LookAhead
 from bayesmc.engines.particles.looking import has_moments
@@ -549,7 +550,7 @@ def test_a_bend_that_is_wide_beside_the_noise_is_followed(monkeypatch: pytest.Mo
     guarded = bmc.filter(bent(), rows, engine=engine, rng=0)
     assert abs(guarded.log_marginal_likelihood - exact) < 0.5
     monkeypatch.setattr(lookahead, "_TURNS", 1)
-    monkeypatch.setattr(guarded, "SHARE", 1e-12)
+    monkeypatch.setattr(guarding, "SHARE", 1e-12)
     assert bmc.filter(bent(), rows, engine=engine, rng=0).log_marginal_likelihood < exact - 1
 
 
