@@ -55,6 +55,7 @@ def test_filters_and_smoothers_match_exact_answers(engine: str) -> None:
             assert found, (case.dbn, found)
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")
 @pytest.mark.parametrize("kind", ["finite", "linear"])
 @pytest.mark.parametrize("variant", PARTICLES)
 def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:

@@ -48,6 +48,9 @@ class ByCase:
         self.model, self.block, self.apart = first.model, first.block, first.apart
         self.between, self.along, self.ignored = first.between, first.along, first.ignored
 
+    def __call__(self, state: Pass) -> None:
+        state.weigh(-self.draw(state, self.believed(state)))
+
     def believed(self, state: Pass) -> Cases:
         """The block given its parents, whose values are in place, and what was seen."""
         beliefs = tuple(look.believed(state) for look in self.looks)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,16 +22,16 @@ from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.mover import Mover
-from bayesmc.engines.particles.optimal import OptimalPlan, guidance
+from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.particles.smoothing import Backward, carried, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
+from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import LowEssWarning, ProposalWarning, UnknownNodeError, UnsupportedError
-from bayesmc.network import Observed
+from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
@@ -263,7 +263,7 @@ class ParticleFilter(FilterEngine):
                 found[name] = "observed, weights the particles"
                 if seen.mask is not None:
                     found[name] += "; sampled where it is missing"
-        return self._described_looks(problem, found)
+        return found | looks_told(self, problem, found)
 
     def filter(
         self,
@@ -278,7 +278,7 @@ class ParticleFilter(FilterEngine):
             raise ValueError(
                 f'keep={keep!r}: give "particles", or None for answers of constant size'
             )
-        self._warn_of_what_is_not_guided(problem.slices, problem.series.observed)
+        warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
             found = self._passed(problem, seed, keep is not None, queries or {}, progress)
         except KeyboardInterrupt as stop:
@@ -298,7 +298,7 @@ class ParticleFilter(FilterEngine):
     ) -> FilteredParticles:
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
-        self._warn_of_what_is_not_guided(problem.slices, problem.series.observed)
+        warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
         sums = carried(problem.slices)
@@ -378,7 +378,7 @@ class ParticleFilter(FilterEngine):
         mover = belief.mover
         if mover is None:
             mover = self._mover(slices, read_static(slices, belief.static))
-            self._warn_of_what_is_not_guided(slices, row.seen)
+            warn_of_what_is_not_guided(self, slices, row.seen)
         chance = belief.chance
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with _quiet():
@@ -427,42 +427,6 @@ class ParticleFilter(FilterEngine):
         found = record.posterior(self)
         found.predictive = looks.found()
         return found
-
-    def _described_looks(self, problem: SeriesProblem, found: dict[str, str]) -> dict[str, str]:
-        """What is done to each node, with what looking at the row does for it."""
-        slices, seen = problem.slices, problem.series.observed
-        if self.proposal == "optimal":
-            told = guidance(slices, seen, plates_apart(slices), min(problem.steps - 1, 1))
-            for name, by in told.guided.items():
-                found[name] = f"sampled with a look at {', '.join(map(repr, by))}"
-            for name in {n for by in told.guided.values() for n in by}:
-                found[name] += f"; guides {', '.join(repr(n) for n, by in told.guided.items() if name in by)}"
-            for name, why in told.unguided.items():
-                found[name] += f"; not guided: {why}"
-            for name, why in told.unheard.items():
-                found[name] += f"; guides nothing: {why}"
-        if self.auxiliary is True and problem.steps > 1:
-            static = {n: o.value for n, o in problem.series.static.items()}
-            stage = PluggedIn(SlicePlan(slices, plates_apart(slices), static), self.particles)
-            row = problem.series.row(1)._replace(
-                seen={n: Observed(o.value[1]) for n, o in seen.items()}
-            )
-            for name, how in stage.treated(row).items():
-                found[name] += f"; {how} by the look ahead"
-        return found
-
-    def _warn_of_what_is_not_guided(self, slices: Slices, seen: Collection[str]) -> None:
-        """One warning where ``proposal="optimal"`` leaves a hidden number to its own density."""
-        if self.proposal != "optimal":
-            return
-        missing = guidance(slices, seen, plates_apart(slices)).missing()
-        if missing is not None:
-            warnings.warn(
-                f'ParticleFilter(proposal="optimal") does not guide all that is hidden: {missing}. What is not '
-                "guided is drawn from its own density; give proposal={...} for it, or use more particles",
-                ProposalWarning,
-                stacklevel=4,
-            )
 
     def _warn_of_collapse(self, filtered: FilteredParticles) -> None:
         """One warning where many slices rest on what is little more than one particle.

@@ -37,7 +37,7 @@ from bayesmc.engines.particles.looking import (
     spreads,
 )
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.forward import Pass, Step, run, summed
+from bayesmc.network.forward import Pass, summed
 
 #: balances the rounding of a central difference against its curvature
 _STEP = float(np.finfo(float).eps ** (1 / 3))
@@ -45,8 +45,6 @@ _STEP = float(np.finfo(float).eps ** (1 / 3))
 _TURNS = 5
 #: standard deviations by which the block may still have moved in the last of them
 _STILL = 0.01
-#: share of the particles that a guarded block draws from its own densities
-SHARE = 0.1
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 #: variance in square radians from which on a Gaussian is no picture of an angle: it has more than one mode
 _TURNED = 1.0
@@ -121,7 +119,9 @@ class LookAhead:
         ]
         self.curved = [n for n in self.seen if n not in self.straight]
         self.within = self._within(self.curved)
-        if len(self.within) > NUMBERS:  # too many for derivatives: what has moments is taken by them
+        if (
+            len(self.within) > NUMBERS
+        ):  # too many for derivatives: what has moments is taken by them
             self.straight += [n for n in self.curved if has_moments(model, n)]
             self.curved = []
         #: what is seen and tells nothing all the same
@@ -212,8 +212,9 @@ class LookAhead:
             weights = np.broadcast_to(dist.weights, (*dist.batch_shape, dist.weights.shape[-1]))
             with np.errstate(divide="ignore"):
                 log = np.log(weights[..., choice])
-            if name in self.masks:
-                log = np.where(self.seen[name], log, 0.0)
+            mask = self.seen.get(name)
+            if mask is not None:
+                log = np.where(mask, log, 0.0)
             total = total + summed(
                 np.broadcast_to(log, (*state.batch, *node.plate_shape)), node, self.apart
             )
@@ -381,55 +382,6 @@ class LookAhead:
             part.flags.writeable = False
             found[name] = part
         return found
-
-
-class Guarded:
-    """Draws a block by looking ahead, a share of the particles from its own densities instead; weighs by p/q.
-
-    A Gaussian can be far too narrow where means are not affine. In the mixture no weight is more than
-    1 / ``SHARE`` of what it is when all are drawn from their own densities (Hesterberg 1995, Weighted average
-    importance sampling and defensive mixture distributions, Technometrics 37).
-
-    Parameters
-    ----------
-    look : LookAhead or ByCase
-    own : sequence of steps
-        Draw the block from its own densities, and compute what lies between.
-    factors : sequence of steps
-        Compute what lies between, and weigh by the block's own densities.
-    """
-
-    def __init__(self, look: Any, own: Sequence[Step], factors: Sequence[Step]) -> None:
-        self.look, self.own, self.factors = look, own, factors
-
-    def __call__(self, state: Pass) -> None:
-        look = self.look
-        belief = look.believed(state)
-        shape = belief.log_density.shape
-        alive = state.alive.reshape(state.batch + (1,) * len(look.apart))
-        dead = np.where(alive, 0.0, -np.inf)  # bad parameters are excused there
-        plain = run(self.own, Pass(state.rng, state.batch, dict(state.values), dead))
-        look.draw(state, belief)
-        valid: dict[str, np.ndarray] = {}
-        plainly = state.rng.random(shape) < SHARE
-        for name in look.block:
-            at = look.along(plainly, look.model[name])
-            mixed = np.where(at, plain.values[name], state.values[name])
-            mixed.flags.writeable = False
-            state.values[name] = mixed
-        drawn = run(self.factors, Pass(state.rng, state.batch, dict(state.values), dead))
-        log_p = np.broadcast_to(drawn.log_weight, shape)
-        lost = log_p == -np.inf
-        if lost.any():  # such as below zero: without weight, but what comes later has to stand them
-            for name in look.block:
-                at = look.along(lost, look.model[name])
-                kept = np.where(at, plain.values[name], state.values[name])
-                kept.flags.writeable = False
-                valid[name] = kept
-        log_q = look.log_density(state.values, belief)
-        mixture = np.logaddexp(math.log1p(-SHARE) + log_q, math.log(SHARE) + log_p)
-        state.weigh(np.where(lost, -np.inf, log_p - mixture))
-        state.values.update(valid)
 
 
 def spread_varies(model: Model, order: Sequence[str], block: Sequence[str], name: str) -> bool:

@@ -138,7 +138,9 @@ def why_not_drawn(model: Model, name: str) -> str | None:
         return f"{family} lies on a circle"
     vector = bool(node.event_shape) and not is_of_components(model, name)
     if vector or not has_moments(model, name):
-        return f"{family} has no mean and {'covariance' if node.event_shape else 'variance'} to go by"
+        return (
+            f"{family} has no mean and {'covariance' if node.event_shape else 'variance'} to go by"
+        )
     return None
 
 

@@ -21,13 +21,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import Row, Slices
 from bayesmc.engines.particles.cases import look_ahead
-from bayesmc.engines.particles.lookahead import Guarded
+from bayesmc.engines.particles.guarded import Guarded
 from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import CompiledNode, Model, Observed

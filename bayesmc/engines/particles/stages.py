@@ -80,7 +80,7 @@ class PluggedIn:
         return _floored(log) if predictive.exact else _shared(_floored(log))
 
     def treated(self, row: Row) -> dict[str, str]:
-        """What the look ahead does to each hidden node of a row's slice; those that it leaves out are not in."""
+        """What the look ahead does to each hidden node of a row's slice that it concerns."""
         return self._predictive(row).treated()
 
     def _predictive(self, row: Row) -> _Predictive:
