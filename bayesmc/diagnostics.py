@@ -120,8 +120,9 @@ def share_mcse(error: Any, count: Any, step: Any = 1.0) -> np.ndarray:
     What draws show of a share has no spread where all of them agree, and too little of it where few differ.
     As Agresti and Coull (1998) add ``z**2`` draws, half of them successes, this adds ``z**2 / count**2`` to
     the variance, with z = 2. So two standard errors about a share of independent draws hold the truth in 95 %
-    of all cases and more, whatever it is and how many draws there are (95.1 % at the least); two about a share that was never seen reach to ``4 / count``, where the exact bound at
-    that level is ``3.7 / count`` (Clopper and Pearson 1934).
+    of all cases and more, whatever it is and how many draws there are (95.1 % at the least); two about a
+    share that was never seen reach to ``4 / count``, where the exact bound at that level is ``3.7 / count``
+    (Clopper and Pearson 1934).
 
     Parameters
     ----------

@@ -81,32 +81,3 @@ class Engine:
     ) -> Posterior:
         """Answer a posed problem, or raise the refusal."""
         raise NotImplementedError
-
-
-def same_question(was: Problem, now: Problem) -> bool:
-    """Whether two problems are the same net with the same evidence and inputs."""
-    old, new = was.model, now.model
-    same_net = (
-        list(old.nodes) == list(new.nodes)
-        and all(old[n].declaration is c.declaration for n, c in new.nodes.items())
-        and list(old.potentials) == list(new.potentials)
-        and all(old.potentials[n][0] is v[0] for n, v in new.potentials.items())
-        and old.sizes == new.sizes
-    )
-    return (
-        same_net
-        and was.observed.keys() == now.observed.keys()
-        and all(
-            np.array_equal(o.value, now.observed[n].value)
-            and _same_mask(o.mask, now.observed[n].mask)
-            for n, o in was.observed.items()
-        )
-        and all(np.array_equal(v, now.inputs[n]) for n, v in was.inputs.items())
-    )
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _same_mask(a: np.ndarray | None, b: np.ndarray | None) -> bool:
-    return a is b if a is None or b is None else np.array_equal(a, b)

@@ -18,8 +18,9 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.base import Engine, same_question
+from bayesmc.engines.base import Engine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
+from bayesmc.engines.question import difference
 from bayesmc.engines.weighted import check_count, no_memory
 from bayesmc.errors import (
     BayesmcError,
@@ -203,14 +204,18 @@ class ChainEngine(Engine):
     ) -> None:
         """Only the same question, asked the same way, can be gone on with."""
         kind = ChainsSums if summed else ChainsPosterior
-        why = "this one answers another question"
-        if isinstance(old, kind) and old.checkpoint is not None and self.continues(old.engine):
+        why: str | None = "this one answers another question"
+        if isinstance(old, kind) and old.checkpoint is not None:
             kept = old._running.names if isinstance(old, ChainsSums) else tuple(old._stored)
-            if set(kept) != set(names):
+            if not self.continues(old.engine):
+                why = f"this one was made by {old.engine!r}"
+            elif set(kept) != set(names):
                 why = "this one kept other nodes"
-            elif old.problem is not None and same_question(old.problem, problem):
+            elif old.problem is not None:
+                why = difference(old.problem, problem, old.checkpoint.values)
+            elif old.checkpoint.fits(old.model, problem):
                 return
-            elif old.problem is None and old.checkpoint.fits(old.model, problem):
+            if why is None:
                 return
         raise UnsupportedError(
             f"infer: resume= takes an earlier {type(self).__name__} posterior of the same net, evidence, "

@@ -294,6 +294,7 @@ class ExactPosterior(Posterior):
         rng: Any = None,
         draws: int | None = None,
     ) -> DrawsPosterior:
+        self._live("predict")
         seed = seed_sequence(rng)
         source = self.resample(4000 if draws is None else draws, seed)
         return source.predict(names, inputs, plates, seed)

@@ -23,6 +23,7 @@ from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.network import Problem
 from bayesmc.network.forward import Step, refuse_unsampled
+from bayesmc.network.sameness import same
 
 
 @dataclass(frozen=True, repr=False)
@@ -132,7 +133,7 @@ class Importance(WeightedEngine):
         return f"check the evidence, and whether the proposals of {given} reach what it allows"
 
     def continues(self, other: Any) -> bool:
-        return isinstance(other, Importance) and dict(other.proposal) == dict(self.proposal)
+        return isinstance(other, Importance) and bool(same(dict(other.proposal), dict(self.proposal)))
 
     def _require_functions(self) -> None:
         if any(spec is None for spec in self.proposal.values()):

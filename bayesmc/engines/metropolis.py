@@ -20,6 +20,7 @@ from bayesmc.kernels.ensemble import BlockWalk, stragglers
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.network import Problem
+from bayesmc.network.sameness import same
 from bayesmc.structure.target import Values
 
 #: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
@@ -130,7 +131,7 @@ class MetropolisHastings(ChainEngine):
         if any(getattr(self, o) != getattr(other, o) for o in options):
             return False
         # a pickle has lost its functions
-        return all(old is None or old == self._given[k] for k, old in other._given.items())
+        return all(old is None or same(old, self._given[k]) for k, old in other._given.items())
 
     def _plan(self, problem: Problem) -> Plan:
         if any(spec is None for spec in self._given.values()):

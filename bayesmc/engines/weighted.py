@@ -14,8 +14,9 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.base import Engine, same_question
+from bayesmc.engines.base import Engine
 from bayesmc.engines.forward import chunk_sizes
+from bayesmc.engines.question import difference
 from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import Pass, Step, run
@@ -25,6 +26,10 @@ from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
 
 #: share of the draws above which weights are even enough to leave their tail unfitted
 _EVEN = 0.5
+
+
+#: draws at which the densities of a net that was declared anew are compared
+_COMPARED = 16
 
 
 class WeightedEngine(Engine):
@@ -142,11 +147,13 @@ class WeightedEngine(Engine):
         problem: Problem,
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
         """Earlier draws of the same question and the new ones, end to end."""
-        if not isinstance(old, DrawsPosterior) or not self._asked_before(old, problem, set(stored)):
+        why = self._unlike(old, problem, set(stored))
+        if why is not None:
             raise UnsupportedError(
                 f"infer: resume= takes an earlier {type(self).__name__} posterior of the same net, "
-                "evidence, inputs and keep=, as infer returned it; this one answers another question"
+                f"evidence, inputs and keep=, as infer returned it; {why}"
             )
+        assert isinstance(old, DrawsPosterior)
         before = old._shape[1]
         joined = {}
         for name, new in stored.items():
@@ -160,12 +167,19 @@ class WeightedEngine(Engine):
         earlier = np.zeros((1, before)) if old.log_weights is None else old.log_weights
         return joined, np.concatenate([earlier, log_weights], axis=1)
 
-    def _asked_before(self, old: DrawsPosterior, problem: Problem, names: set[str]) -> bool:
-        """Whether draws of ``old`` may be joined with new ones for ``problem``."""
-        if old.problem is None or set(old._stored) != names or not self.continues(old.engine):
-            return False
-        weighted = self.is_weighted(problem)
-        return (old.log_weights is not None) == weighted and same_question(old.problem, problem)
+    def _unlike(self, old: Posterior, problem: Problem, names: set[str]) -> str | None:
+        """Why draws of ``old`` cannot be joined with new ones for ``problem``."""
+        if not isinstance(old, DrawsPosterior) or not self.continues(old.engine):
+            return f"this one is {old!r}"
+        if old.problem is None:
+            return "this one was unpickled, and pickles carry no functions"
+        if set(old._stored) != names:
+            return "this one kept other nodes"
+        if (old.log_weights is not None) != self.is_weighted(problem):
+            return "this one answers another question"
+        few = {n: v[0, :_COMPARED] for n, v in old._stored.items()}
+        whole = all(n in few or c.kind == "input" for n, c in problem.model.nodes.items())
+        return difference(old.problem, problem, few if whole else None)
 
     def _refuse_zero(self, top: float, draws: int) -> None:
         if top == -np.inf:

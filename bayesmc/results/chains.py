@@ -60,7 +60,7 @@ class Checkpoint:
         """Whether it belongs to this question, though the functions of its ``model`` are lost."""
         if list(model.nodes) != list(problem.model.nodes) or model.sizes != problem.model.sizes:
             return False
-        if any(_outline(node) != _outline(problem.model[n]) for n, node in model.nodes.items()):
+        if any(outline(node) != outline(problem.model[n]) for n, node in model.nodes.items()):
             return False
         seen = problem.observed
         if self.observed.keys() != seen.keys() or not all(
@@ -68,7 +68,7 @@ class Checkpoint:
             for n, o in self.observed.items()
         ):
             return False
-        before, now = self.densities or {}, _densities(problem, self.values)
+        before, now = self.densities or {}, log_densities(problem, self.values)
         return before.keys() == now.keys() and all(
             math.isclose(now[n], value, rel_tol=1e-9, abs_tol=1e-9) or now[n] == value
             for n, value in before.items()
@@ -105,11 +105,16 @@ class _Chains(Posterior):
         many = f"{chains} chain{'s' if chains > 1 else ''} of {draws} draws"
         return f"{super()._title()}: {many} after {self.warmup} of warmup"
 
+    def _reload(self) -> str:
+        if self.checkpoint is None:
+            return super()._reload()
+        return "declare the net and call infer again (resume= this posterior adds to its draws)"
+
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
         point = self.checkpoint
         if point is not None and point.densities is None and self.problem is not None:
-            densities = _densities(self.problem, point.values)
+            densities = log_densities(self.problem, point.values)
             state["checkpoint"] = replace(point, densities=densities)
         return state
 
@@ -407,7 +412,7 @@ def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
     return (draws[..., None] == np.arange(node.domain.size)).astype(float)
 
 
-def _outline(node: CompiledNode) -> tuple[Any, ...]:
+def outline(node: CompiledNode) -> tuple[Any, ...]:
     """What can be compared of a node whose function is lost."""
     arrays = (node.declaration.probs, node.declaration.value)
     tables = tuple(None if a is None else (a.shape, a.tobytes()) for a in arrays)
@@ -415,7 +420,7 @@ def _outline(node: CompiledNode) -> tuple[Any, ...]:
     return (node.kind, node.parents, node.plates, node.value_shape, states, *tables)
 
 
-def _densities(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, float]:
+def log_densities(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, float]:
     """Log density of every node and potential at some draws, summed; a deterministic node's values."""
     model = problem.model
     at = {**problem.inputs, **values}

@@ -248,14 +248,19 @@ class DrawsPosterior(Posterior):
         }
         ancestors = picked if self.ancestors is None else self.ancestors[picked]
         duplicated = self.weights is not None or self.ancestors is not None
-        return DrawsPosterior(
-            self._live("resample"),
+        problem = self.problem  # which a pickle has lost, and resampling does not need
+        if problem is None:
+            problem = Problem(None, self.model, self._seen, self._inputs)  # type: ignore[arg-type]
+        drawn = DrawsPosterior(
+            problem,
             self.engine,
             stored,
             (1, count),
             independent=not duplicated,
             ancestors=ancestors if duplicated else None,
         )
+        drawn.problem = self.problem
+        return drawn
 
     def predict(
         self,

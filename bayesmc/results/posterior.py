@@ -159,7 +159,10 @@ class Posterior:
         raise self._cannot("predict")
 
     def to_datatree(self, resample: int | None = None, rng: Any = None) -> Any:
-        """The draws as an ArviZ ``DataTree`` (extra ``arviz``)."""
+        """The draws as an ArviZ ``DataTree``, for ``arviz_stats.summary(tree)`` and its like.
+
+        The extra ``arviz`` installs what these need; for pictures install arviz-plots, too.
+        """
         raise self._cannot("to_datatree")
 
     # ---- shared ------------------------------------------------------------------------------
@@ -264,10 +267,17 @@ class Posterior:
 
     def _live(self, what: str) -> Problem:
         if self.problem is None:
+            lost = [n for n, c in self.model.nodes.items() if c.declaration.source == "function"]
+            shown = ", ".join(map(repr, lost[:6])) + (", ..." if len(lost) > 6 else "")
             raise UnsupportedError(
-                f"{what}: this posterior was unpickled, and pickles carry no functions; call infer again"
+                f"{what}: this posterior was unpickled, and pickles carry no functions; it misses those of "
+                f"the nodes {shown}: {self._reload()}"
             )
         return self.problem
+
+    def _reload(self) -> str:
+        """How to have the functions again."""
+        return "declare the net and call infer again, or ask before pickling"
 
     def _cannot(self, what: str) -> UnsupportedError:
         return UnsupportedError(
@@ -280,6 +290,13 @@ class Posterior:
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
         return {**self.__dict__, "problem": None, "model": self.model.without_functions()}
+
+    def __copy__(self) -> Posterior:
+        """A posterior is never changed; copied like a pickle it would lose its functions."""
+        return self
+
+    def __deepcopy__(self, memo: Any) -> Posterior:
+        return self
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}(engine={self.engine!r}, nodes={len(self.names)})"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import pickle
 import sys
 
@@ -492,6 +493,17 @@ def test_to_datatree():
     assert float(tree["observed_data"]["y"]) == 4.0
 
 
+def test_arviz_takes_the_datatree():
+    """The extra installs what ArviZ's functions of a tree need, not only what makes one."""
+    pytest.importorskip("arviz_base")
+    pytest.importorskip("xarray_einstats")
+    import arviz_stats
+
+    p = posterior(False)
+    table = arviz_stats.summary(p.to_datatree(), var_names=["m"], round_to=None)
+    np.testing.assert_allclose(table["mean"].to_numpy(float), p.mean("m").ravel(), rtol=1e-6)
+
+
 def test_to_datatree_shows_gaps_in_the_data_as_gaps():
     pytest.importorskip("arviz_base")
     net = bmc.BayesNet(plates={"p": ("a", "b", "c")})
@@ -521,3 +533,20 @@ def test_nodes_that_were_not_kept():
 def test_summary_of_what_was_kept():
     p = bmc.infer(the_net(), engine=bmc.LikelihoodWeighting(500), rng=0, keep=["s", "z"])
     assert {n.split("[")[0] for n in p.summary().names} == {"s", "z"}
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_pickle_says_what_it_misses_and_does_what_needs_no_functions(weighted):
+    twin = pickle.loads(pickle.dumps(posterior(weighted)))
+    with pytest.raises(UnsupportedError, match="predict: .* it misses those of the nodes 'm', .*"):
+        twin.predict("x")
+    drawn = twin.resample(50, rng=0)
+    np.testing.assert_array_equal(drawn["m"], posterior(weighted).resample(50, rng=0)["m"])
+    with pytest.raises(UnsupportedError, match="unpickled"):
+        drawn.predict("x")
+
+
+def test_a_copy_keeps_its_functions():
+    p = posterior(False)
+    for twin in (copy.copy(p), copy.deepcopy(p)):
+        np.testing.assert_array_equal(twin.predict("x", rng=0)["x"], p.predict("x", rng=0)["x"])

@@ -1,0 +1,125 @@
+"""Whether two posed problems are the same question, so that the draws of one may be gone on with.
+
+The same net may have been declared anew: then functions are compared by what they say, and where that cannot
+be told, by the densities that they give at some draws.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from bayesmc.network import Observed, Problem
+from bayesmc.network.sameness import same
+from bayesmc.results.chains import log_densities, outline
+
+
+def difference(
+    was: Problem, now: Problem, values: Mapping[str, np.ndarray] | None = None
+) -> str | None:
+    """What differs between two questions, in words; None where they are the same.
+
+    Parameters
+    ----------
+    was, now : Problem
+    values : dict, optional
+        Stored values of all nodes at some draws, at which densities are compared.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.question import difference
+    >>> from bayesmc.network import pose
+    >>> def asked(scale):
+    ...     net = bmc.BayesNet()
+    ...     net.add("x", lambda: bmc.Normal(0.0, scale))
+    ...     return pose(net, {})
+    >>> print(difference(asked(1.0), asked(1.0)))
+    None
+    >>> difference(asked(1.0), asked(2.0))
+    "the function of node 'x' is another one"
+    """
+    for found in (_nodes(was, now), _data(was.observed, now.observed), _inputs(was, now)):
+        for words in found:
+            return words
+    unknown: str | None = None
+    for words, known in _functions(was, now):
+        if known is False:
+            return f"{words} is another one"
+        unknown = unknown or (None if known else words)
+    if unknown is None:
+        return None
+    if values is None:
+        return f"{unknown} was declared anew, and whether it is the same cannot be told"
+    before, after = log_densities(was, values), log_densities(now, values)
+    for name, value in before.items():
+        other = after.get(name, math.nan)
+        if not (other == value or math.isclose(other, value, rel_tol=1e-9, abs_tol=1e-9)):
+            return f"{name!r} has another density"
+    return None
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _nodes(was: Problem, now: Problem) -> Iterator[str]:
+    old, new = was.model, now.model
+    if list(old.nodes) != list(new.nodes):
+        apart = [n for n in (*old.nodes, *new.nodes) if (n in old.nodes) != (n in new.nodes)]
+        if apart:
+            yield f"only one of the two nets has a node {apart[0]!r}"
+        else:
+            yield "nodes have other parents, or stand in another order"
+        return
+    for plate, size in old.sizes.items():
+        if new.sizes.get(plate) != size:
+            yield f"plate {plate!r} has size {new.sizes.get(plate)}, not {size}"
+    if old.sizes.keys() != new.sizes.keys():
+        yield "the plates have other names"
+    for name, node in new.nodes.items():
+        parts = zip(
+            ("kind", "parents", "plates", "shape", "states", "table", "value"),
+            outline(old[name]), outline(node), strict=True,
+        )  # fmt: skip
+        for what, a, b in parts:
+            if a != b:
+                other = "other parents" if what == "parents" else f"another {what}"
+                yield f"node {name!r} has {other}"
+    if list(old.potentials) != list(new.potentials):
+        yield "the potentials have other names"
+
+
+def _functions(was: Problem, now: Problem) -> Iterator[tuple[str, bool | None]]:
+    """Every function of both, in words, and whether it is the same."""
+    for name, node in now.model.nodes.items():
+        a, b = was.model[name].declaration, node.declaration
+        if a is not b:
+            yield f"the function of node {name!r}", same(a.function, b.function)
+    for name, (new, _) in now.model.potentials.items():
+        old = was.model.potentials[name][0]
+        if old is not new:
+            fields = ("parents", "plates", "index", "is_table", "function")
+            one, other = ([getattr(p, f) for f in fields] for p in (old, new))
+            yield f"the potential {name!r}", same(one, other)
+
+
+def _data(was: Mapping[str, Observed], now: Mapping[str, Observed]) -> Iterator[str]:
+    for name in [*was, *now]:
+        if (name in was) != (name in now):
+            yield f"{name!r} is observed in one of the two only"
+        else:
+            a, b = was[name], now[name]
+            if not (np.array_equal(a.value, b.value) and _same_mask(a.mask, b.mask)):
+                yield f"the evidence of {name!r} is another one"
+
+
+def _inputs(was: Problem, now: Problem) -> Iterator[str]:
+    for name in was.inputs:
+        if not np.array_equal(was.inputs[name], now.inputs[name]):
+            yield f"input {name!r} has another value"
+
+
+def _same_mask(a: np.ndarray | None, b: np.ndarray | None) -> bool:
+    return a is b if a is None or b is None else np.array_equal(a, b)
