@@ -1,84 +1,140 @@
 """Where chains start: forward draws given the evidence, the most likely of several attempts.
 
 Vague priors put most draws where the evidence is as good as impossible, so some attempts are drawn closer
-to the prior mean.
+to the prior mean; where none has positive density, free numbers are moved until one has (``climbing``). What
+no hidden node can make possible is named at once.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 
-from bayesmc.distributions import Distribution
 from bayesmc.distributions.transforms import transform_of
-from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError, ZeroProbabilityError
+from bayesmc.engines.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
+from bayesmc.engines.start_faults import fault_at, impossible, refuse_impossible
+from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError
 from bayesmc.kernels.enumerate import draw_states
-from bayesmc.kernels.slice import is_half_line
 from bayesmc.network import CompiledNode
-from bayesmc.shapes import Shape
+from bayesmc.network.nearer import nearer
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
 
 #: how far draws go from the prior mean, for successive attempts
 _SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 0.0)
 _ATTEMPTS = 8
-#: numbers of one node drawn at once, at most, where possible states are rare
+#: numbers of one node drawn in all attempts, at most, where possible states are rare
 _MOST = 1 << 19
-#: the most that draws of a half line go from the middle
-_FROM_ZERO = 0.9
-#: supports that hold every point between two of theirs
-_CONVEX = ("real", "interval", "simplex", "real vector", "positive definite", "product")
+#: chains that search for themselves; others start where one of them does
+_SEARCHERS = 8
 
 
-def start_states(target: Target, chains: int, rng: np.random.Generator) -> Values:
+def start_states(
+    target: Target,
+    chains: int,
+    rng: np.random.Generator,
+    given: Values | None = None,
+    search: bool = True,
+) -> Values:
     """Stored values of all nodes, one state of positive density per chain.
+
+    Parameters
+    ----------
+    given : dict, optional
+        Stored values at which some nodes of the chain start, shape ``(chains, *plates, *event)``.
+    search : bool
+        Whether to go on where draws find nothing.
 
     Raises
     ------
     ZeroProbabilityError
         None was found; the message names the term that no attempt could satisfy.
+    ParameterError, DensityError
+        Parameters are out of range, or a density is NaN, wherever it was tried.
     """
-    search = _Search(target, chains, rng)
+    found = _Search(target, chains, rng, given or {})
     continuous = any(not target.model[n].is_discrete for n in target.chain)
     for spread in _SPREADS:
-        search.attempt(spread, _ATTEMPTS)
-        if search.complete and not continuous:
+        found.attempt(spread, _ATTEMPTS)
+        if found.complete and not continuous:
             break
+        if spread == 1.0 and not found.alive:
+            refuse_impossible(target, found.tried)
+    free = [n for n in target.chain if n not in found.given]
+    if search and continuous and free and not found.alive:
+        found.climb()
     largest = max((math.prod(target.model[n].value_shape) for n in target.chain), default=1)
     attempts = _ATTEMPTS
-    while not search.complete and attempts * chains * largest <= _MOST:
+    while not found.complete and free and attempts * chains * largest <= _MOST:
         attempts *= 8
-        search.attempt(1.0, attempts)
-    return {**target.known, **search.found()}
+        found.attempt(1.0, attempts)
+    return {**target.known, **found.found()}
 
 
 class _Search:
     """The best start state of every chain so far."""
 
-    def __init__(self, target: Target, chains: int, rng: np.random.Generator) -> None:
-        self.target, self.chains, self.rng = target, chains, rng
+    def __init__(
+        self, target: Target, chains: int, rng: np.random.Generator, given: Values
+    ) -> None:
+        self.target, self.chains, self.rng, self.given = target, chains, rng, given
         self.best: Values = {}
         self.log = np.full(chains, -np.inf)
         self.attempts = 0
         self.culprits: dict[str, int] = {}
         self.failure: BayesmcError | None = None
+        #: some states, whatever their density, and the best of those that were searched for
+        self.tried: Values = {}
+        self.nearest: Values = {}
 
     @property
     def complete(self) -> bool:
         return bool((self.log > -np.inf).all())
 
+    @property
+    def alive(self) -> bool:
+        return bool((self.log > -np.inf).any())
+
     def attempt(self, spread: float, attempts: int) -> None:
         """Some more draws, which replace what is much less likely."""
+        room = max(MOST_NUMBERS // (largest_term(self.target) * self.chains), 1)
+        while attempts > 0:
+            self._attempt(spread, min(attempts, max(room, _ATTEMPTS)))
+            attempts -= max(room, _ATTEMPTS)
+
+    def climb(self) -> None:
+        """Free numbers moved uphill, for some chains."""
+        rows = min(self.chains, _SEARCHERS)
+        given = {n: v[:rows] for n, v in self.given.items()}
+
+        def draw(count: int) -> Values:
+            spread = float(self.rng.choice(_SPREADS))
+            filled = {n: np.repeat(v, count // rows, axis=0) for n, v in given.items()}
+            return _drawn_all(self.target, count, spread, self.rng, filled)
+
+        try:
+            values, scores = Climb(self.target, given, rows, self.rng, draw).climbed()
+        except ParameterError as error:
+            self.failure = error
+            return
+        order = np.argsort(scores.lost, kind="stable")
+        self.nearest = {n: v[order[:1]] for n, v in values.items()}
+        rows_of = np.resize(np.arange(rows), self.chains)
+        self.best = {n: v[rows_of] for n, v in values.items()}
+        self.log = np.where(scores.lost == 0, scores.log, -np.inf)[rows_of]
+
+    def _attempt(self, spread: float, attempts: int) -> None:
         self.attempts += attempts
+        given = {n: np.tile(v, (attempts,) + (1,) * (v.ndim - 1)) for n, v in self.given.items()}
         try:
             values, log = _attempt(
-                self.target, self.chains * attempts, spread, self.rng, self.culprits
+                self.target, self.chains * attempts, spread, self.rng, self.culprits, given
             )
         except ParameterError as error:
             self.failure = error
             return
+        self.tried = self.tried or values
         log = np.where(np.isnan(log), -np.inf, log).reshape(attempts, self.chains)
         pick = log.argmax(axis=0), np.arange(self.chains)
         # closer to the prior mean only where that helps a lot: starts ought to differ
@@ -94,13 +150,24 @@ class _Search:
     def found(self) -> Values:
         """The states; a chain that found none starts where another does."""
         alive = np.flatnonzero(self.log > -np.inf)
-        if not len(alive):
-            if self.failure is not None and not self.culprits:
-                raise self.failure
-            raise _impossible(self.culprits, self.attempts)
+        whole = bool(self.given) and set(self.given) >= set(self.target.chain)
+        if not len(alive) or (whole and len(alive) < self.chains):
+            raise self._fault()
         rows = np.arange(self.chains)
         rows[self.log == -np.inf] = self.rng.choice(alive, int((self.log == -np.inf).sum()))
         return {n: v[rows] for n, v in self.best.items()}
+
+    def _fault(self) -> BayesmcError:
+        """What stands in the way, at the nearest state that was found."""
+        if self.failure is not None and not self.culprits:
+            return self.failure
+        at = int(np.argmin(self.log))
+        nearest = self.nearest or {n: v[at : at + 1] for n, v in self.best.items()}
+        if nearest:
+            fault = fault_at(self.target, {**self.target.known, **nearest}, self.attempts)
+            if fault is not None:
+                return fault
+        return impossible(self.culprits, self.attempts)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -112,37 +179,42 @@ def _attempt(
     spread: float,
     rng: np.random.Generator,
     culprits: dict[str, int],
+    given: Values,
 ) -> tuple[Values, np.ndarray]:
     """Forward draws of the chain's nodes, and the log density of what was seen given them."""
-    model = target.model
-    values: Values = dict(target.known)
+    values = _drawn_all(target, count, spread, rng, given)
     log = np.zeros(count)
     inside = set(target.chain)
-    for name in model.nodes:
-        if name in inside:
-            value = _drawn(target, model[name], values, count, spread, rng)
-            seen = target.seen(name)
-            if seen is not None:
-                assert seen.mask is not None
-                mask = seen.mask.reshape(seen.mask.shape + (1,) * len(model[name].event_shape))
-                value = np.where(mask, seen.value, value)
-            values[name] = value
-        elif name in target.links:
-            computed, _ = model.evaluate(name, values)
-            shape = (count, *model[name].value_shape)
-            values[name] = np.array(np.broadcast_to(computed, shape))
     for term in target.terms.values():
-        if term.name in inside and target.seen(term.name) is None:
+        if term.name in inside and target.seen(term.name) is None and term.name not in given:
             continue
-        part = np.asarray(term.log(values))
-        lead = part.shape[: part.ndim - len(term.shape)]
-        part = np.broadcast_to(part, lead + term.shape)
-        log = log + part.sum(axis=tuple(range(len(lead), part.ndim)))
+        part = row_logs(term, values, count)
+        log = log + part.sum(axis=tuple(range(1, part.ndim)))
         if not (log > -np.inf).any():
             culprits[term.name] = culprits.get(term.name, 0) + 1
             break
     chosen = {n: v for n, v in values.items() if n in inside or n in target.links}
     return chosen, log
+
+
+def _drawn_all(
+    target: Target, count: int, spread: float, rng: np.random.Generator, given: Values
+) -> Values:
+    """Values of all nodes: forward draws of the chain's, and what follows from them."""
+    model = target.model
+    values: Values = dict(target.known)
+    inside = set(target.chain)
+    for name in model.nodes:
+        if name in inside:
+            value = given[name] if name in given else None
+            if value is None:
+                value = _drawn(target, model[name], values, count, spread, rng)
+            values[name] = with_seen(target, model[name], value)
+        elif name in target.links:
+            computed, _ = model.evaluate(name, values)
+            shape = (count, *model[name].value_shape)
+            values[name] = np.array(np.broadcast_to(computed, shape))
+    return values
 
 
 def _drawn(
@@ -165,7 +237,7 @@ def _drawn(
         return _of_support(node, count, rng)
     if node.domain is not None or node.is_discrete:
         return draws
-    return _shrunk(dist, draws, spread, (count, *node.value_shape), len(node.event_shape))
+    return nearer(dist, draws, spread, (count, *node.value_shape), len(node.event_shape))
 
 
 def _alone(target: Target, node: CompiledNode, values: Values, count: int) -> np.ndarray | None:
@@ -186,39 +258,6 @@ def _alone(target: Target, node: CompiledNode, values: Values, count: int) -> np
     return np.broadcast_to(log, (node.domain.size, count, *node.plate_shape)) if found else None
 
 
-def _shrunk(
-    dist: Distribution, draws: np.ndarray, spread: float, shape: Shape, event_ndim: int
-) -> np.ndarray:
-    """Draws moved towards the middle of the prior, where the support holds what lies between."""
-    if dist.support.kind not in _CONVEX:
-        return draws
-    half_line = dist.support.kind == "interval" and is_half_line(dist.support)
-    if half_line:  # a vague scale is drawn at 1e-200 as likely as not, and a chain never comes back
-        spread = min(spread, _FROM_ZERO)
-    if spread == 1.0:
-        return draws
-    middle = _middle(dist, shape, half_line)
-    axes = tuple(range(len(shape) - event_ndim, len(shape)))
-    fine = np.isfinite(middle).all(axis=axes, keepdims=True)
-    moved = middle + max(spread, 1e-9) * (np.where(np.isfinite(draws), draws, middle) - middle)
-    return np.where(fine, moved, draws)
-
-
-def _middle(dist: Distribution, shape: Shape, half_line: bool) -> np.ndarray:
-    """The prior mean, else the median, else one above a half line's end; NaN where nothing is known."""
-    found = np.full(shape, dist.support.low + 1.0 if half_line else np.nan)
-    for question in (lambda: dist.ppf(0.5), lambda: dist.mean):
-        try:
-            answer = np.broadcast_to(question(), shape)
-        except (UnsupportedError, ValueError):
-            continue
-        sane = np.isfinite(answer)
-        if half_line:
-            sane &= (answer < 1e10) & (answer > 1e-10)
-        found = np.where(sane, answer, found)
-    return found
-
-
 def _of_support(node: CompiledNode, count: int, rng: np.random.Generator) -> np.ndarray:
     """Values of a node that has no sampler: uniform over states, else near the middle of the free scale."""
     shape = (count, *node.value_shape)
@@ -231,12 +270,3 @@ def _of_support(node: CompiledNode, count: int, rng: np.random.Generator) -> np.
     transform = transform_of(node.support, node.event_shape)
     free = rng.normal(size=(count, *node.plate_shape, *transform.unconstrained_shape))
     return transform.constrain(free)
-
-
-def _impossible(culprits: dict[str, int], attempts: int) -> ZeroProbabilityError:
-    names: Sequence[str] = sorted(culprits, key=lambda n: -culprits[n])
-    what = f"the term of {names[0]!r} has probability zero" if names else "some term is impossible"
-    return ZeroProbabilityError(
-        f"no start state of positive density in {attempts} attempts per chain: {what} in all of them; "
-        "check that evidence, or give LikelihoodWeighting or Exact a try"
-    )
