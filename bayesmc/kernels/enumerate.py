@@ -64,6 +64,11 @@ class Enumerate(Kernel):
 
 def draw_states(log: np.ndarray, rng: np.random.Generator, name: str) -> np.ndarray:
     """Positions drawn from unnormalised log probabilities, states first: shape ``log.shape[1:]``."""
+    return states_at(log, rng.random(log.shape[1:]), name)
+
+
+def states_at(log: np.ndarray, uniform: np.ndarray, name: str) -> np.ndarray:
+    """As ``draw_states``, from uniform random numbers of shape ``log.shape[1:]``."""
     count = len(log)
     top = log[0]
     for k in range(1, count):
@@ -78,7 +83,7 @@ def draw_states(log: np.ndarray, rng: np.random.Generator, name: str) -> np.ndar
     for k in range(1, count):
         edges = edges + np.exp(log[k] - top)
         cumulative.append(edges)
-    level = rng.random(top.shape) * edges
+    level = uniform * edges
     found = (level >= cumulative[0]).view(np.uint8)
     for k in range(1, count - 1):
         found = found + (level >= cumulative[k])

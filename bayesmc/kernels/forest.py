@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesmc.kernels.enumerate import draw_states
+from bayesmc.kernels.enumerate import states_at
 
 #: states up to which products of tables are sums of whole arrays, and not of many small matrices
 _FEW = 12
@@ -55,7 +55,8 @@ class Forest:
     >>> single = np.log([[0.5, 0.1], [0.5, 0.9]])[:, :, None]
     >>> tables = np.zeros((2, 2, forest.tables, 1))
     >>> tables[[0, 1], [1, 0], 0] = -np.inf
-    >>> states, log_normaliser = forest.draw(single, tables, np.random.default_rng(0))
+    >>> uniform = np.random.default_rng(0).random((2, 1))
+    >>> states, log_normaliser = forest.draw(single, tables, uniform)
     >>> states.tolist(), np.exp(log_normaliser).round(6).tolist()
     ([[1], [1]], [0.5])
     """
@@ -82,7 +83,7 @@ class Forest:
         self.tables = len(first)
 
     def draw(
-        self, single: np.ndarray, tables: np.ndarray, rng: np.random.Generator, what: str = "forest"
+        self, single: np.ndarray, tables: np.ndarray, uniform: np.ndarray, what: str = "forest"
     ) -> tuple[np.ndarray, np.ndarray]:
         """States of all variables, drawn jointly, and the log normaliser.
 
@@ -93,6 +94,8 @@ class Forest:
         tables : ndarray, shape (states, states, tables, rows)
             Log factors on pairs, the first of an edge on the first axis; what comes after the edges, and all
             in the end, is overwritten.
+        uniform : ndarray, shape (variables, rows)
+            Random numbers, uniform on [0, 1).
         what : str
             Whose draws these are, for errors.
 
@@ -112,7 +115,7 @@ class Forest:
                 total += step.sum_out(single, tables)
         drawn = np.zeros(single.shape[1:], dtype=np.intp)
         for step in reversed(self.rounds):
-            step.draw(single, tables, drawn, rng, what)
+            step.draw(single, tables, drawn, uniform, what)
         return drawn, total
 
 
@@ -182,7 +185,7 @@ class _Round:
         single: np.ndarray,
         tables: np.ndarray,
         drawn: np.ndarray,
-        rng: np.random.Generator,
+        uniform: np.ndarray,
         what: str,
     ) -> None:
         """Draw the variables given those that were left when they were summed out."""
@@ -194,7 +197,7 @@ class _Round:
         if len(members) > end:
             log[:, end:] += self.left.given(tables, drawn)
             log[:, end:] += self.right.given(tables, drawn)
-        drawn[members] = draw_states(log, rng, what)
+        drawn[members] = states_at(log, uniform[members], what)
 
 
 def _apart(left: list[int], near: list[dict[int, int]]) -> list[int]:

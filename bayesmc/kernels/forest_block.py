@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.forest import Forest
-from bayesmc.kernels.forest_terms import COLOURS, Reader, readers
+from bayesmc.kernels.forest_terms import COLOURS, Readers
 from bayesmc.structure.target import Target, Values
 
 
@@ -74,7 +74,6 @@ class ForestBlock(Kernel):
         colour = _two_colours(self.names, edges)
         edges = [(a, b) if colour[a] < colour[b] else (b, a) for a, b in edges]
         self.forest = Forest(len(names), np.array([(place[a], place[b]) for a, b in edges]))
-        self.below = target.below(self.names)
         self.candidates: Values = {}
         for name, card, dtype in zip(names, self.cards, self.dtypes, strict=True):
             shape = [1] * (COLOURS + 1 + len(self.plate_shape))
@@ -82,9 +81,10 @@ class ForestBlock(Kernel):
             self.candidates[name] = np.arange(card, dtype=dtype).reshape(shape)
         ordered = {t: tuple(sorted(m, key=colour.__getitem__)) for t, m in members.items()}
         number = {e: i for i, e in enumerate(edges)}
-        self.readers = [
-            (r, np.array([number[m] if len(m) > 1 else place[m[0]] for m in r.members]))
-            for r in readers(target, ordered, colour, self.candidates)
+        self.read = Readers(target, ordered, colour, self.candidates)
+        self.places = [
+            np.array([number[m] if len(m) > 1 else place[m[0]] for m in reader.members])
+            for reader in self.read.all
         ]
         self.states = max(self.cards)
         self.possible = np.zeros((self.states, len(names), *self.plate_shape))
@@ -108,10 +108,9 @@ class ForestBlock(Kernel):
         single[:] = self.possible[:, :, None]
         single = single.reshape(self.states, len(self.names), rows)
         pairs = np.zeros((self.states, self.states, self.forest.tables, rows))
-        state = {**values, **self.candidates}
-        self.target.compute(state, self.below)
+        state = self.read.placed(values)
         proper = True
-        for reader, at in self.readers:
+        for reader, at in zip(self.read.all, self.places, strict=True):
             log, fine = reader.log(state, chains)
             proper &= fine
             axes = len(reader.axes)
@@ -125,7 +124,10 @@ class ForestBlock(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         single, pairs, proper = self.log_factors(values)
-        drawn, _ = self.forest.draw(single, pairs, rng, self._shown())
+        count, rows = single.shape[1:]
+        chains = len(values[self.names[0]])
+        uniform = rng.random((chains, rows // chains * count)).reshape(rows, count)
+        drawn, _ = self.forest.draw(single, pairs, np.ascontiguousarray(uniform.T), self._shown())
         new = self._spread(drawn)
         if not proper:
             self._check({**values, **new})
@@ -144,8 +146,8 @@ class ForestBlock(Kernel):
 
     def _check(self, values: Values) -> None:
         """Raise where what was drawn has parameters that are wrong."""
-        self.target.compute(values, self.below)
-        for reader, _ in self.readers:
+        self.target.refresh(values, self.names)
+        for reader in self.read.all:
             for term in reader.terms:
                 term.log(values)
 

@@ -9,6 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.forest_block import ForestBlock, members_of
@@ -191,7 +194,8 @@ def _made(target: Target, names: Sequence[str]) -> ForestBlock | None:
         return None
     try:
         block = ForestBlock(target, names)
-        block.log_factors(states)
+        with marking_invalid(), np.errstate(all="ignore"):
+            block.log_factors(states)
     except BayesmcError:  # at a state that is impossible, perhaps
         return None
     return block

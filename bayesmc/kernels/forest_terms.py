@@ -7,7 +7,7 @@ one or two variables that it reads, whatever it computes from them on the way.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +16,8 @@ from bayesmc.errors import BayesmcError
 from bayesmc.network.model import invalid_error
 from bayesmc.shapes import broadcast_shapes
 from bayesmc.structure.like_functions import Slots
-from bayesmc.structure.like_terms import like_groups
+from bayesmc.structure.like_links import LinkSteps
+from bayesmc.structure.like_terms import LikeTerms, like_groups
 from bayesmc.structure.relation import Relation
 from bayesmc.structure.target import Target, Term, Values
 
@@ -73,13 +74,8 @@ class Reader:
         return relation.collect(log, plates)
 
 
-def readers(
-    target: Target,
-    members: Mapping[str, tuple[str, ...]],
-    colour: Mapping[str, int],
-    candidates: Values,
-) -> list[Reader]:
-    """The terms around a forest, like ones together.
+class Readers:
+    """The terms around a forest, like ones together, and what is computed on the way to them.
 
     Parameters
     ----------
@@ -90,42 +86,66 @@ def readers(
     candidates : dict
         Variable -> all its states, along its axis.
     """
-    reached = {n: frozenset([c]) for n, c in colour.items()}
-    for link in target.below(colour):
-        parents = target.model[link].parents
-        reached[link] = frozenset().union(*(reached[p] for p in parents if p in reached))
-    often: dict[tuple[str, ...], int] = {}
-    turn: dict[str, int] = {}
-    for name, these in members.items():  # no group reads a variable, or a pair, twice
-        turn[name] = often[these] = often.get(these, 0) + 1
 
-    def how(term: Term) -> Hashable:
-        these = members[term.name]
-        scope = target.signatures.of(term.name).scope  # type: ignore[union-attr]
-        places = tuple(these.index(n) if n in these else None for n in scope)
-        axes = tuple(reached.get(n) for n in scope)
-        return turn[term.name], tuple(colour[n] for n in these), places, axes
+    def __init__(
+        self,
+        target: Target,
+        members: Mapping[str, tuple[str, ...]],
+        colour: Mapping[str, int],
+        candidates: Values,
+    ) -> None:
+        self.target = target
+        self.members = members
+        self.colour = colour
+        self.candidates = candidates
+        links = target.below(colour)
+        self._axes = {n: frozenset([c]) for n, c in colour.items()}
+        for link in links:
+            parents = target.model[link].parents
+            self._axes[link] = frozenset().union(*(self._axes.get(p, ()) for p in parents))
+        self.links = LinkSteps(target, links, self._along)
+        often: dict[tuple[str, ...], int] = {}
+        self._turn: dict[str, int] = {}
+        for name, these in members.items():  # no group reads a variable, or a pair, twice
+            self._turn[name] = often[these] = often.get(these, 0) + 1
+        groups = like_groups(target, [target.terms[n] for n in members], self._how)
+        taken = {n for group in groups for n in group.names}
+        self.all = [self._of_group(group) for group in groups]
+        self.all += [self._of_term(target.terms[n]) for n in members if n not in taken]
 
-    terms = [target.terms[n] for n in members]
-    found = []
-    for group in like_groups(target, terms, how):
-        first = group.names[0]
+    def placed(self, values: Mapping[str, np.ndarray]) -> Values:
+        """The state with all variables at all their states."""
+        state = {**values, **self.candidates}
+        self.links.compute(state)
+        return state
+
+    def _along(self, name: str) -> Hashable:
+        """The axes of what a term or a link reads."""
+        signature = self.target.signatures.of(name)
+        return signature and tuple(self._axes.get(n) for n in signature.scope)
+
+    def _how(self, term: Term) -> Hashable:
+        these = self.members[term.name]
+        return self._turn[term.name], tuple(self.colour[n] for n in these), self._along(term.name)
+
+    def _of_group(self, group: LikeTerms) -> Reader:
         scope = group.slots.sources
-        own = {n: candidates[n] for n in scope if n in candidates}
-        slots = Slots(target, {n: s for n, s in scope.items() if n not in own}, len(group.names))
+        own = {n: self.candidates[n] for n in scope if n in self.candidates}
+        sources = {n: s for n, s in scope.items() if n not in own}
+        slots = Slots(self.target, sources, len(group.names))
         fixed = {n: np.expand_dims(v, COLOURS + 1) for n, v in own.items()}
-        these = tuple(members[n] for n in group.names)
-        axes = tuple(colour[n] for n in members[first])
-        whole = tuple(target.terms[n] for n in group.names)
-        found.append(Reader(target, whole, these, axes, group.term, slots, fixed))
-    taken = {t.name for reader in found for t in reader.terms}
-    for term in terms:
-        if term.name not in taken:
-            own_axes = tuple(colour[n] for n in members[term.name])
-            found.append(
-                Reader(target, (term,), (members[term.name],), own_axes, term, None, {})
-            )
-    return found
+        terms = tuple(self.target.terms[n] for n in group.names)
+        return self._reader(terms, group.term, slots, fixed)
+
+    def _of_term(self, term: Term) -> Reader:
+        return self._reader((term,), term, None, {})
+
+    def _reader(
+        self, terms: tuple[Term, ...], one: Term, slots: Slots | None, fixed: Values
+    ) -> Reader:
+        members = tuple(self.members[t.name] for t in terms)
+        axes = tuple(self.colour[n] for n in members[0])
+        return Reader(self.target, terms, members, axes, one, slots, fixed)
 
 
 # ---- private ------------------------------------------------------------------------------------

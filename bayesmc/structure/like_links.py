@@ -6,7 +6,7 @@ Links that are alike (``like_functions``) and do not follow from each other get 
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,6 +32,8 @@ class LinkSteps:
     target : Target
     links : sequence of str
         In an order in which they can be computed.
+    also : callable, optional
+        What of a link must be equal within a group, besides what it is.
 
     Attributes
     ----------
@@ -60,9 +62,14 @@ class LinkSteps:
     [3.0, 6.0]
     """
 
-    def __init__(self, target: Target, links: Sequence[str]) -> None:
+    def __init__(
+        self,
+        target: Target,
+        links: Sequence[str],
+        also: Callable[[str], Hashable] | None = None,
+    ) -> None:
         self.target = target
-        self.steps: tuple[str | LikeLinks, ...] = tuple(_steps(target, links))
+        self.steps: tuple[str | LikeLinks, ...] = tuple(_steps(target, links, also))
 
     def compute(self, values: Values) -> None:
         """Put the links' values, given all others, in place."""
@@ -126,7 +133,9 @@ class LikeLinks:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _steps(target: Target, links: Sequence[str]) -> list[str | LikeLinks]:
+def _steps(
+    target: Target, links: Sequence[str], also: Callable[[str], Hashable] | None
+) -> list[str | LikeLinks]:
     """Each link alone, or in the first group of its like that comes after all it is computed from."""
     groups: list[list[str]] = []
     place: dict[str, int] = {}
@@ -138,7 +147,7 @@ def _steps(target: Target, links: Sequence[str]) -> list[str | LikeLinks]:
         at = -1
         if signature is not None and math.prod(target.model[link].value_shape) < _LARGE:
             repeated = tuple(signature.scope.index(n) for n in signature.scope)
-            key = signature.key, repeated
+            key = signature.key, repeated, None if also is None else also(link)
             at = last.get(key, -1)
             if at <= after:
                 at = last[key] = len(groups)

@@ -156,6 +156,21 @@ def three() -> bmc.BayesNet:
     return net
 
 
+def slices() -> bmc.BayesNet:
+    """A hidden chain of four states that are more likely to go up than down, part of it seen."""
+    net = bmc.BayesNet()
+    net.add("s[0]", bmc.Bernoulli(0.3))
+    for t in range(1, 4):
+        net.add(f"s[{t}]", lambda s: bmc.Bernoulli(0.35 + 0.5 * s), parents=[f"s[{t - 1}]"])
+    for t in (1, 3):
+        net.add(f"y[{t}]", lambda s: bmc.Bernoulli(0.2 + 0.5 * s), parents=[f"s[{t}]"])
+    return net
+
+
+def of_slices(seed: int) -> Verdict:
+    return invariant(bmc.Gibbs(), slices(), {"y[1]": 1, "y[3]": 0}, alpha=ALPHA, rng=seed)
+
+
 def enumerated(target: Any) -> Enumerate:
     return Enumerate(Blanket(target, "x"))
 
@@ -311,9 +326,37 @@ MUTANTS = [
     ),
     Mutant(
         "an enumeration loses the last state",
-        (Edit("bayesmc.kernels.enumerate:draw_states", "range(1, count - 1)", "range(1, count - 2)"),),
+        (Edit("bayesmc.kernels.enumerate:states_at", "range(1, count - 1)", "range(1, count - 2)"),),
         lambda seed: detailed_balance(enumerated, three(), {"y": 1}, alpha=ALPHA, rng=seed),
         "detailed_balance (exact)",
+    ),
+    Mutant(
+        "forests: what leaves say is not passed on",
+        (Edit("bayesmc.kernels.forest:_Round.sum_out",
+              "single[:, self.stems] += sums", "single[:, self.stems] += 0.0 * sums"),),
+        of_slices,
+        "invariant (exact)",
+    ),
+    Mutant(
+        "forests: backwards one of two neighbours is ignored",
+        (Edit("bayesmc.kernels.forest:_Round.draw",
+              "log[:, end:] += self.left.given(tables, drawn)", "pass"),),
+        of_slices,
+        "invariant (exact)",
+    ),
+    Mutant(
+        "forests: a table is read the wrong way round",
+        (Edit("bayesmc.kernels.forest:_Side.given",
+              "first = self.is_first[:, None]", "first = ~self.is_first[:, None]"),),
+        of_slices,
+        "invariant (exact)",
+    ),
+    Mutant(
+        "forests: a product of tables is normalised by columns alone",
+        (Edit("bayesmc.kernels.forest:_log_product",
+              "np.log(product) + top_left[:, None] + top_right", "np.log(product) + top_left[:, None]"),),
+        of_slices,
+        "invariant (exact)",
     ),
     Mutant(
         "a deterministic node is stale",
