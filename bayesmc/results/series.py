@@ -189,8 +189,8 @@ class SeriesPosterior:
             raise UnknownNodeError(f"there is no node {name!r}; there are {list(self.model.nodes)}")
         if self.predictive is None:
             raise UnsupportedError(
-                f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare rows "
-                "with what was expected of them; ask the result of filter by a KalmanFilter, an "
+                f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare "
+                "rows with what was expected of them; ask the result of filter by a KalmanFilter, an "
                 "ExtendedKalmanFilter, an UnscentedKalmanFilter or a ParticleFilter, with some rows observed"
             )
         if name not in self.predictive.ranks:

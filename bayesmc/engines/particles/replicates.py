@@ -119,7 +119,9 @@ class Replicates:
         """Log densities of the row that came, first, and of those drawn, shape (1 + rows, *lead)."""
         seen = {}
         for name, own in row.seen.items():
-            each = np.concatenate([np.broadcast_to(own.value, drawn[name].shape[1:])[None], drawn[name]])
+            each = np.concatenate(
+                [np.broadcast_to(own.value, drawn[name].shape[1:])[None], drawn[name]]
+            )
             seen[name] = Observed(np.repeat(each, JUDGES, axis=0), own.mask)
         judged = Row(row.t, seen, row.inputs)
         count = (1 + ROWS) * JUDGES
