@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.errors import LowEssWarning
+from bayesmc.errors import LowEssWarning, ModelMisfitWarning
 from examples import picture
 
 START, STATE, SEEN = (
@@ -95,6 +95,7 @@ def filtered(dbn: bmc.DynamicBayesNet, y: np.ndarray, engine: Any) -> Any:
     keep = "summaries" if isinstance(engine, bmc.GridFilter) else None
     with warnings.catch_warnings():  # fifty particles are few, which is what the table shows
         warnings.simplefilter("ignore", LowEssWarning)
+        warnings.simplefilter("ignore", ModelMisfitWarning)  # Gaussians with one hill are too sure
         return bmc.filter(dbn, {"y": y}, engine=engine, rng=1, keep=keep)
 
 

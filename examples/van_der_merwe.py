@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.errors import LowEssWarning
+from bayesmc.errors import LowEssWarning, ModelMisfitWarning
 from examples import picture
 
 STEPS, RUNS, PARTICLES = 60, 100, 200
@@ -138,6 +138,7 @@ def errors(runs: int) -> dict[str, dict[str, np.ndarray]]:
                 continue
             with warnings.catch_warnings():  # the bootstrap filter has one or two that count
                 warnings.simplefilter("ignore", LowEssWarning)
+                warnings.simplefilter("ignore", ModelMisfitWarning)  # Gaussians are too sure here
                 mean = bmc.filter(dbn, {"y": y}, engine=engine, rng=2).mean("x")
             found[what][name] = np.sqrt(((mean - x) ** 2).mean(axis=0))
     return found

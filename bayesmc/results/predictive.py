@@ -22,13 +22,13 @@ from bayesmc.errors import ModelMisfitWarning
 _LOW = 0.05
 #: chance at which a model that is right has as many unlikely rows
 _ALPHA = 1e-6
-#: nats per number that must be missing, too, so that a model that is a little off does not alarm: of a Gaussian
-#: that is where squares are three times what they should be
+#: nats per number that must be missing, too, so that a model that is a little off does not alarm: of a
+#: Gaussian that is where squares are three times what they should be
 _NATS = 1.0
 #: what one row counts for at most: an outlier now and then is none of the model's
 _CAP = 20.0
-#: rows of a stretch that is judged by itself, too, and share of it that must be unlikely: a filter may be lost
-#: for a while
+#: rows of a stretch that is judged by itself, too, and share of it that must be unlikely: a filter may be
+#: lost for a while
 _STRETCH, _SHARE = 30, 0.5
 
 
@@ -94,17 +94,18 @@ class Predictive:
         if not low.any():
             return None
         # groups of rows as (first, last, element): among slices where something was compared
-        ends = [(0, len(seen), None)]
+        ends: list[tuple[int, int, int | None]] = [(0, len(seen), None)]
         if ranks.shape[1] > 1:
             ends += [(0, len(seen), k) for k in range(ranks.shape[1])]
         starts = range(0, len(seen) - _STRETCH + 1, _STRETCH // 2) if len(seen) > _STRETCH else ()
         ends += [(k, k + _STRETCH, None) for k in starts]
-        sums = [np.cumsum(np.vstack([a[:1] * 0, a[seen]]), axis=0) for a in (low, known)]
-        totals = [s.sum(axis=1) for s in sums]
-        few, many = (
-            np.array([_between(t, s, *e) for e in ends]) for t, s in zip(totals, sums, strict=True)
-        )
-        chance = special.bdtrc(np.maximum(few - 1, 0), np.maximum(many, 1), _LOW)
+        # elements of one slice may share what they do not explain: together they count as one row
+        ones = np.vstack([low[seen].sum(axis=1) / known[seen].sum(axis=1), np.ones(len(seen))])
+        pooled, each = _running(ones.T), _running(np.stack([low, known], axis=-1)[seen])
+        counts = [_between(pooled if e is None else each[:, e], a, b) for a, b, e in ends]
+        few, many = np.floor(np.array(counts) + 1e-9).T
+        # of so many binomial ones or more
+        chance = special.betainc(np.maximum(few, 1), np.maximum(many - few, 0) + 1, _LOW)
         blamed = (few > 0) & (chance * len(ends) < _ALPHA)
         for k in np.flatnonzero(blamed):
             first, last, element = ends[k]
@@ -113,7 +114,8 @@ class Predictive:
             is_stretch = last - first < len(seen)
             nats = np.median(part) if is_stretch else np.minimum(part, _CAP).mean()
             if nats > _NATS and (not is_stretch or few[k] >= _SHARE * many[k]):
-                return Misfit(int(few[k]), int(many[k]), int(rows[0]), int(rows[-1]), float(nats))
+                unlikely = int(low[rows, wide].sum())
+                return Misfit(unlikely, len(part), int(rows[0]), int(rows[-1]), float(nats))
         return None
 
 
@@ -131,11 +133,11 @@ def warn_of_misfit(found: Predictive | None, who: str, start: int, stacklevel: i
         return
     few, many, first, last, nats = misfit
     warnings.warn(
-        f"{who}: {few} of {many} rows compared in slices {start + first} to {start + last} are less likely than "
-        f"95 % of the rows that the filter expected (row_ranks), typically by {nats:.3g} nats per number more "
-        "than they should (row_deficits): the model does not fit there, or the filter is sure of what is wrong, "
-        "and its spreads do not say so; look at the start, at units and signs of what goes in (predictive_ranks "
-        "say which node is off), or at noise that is too narrow",
+        f"{who}: {few} of {many} rows compared in slices {start + first} to {start + last} are less likely "
+        "than 95 % of the rows that the filter expected (row_ranks), typically by "
+        f"{nats:.3g} nats per number more than they should (row_deficits): the model does not fit there, or "
+        "the filter is sure of what is wrong, and its spreads do not say so; look at the start, at units "
+        "and signs of what goes in (predictive_ranks say which node is off), or at noise that is too narrow",
         ModelMisfitWarning,
         stacklevel=stacklevel + 1,
     )
@@ -144,7 +146,11 @@ def warn_of_misfit(found: Predictive | None, who: str, start: int, stacklevel: i
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _between(total: np.ndarray, each: np.ndarray, first: int, last: int, element: int | None) -> int:
-    """A sum over some slices from running sums, of all elements or of one."""
-    sums = total if element is None else each[:, element]
-    return int(sums[last] - sums[first])
+def _running(counts: np.ndarray) -> np.ndarray:
+    """Sums over slices, time first, of none, one, two, ... of them."""
+    return np.concatenate([np.zeros((1, *counts.shape[1:])), np.cumsum(counts, axis=0)])
+
+
+def _between(sums: np.ndarray, first: int, last: int) -> np.ndarray:
+    """The sum over some slices from running sums."""
+    return sums[last] - sums[first]

@@ -50,8 +50,8 @@ class SeriesPosterior:
     row_ranks : ndarray or None, shape (time,) or (time, *plates)
         Share of the rows that the filter expected which are less likely than the one that came: uniform where
         the model is right, near 0 where rows surprise it. NaN where nothing was seen or compared: Gaussian
-        filters compare all rows, particle filters 64 or a fourth of them, with a few rows drawn from their
-        particles. None from other engines.
+        filters compare all rows, particle filters 64 or a fourth of them (of wide ones, such as scans, 16 or
+        every 32nd), with a few rows drawn from their particles. None from other engines.
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
 
@@ -194,8 +194,8 @@ class SeriesPosterior:
             raise UnknownNodeError(f"there is no node {name!r}; there are {list(self.model.nodes)}")
         if self.predictive is None:
             raise UnsupportedError(
-                f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare rows "
-                "with what was expected of them; ask the result of filter by a KalmanFilter, an "
+                f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare "
+                "rows with what was expected of them; ask the result of filter by a KalmanFilter, an "
                 "ExtendedKalmanFilter, an UnscentedKalmanFilter or a ParticleFilter, with some rows observed"
             )
         if name not in self.predictive.ranks:

@@ -156,6 +156,11 @@ class Beams(Distribution):
     def support(self) -> Support:
         return product([(nonnegative, self.event_shape[0])])
 
+    @property
+    def tempering(self) -> float:
+        """Exponent of the density: so much of an independent number is each beam taken for."""
+        return self.model.tempering
+
     def log_prob_by_beam(self, x: Any) -> np.ndarray:
         """Log density of each range, without the exponent, shape (..., beams); 0 where NaN.
 

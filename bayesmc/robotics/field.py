@@ -205,6 +205,11 @@ class FieldScan(Distribution):
     def support(self) -> Support:
         return product([(nonnegative, self.event_shape[0])])
 
+    @property
+    def tempering(self) -> float:
+        """Exponent of the density: so much of an independent number is each beam taken for."""
+        return self.field.tempering
+
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         if x.shape[-1:] != self.event_shape:
             raise ShapeError(f"ranges have shape {x.shape}, not (..., {self.event_shape[0]})")

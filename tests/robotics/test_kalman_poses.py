@@ -10,6 +10,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.kalman.unscented import _joint_root
+from bayesmc.errors import ModelMisfitWarning
 from bayesmc.robotics.landmarks import bearing, range_and_bearing, range_only
 from bayesmc.robotics.motion import OdometryMotion, VelocityMotion
 from bayesmc.robotics.pose_distributions import PoseDistribution, PoseNormal
@@ -125,7 +126,8 @@ def test_a_heading_that_is_no_angle_fails(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setattr(
         Layout, "angles_of", lambda self, name: np.zeros(self.size(name), dtype=bool)
     )
-    wrong = bmc.filter(robot("noise", "joint"), rows["joint"], **options)
+    with pytest.warns(ModelMisfitWarning):
+        wrong = bmc.filter(robot("noise", "joint"), rows["joint"], **options)
     assert wrong.log_marginal_likelihood < right.log_marginal_likelihood - 100
     assert root_mean_square(wrong, truth) > 5 * root_mean_square(right, truth)
 

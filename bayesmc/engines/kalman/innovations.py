@@ -39,7 +39,9 @@ class Innovations:
         self.df = np.zeros(shape, dtype=np.intp)
         self._of = {n: np.full((*shape, layout.size(n)), np.nan) for n in names}
 
-    def put(self, at: Any, layout: Layout, pattern: Pattern, root: np.ndarray, eta: np.ndarray) -> None:
+    def put(
+        self, at: Any, layout: Layout, pattern: Pattern, root: np.ndarray, eta: np.ndarray
+    ) -> None:
         """Those of slices ``at`` (an index, or an array of them): roots, and what they standardise to."""
         p = len(pattern.observed)
         if not p:

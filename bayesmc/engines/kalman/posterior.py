@@ -141,7 +141,9 @@ class GaussianSeries(SeriesPosterior):
 
     def _innovations(self, what: str) -> Innovations:
         if self.normalised is None:
-            raise QueryError(f"{what}: slices ahead of the data have no rows to compare; ask a filter's result")
+            raise QueryError(
+                f"{what}: slices ahead of the data have no rows to compare; ask a filter's result"
+            )
         return self.normalised
 
     def cov(self, *names: str) -> np.ndarray:

@@ -9,6 +9,7 @@ drawn with.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -26,6 +27,8 @@ from bayesmc.results.predictive import Predictive
 ROWS, JUDGES = 19, 20
 #: slices that are looked at: so many of a series, and every so manieth of a long one
 LOOKS, EVERY = 64, 4
+#: the same where rows are wide, such as scans, which are dear to draw; and from how many numbers on they are
+WIDE_LOOKS, WIDE_EVERY, WIDE = 16, 32, 16
 #: and rows below which none is: too few for any conclusion
 _FEW = 5
 
@@ -49,6 +52,7 @@ class Replicates:
         self.names = tuple(problem.series.observed)
         self._looked = _chosen(problem, rng)
         self._failed = False
+        self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)
         self._rows, self._deficits = np.full(lead, np.nan), np.full(lead, np.nan)
         shapes = {n: problem.slices.first[n].value_shape for n in self.names}
@@ -119,7 +123,9 @@ class Replicates:
         """Log densities of the row that came, first, and of those drawn, shape (1 + rows, *lead)."""
         seen = {}
         for name, own in row.seen.items():
-            each = np.concatenate([np.broadcast_to(own.value, drawn[name].shape[1:])[None], drawn[name]])
+            each = np.concatenate(
+                [np.broadcast_to(own.value, drawn[name].shape[1:])[None], drawn[name]]
+            )
             seen[name] = Observed(np.repeat(each, JUDGES, axis=0), own.mask)
         judged = Row(row.t, seen, row.inputs)
         count = (1 + ROWS) * JUDGES
@@ -133,7 +139,7 @@ class Replicates:
     def _write(self, k: int, row: Row, drawn: Mapping[str, np.ndarray], log: np.ndarray) -> None:
         self._rows[k] = self._rank(log[0], log[1:])
         log = np.maximum(log, _LEAST)
-        self._deficits[k] = (log[1:].mean(axis=0) - log[0]) / np.maximum(self._numbers(row), 1)
+        self._deficits[k] = (log[1:].mean(axis=0) - log[0]) / np.maximum(self._numbers(row), _TINY)
         for name, own in row.seen.items():
             node = self.slices.first[name]
             ranks = self._rank(own.value, drawn[name])
@@ -149,23 +155,33 @@ class Replicates:
         return (less + self.rng.random(less.shape) * (equal + 1)) / (ROWS + 1)
 
     def _numbers(self, row: Row) -> np.ndarray:
-        """How many numbers a row has, shape (*lead)."""
+        """How many numbers a row has, shape (*lead); those of tempered densities count for less."""
         total = np.zeros(self.lead)
         for name, own in row.seen.items():
             node = self.slices.first[name]
             mask = np.ones(node.plate_shape) if own.mask is None else own.mask
-            each = mask * float(np.prod(node.event_shape, dtype=float))
+            each = mask * float(np.prod(node.event_shape, dtype=float)) * self._worth(row, name)
             apart = [node.plates.index(p) for p in self.plan.apart]
             rest = tuple(i for i in range(len(node.plates)) if i not in apart)
             left = [p for p in node.plates if p in self.plan.apart]
             total = total + each.sum(axis=rest).transpose([left.index(p) for p in self.plan.apart])
         return total
 
+    def _worth(self, row: Row, name: str) -> float:
+        """The exponent of a density that has one, such as a scan's: numbers that count for less than one."""
+        if name not in self._exponents:
+            model = self.slices.model(row.t)
+            found = model.evaluate(name, model.probe)[0]
+            self._exponents[name] = float(getattr(found, "tempering", 1.0))
+        return self._exponents[name]
+
 
 # ---- private ------------------------------------------------------------------------------------
 
 #: log densities below this one are this one: of rows that no particle explains
 _LEAST = -1e12
+#: numbers of an element without any, to divide by
+_TINY = 1e-9
 
 
 def _chosen(problem: SeriesProblem, rng: np.random.Generator) -> frozenset[int]:
@@ -176,8 +192,11 @@ def _chosen(problem: SeriesProblem, rng: np.random.Generator) -> frozenset[int]:
     rows = np.flatnonzero(some)
     if len(rows) < _FEW:
         return frozenset()
-    if len(rows) <= LOOKS:
+    model = problem.slices.first
+    numbers = sum(math.prod(model[n].event_shape) for n in problem.series.observed)
+    least, every = (WIDE_LOOKS, WIDE_EVERY) if numbers >= WIDE else (LOOKS, EVERY)
+    if len(rows) <= least:
         return frozenset(rows.tolist())
-    edges = np.linspace(0, len(rows), max(LOOKS, len(rows) // EVERY) + 1)
+    edges = np.linspace(0, len(rows), max(least, len(rows) // every) + 1)
     at = edges[:-1] + rng.random(len(edges) - 1) * np.diff(edges)
     return frozenset(rows[np.minimum(at.astype(np.intp), len(rows) - 1)].tolist())

@@ -53,8 +53,8 @@ from bayesmc.robotics.logs.wean import read_wean
 __all__ = [
     "MAX_RANGE", "UNKNOWN_SUBJECT", "Barcode", "GroundTruth", "Increment", "Keyframe", "Landmark",
     "Laser", "LogFault", "Measurement", "Mrclam", "MrclamRobot", "Odometry", "Plaza", "RangeOnly",
-    "Reading", "Record", "RotTransRot", "Timed", "Velocity", "heading_offset", "keyframes", "merge", "pose_at",
-    "read_carmen", "read_freiburg", "read_freiburg_world", "read_mrclam", "read_mrclam_barcodes",
+    "Reading", "Record", "RotTransRot", "Timed", "Velocity", "heading_offset", "keyframes", "merge",
+    "pose_at", "read_carmen", "read_freiburg", "read_freiburg_world", "read_mrclam", "read_mrclam_barcodes",
     "read_mrclam_landmarks", "read_mrclam_measurements", "read_mrclam_truth",
     "read_mrclam_velocities", "read_plaza", "read_plaza_increments", "read_plaza_ranges",
     "read_wean", "sick_angles", "stack", "write_carmen",

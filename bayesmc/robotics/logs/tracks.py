@@ -184,7 +184,9 @@ def heading_offset(track: Iterable[GroundTruth | Odometry], distance: float = 0.
         if math.hypot(dx, dy) >= distance:
             offsets.append(math.atan2(dy, dx) - poses[(start + k) // 2, 2])
             start = k
-    mean = np.mean(np.exp(1j * np.array(offsets))) if offsets else 0.0
+    if not offsets:
+        return math.nan
+    mean = complex(np.exp(1j * np.array(offsets)).mean())
     return float(wrap(np.angle(mean))) if abs(mean) >= _AGREES else math.nan
 
 
