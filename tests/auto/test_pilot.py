@@ -1,4 +1,4 @@
-"""``engine=None`` where Gibbs has closed forms for nothing: a short pilot weighs engines, always the same way."""
+"""``engine=None`` where Gibbs has no closed form: a short pilot weighs engines, always the same way."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def arma() -> tuple[bmc.BayesNet, dict[str, Any]]:
 
 def garch() -> tuple[bmc.BayesNet, dict[str, Any]]:
     rng = np.random.default_rng(4)
-    r = rng.normal(size=40)
+    r = rng.normal(size=150) * np.repeat([0.5, 2.0, 0.7], 50)
     net = bmc.BayesNet()
     net.add("a0", bmc.HalfNormal(1.0))
     net.add("a1", bmc.Uniform(0.0, 1.0))
@@ -103,17 +103,15 @@ def test_the_cheaper_engine_is_taken(name: str) -> None:
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
 def test_what_is_chosen_answers_as_gibbs_does() -> None:
     """The two differ by less than 5 of their errors: false alarm 6e-7 for each figure."""
-    for make in (with_scipy, zero_inflated):
-        net, data = make()
-        chosen, gibbs = (
-            bmc.infer(net, data, engine=engine, rng=0)
-            for engine in (None, bmc.Gibbs(200, warmup=50, chains=4))
-        )
-        assert not isinstance(chosen.engine, bmc.Gibbs)
-        for name in gibbs.names:
-            if name != "y":
-                error = np.hypot(chosen.mcse(name), gibbs.mcse(name))
-                assert abs(chosen.mean(name) - gibbs.mean(name)) < 5 * error
+    net, data = zero_inflated()
+    chosen, gibbs = (
+        bmc.infer(net, data, engine=engine, rng=0)
+        for engine in (None, bmc.Gibbs(200, warmup=50, chains=4))
+    )
+    assert not isinstance(chosen.engine, bmc.Gibbs)
+    for name in ("p", "rate"):
+        error = np.hypot(chosen.mcse(name), gibbs.mcse(name))
+        assert abs(chosen.mean(name) - gibbs.mean(name)) < 5 * error
 
 
 def closed_form() -> tuple[bmc.BayesNet, dict[str, Any]]:
@@ -141,10 +139,10 @@ def test_other_nets_are_left_to_gibbs(make: Any) -> None:
 
 def test_chains_are_taken_where_weights_are_uneven() -> None:
     """Many data make weights uneven: chains are compared."""
-    net = bmc.BayesNet(plates={"i": 3000})
+    net = bmc.BayesNet(plates={"i": 300})
     net.add("r", bmc.LogNormal(0.0, 2.0))
     net.add("y", lambda r: bmc.Weibull(r, 1.0), plates="i")
-    y = np.random.default_rng(0).weibull(1.5, 3000)
+    y = np.random.default_rng(0).weibull(1.5, 300)
     chosen = bmc.explain(net, {"y": y})
     assert "LikelihoodWeighting" not in type(chosen.engine).__name__
     assert "effective of" in chosen.reasons[0]
