@@ -161,7 +161,8 @@ class ChainsPosterior(_Chains, DrawsPosterior):
         """The same draws with components named by the order of a node, draw by draw.
 
         A model that does not tell its components apart leaves chains free to name them differently. What
-        is asked of the answer here is about the component with the smallest value of ``by``, the next, and so on.
+        is asked of the answer here is about the component with the smallest value of ``by``, the next, and
+        so on.
 
         Parameters
         ----------

@@ -1,8 +1,8 @@
 """Components that a model does not tell apart: found, and put in an order draw by draw.
 
 The posterior of a mixture is the same however its components are named, so chains may name them
-differently, and one chain may change its mind. That is no fault of theirs: what does not depend on the names can mix all the
-same, and among it every figure of components that are named by their order.
+differently, and one chain may change its mind. That is no fault of theirs: what does not depend on the
+names can mix all the same, and among it every figure of components that are named by their order.
 """
 
 from __future__ import annotations
