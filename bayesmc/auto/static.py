@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from bayesmc.auto.explanation import Explanation
+from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
@@ -142,7 +143,16 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
     if plan.kernels and (forward is not None or not plan.constraints):
         if forward is not None:
             refused["LikelihoodWeighting"] = forward
-        return Gibbs(), (f"the full conditionals can be drawn from: {plan.in_short()}",), refused
+        found = weighed(problem, plan)
+        if found is None:
+            return (
+                Gibbs(),
+                (f"the full conditionals can be drawn from: {plan.in_short()}",),
+                refused,
+            )
+        best, others = found
+        refused.update({type(t.engine).__name__: t.words for t in others})
+        return best.engine, (f"it did best in a short pilot: {best.words}",), refused
     if forward is not None:
         raise UnsupportedError(f"infer: no engine can answer. {why_not}. {forward}")
     if not plan.kernels:

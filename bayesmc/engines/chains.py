@@ -20,6 +20,7 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
+from bayesmc.engines.funnels import missed_ends
 from bayesmc.engines.question import difference
 from bayesmc.engines.weighted import check_count, no_memory
 from bayesmc.errors import (
@@ -235,6 +236,8 @@ class ChainEngine(Engine):
             warnings.warn(message, InterruptWarning, stacklevel=4)
         found = poor_mixing(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         band = getattr(sampler, "acceptance_band", _BAND)
+        if isinstance(posterior, ChainsPosterior):
+            found += missed_ends(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 

@@ -17,6 +17,7 @@ from bayesmc import diagnostics
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results import ChainsPosterior, ChainsSums
 from bayesmc.results.draws import near
+from bayesmc.results.relabelling import ordered, pivot_of, symmetries
 
 #: R-hat above which chains disagree (Vehtari et al. 2021, sec. 5)
 MAX_RHAT = 1.01
@@ -41,12 +42,9 @@ _SAMPLE = 1000
 def poor_mixing(posterior: ChainsPosterior | ChainsSums, forward: frozenset[str]) -> list[str]:
     """What is wrong with the chains, in words, and the remedy; nodes of ``forward`` are not looked at."""
     if isinstance(posterior, ChainsSums):
-        judged = _summed_figures(posterior, forward)
-    else:
-        judged = _figures(posterior, forward)
-    if not judged.looked:
-        return []
-    return [*_disagreement(judged), *_few_draws(judged, *posterior._chains_and_draws)]
+        return _faults(_summed_figures(posterior, forward), posterior)
+    found = _faults(_figures(posterior, posterior._stored, forward), posterior)
+    return _but_for_labels(posterior, forward, found) if found else []
 
 
 def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator[str]:
@@ -80,6 +78,42 @@ class _Judged(NamedTuple):
     rhat: dict[str, float]
     #: name of a scalar -> the smaller one of its effective sizes, and which it is
     ess: dict[str, tuple[float, str]]
+
+
+def _faults(judged: _Judged, posterior: ChainsPosterior | ChainsSums) -> list[str]:
+    if not judged.looked:
+        return []
+    return [*_disagreement(judged), *_few_draws(judged, *posterior._chains_and_draws)]
+
+
+def _but_for_labels(
+    posterior: ChainsPosterior, forward: frozenset[str], found: list[str]
+) -> list[str]:
+    """What is wrong once components that the model does not tell apart are named by their order.
+
+    Where nothing is, the posterior says so, and there is no reason to warn.
+    """
+    point = posterior.checkpoint
+    if posterior.problem is None or point is None:
+        return found
+    stored, words = posterior._stored, []
+    for symmetry in symmetries(posterior.problem, point.values):
+        pivot = pivot_of(symmetry, posterior.model)
+        if pivot is not None and pivot in stored:
+            stored = ordered(stored, symmetry, pivot)
+            of = f"plate {symmetry.plate!r}" if symmetry.plate else f"{pivot!r}"
+            words.append(
+                f"the {symmetry.size} components of {of} are named differently from draw to draw, as the "
+                f"model does not tell them apart; by the order of {pivot!r} they have mixed: ask "
+                f"relabelled({pivot!r}), or for what does not depend on names"
+            )
+    if not words:
+        return found
+    left = _faults(_figures(posterior, stored, forward), posterior)
+    if left:
+        return [f"with components named by their order, {fault}" for fault in left]
+    posterior.label_switching = "; ".join(words)
+    return []
 
 
 def _disagreement(judged: _Judged) -> Iterator[str]:
@@ -123,13 +157,15 @@ def _others(bad: list[bool], looked: int) -> str:
     return f", and so are {count} more of the {len(bad)} that look worst of {looked}"
 
 
-def _figures(posterior: ChainsPosterior, forward: frozenset[str]) -> _Judged:
+def _figures(
+    posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
+) -> _Judged:
     """What ArviZ says of those scalars that the screen finds worst; scalars that never move are left out."""
     block, chains = posterior.ensemble_size, posterior._chains_and_draws[0]
     names, columns = [], []
     for name, index in _some(_moving(posterior, forward), posterior.model):
         at: tuple[Any, ...] = (slice(None), slice(None), *index)
-        values = posterior._stored[name][at]
+        values = stored[name][at]
         if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
             names.append(_scalar(posterior.model, name, index))
             columns.append(_uncut(posterior.model[name], index, _thinned(values, block)))

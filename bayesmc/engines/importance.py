@@ -133,7 +133,9 @@ class Importance(WeightedEngine):
         return f"check the evidence, and whether the proposals of {given} reach what it allows"
 
     def continues(self, other: Any) -> bool:
-        return isinstance(other, Importance) and bool(same(dict(other.proposal), dict(self.proposal)))
+        return isinstance(other, Importance) and bool(
+            same(dict(other.proposal), dict(self.proposal))
+        )
 
     def _require_functions(self) -> None:
         if any(spec is None for spec in self.proposal.values()):

@@ -16,9 +16,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import marking_invalid
+from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model, Observed, Problem
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.posterior import Posterior
+from bayesmc.results.relabelling import ordered, symmetries
 from bayesmc.results.sums import Sums, SumsPosterior
 
 #: batch means kept per chain, once there are as many; twice as many are merged in pairs
@@ -85,6 +87,8 @@ class _Chains(Posterior):
     #: sweeps before the first draw, during which the engine adapted
     warmup: int
     checkpoint: Checkpoint | None
+    #: a sentence where chains name components differently that the model does not tell apart
+    label_switching: str | None = None
 
     def _describe(
         self,
@@ -103,7 +107,8 @@ class _Chains(Posterior):
     def _title(self) -> str:
         chains, draws = self._chains_and_draws
         many = f"{chains} chain{'s' if chains > 1 else ''} of {draws} draws"
-        return f"{super()._title()}: {many} after {self.warmup} of warmup"
+        title = f"{super()._title()}: {many} after {self.warmup} of warmup"
+        return f"{title}\n{self.label_switching}" if self.label_switching else title
 
     def _reload(self) -> str:
         if self.checkpoint is None:
@@ -151,6 +156,57 @@ class ChainsPosterior(_Chains, DrawsPosterior):
     ) -> None:
         super().__init__(problem, engine, stored, shape)
         self._describe(shape, acceptance or {}, ensemble_size, warmup, checkpoint)
+
+    def relabelled(self, by: str) -> ChainsPosterior:
+        """The same draws with components named by the order of a node, draw by draw.
+
+        A model that does not tell its components apart leaves chains free to name them differently. What
+        is asked of the answer here is about the component with the smallest value of ``by``, the next, and
+        so on.
+
+        Parameters
+        ----------
+        by : str
+            A node with one number for each component, as ``label_switching`` names it.
+
+        Raises
+        ------
+        UnsupportedError
+            The components are told apart by the model or its evidence, or ``by`` has no number for each.
+
+        References
+        ----------
+        Stephens (2000), Dealing with label switching in mixture models, JRSS B 62, sec. 2.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import bayesmc as bmc
+        >>> net = bmc.BayesNet(plates={"cluster": 2, "point": 6})
+        >>> net.add("mean", bmc.Normal(0.0, 10.0), plates="cluster")
+        >>> net.add("label", bmc.Bernoulli(0.5), plates="point")
+        >>> net.add("x", lambda label, mean: bmc.Normal(mean[label], 1.0), plates="point")
+        >>> data = {"x": [-3.0, -2.0, -2.5, 2.0, 3.0, 2.5]}
+        >>> posterior = bmc.infer(net, data, engine=bmc.Gibbs(500, warmup=200), rng=0)
+        >>> posterior.relabelled("mean").mean("mean").round()
+        array([-2.,  2.])
+        """
+        self._node(by)
+        problem = self._live("relabelled")
+        point = None if self.checkpoint is None else self.checkpoint.values
+        for found in [] if point is None else symmetries(problem, point):
+            if by in found.axes and self.model[by].value_shape == (found.size,):
+                twin = copy.copy(self.__dict__)
+                new = object.__new__(type(self))
+                new.__dict__.update(twin)
+                new.__dict__.pop("_slowest", None)
+                new._stored = ordered(self._stored, found, by)
+                new.checkpoint = new.label_switching = None
+                return new
+        raise UnsupportedError(
+            f"relabelled({by!r}): its elements are no components that the model could name otherwise; ask of "
+            "the posterior as it is"
+        )
 
     def _predict(self, *arguments: Any) -> DrawsPosterior:
         drawn = super()._predict(*arguments)

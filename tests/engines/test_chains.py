@@ -310,9 +310,7 @@ def test_a_net_declared_anew_goes_on() -> None:
         "node 'n' has another states": lambda n: n.add(
             "n", bmc.DiscreteUniform(1, 4), replace=True
         ),
-        "node 'nine' has other parents": lambda n: n.add(
-            "nine", lambda angle: 9.0, replace=True
-        ),
+        "node 'nine' has other parents": lambda n: n.add("nine", lambda angle: 9.0, replace=True),
     }
     for words, change in other.items():
         net = net_of()
