@@ -98,7 +98,7 @@ class ForestBlock(Kernel):
         self.match = f"filtering and sampling along {size}"
 
     def log_factors(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Log factors on single nodes and on pairs, as ``Forest.draw`` takes them, and whether all are proper.
+        """Log factors on single nodes and on pairs, as ``Forest.draw`` takes them; are all proper?
 
         Rows are chains, and elements of the plates within them.
         """
