@@ -274,8 +274,8 @@ def _log_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     log = np.log(product) + top_left[:, None] + top_right
     small = np.nonzero(product < _SMALL)  # what is impossible, and what was lost
     if len(small[0]):
-        i, k, *rest = small
-        log[small] = _log_sum(left[(slice(None), i, *rest)] + right[(slice(None), k, *rest)])
+        i, k, variable, row = small
+        log[small] = _log_sum(left[:, i, variable, row] + right[:, k, variable, row])
     return log
 
 

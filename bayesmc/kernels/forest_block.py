@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -117,7 +118,8 @@ class ForestBlock(Kernel):
             log = np.moveaxis(log, axes, axes + 1)  # (*states, terms, chains, *plates)
             log = log.reshape(*log.shape[: axes + 1], rows)
             where = single if axes == 1 else pairs
-            where[(*(slice(0, n) for n in log.shape[:axes]), at)] += log
+            own: Any = (*(slice(0, n) for n in log.shape[:axes]), at)
+            where[own] += log
         return single, pairs, proper
 
     def step(

@@ -27,9 +27,10 @@ class ParticleMetropolis(ParticleEngine):
 
     Static nodes move together on the unconstrained scale, by an adaptive random walk and by steps to anywhere
     in what the warmup has learnt of the posterior; a step is accepted by the filter's estimate of the
-    likelihood, and the trajectory drawn from that filter comes with it. The estimate is kept with its chain, which makes the answers exact in the long run for any number of
-    particles. It suits static nodes that hold the trajectory fast, where ``ParticleGibbs`` mixes slowly. It
-    is called with the template, ``infer(dbn, observations, engine=ParticleMetropolis())``.
+    likelihood, and the trajectory drawn from that filter comes with it. The estimate is kept with its chain,
+    which makes the answers exact in the long run for any number of particles. It suits static nodes that hold
+    the trajectory fast, where ``ParticleGibbs`` mixes slowly. It is called with the template, ``infer(dbn,
+    observations, engine=ParticleMetropolis())``.
 
     Parameters
     ----------

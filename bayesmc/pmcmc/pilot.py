@@ -1,4 +1,4 @@
-"""Where static nodes start, and how many particles they need: a short look at the posterior before the warmup.
+"""Where static nodes start, and how many particles they need: a look at the posterior beforehand.
 
 Candidates from the prior are weighed by filters of few particles, and drawn anew where they weigh most, a few
 times over. It is adaptive importance sampling with weights that are flattened until enough candidates count,

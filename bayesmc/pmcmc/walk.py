@@ -75,7 +75,9 @@ class ParameterWalk(BlockWalk):
         self.statics = self.names
         self.names = (*self.statics, *filter.trellis.names)
         #: chance of a step to anywhere
-        self.anew = 0.0 if self.steps.angles is not None else _ANEW if self.size <= _FEW else _SELDOM
+        self.anew = (
+            0.0 if self.steps.angles is not None else _ANEW if self.size <= _FEW else _SELDOM
+        )
         self.match += f", likelihood by {_particles(filter)}"
 
     def words(self, name: str) -> tuple[str, str]:
@@ -171,7 +173,7 @@ class ParameterWalk(BlockWalk):
     def _tried(
         self, memory: Memory, rng: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where chains might go, which go anywhere, and the log of the chance of going back over that of going.
+        """Where chains might go, which go anywhere, and the log chance of the way back less that of the way.
 
         Which kind a step is does not depend on where a chain is, so that each leaves the posterior invariant.
         """
