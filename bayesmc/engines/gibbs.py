@@ -19,9 +19,10 @@ class Gibbs(ChainEngine):
     """Markov chains that draw every node in turn from its distribution given all others.
 
     What kernel a node gets is found, not declared (`explain` shows the table): nodes on which nothing
-    observed depends are drawn forward; conjugate pairs in closed form; finite nodes by trying all states;
-    numbers by slice sampling; simplices and matrices by an adaptive random walk. All chains and all
-    elements of a plate move in one array operation.
+    observed depends are drawn forward; conjugate pairs in closed form; chains and trees of finite nodes as
+    one, by filtering and sampling along them; other finite nodes by trying all states; numbers by slice
+    sampling; simplices and matrices by an adaptive random walk. All chains and all elements of a plate move
+    in one array operation.
 
     Parameters
     ----------

@@ -222,7 +222,7 @@ def _eliminated(chosen: list[int], near: list[dict[int, int]], first: list[int])
         if not around:
             alone.append(v)
         elif len(around) == 1:
-            (n, e), = around
+            ((n, e),) = around
             leaves.append((v, n, e, first[e] == v))
         else:
             (a, e), (b, f) = around
@@ -264,7 +264,9 @@ def _log_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     top_left, top_right = _top(left), _top(right)
     a, b = np.exp(left - top_left), np.exp(right - top_right)
     if len(left) > _FEW:
-        product = np.moveaxis(np.moveaxis(a, (0, 1), (-1, -2)) @ np.moveaxis(b, (0, 1), (-2, -1)), (-2, -1), (0, 1))
+        product = np.moveaxis(
+            np.moveaxis(a, (0, 1), (-1, -2)) @ np.moveaxis(b, (0, 1), (-2, -1)), (-2, -1), (0, 1)
+        )
     else:
         product = a[0][:, None] * b[0]
         for j in range(1, len(a)):
@@ -272,8 +274,8 @@ def _log_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     log = np.log(product) + top_left[:, None] + top_right
     small = np.nonzero(product < _SMALL)  # what is impossible, and what was lost
     if len(small[0]):
-        i, k, *rest = small
-        log[small] = _log_sum(left[(slice(None), i, *rest)] + right[(slice(None), k, *rest)])
+        i, k, variable, row = small
+        log[small] = _log_sum(left[:, i, variable, row] + right[:, k, variable, row])
     return log
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -98,7 +99,7 @@ class ForestBlock(Kernel):
         self.match = f"filtering and sampling along {size}"
 
     def log_factors(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, bool]:
-        """Log factors on single nodes and on pairs, as ``Forest.draw`` takes them, and whether all are proper.
+        """Log factors on single nodes and on pairs, as ``Forest.draw`` takes them; are all proper?
 
         Rows are chains, and elements of the plates within them.
         """
@@ -117,7 +118,8 @@ class ForestBlock(Kernel):
             log = np.moveaxis(log, axes, axes + 1)  # (*states, terms, chains, *plates)
             log = log.reshape(*log.shape[: axes + 1], rows)
             where = single if axes == 1 else pairs
-            where[(*(slice(0, n) for n in log.shape[:axes]), at)] += log
+            own: Any = (*(slice(0, n) for n in log.shape[:axes]), at)
+            where[own] += log
         return single, pairs, proper
 
     def step(

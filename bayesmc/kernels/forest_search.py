@@ -34,8 +34,8 @@ def forest_blocks(
 ) -> list[ForestBlock]:
     """The blocks of finite nodes that are drawn jointly; nodes that stand in none are left to others.
 
-    Nodes all of whose factors are fixed tables move very fast one by one, and are joined only where they
-    are many of a kind: the slices of a template, or what a loop declared.
+    Nodes all of whose factors are fixed tables move very fast one by one, and are joined only where they,
+    or those beside them, are many of a kind: the slices of a template, or what a loop declared.
 
     Parameters
     ----------
@@ -71,7 +71,9 @@ def forest_blocks(
     eligible = [n for n in names if _is_eligible(target, blankets[n])]
     families = _families(target, eligible)
     tabulated = {n for n in eligible if terms.around((n,)) is not None and not _plated(target, n)}
-    chosen = [n for n in eligible if n not in tabulated or families[n][1] >= FEWEST]
+    wanted = {n for n in eligible if n not in tabulated or families[n][1] >= FEWEST}
+    beside = {n for m in members_of(target, eligible).values() if wanted & set(m) for n in m}
+    chosen = [n for n in eligible if n in wanted | beside]
     by_plates: dict[tuple[str, ...], list[str]] = {}
     for name in chosen:
         by_plates.setdefault(target.model[name].plates, []).append(name)

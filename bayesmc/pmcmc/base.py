@@ -36,14 +36,15 @@ class ParticleEngine(ChainEngine):
 
     Attributes
     ----------
-    particles : int
+    particles : int or None
     """
 
-    particles: int
+    particles: int | None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_count(self, "particles", self.particles, "100")
+        if self.particles is not None:
+            check_count(self, "particles", self.particles, "100")
 
     def unsupported(
         self,

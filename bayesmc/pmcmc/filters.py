@@ -11,6 +11,7 @@ and Schön (2014), Particle Gibbs with ancestor sampling, JMLR 15.
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -66,13 +67,23 @@ class Filter:
     ----------
     trellis : Trellis
     particles : int
+    chosen : bool
+        Whether another number may be chosen for the data (``of``).
     """
 
-    def __init__(self, trellis: Trellis, particles: int) -> None:
-        self.trellis, self.particles = trellis, particles
+    def __init__(self, trellis: Trellis, particles: int, chosen: bool = False) -> None:
+        self.trellis, self.particles, self.chosen = trellis, particles, chosen
         self.plates = {n: (_CHAIN, *trellis.model[n].plates) for n in trellis.series.slices.dynamic}
         self.trailing = {n: len(trellis.model[n].value_shape) for n in self.plates}
         self.apart = (_CHAIN, *trellis.apart)
+
+    def of(self, particles: int) -> Filter:
+        """The filter with another number of particles."""
+        if particles == self.particles:
+            return self
+        other = copy.copy(self)
+        other.particles = particles
+        return other
 
     def run(self, values: Values, chains: int, rng: np.random.Generator) -> History:
         """One filter for the static nodes of every chain.

@@ -34,7 +34,7 @@ class ParticleGibbs(ParticleEngine):
     warmup : int
         Sweeps before that.
     chains : int
-        Chains, all in one array.
+        Chains, all in one array: many cost little more than few.
     particles : int
         Two or more, of each chain; the trajectory that is kept is one of them.
     thinning : int
@@ -69,10 +69,10 @@ class ParticleGibbs(ParticleEngine):
     ((4, 400), True)
     """
 
-    draws: int = 1000
-    warmup: int = 500
-    chains: int = 2
-    particles: int = 100
+    draws: int = 500
+    warmup: int = 100
+    chains: int = 16
+    particles: int = 50
     thinning: int = 1
 
     label: ClassVar[str] = "particle Gibbs"

@@ -17,25 +17,32 @@ from bayesmc.results import Checkpoint
 
 #: errors of the log likelihood beyond which a chain hardly moves, and the best to have
 _NOISY, _BEST = 2.0, 1.2
+#: particles where none are given and nothing is known of the data
+_FIRST = 200
 
 
 @dataclass(frozen=True)
 class ParticleMetropolis(ParticleEngine):
     """Markov chains over static nodes, each step of which runs a particle filter over all rows.
 
-    Static nodes move together by an adaptive random walk on the unconstrained scale; a step is accepted by
-    the filter's estimate of the likelihood, and the trajectory drawn from that filter comes with it. The
-    estimate is kept with its chain, which makes the answers exact in the long run for any number of
-    particles. It suits static nodes that hold the trajectory fast, where ``ParticleGibbs`` mixes slowly. It
-    is called with the template, ``infer(dbn, observations, engine=ParticleMetropolis())``.
+    Static nodes move together on the unconstrained scale, by an adaptive random walk and by steps to anywhere
+    in what the warmup has learnt of the posterior; a step is accepted by the filter's estimate of the
+    likelihood, and the trajectory drawn from that filter comes with it. The estimate is kept with its chain,
+    which makes the answers exact in the long run for any number of particles. It suits static nodes that hold
+    the trajectory fast, where ``ParticleGibbs`` mixes slowly. It is called with the template, ``infer(dbn,
+    observations, engine=ParticleMetropolis())``.
 
     Parameters
     ----------
-    draws, warmup, chains, thinning : int
+    draws, warmup, thinning : int
         As for ``Gibbs``.
-    particles : int
+    chains : int
+        They share one array, so that many cost little more than few.
+    particles : int, optional
         Of each filter. Best is an error of the log likelihood near 1.2 (its variance falls with the number of
-        particles, and rises with that of rows); the warmup measures it, and over 2 there is a warning.
+        particles, and rises with that of rows). By default as many as it takes for that, from 50 to 5,000, by
+        a look at the posterior before the warmup, where chains start, too; the warmup measures the error, and
+        over 2 there is a warning.
 
     Raises
     ------
@@ -62,10 +69,10 @@ class ParticleMetropolis(ParticleEngine):
     ((20, 500), ['scale'])
     """
 
-    draws: int = 1000
-    warmup: int = 1000
-    chains: int = 2
-    particles: int = 200
+    draws: int = 500
+    warmup: int = 100
+    chains: int = 16
+    particles: int | None = None
     thinning: int = 1
 
     label: ClassVar[str] = "particle Metropolis"
@@ -103,14 +110,14 @@ class ParticleMetropolis(ParticleEngine):
 
     def _walk(self, problem: Problem) -> ParameterWalk:
         question = self._question(problem)
-        filter = Filter(question.trellis, self.particles)
+        filter = Filter(question.trellis, self.particles or _FIRST, chosen=self.particles is None)
         return ParameterWalk(question.target, question.statics, filter)
 
     def _posterior(self, problem: Problem, sampler: Any, held: Any, checkpoint: Checkpoint) -> Any:
         (memory,) = checkpoint.state["memory"]
         error = memory["error"]
         if len(memory["looks"]) and error > _NOISY:
-            wanted = self.particles * (error / _BEST) ** 2
+            wanted = memory["particles"] * (error / _BEST) ** 2
             warnings.warn(
                 f"ParticleMetropolis: the log likelihood is estimated with an error of {error:.1f} (standard "
                 f"deviation), so that chains hardly move; give about particles={wanted:.0f}",

@@ -34,6 +34,7 @@ class ParticleSampler(SweepSampler):
         super().__init__(target, kernels)
         self.filter = filter
         walks = [k for k in self.kernels if isinstance(k, ParameterWalk)]
+        self.walk = walks[0] if walks else None
         #: rates are low where estimates are noisy, which is warned of by itself
         self.acceptance_band = {", ".join(walk.statics): (0.02, 0.9) for walk in walks}
 
@@ -48,10 +49,28 @@ class ParticleSampler(SweepSampler):
 
     def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:
         values = self._begun(rng, rows)
+        particles = None if self.walk is None else self._located(values, rng, rows)
         self.target.refresh(values, self.target.chain)
         inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
         memory = [kernel.start(values, rows) for kernel in self.kernels]
+        if particles is not None:
+            memory = [{**m, "particles": particles} for m in memory]
         return {"values": inside, "memory": memory, "chains": chains}
+
+    def _located(self, values: Values, rng: np.random.Generator, rows: int) -> int | None:
+        """Put static nodes near the mass of their posterior; how many particles they need there."""
+        assert self.walk is not None
+        found = self.walk.located(values, rows, rng)
+        if found is None:
+            return None
+        moved, particles = found
+        state = {**values, **moved}
+        self.target.refresh(state, self.walk.statics)
+        history = self.filter.run(state, rows, rng)
+        good = np.isfinite(history.log_likelihood)
+        for name, value in {**moved, **self.filter.drawn(history, rng)}.items():
+            values[name] = instead(~good, value, values[name])
+        return particles
 
     def _begun(self, rng: np.random.Generator, rows: int) -> Values:
         """Static nodes and trajectories of positive density."""

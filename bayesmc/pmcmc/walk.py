@@ -9,14 +9,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import scipy.linalg
 import scipy.special
 
+from bayesmc.engines.starting import start_states
 from bayesmc.kernels.adaptation import chance
 from bayesmc.kernels.base import Memory
 from bayesmc.kernels.densities import accepted, instead
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.random_walk import counted
 from bayesmc.pmcmc.filters import Filter
+from bayesmc.pmcmc.pilot import CANDIDATES, located, particles_for
+from bayesmc.resampling import systematic
 from bayesmc.structure.target import Target, Values
 
 #: sweeps of the warmup between two looks at the error of the estimate, and how much of what was seen is kept
@@ -27,6 +31,12 @@ _MEDIAN = 0.9539
 _FIRST_ERROR = 1.0
 #: share of accepted steps of length zero below which the walk no longer makes up for the error
 _LEAST = 0.25
+#: chance of a step to anywhere; in more than so many dimensions, where few are accepted
+_ANEW, _FEW, _SELDOM = 0.5, 8, 0.1
+#: particles of the first look, the error of the log likelihood to aim at, and how many are taken for that
+_PILOT, _BEST, _PARTICLES = 100, 1.2, (50, 5000)
+#: degrees of freedom of such steps, and how much wider than what was learnt they are
+_DF, _WIDER = 5.0, 1.2
 
 
 class ParameterWalk(BlockWalk):
@@ -42,6 +52,10 @@ class ParameterWalk(BlockWalk):
 
     Notes
     -----
+    Half of the steps do not start from where a chain is: they are drawn from a Student distribution with the
+    mean and the covariance that the warmup has learnt (for angles, and in many dimensions, there are none or
+    few).
+
     An error of the log likelihood lowers the rate at which steps are accepted, by ``erfc(sd / 2)`` for steps
     of length zero. The warmup measures it, and aims at that share of the usual rate, so that steps do not
     shrink because particles are few.
@@ -60,7 +74,11 @@ class ParameterWalk(BlockWalk):
         self.filter = filter
         self.statics = self.names
         self.names = (*self.statics, *filter.trellis.names)
-        self.match += f", likelihood by {filter.particles} particles"
+        #: chance of a step to anywhere
+        self.anew = (
+            0.0 if self.steps.angles is not None else _ANEW if self.size <= _FEW else _SELDOM
+        )
+        self.match += f", likelihood by {_particles(filter)}"
 
     def words(self, name: str) -> tuple[str, str]:
         if name in self.statics:
@@ -74,6 +92,7 @@ class ParameterWalk(BlockWalk):
             "u": u,
             "log": log,
             "log_likelihood": None,
+            "particles": self.filter.particles,
             "error": _FIRST_ERROR,
             "looks": np.zeros(0),
             "sweep": 0,
@@ -86,16 +105,16 @@ class ParameterWalk(BlockWalk):
     ) -> tuple[Values, Memory]:
         now = {n: values[n] for n in self.names}
         if memory["log_likelihood"] is None:
-            found, likelihood = self._estimated(values, rng)
+            found, likelihood = self._estimated(values, memory, rng)
             now = {**now, **found}
             memory = {**memory, "log_likelihood": likelihood}
         u, log, likelihood = memory["u"], memory["log"], memory["log_likelihood"]
-        tried = u + self.steps.draw(memory["steps"], rng)[:, 0]
+        tried, anew, backward = self._tried(memory, rng)
         moved, grown = self._evaluated({**values, **now}, tried)
         state = {**values, **moved}
         self.block.target.refresh(state, self.statics)
-        found, estimate = self._estimated(state, rng)
-        log_ratio = (grown - log) + (estimate - likelihood)
+        found, estimate = self._estimated(state, memory, rng)
+        log_ratio = (grown - log) + (estimate - likelihood) + backward
         accept = accepted(log_ratio, rng)
         new = {n: instead(~accept, v, now[n]) for n, v in {**moved, **found}.items()}
         memory = {
@@ -106,14 +125,70 @@ class ParameterWalk(BlockWalk):
         }
         if not warmup:
             return new, counted(memory, accept)
-        return new, self._adapted({**values, **new}, memory, chance(log_ratio), rng)
+        rates = np.where(anew, np.nan, chance(log_ratio))
+        return new, self._adapted({**values, **new}, memory, rates, rng)
+
+    def located(
+        self, values: Values, chains: int, rng: np.random.Generator
+    ) -> tuple[Values, int] | None:
+        """Values of the static nodes near the mass of their posterior, and how many particles to take.
+
+        None where no candidate is possible; ``values`` has those of other nodes, and as many rows.
+        """
+        prior, count = self.block.target, max(chains, CANDIDATES)
+        start = start_states(prior, count, rng)
+        u, _ = self._placed(start)
+        start = {**{n: values[n] for n in self.names}, **start}  # trajectories are not looked at
+        filter = self.filter.of(_PILOT) if self.filter.chosen else self.filter
+
+        def weigh(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            moved, log = self._evaluated(start, points)
+            state = {**start, **moved}
+            prior.refresh(state, self.statics)
+            return log, filter.run(state, len(points), rng).log_likelihood
+
+        first = weigh(u)[1]
+        if not np.isfinite(first).any():
+            return None
+        points, weights = located(u, first, weigh, rng)
+        chosen = points[systematic(weights, chains, rng)]
+        rows = {n: v[:chains] if n in self.statics else v for n, v in start.items()}
+        moved = {n: v for n, v in self._evaluated(rows, chosen)[0].items() if n in self.statics}
+        if not self.filter.chosen:
+            return moved, self.filter.particles
+        best = points[np.argmin(np.square(points - weights @ points).sum(axis=1))]
+        estimates = weigh(np.tile(best, (count, 1)))[1]
+        return moved, particles_for(estimates, _PILOT, _BEST, *_PARTICLES)
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _estimated(self, values: Values, rng: np.random.Generator) -> tuple[Values, np.ndarray]:
+    def _estimated(
+        self, values: Values, memory: Memory, rng: np.random.Generator
+    ) -> tuple[Values, np.ndarray]:
         """A trajectory given the static nodes, and the log of an estimate of their likelihood."""
-        history = self.filter.run(values, len(values[self.statics[0]]), rng)
-        return self.filter.drawn(history, rng), history.log_likelihood
+        filter = self.filter.of(memory["particles"])
+        history = filter.run(values, len(values[self.statics[0]]), rng)
+        return filter.drawn(history, rng), history.log_likelihood
+
+    def _tried(
+        self, memory: Memory, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where chains might go, which go anywhere, and the log chance of the way back less that of the way.
+
+        Which kind a step is does not depend on where a chain is, so that each leaves the posterior invariant.
+        """
+        u = memory["u"]
+        tried = u + self.steps.draw(memory["steps"], rng)[:, 0]
+        anew = rng.random(len(u)) < self.anew
+        if not anew.any():
+            return tried, anew, np.zeros(len(u))
+        factor = np.linalg.cholesky(_widened(memory["steps"]["cov"][0]))
+        mean = memory["steps"]["mean"][0]
+        normal = rng.standard_normal(u.shape) @ factor.T
+        heavy = np.sqrt(_DF / rng.chisquare(_DF, len(u)))[:, None]
+        tried = np.where(anew[:, None], mean + heavy * normal, tried)
+        backward = _student(u - mean, factor) - _student(tried - mean, factor)
+        return tried, anew, np.where(anew, backward, 0.0)
 
     def _adapted(
         self, values: Values, memory: Memory, rates: np.ndarray, rng: np.random.Generator
@@ -122,13 +197,13 @@ class ParameterWalk(BlockWalk):
         sweep = memory["sweep"] + 1
         memory = {**memory, "sweep": sweep}
         share = max(float(scipy.special.erfc(memory["error"] / 2.0)), _LEAST)
-        rates = np.minimum(rates / share, 1.0)[:, None]
+        rates = np.minimum(rates / share, 1.0)[:, None]  # NaN where no step was one of the walk's
         steps = self.steps.learnt(memory["steps"], memory["u"][:, None], rates)
         memory["steps"] = steps
         if sweep % _EVERY:
             return memory
         self.block.target.refresh(values, self.statics)
-        once, twice = (self._estimated(values, rng)[1] for _ in range(2))
+        once, twice = (self._estimated(values, memory, rng)[1] for _ in range(2))
         with np.errstate(invalid="ignore"):
             apart = np.abs(once - twice)
         looks = np.concatenate([memory["looks"], apart[~np.isnan(apart)]])[-_KEPT:]
@@ -147,3 +222,25 @@ def prior_of(target: Target, statics: tuple[str, ...]) -> Target:
             reached.add(link)
             links.append(link)
     return replace(target, chain=tuple(terms), links=tuple(links), terms=terms, _below={})
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _particles(filter: Filter) -> str:
+    return "as many particles as it takes" if filter.chosen else f"{filter.particles} particles"
+
+
+def _widened(cov: np.ndarray) -> np.ndarray:
+    """A covariance made wider, and positive definite where chains have hardly moved."""
+    wider = _WIDER**2 * cov
+    at = np.diag_indices_from(wider)
+    wider[at] += 1e-6 * wider[at] + 1e-300
+    return wider
+
+
+def _student(away: np.ndarray, factor: np.ndarray) -> np.ndarray:
+    """Log density of a Student distribution up to a constant."""
+    scaled = scipy.linalg.solve_triangular(factor, away.T, lower=True)
+    square = np.square(scaled).sum(axis=0)
+    return -0.5 * (_DF + away.shape[1]) * np.log1p(square / _DF)

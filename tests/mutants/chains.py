@@ -157,18 +157,18 @@ def three() -> bmc.BayesNet:
 
 
 def slices() -> bmc.BayesNet:
-    """A hidden chain of four states that are more likely to go up than down, part of it seen."""
+    """A hidden chain of five states that are more likely to go up than down, its middle and end seen."""
     net = bmc.BayesNet()
     net.add("s[0]", bmc.Bernoulli(0.3))
-    for t in range(1, 4):
+    for t in range(1, 5):
         net.add(f"s[{t}]", lambda s: bmc.Bernoulli(0.35 + 0.5 * s), parents=[f"s[{t - 1}]"])
-    for t in (1, 3):
+    for t in (2, 4):
         net.add(f"y[{t}]", lambda s: bmc.Bernoulli(0.2 + 0.5 * s), parents=[f"s[{t}]"])
     return net
 
 
 def of_slices(seed: int) -> Verdict:
-    return invariant(bmc.Gibbs(), slices(), {"y[1]": 1, "y[3]": 0}, alpha=ALPHA, rng=seed)
+    return invariant(bmc.Gibbs(), slices(), {"y[2]": 1, "y[4]": 0}, alpha=ALPHA, rng=seed)
 
 
 def enumerated(target: Any) -> Enumerate:
