@@ -7,6 +7,7 @@ out while the slices passed by. What a family keeps besides (particles, joint co
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,11 @@ class SeriesPosterior:
         Whether particles were drawn anew, since no weight was left; evidence and answers are biased then.
     queries : dict
         Name -> expectation of a function in every slice, time first.
+    log_marginal_likelihood_mcse : float, ndarray or None
+        Root mean square error of the log evidence by Monte Carlo, its bias included; its shape. 0 where it is
+        exact, infinite where the particles cannot tell it, None where nothing is known of it.
+    queries_mcse : dict
+        Name -> Monte Carlo standard errors of ``queries``, of particles.
 
     Examples
     --------
@@ -58,6 +64,10 @@ class SeriesPosterior:
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None
     rejuvenated: np.ndarray | None = None
+    log_marginal_likelihood_mcse: Any = None
+    queries_mcse: Mapping[str, np.ndarray] = MappingProxyType({})
+    #: errors of means by node, time first; a node that is left out has none
+    mean_errors: Mapping[str, np.ndarray] | None = None
 
     def __init__(
         self,
@@ -130,6 +140,32 @@ class SeriesPosterior:
             )
         return self._tables[name].copy()
 
+    def mcse(self, what: Any) -> np.ndarray:
+        """Monte Carlo standard errors of ``mean(name)``, time first; of each probability, for labels.
+
+        Answers that nothing was drawn for have none: 0. What a filter leaves out by its assumptions (an
+        extended Kalman filter's tangents, say) is no part of it. Those of particles come from the families
+        of particles of earlier slices (see ``ParticleFilter``).
+
+        Raises
+        ------
+        UnknownNodeError
+        UnsupportedError
+            Functions, unless particles are kept; trajectories that were drawn backwards by ``smooth``, which
+            state none (with ``lag=`` they do).
+        """
+        if callable(what):
+            raise UnsupportedError(
+                "mcse: give a node's name, or the function in queries=, whose errors are in queries_mcse"
+            )
+        node = self._node(what)
+        if self.mean_errors is None and self.weight_ess is not None:
+            raise self._no_errors()
+        if self.mean_errors is not None and what in self.mean_errors:
+            return self.mean_errors[what].copy()
+        labelled = node.domain is not None and node.domain.labels is not None
+        return np.zeros(np.shape(self.probabilities(what) if labelled else self.mean(what)))
+
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
 
@@ -143,6 +179,9 @@ class SeriesPosterior:
         )  # fmt: skip
         if self.weight_ess is not None:
             found.weight_ess = self.weight_ess[-steps:]
+        if self.mean_errors is not None:
+            found.mean_errors = cut(self.mean_errors)
+        found.queries_mcse = cut(self.queries_mcse)
         return found
 
     def __getstate__(self) -> dict[str, Any]:
@@ -166,6 +205,12 @@ class SeriesPosterior:
                 "queries={name: function}"
             )
         return node
+
+    def _no_errors(self) -> UnsupportedError:
+        return UnsupportedError(
+            "mcse: trajectories that were drawn backwards state no errors of their means; run with a few "
+            "seeds, or smooth with lag="
+        )
 
     def _not_kept(self, what: str) -> UnsupportedError:
         return UnsupportedError(
