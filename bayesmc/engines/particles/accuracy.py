@@ -1,8 +1,7 @@
 """Errors of means: by how far the families of a slice differ.
 
 Each family's part of a weighted mean is nearly independent of the others', so the sum of their squares is its
-variance (``families`` says why), with a correction for what the mean owes to the family itself. Small clouds
-are taken many slices at a time, since what costs there is calling NumPy.
+variance (``families`` says why), with a correction for what the mean owes to the family itself.
 """
 
 from __future__ import annotations
@@ -16,26 +15,25 @@ from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.engines.particles.families import OLD, YOUNG, Families, group_sums, row_sums
 from bayesmc.network import CompiledNode
 
-#: numbers of a node that are taken together: larger arrays cost the machine a page at a time
-BATCH = 14_000
 #: particles above which families are taken one by one, without a copy
 MANY = 30_000
-#: even families below which the young origin is asked, too
-ENOUGH = 8.0
+#: even families below which the young origin is asked, too; if it has no more than so many, nobody knows
+ENOUGH, LAST = 8.0, 1.1
 
 
 class MeanErrors:
     """Errors of the means of nodes, written as the slices pass; read them by ``found``.
+
+    Of nodes that are one number, the sums over families are kept, and what they come to is worked out in the
+    end, for all slices at a time: what costs here is calling NumPy.
 
     Parameters
     ----------
     layout : Layout
     nodes : sequence of CompiledNode
     steps : int
-    means, variances, tables : dict
-        What the clouds say, time first; entries must be there when their slice is added.
-    together : bool
-        Whether clouds stay as they are, so that many can be taken at a time.
+    answers : tuple of dict
+        Means, variances and tables, time first; entries must be there when their slice is added.
     """
 
     def __init__(
@@ -44,75 +42,98 @@ class MeanErrors:
         nodes: Sequence[CompiledNode],
         steps: int,
         answers: tuple[Mapping[str, np.ndarray], ...],
-        together: bool,
     ) -> None:
         self.layout, self.nodes, self.answers = layout, nodes, answers
-        most = max((int(np.prod(n.value_shape)) for n in nodes), default=1)
-        few = together and not layout.apart
-        self._batch = BATCH // (layout.particles * max(most, 1)) if few else 1
-        self._waiting: list[tuple[int, Cloud, np.ndarray]] = []
         self._found = {n.name: np.zeros((steps, *_shape(n))) for n in nodes}
+        self._plain = frozenset(
+            n.name
+            for n in nodes
+            if n.domain is None and n.angles is None and not n.value_shape and not layout.apart
+        )
+        #: of each origin: slices, and shares and parts of the means of its families
+        self._parts: tuple[_Parts, _Parts] = (_Parts(self._plain), _Parts(self._plain))
 
     def add(self, k: int, cloud: Cloud, families: Families) -> None:
         """Take in the cloud of the k-th slice."""
-        waiting = self._waiting
-        if waiting and len(waiting[0][1].weights) != len(cloud.weights):
-            self._settle()
-        self._waiting.append((k, cloud, families.bounds))
-        if len(self._waiting) >= self._batch:
-            self._settle()
+        means, variances, tables = self.answers
+        if self._plain:
+            self._add_plain(k, cloud, families)
+        for node in self.nodes:
+            name, value = node.name, cloud.values[node.name]
+            if value.ndim == len(node.value_shape) or name in self._plain:
+                continue
+            if node.domain is not None:
+                centre: Any = (tables[name][k : k + 1], None)
+            else:
+                centre = (means[name][k : k + 1], variances[name][k : k + 1])
+            found = node_errors(self.layout, cloud, families.bounds, node, centre)
+            self._found[name][k] = found
 
     def found(self) -> dict[str, np.ndarray]:
         """Errors by node, time first, shape of the mean; of each state's probability, for labels."""
-        self._settle()
+        for name in self._plain:
+            mean, variance = self.answers[0][name], np.zeros(len(self._found[name]))
+            for parts in self._parts:
+                at, sums, shares = parts.of(name)
+                if len(at):
+                    found = _by_shares(sums - shares * mean[at, None], shares)
+                    if parts is self._parts[YOUNG]:
+                        found[(shares**2).sum(axis=1) > 1.0 / LAST] = np.inf
+                    variance[at] = np.maximum(variance[at], found)
+            self._found[name] = np.sqrt(variance)
         return self._found
 
-    def _settle(self) -> None:
-        waiting, self._waiting = self._waiting, []
-        if not waiting:
-            return
-        means, variances, tables = self.answers
-        for node in self.nodes:
-            name, rank = node.name, len(node.value_shape)
-            rows = [w for w in waiting if w[1].values[name].ndim > rank]
-            if not rows:
-                continue
-            at = [k for k, _, _ in rows]
-            if node.domain is not None:
-                centre: Any = (tables[name][at], None)
-            else:
-                centre = (means[name][at], variances[name][at])
-            errors = node_errors(
-                self.layout, [c for _, c, _ in rows], [b for _, _, b in rows], node, centre
-            )
-            self._found[name][at] = errors
+    def _add_plain(self, k: int, cloud: Cloud, families: Families) -> None:
+        weights, total = cloud.weights, cloud.total
+        for bounds, parts in zip(families.bounds, self._parts, strict=True):
+            shares = group_sums(weights, bounds) / total
+            for name in self._plain:
+                value = cloud.values[name]
+                if value.ndim:
+                    parts.add(name, k, _plain_sums(weights, value, bounds) / total, shares)
+            if shares.dot(shares) * ENOUGH < 1.0:  # else the young origin is asked, too
+                break
+
+
+class _Parts:
+    """What families have of the means of nodes that are one number."""
+
+    def __init__(self, names: frozenset[str]) -> None:
+        self._rows: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {n: [] for n in names}
+
+    def add(self, name: str, k: int, sums: np.ndarray, shares: np.ndarray) -> None:
+        self._rows[name].append((k, sums, shares))
+
+    def of(self, name: str) -> tuple[list[int], np.ndarray, np.ndarray]:
+        """Slices, parts and shares, slices first."""
+        rows = self._rows[name]
+        if not rows:
+            return [], np.zeros(0), np.zeros(0)
+        at, sums, shares = zip(*rows, strict=True)
+        return list(at), np.stack(sums), np.stack(shares)
 
 
 def node_errors(
     layout: Layout,
-    clouds: Sequence[Cloud],
-    bounds: Sequence[np.ndarray],
+    cloud: Cloud,
+    bounds: np.ndarray,
     node: CompiledNode,
     centre: tuple[np.ndarray, np.ndarray | None],
 ) -> np.ndarray:
-    """Errors of a node's mean, or of its states' probabilities where they have labels, slices first.
+    """Errors of a node's mean, or of its states' probabilities where they have labels.
 
     Parameters
     ----------
     layout : Layout
-    clouds : sequence of Cloud
-        Of as many particles each; one, where plates are filtered separately.
-    bounds : sequence of ndarray, shape (2, groups + 1, *apart)
-        The families of each.
+    cloud : Cloud
+    bounds : ndarray of int, shape (2, groups + 1, *apart)
     node : CompiledNode
     centre : tuple
-        Its mean and variance in each slice, or its table and None.
+        Its mean and variance, or its table and None, with an axis of length 1 in front.
     """
     mean, variance = centre
     count = None
-    if node.domain is None and node.angles is None and _is_large(clouds, layout):
-        return np.sqrt(_of_slices(clouds[0], bounds[0], clouds[0].values[node.name], mean[0]))[None]
-    value = np.stack([c.values[node.name] for c in clouds])
+    value = cloud.values[node.name][None]
     if node.domain is None:
         off = value - mean[:, None]
         if node.angles is not None:
@@ -127,13 +148,13 @@ def node_errors(
         off = (value[..., None] == np.arange(node.domain.size)) - mean[:, None]
         count = mean
     if not layout.apart:
-        found = _variances(np.stack([c.weights for c in clouds]), off, np.stack(bounds, axis=-1))
-        ess: Any = np.array([c.ess for c in clouds])
+        found = _variances(cloud.weights[None], off, bounds[..., None])
+        ess: Any = np.array([cloud.ess])
     else:
-        found, ess = _of_plates(layout, clouds[0], bounds[0], node, off[0])
+        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
     if count is not None:
         found = np.maximum(found, _unseen(count, _beside(ess, node, layout, count.ndim)))
-    return np.sqrt(found)
+    return np.sqrt(found[0])
 
 
 def value_errors(
@@ -179,7 +200,8 @@ def _variances(weights: np.ndarray, off: np.ndarray, bounds: np.ndarray) -> np.n
     found, even = _of_families(weights, weighted, bounds[OLD], total)
     few = even < ENOUGH
     if few.any():
-        young, _ = _of_families(weights[few], weighted[few], bounds[YOUNG][:, few], total[few])
+        young, left = _of_families(weights[few], weighted[few], bounds[YOUNG][:, few], total[few])
+        young[left < LAST] = np.inf
         found[few] = np.maximum(found[few], young)
     return found
 
@@ -192,32 +214,22 @@ def _of_families(
     parts = row_sums(weighted, bounds)
     tail = (1,) * (parts.ndim - 2)
     parts /= total.reshape(-1, 1, *tail)
-    left = np.maximum(1.0 - shares, 1e-12)
-    found = (parts**2 / left.reshape(*left.shape, *tail)).sum(axis=1)
-    return found, 1.0 / (shares**2).sum(axis=1)
+    even = 1.0 / (shares**2).sum(axis=1)
+    return _by_shares(parts, shares.reshape(*shares.shape, *tail)), even
 
 
-def _is_large(clouds: Sequence[Cloud], layout: Layout) -> bool:
-    return len(clouds[0].weights) > MANY and len(clouds) == 1 and not layout.apart
+def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Variances by parts ``(rows, groups, *rest)`` of means, with what these owe to each family."""
+    return (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=1)
 
 
-def _of_slices(cloud: Cloud, bounds: np.ndarray, value: np.ndarray, mean: np.ndarray) -> np.ndarray:
-    """Variance of the mean of numbers of one cloud, family by family."""
-    flat, centre = value.reshape(len(value), -1), np.reshape(mean, -1)
-    shape = value.shape[1:]
-
-    def by(edges: np.ndarray) -> tuple[np.ndarray, float]:
-        pairs = list(zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True))
-        shares = group_sums(cloud.weights, edges) / cloud.total
-        sums = np.array([cloud.weights[a:b].dot(flat[a:b]) for a, b in pairs]) / cloud.total
-        parts = sums - shares[:, None] * centre
-        left = np.maximum(1.0 - shares, 1e-12)
-        return (parts**2 / left[:, None]).sum(axis=0), 1.0 / (shares**2).sum()
-
-    found, even = by(bounds[OLD])
-    if even < ENOUGH:
-        found = np.maximum(found, by(bounds[YOUNG])[0])
-    return found.reshape(shape)
+def _plain_sums(weights: np.ndarray, value: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Weighted sums of one number over families."""
+    if len(weights) <= MANY:
+        return group_sums(weights * value, bounds)
+    edges = bounds.tolist()
+    pairs = zip(edges[:-1], edges[1:], strict=True)
+    return np.array([weights[a:b].dot(value[a:b]) for a, b in pairs])
 
 
 def _of_plates(

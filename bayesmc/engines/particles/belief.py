@@ -133,7 +133,7 @@ class ParticleBelief:
         else:
             mean, variance = moments(layout, cloud, node, value)
             centre = (np.asarray(mean)[None], np.asarray(variance)[None])
-        return node_errors(layout, [cloud], [bounds], node, centre)[0]
+        return node_errors(layout, cloud, bounds, node, centre)
 
     def particles(self, name: str) -> np.ndarray:
         """Values of all particles, ``(particles, *plates, *event)``, not weighted."""

@@ -2,9 +2,9 @@
 
 The particles of an earlier slice, its *origin*, are cut into a few groups of neighbours. Ancestors are
 sorted, so the descendants of a group are neighbours, too, in every later slice: a family is two positions,
-and to follow it costs a search. Families hardly meet (resampling lets a family have about as many particles as its
-weight demands), so each is nearly a filter of its own, and what their shares of the weight differ by says how
-far the sum of all is off: batch means, over a genealogy.
+and to follow it costs a search. Families hardly meet (resampling lets a family have about as many particles
+as its weight demands), so each is nearly a filter of its own, and what their shares of the weight differ by
+says how far the sum of all is off: batch means, over a genealogy.
 
 An origin must be old enough for its errors to have shown, and young enough for many families to be left. So
 there are two, and what happens between them is settled by the families of both when the older one is given
@@ -18,8 +18,9 @@ References
 ----------
 Chan and Lai (2013), A general theory of particle filters in hidden Markov models, Ann. Statist. 41; Lee and
 Whiteley (2018), Variance estimation in the particle filter, Biometrika 105; Olsson and Douc (2019),
-Numerically stable online estimation of variance in particle filters, Bernoulli 25. Their families have one founder, which
-is right for multinomial resampling; other schemes leave a group its share, so here groups found families.
+Numerically stable online estimation of variance in particle filters, Bernoulli 25. Their families have one
+founder, which is right for multinomial resampling; other schemes leave a group its share, so here groups
+found families.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ import numpy as np
 from bayesmc.engines.particles.cloud import Cloud, Layout
 
 #: families of an origin, and founders of each, at least, where there are particles enough
-GROUPS, LEAST = 32, 8
+GROUPS, LEAST = 32, 4
 #: slices after which the younger origin takes over, at the latest and at the soonest
 LONGEST, SHORTEST = 50, 6
 #: slices from one look at the families to the next
@@ -240,13 +241,18 @@ def _begun_again(
     """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
     groups = families.shares.shape[1]
     bounds, shares = _even(len(cloud.weights), groups, cloud.weights.ndim - 1)
-    fresh = (bounds, shares, 0.0, 0.0, cloud.t)
-    found = []
+    fresh: tuple[Any, ...] = (bounds, shares, 0.0, 0.0, cloud.t)
+    found: list[np.ndarray] = []
+    if cloud.weights.ndim == 1:
+        for value, new in zip(families[:5], fresh, strict=True):
+            found.append(np.empty_like(value))
+            found[-1][OLD], found[-1][YOUNG] = new if both else value[YOUNG], new
+        return Families._make([*found, settled])
     for value, new in zip(families[:5], fresh, strict=True):
         young = np.broadcast_to(new, value[YOUNG].shape)
         old = young if both else value[YOUNG]
         found.append(np.where(where, np.stack([old, young]), value))
-    return Families(*found, settled)
+    return Families._make([*found, settled])
 
 
 def _weights(families: Families, cloud: Cloud) -> np.ndarray:

@@ -128,13 +128,12 @@ class ParticleFilter(FilterEngine):
     Notes
     -----
     Answers state their own errors: ``log_marginal_likelihood_mcse``, ``mcse(name)`` and ``queries_mcse``.
-    They come from the genealogy: particles of a slice are cut into groups of neighbours, and what the shares of
-    their descendants differ by says how far all together are off (as Chan and Lai 2013 and Lee and Whiteley
-    2018 do with single particles; groups make it right for systematic resampling, too). That of the evidence
-    is the root of the mean square error, sqrt(v + v^2/4) for a variance of the log of v, since its log is
-    v/2 too low on average. Particles know nothing of where none of them has been: the error is infinite where
-    a slice rests on fewer than four, or their descendants show that later rows ask for the edge of the
-    cloud.
+    They come from the genealogy: particles of a slice are cut into groups of neighbours, and what the shares
+    of their descendants differ by says how far all together are off (as Chan and Lai 2013 and Lee and
+    Whiteley 2018 do with single particles; groups make it right for systematic resampling, too). That of the
+    evidence is the root of the mean square error, sqrt(v + v^2/4) for a log of variance v, which is v/2 too
+    low on average. Particles know nothing of where none of them has been: the error is infinite where a slice
+    rests on fewer than four, or their descendants show that later rows ask for the edge of the cloud.
 
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
     sequences in a plate are 64 filters in one array.
@@ -331,7 +330,7 @@ class ParticleFilter(FilterEngine):
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
         if self.particles is None:
-            options = {"lag": lag, "queries": queries, "progress": progress}
+            options: dict[str, Any] = {"lag": lag, "queries": queries, "progress": progress}
             return self._sized(START).smooth(problem, seed, **options)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)

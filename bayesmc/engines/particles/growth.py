@@ -109,7 +109,7 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     if engine.particles is None and engine.adapt is None:
         more = f"a larger budget= than {engine.budget:_}"
     return (
-        f"{int(filtered.counts.max())} particles {said}, and figures after rows that were hard to explain may "
+        f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
         f"be off as well (weight_ess is lowest in slice {filtered.start + at}: {ess[at]:.1f}); use {more}, a "
         "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
     )

@@ -64,9 +64,11 @@ class Record:
         self.anew = np.zeros(steps, dtype=np.intp)
         self._nodes = [(n, model[n], len(model[n].value_shape)) for n in problem.hidden]
         self.errors = MeanErrors(
-            layout, [model[n] for n in problem.hidden], steps,
-            (self.means, self.variances, self.tables), keep or layout.particles <= layout.block,
-        )  # fmt: skip
+            layout,
+            [model[n] for n in problem.hidden],
+            steps,
+            (self.means, self.variances, self.tables),
+        )
         self.query_errors: dict[str, list[np.ndarray]] = {n: [] for n in queries}
         self._last: tuple[Families, Cloud] | None = None
         self.families: list[Families] | None = [] if keep else None
