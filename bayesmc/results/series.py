@@ -33,10 +33,10 @@ class SeriesPosterior:
         Log density of all rows; one for each element of the plates that are filtered separately.
     log_marginal_increments : ndarray, shape (time,) or (time, *plates)
         Log density of each row given those before; they add up to the above.
-    log_marginal_likelihood_mcse : float or ndarray
-        Its error: the Monte Carlo standard error of filters that draw, a bound for a grid that was found
-        (NaN for one that was given), 0 where it is computed; what tangents and sigma points leave out is no
-        part of it.
+    log_marginal_likelihood_mcse : float, ndarray or None
+        Its error: the root mean square error of filters that draw (bias included, infinite where the
+        particles cannot tell it), a bound for a grid that was found (NaN for one that was given), 0 where it
+        is computed; what tangents and sigma points leave out is no part of it.
     weight_ess : ndarray or None, shape (time,) or (time, *plates)
         Equally weighted particles that those of each slice are worth, before they are resampled.
     resampled : ndarray of bool or None
@@ -54,6 +54,8 @@ class SeriesPosterior:
         every 32nd), with a few rows drawn from their particles. None from other engines.
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
+    queries_mcse : dict
+        Name -> Monte Carlo standard errors of ``queries``, of particles.
 
     Examples
     --------
@@ -66,12 +68,14 @@ class SeriesPosterior:
     [[0.182, 0.818], [0.117, 0.883]]
     """
 
-    log_marginal_likelihood_mcse: Any = 0.0
     weight_ess: np.ndarray | None = None
     resampled: np.ndarray | None = None
     unique_ancestors: np.ndarray | None = None
     rejuvenated: np.ndarray | None = None
     predictive: Predictive | None = None
+    log_marginal_likelihood_mcse: Any = None
+    #: errors of means by node, time first; a node that is left out has none
+    mean_errors: Mapping[str, np.ndarray] | None = None
 
     def __init__(
         self,
@@ -94,12 +98,14 @@ class SeriesPosterior:
         self._means = dict(means or {})
         self._variances = dict(variances or {})
         self.queries = dict(queries or {})
+        self.queries_mcse: dict[str, np.ndarray] = {}
         self.start = start
         self.log_marginal_increments = increments
         self.log_marginal_likelihood: Any = None
         if increments is not None:
             total = increments.sum(axis=0)
             self.log_marginal_likelihood = total if increments.ndim > 1 else float(total)
+            self.log_marginal_likelihood_mcse = np.zeros(total.shape) if total.ndim else 0.0
         answered = next(iter([*self._tables.values(), *self._means.values()]), None)
         if steps is None:
             found = increments if increments is not None else answered
@@ -204,6 +210,32 @@ class SeriesPosterior:
             )
         return self.predictive.ranks[name].copy()
 
+    def mcse(self, what: Any) -> np.ndarray:
+        """Monte Carlo standard errors of ``mean(name)``, time first; of each probability, for labels.
+
+        Answers that nothing was drawn for have none: 0. What a filter leaves out by its assumptions (an
+        extended Kalman filter's tangents, say) is no part of it. Those of particles come from the families
+        of particles of earlier slices (see ``ParticleFilter``).
+
+        Raises
+        ------
+        UnknownNodeError
+        UnsupportedError
+            Functions, unless particles are kept; trajectories that were drawn backwards by ``smooth``, which
+            state none (with ``lag=`` they do).
+        """
+        if callable(what):
+            raise UnsupportedError(
+                "mcse: give a node's name, or the function in queries=, whose errors are in queries_mcse"
+            )
+        node = self._node(what)
+        if self.mean_errors is None and self.weight_ess is not None:
+            raise self._no_errors()
+        if self.mean_errors is not None and what in self.mean_errors:
+            return self.mean_errors[what].copy()
+        labelled = node.domain is not None and node.domain.labels is not None
+        return np.zeros(np.shape(self.probabilities(what) if labelled else self.mean(what)))
+
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
 
@@ -217,6 +249,9 @@ class SeriesPosterior:
         )  # fmt: skip
         if self.weight_ess is not None:
             found.weight_ess = self.weight_ess[-steps:]
+        if self.mean_errors is not None:
+            found.mean_errors = cut(self.mean_errors)
+        found.queries_mcse = cut(self.queries_mcse)
         return found
 
     def __getstate__(self) -> dict[str, Any]:
@@ -240,6 +275,12 @@ class SeriesPosterior:
                 "queries={name: function}"
             )
         return node
+
+    def _no_errors(self) -> UnsupportedError:
+        return UnsupportedError(
+            "mcse: trajectories that were drawn backwards state no errors of their means; run with a few "
+            "seeds, or smooth with lag="
+        )
 
     def _not_kept(self, what: str) -> UnsupportedError:
         return UnsupportedError(

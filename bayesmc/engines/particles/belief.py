@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
+from bayesmc.engines.particles.accuracy import node_errors, value_errors
 from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.families import Families, evidence_error
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
@@ -25,6 +27,8 @@ class ParticleBelief:
         The slice; -1 before anything was absorbed.
     log_marginal_likelihood : float or ndarray
         Log density of all rows absorbed so far.
+    log_marginal_likelihood_mcse : float or ndarray
+        Its root mean square error.
     weight_ess : float or ndarray
         Equally weighted particles that these are worth.
     resampled : bool or ndarray of bool
@@ -59,10 +63,12 @@ class ParticleBelief:
         log_marginal_likelihood: Any = 0.0,
         chance: Mapping[str, Any] | None = None,
         inputs: Mapping[str, np.ndarray] | None = None,
+        families: Families | None = None,
     ) -> None:
         self.dbn, self.seed, self.static = dbn, seed, dict(static)
         self.mover, self.cloud, self.chance = mover, cloud, chance
         self.inputs = dict(inputs or {})
+        self.families = families
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if cloud is None else cloud.t
 
@@ -99,6 +105,35 @@ class ParticleBelief:
     def names(self) -> tuple[str, ...]:
         """Nodes whose particles are kept."""
         return tuple(self._cloud.values)
+
+    @property
+    def log_marginal_likelihood_mcse(self) -> Any:
+        """Root mean square error of ``log_marginal_likelihood``; infinite where particles cannot tell it."""
+        if self.cloud is None or self.families is None:
+            return 0.0
+        return evidence_error(self.families, self.cloud)
+
+    def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
+        """Monte Carlo standard error of ``mean(name)`` or of a function's expectation or probability.
+
+        Its shape; of each state's probability, for labels.
+        """
+        cloud, layout = self._cloud, self._mover.layout
+        assert self.families is not None
+        bounds = self.families.bounds
+        if callable(what):
+            values = evaluated(layout, cloud, self._mover.slices.first, what)
+            return value_errors(layout, cloud, bounds, values, weighted_mean(cloud, values))
+        node, value = self._found(what)
+        if value.ndim == len(node.value_shape):  # the same for all particles
+            labelled = node.domain is not None and node.domain.labels is not None
+            return np.zeros(np.shape(self.probabilities(what) if labelled else self.mean(what)))
+        if node.domain is not None:
+            centre: Any = (self.probabilities(what)[None], None)
+        else:
+            mean, variance = moments(layout, cloud, node, value)
+            centre = (np.asarray(mean)[None], np.asarray(variance)[None])
+        return node_errors(layout, cloud, bounds, node, centre)
 
     def particles(self, name: str) -> np.ndarray:
         """Values of all particles, ``(particles, *plates, *event)``, not weighted."""
@@ -185,6 +220,17 @@ def expectation(
     read: Callable[[np.ndarray], np.ndarray] = np.asarray,
 ) -> np.ndarray:
     """Weighted mean of a function's values as ``read`` has them, shape what one value has."""
+    return weighted_mean(cloud, evaluated(layout, cloud, model, function, read))
+
+
+def evaluated(
+    layout: Layout,
+    cloud: Cloud,
+    model: Model,
+    function: Callable[..., Any],
+    read: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> np.ndarray:
+    """A function's values as ``read`` has them, particles first."""
     arguments = []
     for name in inspect.signature(function).parameters:
         if name not in cloud.values:
@@ -206,6 +252,11 @@ def expectation(
             f"a query returns shape {values.shape}; plates {layout.apart} are filtered separately, so their "
             "axes follow that of the particles"
         )
+    return values
+
+
+def weighted_mean(cloud: Cloud, values: np.ndarray) -> np.ndarray:
+    """Mean of values that have the particles first, then the plates filtered separately."""
     lead = cloud.weights.reshape(cloud.weights.shape + (1,) * (values.ndim - cloud.weights.ndim))
     share = np.asarray(cloud.total)
     total = share.reshape(share.shape + (1,) * (values.ndim - 1 - share.ndim))

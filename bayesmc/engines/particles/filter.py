@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
+import math
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -21,17 +20,34 @@ from bayesmc.engines.particles.anew import Lost, Rejuvenation
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.engines.particles.counts import KLD
+from bayesmc.engines.particles.families import Families
+from bayesmc.engines.particles.growth import (
+    BUDGET,
+    START,
+    TOLERANCE,
+    collapsed,
+    enough,
+    uncertain,
+)
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.engines.particles.optimal import OptimalPlan
+from bayesmc.engines.particles.options import (
+    check_budget,
+    check_choice,
+    check_count,
+    check_kind,
+    check_threshold,
+    read_by,
+    read_functions,
+)
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.particles.smoothing import Backward, carried, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
-from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
+from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
@@ -40,10 +56,6 @@ from bayesmc.results.predictive import warn_of_misfit
 
 #: options that hold functions by node
 _FUNCTIONS = ("proposal", "initial_proposal", "rejuvenation")
-#: equally weighted particles below which a slice rests on a single one
-_COLLAPSED = 2.0
-#: share of such slices from which on a warning says so
-_MANY = 0.1
 
 
 @dataclass(frozen=True)
@@ -52,7 +64,11 @@ class ParticleFilter(FilterEngine):
 
     Parameters
     ----------
-    particles : int
+    particles : int, optional
+        By default as many as ``tolerance`` needs, 1,000 or more, for ``filter`` and ``forecast``: short runs
+        of few particles say how many (a quarter of the time, or a third, goes there), and the run that
+        answers has a random stream of its own. 1,000 for ``smooth``, ``start`` and ``step``, and with
+        ``adapt``.
     resampling : str, callable or Adaptive
         ``"multinomial"``, ``"stratified"``, ``"systematic"``, ``"residual"``, ``"ssp"``, or a function
         ``(weights, draws, rng) -> sorted indices``; an ``Adaptive`` brings its own threshold, which is taken
@@ -98,6 +114,11 @@ class ParticleFilter(FilterEngine):
         How ``smooth`` draws them: by rejection where the transition's height is known (time linear in the
         particles, and the same law), else with all particles tried for each.
 
+    tolerance : float
+        Error of the log evidence that is aimed at where ``particles`` is left out.
+    budget : int
+        Particles times slices (times elements of plates that are filtered separately) that this may take.
+
     Raises
     ------
     DegeneracyError
@@ -108,10 +129,19 @@ class ParticleFilter(FilterEngine):
     ProposalWarning
         ``proposal="optimal"`` leaves a hidden number, or what is seen of it, out.
     LowEssWarning
-        From the filter, where more than a tenth of the slices rest on little more than one particle.
+        From the filter, where more than a tenth of the slices rest on little more than one particle, or the
+        stated error of the log evidence is above 1, or cannot be told.
 
     Notes
     -----
+    Answers state their own errors: ``log_marginal_likelihood_mcse``, ``mcse(name)`` and ``queries_mcse``.
+    They come from the genealogy: particles of a slice are cut into groups of neighbours, and what the shares
+    of their descendants differ by says how far all together are off (as Chan and Lai 2013 and Lee and
+    Whiteley 2018 do with single particles; groups make it right for systematic resampling, too). That of the
+    evidence is the root of the mean square error, sqrt(v + v^2/4) for a log of variance v, which is v/2 too
+    low on average. Particles know nothing of where none of them has been: the error is infinite where a slice
+    rests on fewer than four, or their descendants show that later rows ask for the edge of the cloud.
+
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
     sequences in a plate are 64 filters in one array.
 
@@ -119,7 +149,8 @@ class ParticleFilter(FilterEngine):
     ----------
     Gordon, Salmond and Smith (1993), IEE Proceedings F 140; Koller and Friedman (2009), sec. 15.3.3
     (LW-2TBN); Doucet and Johansen (2011), A tutorial on particle filtering and smoothing; Pitt and Shephard
-    (1999), JASA 94; Okuma et al. (2004), A boosted particle filter.
+    (1999), JASA 94; Okuma et al. (2004), A boosted particle filter; Chan and Lai (2013), Ann. Statist. 41;
+    Lee and Whiteley (2018), Variance estimation in the particle filter, Biometrika 105.
 
     Examples
     --------
@@ -132,7 +163,7 @@ class ParticleFilter(FilterEngine):
     ((3,), True)
     """
 
-    particles: int = 1000
+    particles: int | None = None
     resampling: str | Callable[..., np.ndarray] = "systematic"
     ess_threshold: float = 0.5
     proposal: Mapping[Any, Any] | str | None = field(default=None, hash=False)
@@ -144,30 +175,34 @@ class ParticleFilter(FilterEngine):
     recovery: Recovery | None = None
     trajectories: int | None = None
     backward: str = "rejection"
+    tolerance: float = TOLERANCE
+    budget: int = BUDGET
 
     label: ClassVar[str] = "particle filter"
     keeps: ClassVar[bool] = True
     belief: ClassVar[type] = ParticleBelief
 
     def __post_init__(self) -> None:
-        _check_count("particles", self.particles, "such as 10_000")
+        if self.particles is not None:
+            check_count("particles", self.particles, "such as 10_000")
+        check_budget(self.tolerance, self.budget)
         if self.trajectories is not None:
-            _check_count(
+            check_count(
                 "trajectories", self.trajectories, "or None for as many as there are particles"
             )
-        _check_threshold(self.ess_threshold)
+        check_threshold(self.ess_threshold)
         scheme_of(self.resampling)
-        _check_choice("backward", self.backward, "rejection", "exact")
-        _check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
-        _check_kind("adapt", self.adapt, KLD)
-        _check_kind("recovery", self.recovery, Recovery)
+        check_choice("backward", self.backward, "rejection", "exact")
+        check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
+        check_kind("adapt", self.adapt, KLD)
+        check_kind("recovery", self.recovery, Recovery)
         if not isinstance(self.auxiliary, bool) and not callable(self.auxiliary):
             raise TypeError(
                 f"ParticleFilter(auxiliary={self.auxiliary!r}): give True, False, or a function that returns "
                 "log factors"
             )
         for option in _FUNCTIONS:
-            object.__setattr__(self, option, _read_functions(option, getattr(self, option)))
+            object.__setattr__(self, option, read_functions(option, getattr(self, option)))
         self._check_together()
 
     def _check_together(self) -> None:
@@ -280,10 +315,11 @@ class ParticleFilter(FilterEngine):
             )
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         try:
-            found = self._passed(problem, seed, keep is not None, queries or {}, progress)
+            sized = self._sized(self._enough(problem, seed, keep is not None, progress))
+            found = sized._passed(problem, seed, keep is not None, queries or {}, progress)
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
-        self._warn_of_collapse(found)
+        self._warn(found)
         warn_of_misfit(found.predictive, type(self).__name__, found.start, 4)
         return found
 
@@ -298,6 +334,9 @@ class ParticleFilter(FilterEngine):
     ) -> FilteredParticles:
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
+        if self.particles is None:
+            options: dict[str, Any] = {"lag": lag, "queries": queries, "progress": progress}
+            return self._sized(START).smooth(problem, seed, **options)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
@@ -305,12 +344,12 @@ class ParticleFilter(FilterEngine):
         if sums:
             raise UnsupportedError(_not_backwards(sums[0]))
         filtered = self._passed(problem, seed, True, {}, progress)
-        self._warn_of_collapse(filtered)
+        self._warn(filtered)
         warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 4)
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
-        count = self.particles if self.trajectories is None else self.trajectories
+        count = mover.particles if self.trajectories is None else self.trajectories
         backward = Backward(mover.plan, mover.layout, self.backward == "rejection")
         with _quiet():
             rng = stream(seed, Purpose.SMOOTH)
@@ -338,17 +377,18 @@ class ParticleFilter(FilterEngine):
         rng, rows, last = stream(seed, Purpose.FILTER), problem.series, problem.steps - 1
         looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK))
         cloud: Cloud | None = None
+        families: Families | None = None
 
         def move(k: int) -> None:
-            nonlocal cloud
+            nonlocal cloud, families
             row = rows.row(k)
             looks.look(k, cloud, row)
-            cloud = mover.first(row, rng) if cloud is None else mover.next(cloud, row, rng)
-            filtered.add(k, cloud)
+            cloud, families = mover.moved(cloud, families, row, rng)
+            filtered.add(k, cloud, families)
             window.append(cloud)
             while window and (len(window) > lag or k == last):
                 at = k - len(window) + 1
-                record.add(at, lagged(list(window), mover.layout, mover.slices))
+                record.add(at, lagged(list(window), mover.layout, mover.slices), families)
                 window.popleft()
 
         with Progress(problem.steps, self.label, progress) as bar, _quiet():
@@ -356,7 +396,7 @@ class ParticleFilter(FilterEngine):
             pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         whole = filtered.posterior(self)
         whole.predictive = looks.found()
-        self._warn_of_collapse(whole)
+        self._warn(whole)
         warn_of_misfit(whole.predictive, type(self).__name__, whole.start, 4)
         return self._given_filtered(record.posterior(self, "fixed-lag"), whole)
 
@@ -366,6 +406,7 @@ class ParticleFilter(FilterEngine):
         """Smoothed answers with the filter's figures."""
         found.log_marginal_increments = filtered.log_marginal_increments
         found.log_marginal_likelihood = filtered.log_marginal_likelihood
+        found.log_marginal_likelihood_mcse = filtered.log_marginal_likelihood_mcse
         found.weight_ess, found.resampled = filtered.weight_ess, filtered.resampled
         found.unique_ancestors = filtered.unique_ancestors
         found.rejuvenated, found.predictive = filtered.rejuvenated, filtered.predictive
@@ -377,20 +418,17 @@ class ParticleFilter(FilterEngine):
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
         mover = belief.mover
         if mover is None:
-            mover = self._mover(slices, read_static(slices, belief.static))
+            mover = self._sized(START)._mover(slices, read_static(slices, belief.static))
             warn_of_what_is_not_guided(self, slices, row.seen)
         chance = belief.chance
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with _quiet():
-            if belief.cloud is None:
-                cloud = mover.first(row, rng)
-            else:
-                cloud = mover.next(belief.cloud, row, rng)
+            cloud, families = mover.moved(belief.cloud, belief.families, row, rng)
         total = belief.log_marginal_likelihood + cloud.increment
         return ParticleBelief(
             belief.dbn, belief.seed, belief.static, mover, cloud,
             total if np.ndim(total) else float(total), rng.bit_generator.state,
-            {n: row.inputs[n] for n in slices.template.inputs},
+            {n: row.inputs[n] for n in slices.template.inputs}, families,
         )  # fmt: skip
 
     # ---- private -------------------------------------------------------------------------------
@@ -402,22 +440,25 @@ class ParticleFilter(FilterEngine):
         keep: bool,
         queries: Queries,
         progress: bool | None,
+        unit: int = 0,
     ) -> FilteredParticles:
-        """All slices, one by one; Ctrl-C goes on, with the answer so far."""
+        """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far."""
         static = {n: o.value for n, o in problem.series.static.items()}
-        asked = _asked(queries, problem.slices)
+        asked = read_by(queries, problem.slices)
         mover = self._mover(problem.slices, static, None if keep else [*problem.hidden, *asked])
         record = Record(problem, mover.layout, queries, keep)
-        rng, rows = stream(seed, Purpose.FILTER), problem.series
-        looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK))
+        rng, rows = stream(seed, Purpose.FILTER, unit), problem.series
+        looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK, unit))
         cloud: Cloud | None = None
+        families: Families | None = None
 
         def move(k: int) -> None:
-            nonlocal cloud
+            nonlocal cloud, families
             row, old = rows.row(k), cloud
-            looks.look(k, old, row)
-            cloud = mover.first(row, rng) if old is None else mover.next(old, row, rng)
-            record.add(k, cloud)
+            if unit == 0:  # runs that only say how many particles are needed look at nothing
+                looks.look(k, old, row)
+            cloud, families = mover.moved(old, families, row, rng)
+            record.add(k, cloud, families)
             if old is not None and not keep:
                 mover.recycle(old)
 
@@ -425,31 +466,44 @@ class ParticleFilter(FilterEngine):
             so_far = partial(record.posterior, self, "filter")
             pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         found = record.posterior(self)
-        found.predictive = looks.found()
+        found.predictive = looks.found() if unit == 0 else None
         return found
 
-    def _warn_of_collapse(self, filtered: FilteredParticles) -> None:
-        """One warning where many slices rest on what is little more than one particle.
+    def _sized(self, particles: int) -> ParticleFilter:
+        """The same filter with so many particles, where their number was left out."""
+        if self.particles is not None:
+            return self
+        found = object.__new__(type(self))
+        found.__dict__.update(self.__dict__, particles=particles)
+        return found
 
-        A surprising row now and then does that to any filter, and the next rows mend it.
-        """
-        assert filtered.weight_ess is not None
-        ess = filtered.weight_ess.reshape(filtered.steps, -1)
-        poor = ess < min(_COLLAPSED, 0.9 * self.particles)
-        share = poor.mean(axis=0)
-        worst = int(share.argmax())
-        if share[worst] > _MANY:
-            own = ess[:, worst]
-            at = int(own.argmin())
-            warnings.warn(
-                f"ParticleFilter: in {int(poor[:, worst].sum())} of {len(own)} slices the {self.particles} "
-                f"particles are worth less than {_COLLAPSED:g} equally weighted ones (weight_ess; "
-                f"{own[at]:.1f} in slice {filtered.start + at}), so means, spreads and the evidence rest on "
-                "one of them: use more particles, a proposal= that looks at the observations, or less narrow "
-                "noise",
-                LowEssWarning,
-                stacklevel=4,
-            )
+    def _enough(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        keep: bool,
+        progress: bool | None,
+    ) -> int:
+        """How many particles the error of the evidence needs, by runs whose draws do not come back."""
+        if self.particles is not None or self.adapt is not None:
+            return START
+
+        def tried(particles: int, unit: int) -> float:
+            try:
+                found = self._sized(particles)._passed(problem, seed, False, {}, progress, unit)
+            except DegeneracyError:
+                return math.inf
+            return float(np.max(found.log_marginal_likelihood_mcse))
+
+        sizes = problem.slices.first.sizes
+        slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
+        return enough(tried, self.tolerance, slices, self.budget, keep)
+
+    def _warn(self, filtered: FilteredParticles) -> None:
+        """At most one warning: that slices rest on one particle, or that the evidence is not known well."""
+        text = collapsed(filtered) or uncertain(filtered, self)
+        if text is not None:
+            warnings.warn(f"ParticleFilter: {text}", LowEssWarning, stacklevel=4)
 
     def _proposals(self, slices: Slices) -> SliceProposals:
         assert not isinstance(self.proposal, str)
@@ -468,6 +522,7 @@ class ParticleFilter(FilterEngine):
         if isinstance(scheme, Adaptive):
             scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
         scheme = checked(scheme)
+        assert self.particles is not None
         apart = plates_apart(slices)
         if isinstance(self.proposal, str):
             plan: SlicePlan = OptimalPlan(slices, apart, static)
@@ -500,61 +555,6 @@ def _not_backwards(name: str) -> str:
         f"ParticleFilter: {name!r} is computed from its own past, so trajectories cannot be drawn "
         "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
     )
-
-
-def _check_count(option: str, given: Any, what: str) -> None:
-    if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 1:
-        raise ValueError(
-            f"ParticleFilter({option}={given!r}): give a number of {option}, 1 or more, {what}"
-        )
-
-
-def _check_threshold(given: Any) -> None:
-    if isinstance(given, bool) or not isinstance(given, (int, float)) or not given >= 0:
-        raise ValueError(
-            f"ParticleFilter(ess_threshold={given!r}): give a share of the particles, 0 (never resample) "
-            "to 1 (always)"
-        )
-
-
-def _check_choice(option: str, given: Any, one: str, other: str) -> None:
-    if given not in (one, other):
-        raise ValueError(f'ParticleFilter({option}={given!r}): give "{one}" or "{other}"')
-
-
-def _check_kind(option: str, given: Any, kind: type) -> None:
-    if given is not None and not isinstance(given, kind):
-        raise TypeError(f"ParticleFilter({option}={given!r}): give a {kind.__name__}(...), or None")
-
-
-def _read_functions(option: str, given: Any) -> Any:
-    """Functions by node, checked and frozen; ``"optimal"`` and None as they are."""
-    if option == "proposal" and isinstance(given, str):
-        if given != "optimal":
-            raise ValueError(
-                f'ParticleFilter(proposal={given!r}): give "optimal", or a dict from node name to {FUNCTION}'
-            )
-        return given
-    if given is None:
-        return None
-    functions = check_specification("ParticleFilter", given, FUNCTION, option)
-    for key, spec in functions.items():
-        as_function("ParticleFilter", key, spec, FUNCTION, option)
-    return MappingProxyType(functions)
-
-
-def _asked(queries: Queries, slices: Slices) -> list[str]:
-    """Nodes that queries read."""
-    found = []
-    for query, function in queries.items():
-        for name in inspect.signature(function).parameters:
-            if name not in slices.dynamic:
-                raise UnknownNodeError(
-                    f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice; there are "
-                    f"{list(slices.dynamic)}"
-                )
-            found.append(name)
-    return found
 
 
 @contextmanager

@@ -15,10 +15,12 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.cloud import BLOCK, Cloud, Layout, Selection, along_plates
 from bayesmc.engines.particles.counts import KLD
+from bayesmc.engines.particles.families import Families, begun, followed
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn
+from bayesmc.resampling import ssp, stratified, systematic
 from bayesmc.shapes import first_index
 
 #: log factors by which particles of the slice before are chosen, from its values and the row
@@ -102,6 +104,22 @@ class Mover:
         self._even = np.ones((particles, *self.lead))
         self._even.flags.writeable = False
         self._spare = _Spare()
+        # after a first stage, what a family should have is not what its weight says
+        self.steady = resample in (stratified, systematic, ssp) or first_stage is not None
+
+    def moved(
+        self,
+        cloud: Cloud | None,
+        families: Families | None,
+        row: Row,
+        rng: np.random.Generator,
+    ) -> tuple[Cloud, Families]:
+        """The cloud of the next slice, or of the first, and whose descendants its particles are."""
+        if cloud is None or families is None:
+            found = self.first(row, rng)
+            return found, begun(found, self.layout)
+        found = self.next(cloud, row, rng)
+        return found, followed(families, cloud, found, self.steady)
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""

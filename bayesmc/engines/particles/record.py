@@ -9,15 +9,19 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
+from bayesmc.engines.particles.accuracy import MeanErrors, value_errors
 from bayesmc.engines.particles.belief import (
     covariance,
+    evaluated,
     expectation,
     moments,
     probability,
     quantiles,
     table_of_states,
+    weighted_mean,
 )
 from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.families import Families, evidence_error
 from bayesmc.errors import QueryError
 from bayesmc.results import SeriesPosterior
 
@@ -59,9 +63,18 @@ class Record:
         self.counts = np.empty(steps, dtype=np.intp)
         self.anew = np.zeros(steps, dtype=np.intp)
         self._nodes = [(n, model[n], len(model[n].value_shape)) for n in problem.hidden]
+        self.errors = MeanErrors(
+            layout,
+            [model[n] for n in problem.hidden],
+            steps,
+            (self.means, self.variances, self.tables),
+        )
+        self.query_errors: dict[str, list[np.ndarray]] = {n: [] for n in queries}
+        self._last: tuple[Families, Cloud] | None = None
+        self.families: list[Families] | None = [] if keep else None
 
-    def add(self, k: int, cloud: Cloud) -> None:
-        """Take in the cloud of the k-th slice."""
+    def add(self, k: int, cloud: Cloud, families: Families | None = None) -> None:
+        """Take in the cloud of the k-th slice, and whose descendants its particles are."""
         layout = self.layout
         self.increments[k] = cloud.increment
         self.ess[k] = cloud.ess
@@ -83,9 +96,19 @@ class Record:
             else:
                 self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
         for name, function in self.asked.items():
-            self.queries[name].append(expectation(layout, cloud, self.problem.model, function))
+            values = evaluated(layout, cloud, self.problem.model, function)
+            mean = weighted_mean(cloud, values)
+            self.queries[name].append(mean)
+            if families is not None:
+                errors = value_errors(layout, cloud, families.bounds, values, mean)
+                self.query_errors[name].append(errors)
+        if families is not None:
+            self.errors.add(k, cloud, families)
+            self._last = (families, cloud)
         if self.clouds is not None:
             self.clouds.append(cloud)
+            if self.families is not None and families is not None:
+                self.families.append(families)
 
     def posterior(
         self, engine: Any, kind: str = "filter", steps: int | None = None
@@ -109,6 +132,12 @@ class Record:
         found.counts, found.anew = self.counts[:k], self.anew[:k]
         found.clouds = None if self.clouds is None else self.clouds[:k]
         found.layout = self.layout
+        if self._last is not None:
+            found.log_marginal_likelihood_mcse = evidence_error(*self._last)
+            found.mean_errors = first_slices(self.errors.found(), k)
+            rows = self.query_errors.items()
+            found.queries_mcse = {n: np.stack(errors[:k]) for n, errors in rows}
+            found.families = self.families and self.families[:k]
         return found
 
 
@@ -141,6 +170,21 @@ class FilteredParticles(SeriesPosterior):
     anew: np.ndarray | None = None
     clouds: list[Cloud] | None = None
     layout: Layout | None = None
+    families: list[Families] | None = None
+
+    def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
+        """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
+        if not callable(what):
+            return super().mcse(what)
+        clouds, layout = self._kept("mcse of a function")
+        if self.families is None:
+            raise self._no_errors()
+        rows = []
+        for cloud, families in zip(clouds, self.families, strict=True):
+            values = evaluated(layout, cloud, self.model, what)
+            mean = weighted_mean(cloud, values)
+            rows.append(value_errors(layout, cloud, families.bounds, values, mean))
+        return np.stack(rows)
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""

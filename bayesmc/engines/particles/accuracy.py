@@ -1,0 +1,268 @@
+"""Errors of means: by how far the families of a slice differ.
+
+Each family's part of a weighted mean is nearly independent of the others', so the sum of their squares is its
+variance (``families`` says why), with a correction for what the mean owes to the family itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.families import OLD, YOUNG, Families, group_sums, row_sums
+from bayesmc.network import CompiledNode
+
+#: particles above which families are taken one by one, without a copy
+MANY = 30_000
+#: even families below which the young origin is asked, too; if it has no more than so many, nobody knows
+ENOUGH, LAST = 8.0, 1.1
+
+
+class MeanErrors:
+    """Errors of the means of nodes, written as the slices pass; read them by ``found``.
+
+    Of nodes that are one number, the sums over families are kept, and what they come to is worked out in the
+    end, for all slices at a time: what costs here is calling NumPy.
+
+    Parameters
+    ----------
+    layout : Layout
+    nodes : sequence of CompiledNode
+    steps : int
+    answers : tuple of dict
+        Means, variances and tables, time first; entries must be there when their slice is added.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        nodes: Sequence[CompiledNode],
+        steps: int,
+        answers: tuple[Mapping[str, np.ndarray], ...],
+    ) -> None:
+        self.layout, self.nodes, self.answers = layout, nodes, answers
+        self._found = {n.name: np.zeros((steps, *_shape(n))) for n in nodes}
+        self._plain = frozenset(
+            n.name
+            for n in nodes
+            if n.domain is None and n.angles is None and not n.value_shape and not layout.apart
+        )
+        #: of each origin: slices, and shares and parts of the means of its families
+        self._parts: tuple[_Parts, _Parts] = (_Parts(self._plain), _Parts(self._plain))
+
+    def add(self, k: int, cloud: Cloud, families: Families) -> None:
+        """Take in the cloud of the k-th slice."""
+        means, variances, tables = self.answers
+        if self._plain:
+            self._add_plain(k, cloud, families)
+        for node in self.nodes:
+            name, value = node.name, cloud.values[node.name]
+            if value.ndim == len(node.value_shape) or name in self._plain:
+                continue
+            if node.domain is not None:
+                centre: Any = (tables[name][k : k + 1], None)
+            else:
+                centre = (means[name][k : k + 1], variances[name][k : k + 1])
+            found = node_errors(self.layout, cloud, families.bounds, node, centre)
+            self._found[name][k] = found
+
+    def found(self) -> dict[str, np.ndarray]:
+        """Errors by node, time first, shape of the mean; of each state's probability, for labels."""
+        for name in self._plain:
+            mean, variance = self.answers[0][name], np.zeros(len(self._found[name]))
+            for parts in self._parts:
+                at, sums, shares = parts.of(name)
+                if len(at):
+                    found = _by_shares(sums - shares * mean[at, None], shares)
+                    if parts is self._parts[YOUNG]:
+                        found[(shares**2).sum(axis=1) > 1.0 / LAST] = np.inf
+                    variance[at] = np.maximum(variance[at], found)
+            self._found[name] = np.sqrt(variance)
+        return self._found
+
+    def _add_plain(self, k: int, cloud: Cloud, families: Families) -> None:
+        weights, total = cloud.weights, cloud.total
+        for bounds, parts in zip(families.bounds, self._parts, strict=True):
+            shares = group_sums(weights, bounds) / total
+            for name in self._plain:
+                value = cloud.values[name]
+                if value.ndim:
+                    parts.add(name, k, _plain_sums(weights, value, bounds) / total, shares)
+            if shares.dot(shares) * ENOUGH < 1.0:  # else the young origin is asked, too
+                break
+
+
+class _Parts:
+    """What families have of the means of nodes that are one number."""
+
+    def __init__(self, names: frozenset[str]) -> None:
+        self._rows: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {n: [] for n in names}
+
+    def add(self, name: str, k: int, sums: np.ndarray, shares: np.ndarray) -> None:
+        self._rows[name].append((k, sums, shares))
+
+    def of(self, name: str) -> tuple[list[int], np.ndarray, np.ndarray]:
+        """Slices, parts and shares, slices first."""
+        rows = self._rows[name]
+        if not rows:
+            return [], np.zeros(0), np.zeros(0)
+        at, sums, shares = zip(*rows, strict=True)
+        return list(at), np.stack(sums), np.stack(shares)
+
+
+def node_errors(
+    layout: Layout,
+    cloud: Cloud,
+    bounds: np.ndarray,
+    node: CompiledNode,
+    centre: tuple[np.ndarray, np.ndarray | None],
+) -> np.ndarray:
+    """Errors of a node's mean, or of its states' probabilities where they have labels.
+
+    Parameters
+    ----------
+    layout : Layout
+    cloud : Cloud
+    bounds : ndarray of int, shape (2, groups + 1, *apart)
+    node : CompiledNode
+    centre : tuple
+        Its mean and variance, or its table and None, with an axis of length 1 in front.
+    """
+    mean, variance = centre
+    count = None
+    value = cloud.values[node.name][None]
+    if node.domain is None:
+        off = value - mean[:, None]
+        if node.angles is not None:
+            assert variance is not None
+            length = np.exp(-0.5 * variance)[:, None]
+            with np.errstate(divide="ignore", invalid="ignore"):
+                off = np.where(node.angles, np.sin(off) / length, off)
+    elif node.domain.labels is None:
+        numbers = np.asarray(node.domain.numbers, dtype=float)
+        off = numbers[value] - (mean @ numbers)[:, None]
+    else:
+        off = (value[..., None] == np.arange(node.domain.size)) - mean[:, None]
+        count = mean
+    if not layout.apart:
+        found = _variances(cloud.weights[None], off, bounds[..., None])
+        ess: Any = np.array([cloud.ess])
+    else:
+        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
+    if count is not None:
+        found = np.maximum(found, _unseen(count, _beside(ess, node, layout, count.ndim)))
+    return np.sqrt(found[0])
+
+
+def value_errors(
+    layout: Layout, cloud: Cloud, bounds: np.ndarray, values: np.ndarray, mean: np.ndarray
+) -> np.ndarray:
+    """Errors of the mean of what a function says of each particle: shape what one value has."""
+    off = values - mean
+    n, many = len(off), int(np.prod(layout.lead))
+    rest = off.shape[1 + len(layout.lead) :]
+    rows = np.moveaxis(off.reshape(n, many, *rest), 1, 0)
+    found = _variances(cloud.weights.reshape(n, many).T, rows, _flat(bounds, many))
+    share = found.reshape(np.shape(mean))
+    if values.dtype.kind == "b":  # an event that no particle has seen may happen
+        ess = np.asarray(cloud.ess, dtype=float)
+        share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
+    return np.sqrt(share)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _shape(node: CompiledNode) -> tuple[int, ...]:
+    if node.domain is not None and node.domain.labels is not None:
+        return (*node.plate_shape, node.domain.size)
+    return node.value_shape
+
+
+def _flat(bounds: np.ndarray, many: int) -> np.ndarray:
+    return bounds.reshape(*bounds.shape[:2], many)
+
+
+def _variances(weights: np.ndarray, off: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Variances of weighted means about which values lie off, shape ``(rows, *rest)``.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (rows, particles)
+    off : ndarray, shape (rows, particles, *rest)
+    bounds : ndarray of int, shape (2, groups + 1, rows)
+    """
+    total = weights.sum(axis=1)
+    weighted = weights.reshape(weights.shape + (1,) * (off.ndim - 2)) * off
+    found, even = _of_families(weights, weighted, bounds[OLD], total)
+    few = even < ENOUGH
+    if few.any():
+        young, left = _of_families(weights[few], weighted[few], bounds[YOUNG][:, few], total[few])
+        young[left < LAST] = np.inf
+        found[few] = np.maximum(found[few], young)
+    return found
+
+
+def _of_families(
+    weights: np.ndarray, weighted: np.ndarray, bounds: np.ndarray, total: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Variances by the families of one origin, and how many even ones these are worth."""
+    shares = row_sums(weights, bounds) / total[:, None]
+    parts = row_sums(weighted, bounds)
+    tail = (1,) * (parts.ndim - 2)
+    parts /= total.reshape(-1, 1, *tail)
+    even = 1.0 / (shares**2).sum(axis=1)
+    return _by_shares(parts, shares.reshape(*shares.shape, *tail)), even
+
+
+def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Variances by parts ``(rows, groups, *rest)`` of means, with what these owe to each family."""
+    return (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=1)
+
+
+def _plain_sums(weights: np.ndarray, value: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Weighted sums of one number over families."""
+    if len(weights) <= MANY:
+        return group_sums(weights * value, bounds)
+    edges = bounds.tolist()
+    pairs = zip(edges[:-1], edges[1:], strict=True)
+    return np.array([weights[a:b].dot(value[a:b]) for a, b in pairs])
+
+
+def _of_plates(
+    layout: Layout, cloud: Cloud, bounds: np.ndarray, node: CompiledNode, off: np.ndarray
+) -> tuple[np.ndarray, Any]:
+    """Variances where plates are filtered separately, slices first, and what particles are worth."""
+    many = int(np.prod(layout.lead))
+    at = [1 + node.plates.index(p) for p in layout.apart if p in node.plates]
+    first = range(1, 1 + len(at))
+    rows = np.moveaxis(off, at, first)
+    rest = rows.shape[1 + len(at) :]
+    if len(at) < len(layout.apart):  # it hangs on nothing that was drawn
+        return np.zeros((1, *off.shape[1:])), np.asarray(cloud.ess)
+    rows = np.moveaxis(rows.reshape(len(off), many, *rest), 1, 0)
+    found = _variances(cloud.weights.reshape(-1, many).T, rows, _flat(bounds, many))
+    found = np.moveaxis(found.reshape(*layout.lead, *rest), range(len(at)), [a - 1 for a in at])
+    return found[None], np.asarray(cloud.ess)
+
+
+def _beside(ess: Any, node: CompiledNode, layout: Layout, ndim: int) -> Any:
+    """What particles are worth, with the axes of a node's table."""
+    if not layout.apart:
+        return ess.reshape(-1, *(1,) * (ndim - 1))
+    order = [p for p in node.plates if p in layout.apart]
+    moved = ess.transpose([layout.apart.index(p) for p in order])
+    shape = [
+        n if p in layout.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
+    ]
+    return moved.reshape(1, *shape, 1)
+
+
+def _unseen(share: np.ndarray, ess: Any) -> np.ndarray:
+    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
+    centre = (share * ess + 2.0) / (ess + 4.0)
+    rare = np.minimum(share, 1.0 - share) * ess < 1.0
+    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)

@@ -1,0 +1,115 @@
+"""How many particles are enough, and what is said where they are not."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from bayesmc.engines.particles.record import FilteredParticles
+
+if TYPE_CHECKING:
+    from bayesmc.engines.particles.filter import ParticleFilter
+
+#: particles of a filter that is not told how many, at least, and at most
+START, MOST = 1000, 100_000
+#: those of the first short run; each next one has four times as many
+FIRST, TIMES = 250, 4
+#: error of the log evidence that is aimed at
+TOLERANCE = 0.5
+#: particles times slices that a run may take, and those whose particles are kept
+BUDGET, KEPT = 30_000_000, 5_000_000
+#: error of a short run up to which it says how many particles are enough; beyond it is no longer normal
+TRUSTED = 1.5
+#: variance that is aimed at, as a share of the tolerance's
+AIM = 0.6
+#: error of the log evidence above which a warning says so
+LARGE = 1.0
+#: equally weighted particles below which a slice rests on a single one
+COLLAPSED = 2.0
+#: share of such slices from which on a warning says so
+MANY = 0.1
+
+
+def enough(
+    tried: Callable[[int, int], float], tolerance: float, slices: int, budget: int, keep: bool
+) -> int:
+    """Particles with which the error of the log evidence is likely to be as small as is asked.
+
+    Parameters
+    ----------
+    tried : callable
+        ``(particles, unit) -> error`` of a run with a random stream of its own.
+    tolerance : float
+    slices : int
+        Times the elements of plates that are filtered separately.
+    budget : int
+        Particles times slices.
+    keep : bool
+        Whether particles of all slices are held, which takes memory.
+
+    Returns
+    -------
+    int
+        A power of two times ``START``, or the most that the budget allows; ``START`` at least. The answer is
+        that of a run of its own, so what chose the number has no part in it, and the evidence is unbiased.
+    """
+    share = min(budget, KEPT) if keep else budget
+    most = max(START, min(MOST, share // max(slices, 1)))
+    particles, unit = FIRST, 1
+    while particles < most:
+        error = tried(particles, unit)
+        if error <= TRUSTED:
+            wanted = particles * (error / tolerance) ** 2 / AIM
+            doublings = math.ceil(math.log2(max(wanted / START, 1.0)))
+            return min(START * 2**doublings, most)
+        particles, unit = particles * TIMES, unit + 1
+    return most
+
+
+def collapsed(filtered: FilteredParticles) -> str | None:
+    """What is said where many slices rest on what is little more than one particle.
+
+    A surprising row now and then does that to any filter, and the next rows mend it.
+    """
+    assert filtered.weight_ess is not None and filtered.counts is not None
+    ess = filtered.weight_ess.reshape(filtered.steps, -1)
+    most = int(filtered.counts.max())
+    poor = ess < min(COLLAPSED, 0.9 * most)
+    share = poor.mean(axis=0)
+    worst = int(share.argmax())
+    if share[worst] <= MANY:
+        return None
+    own = ess[:, worst]
+    at = int(own.argmin())
+    return (
+        f"in {int(poor[:, worst].sum())} of {len(own)} slices the {most} particles are worth less than "
+        f"{COLLAPSED:g} equally weighted ones (weight_ess; {own[at]:.1f} in slice {filtered.start + at}), so "
+        "means, spreads and the evidence rest on one of them: use more particles, a proposal= that looks at "
+        "the observations, or less narrow noise"
+    )
+
+
+def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None:
+    """What is said where the log evidence is not known well."""
+    assert filtered.counts is not None and filtered.weight_ess is not None
+    errors = np.atleast_1d(np.asarray(filtered.log_marginal_likelihood_mcse, dtype=float))
+    worst = float(errors.max())
+    if not worst > LARGE:
+        return None
+    ess = filtered.weight_ess.reshape(filtered.steps, -1)[:, int(errors.reshape(-1).argmax())]
+    at = int(ess.argmin())
+    if math.isinf(worst):
+        said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
+    else:
+        said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
+    more = "more particles"
+    if engine.particles is None and engine.adapt is None:
+        more = f"a larger budget= than {engine.budget:_}"
+    return (
+        f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
+        f"be off as well (weight_ess is lowest in slice {filtered.start + at}: {ess[at]:.1f}); use {more}, a "
+        "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
+    )
