@@ -85,7 +85,7 @@ def filter(
     (3,)
     """
     problem = pose_series(dbn, observations, inputs)
-    chosen = _engine(problem, engine, Asked("filter", keep, tuple(queries or ())))
+    chosen = _engine(problem, engine, Asked("filter", keep, queries or {}))
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options)
 
@@ -120,7 +120,7 @@ def smooth(
     ):
         raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
     kind = "smooth" if lag is None else "fixed-lag"
-    chosen = _engine(problem, engine, Asked(kind, None, tuple(queries or ())))
+    chosen = _engine(problem, engine, Asked(kind, None, queries or {}))
     return chosen.smooth(problem, seed_sequence(rng), lag=lag, queries=queries, progress=progress)
 
 
@@ -149,7 +149,7 @@ def forecast(
     """
     check_steps("forecast", steps)
     problem = pose_series(dbn, observations, inputs, ahead=steps)
-    chosen = _engine(problem, engine, Asked("forecast", None, tuple(queries or ())))
+    chosen = _engine(problem, engine, Asked("forecast", None, queries or {}))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
 

@@ -46,6 +46,8 @@ class SeriesPosterior:
         Whether particles were drawn anew, since no weight was left; evidence and answers are biased then.
     queries : dict
         Name -> expectation of a function in every slice, time first.
+    queries_mcse : dict
+        Name -> their standard errors, where the engine states some.
 
     Examples
     --------
@@ -85,6 +87,7 @@ class SeriesPosterior:
         self._means = dict(means or {})
         self._variances = dict(variances or {})
         self.queries = dict(queries or {})
+        self.queries_mcse: dict[str, np.ndarray] = {}
         self.start = start
         self.log_marginal_increments = increments
         self.log_marginal_likelihood: Any = None
@@ -146,6 +149,7 @@ class SeriesPosterior:
             tables=cut(self._tables), means=cut(self._means), variances=cut(self._variances),
             queries=cut(self.queries), steps=steps, start=self.start + self.steps - steps,
         )  # fmt: skip
+        found.queries_mcse = cut(self.queries_mcse)
         if self.weight_ess is not None:
             found.weight_ess = self.weight_ess[-steps:]
         return found

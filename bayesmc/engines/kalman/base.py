@@ -28,7 +28,6 @@ from bayesmc.progress import Progress
 class GaussianFilter(FilterEngine):
     """Base of ``KalmanFilter``, ``ExtendedKalmanFilter`` and ``UnscentedKalmanFilter``."""
 
-    takes_queries: ClassVar[bool] = False
     belief: ClassVar[type] = GaussianBelief
 
     def refusal(self, problem: SeriesProblem) -> str | None:
@@ -81,13 +80,12 @@ class GaussianFilter(FilterEngine):
                 f"keep={keep!r}: {type(self).__name__} has no particles; ask its result for mean, var and "
                 "cov, or use a ParticleFilter"
             )
-        self._check_queries(queries)
         data = self._data(problem)
         try:
             found = self._passed(problem, data, False, progress)
         except KeyboardInterrupt as stop:
             return answer_so_far(stop, self)
-        return filter_answers(self, problem, data, found)
+        return filter_answers(self, problem, data, found, queries)
 
     def smooth(
         self,
@@ -98,12 +96,11 @@ class GaussianFilter(FilterEngine):
         queries: Queries | None = None,
         progress: bool | None = None,
     ) -> GaussianSeries:
-        self._check_queries(queries)
         data = self._data(problem)
         found = self._passed(problem, data, True, progress)
         smoothed = backward(data.layouts[0], found, lag)
         kind = "smooth" if lag is None else "fixed-lag"
-        return smooth_answers(self, problem, data, found, smoothed, kind)
+        return smooth_answers(self, problem, data, found, smoothed, kind, queries)
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
@@ -176,14 +173,6 @@ class GaussianFilter(FilterEngine):
             with quiet():
                 problem.cache["kalman data"] = SeriesData(problem)
         return problem.cache["kalman data"]
-
-    def _check_queries(self, queries: Queries | None) -> None:
-        if queries:
-            raise UnsupportedError(
-                f"queries={list(queries)}: {type(self).__name__} answers mean, var, std and cov of nodes; "
-                "declare a deterministic node for an affine function of them, or use a ParticleFilter, which "
-                "answers for any function"
-            )
 
 
 @contextmanager
