@@ -1,7 +1,7 @@
 """Averages of users' functions over beliefs that are densities: one number by sums, several by point sets.
 
 Sums over even points are as good as exact for smooth functions under smooth densities (the trapezoidal rule);
-where a function jumps, as an event does, the place is found by bisection and what the sum gets wrong there is
+where a function jumps, as an event does, the place is found and what the sum gets wrong there is
 put right. Several numbers are averaged over point sets that have the mean and the covariance of the normal
 law, so that quadratic functions are exact; shifted sets give the error. Beliefs and nodes are not known here.
 """
@@ -24,12 +24,12 @@ Evaluated = Callable[[np.ndarray, np.ndarray], np.ndarray]
 _HELD = 1 << 20
 #: a difference between neighbours that is so many times those beside it is a jump
 _JUMP = 8.0
-#: jumps that are looked for at most, and steps of bisection
-_JUMPS, _HALVINGS = 1 << 18, 45
+#: jumps that are looked for at most; parts that their surroundings are cut into, so many times over
+_JUMPS, _PARTS, _ROUNDS = 1 << 18, 64, 3
 #: even points for a normal number, and how far they reach in standard deviations
 _POINTS, _REACH = 1024, 8.5
-#: shifted sets for several numbers, points in each at least and at most, and in those of all beliefs; dimensions
-#: up to which they are Kronecker's
+#: shifted sets for several numbers, points in each at least and at most, and in those of all beliefs;
+#: dimensions up to which they are Kronecker's
 _SETS, _FEW, _MANY, _ALL, _KRONECKER = 8, 512, 1 << 14, 1 << 22, 16
 
 
@@ -170,16 +170,19 @@ def _mend(
 ) -> None:
     """Give what lies between two points to the side of the jump that it is on."""
     row, j, *rest = where
-    count = np.arange(len(row))
     one, other = values[(row, j, *rest)], values[(row, j + 1, *rest)]
-    left, right = points[j].astype(float), points[j + 1].astype(float)
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (left + right)
-        here = np.asarray(evaluate(row + low, middle)).astype(float)[(count, *rest)]
-        near = np.abs(here - one) <= np.abs(here - other)
-        left, right = np.where(near, middle, left), np.where(near, right, middle)
+    left, width = points[j].astype(float), points[j + 1] - points[j]
+    count, inner = np.arange(len(row)), np.arange(1, _PARTS) / _PARTS
+    for _ in range(_ROUNDS):
+        tried = left[:, None] + inner * width[:, None]
+        here = np.asarray(evaluate(np.repeat(row + low, len(inner)), tried.ravel())).astype(float)
+        here = here.reshape(*tried.shape, *here.shape[1:])
+        here = here[(count[:, None], np.arange(len(inner)), *(r[:, None] for r in rest))]
+        far = np.abs(here - one[:, None]) > np.abs(here - other[:, None])
+        passed = np.where(far.any(axis=1), far.argmax(axis=1), len(inner))
+        left, width = left + passed * width / _PARTS, width / _PARTS
     step = points[j + 1] - points[j]
-    border, jump = 0.5 * (points[j] + points[j + 1]), 0.5 * (left + right)
+    border, jump = 0.5 * (points[j] + points[j + 1]), left + 0.5 * width
     share = (0.5 * (border + jump) - points[j]) / step
     first, second = masses[(row, j, *rest)], masses[(row, j + 1, *rest)]
     between = (jump - border) / step * (first + share * (second - first))

@@ -86,7 +86,7 @@ class SliceAnswers:
         return np.concatenate(parts)
 
     def check(self, function: Callable[..., Any]) -> tuple[list[str], dict[int, Term]]:
-        """What a query reads, in the three kinds of slices; raises what ``expectation`` does, and ahead of it."""
+        """What a query reads, in the three kinds of slices; raises ahead what ``expectation`` does."""
         names = arguments_of(function)
         for name in names:
             if name not in self.model.nodes:

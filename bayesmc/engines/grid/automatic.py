@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.filtering import in_slice
-from bayesmc.engines.grid.axes import Axis
+from bayesmc.engines.grid.axes import Axis, axis_of
 from bayesmc.engines.grid.lattice import Lattice, Line
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.tables import GridModel
@@ -151,7 +151,11 @@ class _Search:
             inside = len(share) * share > self.limit / 2  # as ``_reached`` judges ends
             some = np.flatnonzero(inside.reshape(len(share), -1).any(axis=1))
             width = lattice.step / (2.51 * float(tops.max()))
-            if line.kind in ("interval", "integers") or np.ptp(some) >= 0.7 * lattice.cells:
+            if (
+                line.kind == "integers"
+                or not any(line.grows)
+                or np.ptp(some) >= 0.7 * lattice.cells
+            ):
                 break
             ends = lattice.low + lattice.step * np.array([some[0] - 2, some[-1] + 3])
             lattice = Lattice(line, float(ends[0]), float(ends[1]), 256)
@@ -164,7 +168,7 @@ class _Search:
 
     def _guess(self, line: Line) -> tuple[float, float]:
         """Coordinates between which slice 0 may lie: draws from its density, and what was seen."""
-        if line.kind == "interval":
+        if not any(line.grows):
             return line.low, line.high
         start = 1.0 if line.kind == "real" else float(np.clip(1.0, line.low + 1, line.high - 1))
         point = float(line.number(np.asarray(0.0))) if line.kind in ("above", "below") else start
@@ -195,7 +199,7 @@ class _Search:
         """How wide the densities are that lead on from there, in the coordinate."""
         if len(self.rows) < 2:
             return np.inf
-        model = self.make(lattice.cut(64).axis())
+        model = self.make(axis_of(lattice.cut(64)))
         before, now = model.place(self.rows[0]), model.place(self.rows[1])
         dist = model.evaluate(False, self.name, model.base(before, now))
         centre: Any = None
@@ -260,7 +264,7 @@ class _Search:
                 kept.append(before)
         whole = np.array(increments)
         return _Passed(
-            lattice.axis(), mover, whole, beyond * np.ones(whole.shape[1:]), kept if few else None
+            axis_of(lattice), mover, whole, beyond * np.ones(whole.shape[1:]), kept if few else None
         )
 
     def answer(self, found: _Passed, before: np.ndarray) -> FoundGrid:
@@ -296,7 +300,7 @@ class _Search:
     # ---- private --------------------------------------------------------------------------------
 
     def _mover(self, lattice: Lattice) -> GridMover:
-        return GridMover(self.make(lattice.axis()), np.inf)
+        return GridMover(self.make(axis_of(lattice)), np.inf)
 
     def _tried(self, mover: GridMover, before: Cells | None, row: Row) -> Cells | None:
         try:

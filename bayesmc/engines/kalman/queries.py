@@ -175,7 +175,7 @@ def _called(
 
 
 def _roots(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Roots of covariances that may be singular, largest columns last, and where one column is all there is."""
+    """Roots of covariances, largest columns last, and where one column is all there is."""
     values, vectors = np.linalg.eigh(covariances)
     values = np.clip(values, 0.0, None)
     rest = values[..., :-1].sum(axis=-1) <= 1e-14 * values[..., -1]
