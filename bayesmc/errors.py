@@ -208,6 +208,10 @@ class GridWarning(BayesmcWarning):
     """A grid that is too small or too coarse for the densities on it."""
 
 
+class EngineWarning(BayesmcWarning):
+    """An option has another engine answer than would without it."""
+
+
 class LogWarning(BayesmcWarning):
     """Lines of a log were skipped, since they do not read."""
 

@@ -86,6 +86,10 @@ class FilterEngine:
         """Why this engine is not taken where the user names none, though it can answer; or None."""
         return None
 
+    def is_displaced(self, problem: SeriesProblem) -> bool:
+        """Whether it would be asked before others, were it not for an option; told without a run."""
+        return not self.unanswered(problem)
+
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
         """Why this engine is taken where the user names none, if there is more to say than of its kind."""
         return ()

@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.filtering import Asked, FilterEngine
 from bayesmc.engines.grid.automatic import TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
@@ -61,6 +62,23 @@ class GridSearch(FilterEngine):
         if 16 * problem.steps * each > self.max_bytes:
             return f"the beliefs of {problem.steps} slices on {found.axis.size} cells do not fit max_bytes"
         return None
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        if reason is not None:
+            return reason
+        model = self.model_on_grid(problem.slices, known_static(problem))
+        for query, function in asked.queries.items():
+            for name in arguments_of(function):
+                if name in model.leaves and name in problem.hidden:
+                    return (
+                        f"queries={{{query!r}: ...}} reads {name!r}, which is hidden and not on the grid, "
+                        "since nothing depends on it"
+                    )
+        return None
+
+    def is_displaced(self, problem: SeriesProblem) -> bool:
+        return self.automatic(problem) is not None and super().is_displaced(problem)
 
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
         found = self.found(problem)

@@ -14,7 +14,8 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.filtering import FilterEngine, Queries, answer_so_far
+from bayesmc.engines.averages import arguments_of
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.kalman.answers import filter_answers, smooth_answers
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.passes import Filtered, State, backward
@@ -37,6 +38,18 @@ class GaussianFilter(FilterEngine):
         with quiet():
             why = self._own_refusal(problem, self._data(problem))
         return None if why is None else f"{type(self).__name__}: {why}"
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        silent = set(self.unanswered(problem)) if asked.queries and reason is None else set()
+        for query, function in asked.queries.items():
+            for name in arguments_of(function):
+                if name in silent:
+                    return (
+                        f"queries={{{query!r}: ...}} reads {name!r}, which takes no continuous values, and a "
+                        "Gaussian belief does not answer for it"
+                    )
+        return reason
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         silent = {n for layout in self._data(problem).layouts for n in layout.silent}
