@@ -30,6 +30,12 @@ MOST_CELLS, MOST_ENTRIES = 4000, 6e9
 ANEW = 20
 #: probability of one cell from which on cells are too wide for a belief
 _TOP = 0.5
+#: what may lie beyond an end in one slice: so that moments are good, too, where that can be had
+_DUST = 1e-6
+#: cells per width of the narrowest density, to begin with
+_FINE = 1.25
+#: what a halving of the cells that were asked for changes, times this, bounds their error
+_SAFE = 1.5
 #: bytes of beliefs that are kept for the answers, which are worked out again otherwise
 _KEPT = float(2**27)
 
@@ -87,20 +93,23 @@ def find_grid(
         No grid of a bounded size holds the beliefs.
     """
     search = _Search(name, make, rows)
-    lattice = search.first(line)
-    lattice, before = search.pilot(lattice, cells)
+    lattice, before = search.held(line, cells)
     if cells is not None:
-        before = search.passed(lattice.cut(max(cells // 2, 2))).increments
-        return search.answer(search.passed(lattice.cut(cells)), before)
+        finer = search.passed(lattice.cut(2 * cells)).increments
+        return search.answer(search.passed(lattice.cut(cells)), finer, _SAFE)
+    finer = lattice.cut(2 * lattice.cells)
     while True:
-        finer = lattice.cut(2 * lattice.cells)
         search.check_price(finer)
         found = search.passed(finer)
-        done = search.answer(found, before)
-        last = 2 * finer.cells > MOST_CELLS or line.kind == "integers"
-        if last or np.max(done.error) <= TARGET or search.price(finer.cut(2 * finer.cells)) > 1:
+        wider = finer.widened(*(found.ends.reshape(2, -1).max(axis=1) > TARGET / 4))
+        if wider != finer:  # the first pass saw too little of it
+            finer = wider
+            continue
+        done, half = search.answer(found, before), finer.cut(2 * finer.cells)
+        small = np.max(done.error) <= TARGET or line.kind == "integers"
+        if small or half.cells > MOST_CELLS or search.price(half) > 1:
             return done
-        lattice, before = finer, found.increments
+        finer, before = half, found.increments
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -113,7 +122,7 @@ class _Passed:
     axis: Axis
     mover: GridMover
     increments: np.ndarray
-    beyond: np.ndarray
+    ends: np.ndarray
     kept: list[Cells] | None
 
 
@@ -122,7 +131,23 @@ class _Search:
 
     def __init__(self, name: str, make: Callable[[Axis], GridModel], rows: Sequence[Row]) -> None:
         self.name, self.make, self.rows = name, make, rows
-        self.limit = TARGET / (4 * len(rows))
+        self.limit = _DUST
+
+    def held(self, line: Line, cells: int | None) -> tuple[Lattice, np.ndarray]:
+        """A lattice that holds all beliefs, and the log evidence of each row on it.
+
+        It ends where next to nothing is left, or, if that takes too many cells, where the evidence would not
+        tell.
+        """
+        loose = TARGET / (4 * len(self.rows))
+        for limit in (min(_DUST, loose), loose):
+            self.limit = limit
+            try:
+                return self.pilot(self.first(line), cells)
+            except UnsupportedError:
+                if limit == loose:
+                    raise
+        raise AssertionError
 
     # ---- where to begin -------------------------------------------------------------------------
 
@@ -164,7 +189,7 @@ class _Search:
         if line.kind == "integers":
             return lattice
         width = min(width, self._narrowest(lattice))
-        return self._cut(lattice, (lattice.high - lattice.low) / width)
+        return self._cut(lattice, _FINE * (lattice.high - lattice.low) / width)
 
     def _guess(self, line: Line) -> tuple[float, float]:
         """Coordinates between which slice 0 may lie: draws from its density, and what was seen."""
@@ -249,7 +274,7 @@ class _Search:
         """A pass on one lattice."""
         mover, before = self._mover(lattice), None
         increments, kept = [], []
-        beyond: Any = 0.0
+        ends: Any = 0.0
         few = True
         for row in self.rows:
             with in_slice(row.t):
@@ -257,21 +282,20 @@ class _Search:
             increments.append(before.increment)
             share = self._shares(before)
             if share is not None:
-                ends = np.where(self._open(lattice), share[[0, -1]].T, 0.0).T
-                beyond = beyond + len(share) * ends.sum(axis=0)
+                open_ends = np.where(self._open(lattice), share[[0, -1]].T, 0.0).T
+                ends = ends + len(share) * open_ends
             few = few and 2 * before.probs.nbytes * len(self.rows) <= _KEPT
             if few:
                 kept.append(before)
         whole = np.array(increments)
-        return _Passed(
-            axis_of(lattice), mover, whole, beyond * np.ones(whole.shape[1:]), kept if few else None
-        )
+        ends = ends * np.ones((2, *whole.shape[1:]))
+        return _Passed(axis_of(lattice), mover, whole, ends, kept if few else None)
 
-    def answer(self, found: _Passed, before: np.ndarray) -> FoundGrid:
-        """A grid with its error: what the last halving changed, and what may lie beyond the ends."""
-        off = np.abs(found.increments.sum(axis=0) - before.sum(axis=0))
+    def answer(self, found: _Passed, other: np.ndarray, times: float = 1.0) -> FoundGrid:
+        """A grid with its error: what a halving of cells changed, and what may lie beyond the ends."""
+        off = times * np.abs(found.increments.sum(axis=0) - other.sum(axis=0))
         rounding = 1e-15 * np.abs(found.increments).sum(axis=0)
-        error = off + found.beyond + rounding
+        error = off + found.ends.sum(axis=0) + rounding
         return FoundGrid(self.name, found.axis, error, found.mover, found.kept)
 
     def price(self, lattice: Lattice) -> float:

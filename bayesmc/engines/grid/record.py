@@ -164,11 +164,6 @@ class GridPosterior(SeriesPosterior):
         with marking_invalid(), np.errstate(all="ignore"):
             return np.stack([ask(one) for one in self.answers])
 
-    @property
-    def gridded(self) -> tuple[str, ...]:
-        """Nodes whose densities were kept."""
-        return tuple(self._grids)
-
     def density(self, name: str) -> np.ndarray:
         """Densities at the points of the grid, shape ``(time, *plates, *cells)``.
 

@@ -94,11 +94,7 @@ class GridSearch(FilterEngine):
         if self.quadrature != "midpoint":
             return None
         model = self.model_on_grid(problem.slices, known_static(problem))
-        numbers = [
-            n
-            for n in problem.hidden
-            if n in model.own and n not in model.leaves and problem.model[n].domain is None
-        ]
+        numbers = _numbers(problem, model)
         if len(numbers) != 1 or numbers[0] in self.grid:
             return None
         name = numbers[0]
@@ -148,10 +144,19 @@ class GridSearch(FilterEngine):
                     GridWarning,
                     stacklevel=4,
                 )
-        elif any(problem.model[n].domain is None for n in posterior.gridded):
+        elif _numbers(problem, self.model_on_grid(problem.slices, known_static(problem))):
             nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
             posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
         return posterior
+
+
+def _numbers(problem: SeriesProblem, model: GridModel) -> list[str]:
+    """Hidden nodes that have cells and no states."""
+    return [
+        n
+        for n in problem.hidden
+        if n in model.own and n not in model.leaves and problem.model[n].domain is None
+    ]
 
 
 @contextmanager
