@@ -225,6 +225,10 @@ class ModelMisfitWarning(BayesmcWarning):
     """Rows of a series are, as a whole, far less likely than the model says that rows are."""
 
 
+class EngineWarning(BayesmcWarning):
+    """An option has another engine answer than would without it."""
+
+
 class LogWarning(BayesmcWarning):
     """Lines of a log were skipped, since they do not read."""
 

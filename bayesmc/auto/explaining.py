@@ -20,6 +20,8 @@ def explain(
     *,
     inputs: Mapping[str, Any] | None = None,
     question: str = "filter",
+    keep: str | None = None,
+    queries: Mapping[str, Any] | None = None,
 ) -> Explanation:
     """Which engine would answer, why, what it does to each node, and why anything better was refused.
 
@@ -35,6 +37,8 @@ def explain(
     inputs : dict, optional
     question : str
         For templates: ``"filter"``, ``"smooth"``, ``"fixed-lag"``, ``"forecast"`` or ``"most_likely"``.
+    keep, queries : optional
+        As the call would have them: they may ask for more than an engine answers.
 
     Raises
     ------
@@ -52,7 +56,7 @@ def explain(
       a  eliminated
     """
     if isinstance(net, DynamicBayesNet) and not isinstance(engine, Engine):
-        explanation = explained_series(net, evidence, engine, inputs, question)
+        explanation = explained_series(net, evidence, engine, inputs, question, keep, queries)
     else:
         explanation = explained(net, evidence, engine, inputs)
     print(explanation)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.particles.filter import ParticleFilter
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import EngineWarning, UnsupportedError
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import SeriesPosterior
 
@@ -62,7 +63,9 @@ def filter(
     keep : "particles", optional
         Hold the particles of all slices, for queries afterwards; memory grows with time.
     queries : dict, optional
-        Name -> function of nodes of a slice; its expectation in every slice is in ``.queries``.
+        Name -> function of nodes of a slice, whose arguments have an axis of points, cells, states or
+        particles first; its expectation in every slice is in ``.queries``, its standard error, where one is
+        stated, in ``.queries_mcse``.
 
     Returns
     -------
@@ -71,6 +74,11 @@ def filter(
     Raises
     ------
     ModelError, EvidenceError, UnsupportedError, DegeneracyError
+
+    Warns
+    -----
+    EngineWarning
+        ``keep`` or ``queries`` has another engine answer than would without it.
 
     Examples
     --------
@@ -85,7 +93,7 @@ def filter(
     (3,)
     """
     problem = pose_series(dbn, observations, inputs)
-    chosen = _engine(problem, engine, Asked("filter", keep, tuple(queries or ())))
+    chosen = _engine(problem, engine, Asked("filter", keep, queries or {}))
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options)
 
@@ -120,7 +128,7 @@ def smooth(
     ):
         raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
     kind = "smooth" if lag is None else "fixed-lag"
-    chosen = _engine(problem, engine, Asked(kind, None, tuple(queries or ())))
+    chosen = _engine(problem, engine, Asked(kind, None, queries or {}))
     return chosen.smooth(problem, seed_sequence(rng), lag=lag, queries=queries, progress=progress)
 
 
@@ -149,7 +157,7 @@ def forecast(
     """
     check_steps("forecast", steps)
     problem = pose_series(dbn, observations, inputs, ahead=steps)
-    chosen = _engine(problem, engine, Asked("forecast", None, tuple(queries or ())))
+    chosen = _engine(problem, engine, Asked("forecast", None, queries or {}))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
 
@@ -187,15 +195,18 @@ def explained_series(
     engine: FilterEngine | None,
     inputs: Mapping[str, Any] | None,
     question: str,
+    keep: str | None = None,
+    queries: Queries | None = None,
 ) -> Explanation:
     """See ``explain``."""
     if question not in _QUESTIONS:
         raise ValueError(
             f"explain(question={question!r}): there are {', '.join(map(repr, _QUESTIONS))}"
         )
-    problem, asked = pose_series(dbn, observations, inputs), Asked(question)
+    problem = pose_series(dbn, observations, inputs)
+    asked = Asked(question, keep, queries or {})
     if engine is None:
-        chosen, reasons, refused = _choose(problem, asked)
+        chosen, reasons, refused, _ = _choose(problem, asked)
         return Explanation(chosen, reasons, refused, chosen.describe(problem))
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
@@ -211,7 +222,15 @@ def explained_series(
 def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -> FilterEngine:
     """The engine asked for, or the one chosen; a refusal is raised with an alternative."""
     if engine is None:
-        return _choose(problem, asked)[0]
+        chosen = _choose(problem, asked)
+        if chosen.instead is not None:
+            warnings.warn(
+                f"{asked.what}: {chosen.instead}; if that is what you want, name the engine, "
+                f"engine={type(chosen.engine).__name__}(...)",
+                EngineWarning,
+                stacklevel=3,
+            )
+        return chosen.engine
     reason = _checked(engine).refusal(problem)
     if reason is None:
         return engine  # what else it cannot do, its own method says best
@@ -220,14 +239,27 @@ def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -
     raise UnsupportedError(reason if able is None else f"{reason}. {able}() can answer")
 
 
-def _choose(
-    problem: SeriesProblem, asked: Asked
-) -> tuple[FilterEngine, tuple[str, ...], dict[str, str]]:
+class _Chosen(NamedTuple):
+    """An engine that was chosen, why, why not others, and which an option kept from being chosen."""
+
+    engine: FilterEngine
+    reasons: tuple[str, ...]
+    refused: dict[str, str]
+    instead: str | None = None
+
+
+def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
     refused: dict[str, str] = {}
     late: list[FilterEngine] = []
+    displaced: FilterEngine | None = None
+    plain = Asked(asked.what)
     for candidate in _CANDIDATES:
         engine, name = candidate(), candidate.__name__
-        reason = _why_not(engine, problem, asked)
+        reason = engine.refusal(problem)
+        if reason is None:
+            reason = engine.unable(problem, asked)
+            if reason is not None and displaced is None and engine.unable(problem, plain) is None:
+                displaced = engine if engine.is_displaced(problem) else None
         if reason is None and (silent := engine.unanswered(problem)):
             reason = f"it would not answer for {', '.join(map(repr, silent))}"
         if reason is None:
@@ -235,14 +267,27 @@ def _choose(
             if reason is not None:
                 late.append(engine)
         if reason is None:
-            return engine, engine.reasons(problem) or (_WHY[name],), refused
+            instead = _instead(engine, displaced, asked, refused)
+            why = engine.reasons(problem) or (_WHY[name],)
+            return _Chosen(engine, why if instead is None else (*why, instead), refused, instead)
         refused[name] = reason
     if late:  # nothing that is better can answer
-        engine = late[0]
-        del refused[type(engine).__name__]
-        return engine, (_WHY[type(engine).__name__],), refused
+        name = type(late[0]).__name__
+        del refused[name]
+        return _Chosen(late[0], (_WHY[name],), refused)
     whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
+
+
+def _instead(
+    chosen: FilterEngine, displaced: FilterEngine | None, asked: Asked, refused: Mapping[str, str]
+) -> str | None:
+    """What an option does to the choice of engine."""
+    if displaced is None:
+        return None
+    option = f"keep={asked.keep!r}" if asked.keep is not None else f"queries={list(asked.queries)}"
+    name = type(displaced).__name__
+    return f"{option} has {type(chosen).__name__} answer where {name} would without it ({refused[name]})"
 
 
 def _why_not(engine: FilterEngine, problem: SeriesProblem, asked: Asked) -> str | None:

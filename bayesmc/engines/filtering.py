@@ -11,6 +11,7 @@ import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -37,13 +38,13 @@ class Asked(NamedTuple):
     what : str
         ``"filter"``, ``"smooth"``, ``"fixed-lag"``, ``"forecast"`` or ``"most_likely"``.
     keep : str or None
-    queries : tuple of str
-        Names of functions whose expectations are wanted.
+    queries : dict
+        Functions whose expectations are wanted, by name.
     """
 
     what: str = "filter"
     keep: str | None = None
-    queries: tuple[str, ...] = ()
+    queries: Queries = MappingProxyType({})
 
 
 class FilterEngine:
@@ -84,6 +85,10 @@ class FilterEngine:
     def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
         """Why this engine is not taken where the user names none, though it can answer; or None."""
         return None
+
+    def is_displaced(self, problem: SeriesProblem) -> bool:
+        """Whether it would be asked before others, were it not for an option; told without a run."""
+        return not self.unanswered(problem)
 
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
         """Why this engine is taken where the user names none, if there is more to say than of its kind."""

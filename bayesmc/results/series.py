@@ -55,7 +55,7 @@ class SeriesPosterior:
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
     queries_mcse : dict
-        Name -> Monte Carlo standard errors of ``queries``, of particles.
+        Name -> standard errors of ``queries``, where the engine states some.
 
     Examples
     --------

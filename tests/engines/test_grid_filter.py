@@ -807,10 +807,12 @@ def test_edges_of_vectors_and_of_plates() -> None:
 
 def test_refusals() -> None:
     rows = {"y": [0.1, 0.2]}
+    two = linear()
+    two.add("v", lambda v_prev, x: bmc.Normal(v_prev, 1.0 + x**2), initial=bmc.Normal(0.0, 1.0))
     with pytest.raises(
         UnsupportedError, match=r"'x' is hidden and unbounded; give it a grid, grid=\{'x'"
     ):
-        bmc.filter(linear(), rows, engine=GridFilter())
+        bmc.filter(two, rows, engine=GridFilter())
     with pytest.raises(UnsupportedError, match="40000 x 40000 cells for 'x', 11.9 GiB"):
         bmc.filter(linear(), rows, engine=GridFilter({"x": (-9.0, 9.0, 40_000)}))
     engine = GridFilter({"x": (-9.0, 9.0, 40_000)})
@@ -919,7 +921,8 @@ def test_engines_explain_themselves() -> None:
     assert why.nodes["s"] == "on a grid of 2 states"
     assert why.nodes["x"] == "on a grid of 50 cells"
     assert why.nodes["y"] == "observed, weights the cells"
-    assert "unbounded" in str(GridFilter().unsupported(linear(), {"y": [0.1]}))
+    found = bmc.explain(linear(), {"y": [0.1, 0.2]}, engine=GridFilter())
+    assert "on a grid of" in found.nodes["x"]
 
 
 # ---- factors with named axes --------------------------------------------------------------------

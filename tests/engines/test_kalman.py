@@ -412,15 +412,13 @@ def test_refuses_what_is_nonlinear_through_deterministic_memory() -> None:
         bmc.filter(dbn, {"y": [1.0, 0.0, 2.0]}, engine=KalmanFilter())
 
 
-def test_refuses_hidden_finite_nodes_queries_and_particles() -> None:
+def test_refuses_hidden_finite_nodes_and_particles() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.3, 0.7]], initial=[0.5, 0.5])
     dbn.add("y", lambda s: bmc.Normal(1.0 * s, 1.0))
     with pytest.raises(bmc.errors.UnsupportedError, match="'s' is hidden and discrete"):
         bmc.filter(dbn, {"y": [1.0, 0.0]}, engine=KalmanFilter())
     plain = local_level(0.0, 1.0)
-    with pytest.raises(bmc.errors.UnsupportedError, match="queries"):
-        bmc.filter(plain, {"y": NILE}, engine=KalmanFilter(), queries={"q": lambda x: x})
     with pytest.raises(bmc.errors.UnsupportedError, match="particles"):
         bmc.filter(plain, {"y": NILE}, engine=KalmanFilter(), keep="particles")
 

@@ -561,18 +561,20 @@ def test_same_calls_and_what_is_refused_names_the_particle_filter(engine: Any) -
     asked: dict[str, Any] = {"inputs": case.inputs, "engine": engine}
     for call in (bmc.filter, bmc.smooth, bmc.most_likely):
         call(case.dbn, case.observations, **asked)
-    for call, options in ((bmc.filter, {"keep": "particles"}), (bmc.filter, {"queries": {"a": abs}}),
-                          (bmc.smooth, {"queries": {"a": abs}})):  # fmt: skip
-        with pytest.raises(bmc.errors.UnsupportedError, match="ParticleFilter"):
-            call(case.dbn, case.observations, **asked, **options)
+    with pytest.raises(bmc.errors.UnsupportedError, match="ParticleFilter"):
+        bmc.filter(case.dbn, case.observations, keep="particles", **asked)
+    for call in (bmc.filter, bmc.smooth):
+        with pytest.raises(bmc.errors.UnknownNodeError, match="reads 'nothing'"):
+            call(case.dbn, case.observations, queries={"a": lambda nothing: nothing}, **asked)
     ahead = growth(1)
     if isinstance(engine, KalmanFilter):
         ahead = bmc.DynamicBayesNet()
         ahead.add("y", lambda y_prev: bmc.Normal(0.5 * y_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
     rows = {"y": ahead.sample(3, rng=0)["y"][0]}
     assert bmc.forecast(ahead, rows, steps=2, engine=engine).mean("y").shape[0] == 2
-    with pytest.raises(bmc.errors.UnsupportedError, match="ParticleFilter"):
-        bmc.forecast(ahead, rows, steps=2, engine=engine, queries={"a": abs})
+    asked = {"engine": engine, "queries": {"a": lambda y: y}}
+    found = bmc.forecast(ahead, rows, steps=2, **asked)
+    np.testing.assert_allclose(found.queries["a"], found.mean("y"), atol=1e-9)
 
 
 def test_options_are_checked() -> None:
@@ -666,11 +668,11 @@ def test_the_exact_filter_refuses_truth_values_and_the_choice_goes_on() -> None:
     assert why is not None
     assert "'pos' is computed from hidden nodes and takes no continuous values" in why
     assert why.endswith("; use ParticleFilter")
-    found, exact = bmc.filter(dbn, rows, rng=0), bmc.filter(plain, rows)
-    assert isinstance(found.engine, bmc.ParticleFilter)
+    found, exact = bmc.filter(dbn, rows), bmc.filter(plain, rows)
+    assert isinstance(found.engine, bmc.GridFilter)
     assert isinstance(exact.engine, KalmanFilter)
-    chance = ndtr(exact.mean("x") / exact.std("x"))  # five deviations of 1,000 particles at a half
-    assert np.abs(found.mean("pos") - chance).max() < 0.08
+    chance = ndtr(exact.mean("x") / exact.std("x"))
+    assert np.abs(found.mean("pos") - chance).max() < 1e-4
 
 
 @pytest.mark.parametrize("engine", ENGINES[:2], ids=SHORT[:2])

@@ -39,6 +39,14 @@ def switching() -> bmc.DynamicBayesNet:
     return dbn
 
 
+def lagged() -> bmc.DynamicBayesNet:
+    """Two hidden numbers a slice."""
+    dbn = curved()
+    dbn.add("w", lambda x_prev, w_prev: bmc.Normal(np.cos(x_prev), 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("v", lambda x, w: bmc.Normal(x * w, 0.5))
+    return dbn
+
+
 Y = {"y": [0.4, 1.1, -0.3]}
 
 
@@ -47,9 +55,11 @@ Y = {"y": [0.4, 1.1, -0.3]}
     [
         (linear, "filter", "KalmanFilter"),
         (linear, "most_likely", "KalmanFilter"),
-        (curved, "filter", "ParticleFilter"),
-        (curved, "smooth", "ParticleFilter"),
-        (turning, "forecast", "ParticleFilter"),
+        (curved, "filter", "GridFilter"),
+        (curved, "smooth", "GridFilter"),
+        (curved, "most_likely", "GridFilter"),
+        (turning, "forecast", "GridFilter"),
+        (lagged, "filter", "ParticleFilter"),
         (turning, "most_likely", "GridFilter"),
         (switching, "most_likely", "DiscreteFilter"),
     ],
@@ -61,15 +71,18 @@ def test_the_engine_fits_the_question(make: Any, question: str, engine: str, cap
 
 
 def test_what_is_asked_besides_is_taken_into_account() -> None:
-    found = bmc.filter(linear(), Y, queries={"up": lambda x: x > 0}, rng=0)
-    assert type(found.engine).__name__ == "ParticleFilter" and found.queries["up"].shape == (3,)
-    kept = bmc.filter(linear(), Y, keep="particles", rng=0)
-    assert type(kept.engine).__name__ == "ParticleFilter"
+    for make in (linear, curved):
+        with pytest.warns(bmc.errors.EngineWarning, match="keep='particles' has ParticleFilter"):
+            kept = bmc.filter(make(), Y, keep="particles", rng=0)
+        assert type(kept.engine).__name__ == "ParticleFilter"
+        said = bmc.explain(make(), Y, keep="particles").reasons
+        assert any("keep='particles' has ParticleFilter answer where" in why for why in said)
+    bmc.filter(lagged(), Y, keep="particles", rng=0)  # which particles answer anyway: no warning
     assert bmc.most_likely(turning(), Y)["x"].shape == (3,)
     with pytest.raises(
         bmc.errors.UnsupportedError, match=r"most_likely: no engine.*give it a grid"
     ):
-        bmc.most_likely(curved(), Y)
+        bmc.most_likely(lagged(), Y)
     with pytest.raises(ValueError, match="'most_likely'"):
         bmc.explain(linear(), Y, question="viterbi")
 

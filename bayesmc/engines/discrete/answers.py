@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term
@@ -64,28 +64,39 @@ class SliceAnswers:
                     self._place(out, start, stop, node, element, self.run.joint(scope, start, stop))
         return out[1:]
 
-    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+    def expectation(
+        self,
+        function: Callable[..., Any],
+        read: Callable[[Any], np.ndarray] = np.asarray,
+    ) -> np.ndarray:
         """Mean of a function of nodes of a slice, whose arguments have one leading axis, in every slice.
+
+        ``read`` makes an array of what it returns.
 
         Raises
         ------
         UnknownNodeError, QueryError, UnsupportedError, BudgetError
         """
+        names, kinds = self.check(function)
+        parts = []
+        entries = max(math.prod(map(float, self.reader.cards(t))) for t in kinds.values())
+        for start, stop in self._cut(kinds[2], entries):
+            rows = self.plan.rows(self.run.series, start, stop)
+            parts.append(self._expectation(function, names, kinds[rows.kind], rows, read))
+        return np.concatenate(parts)
+
+    def check(self, function: Callable[..., Any]) -> tuple[list[str], dict[int, Term]]:
+        """What a query reads, in the three kinds of slices; raises ahead what ``expectation`` does."""
         names = arguments_of(function)
         for name in names:
             if name not in self.model.nodes:
                 raise UnknownNodeError(
                     f"a query reads {name!r}, which is no node of a slice; there are {list(self.model.nodes)}"
                 )
-        parts = []
         kinds = {k: self.reader.question(names, k) for k in (0, 1, 2)}
         for term in kinds.values():
             self._check_question(term)
-        entries = max(math.prod(map(float, self.reader.cards(t))) for t in kinds.values())
-        for start, stop in self._cut(kinds[2], entries):
-            rows = self.plan.rows(self.run.series, start, stop)
-            parts.append(self._expectation(function, names, kinds[rows.kind], rows))
-        return np.concatenate(parts)
+        return names, kinds
 
     # ---- private ----------------------------------------------------------------------------
 
@@ -253,7 +264,12 @@ class SliceAnswers:
             )
 
     def _expectation(
-        self, function: Callable[..., Any], names: Sequence[str], term: Term, rows: Rows
+        self,
+        function: Callable[..., Any],
+        names: Sequence[str],
+        term: Term,
+        rows: Rows,
+        read: Callable[[Any], np.ndarray],
     ) -> np.ndarray:
         reader = self.reader
         placed = rows.on_axes(reader, term)
@@ -266,7 +282,7 @@ class SliceAnswers:
                 node = reader.model(term.kind, 0)[name]
                 value = np.broadcast_to(placed.value(name, 0), (*lead, *node.value_shape))
                 arguments.append(node.decode(value.reshape(count, *node.value_shape)))
-            values = np.asarray(function(*arguments))
+            values = read(function(*arguments))
         if (
             not values.ndim
             or len(values) != count
@@ -284,12 +300,6 @@ class SliceAnswers:
         weights = np.moveaxis(weights, -1, 1)
         weights = weights.reshape(weights.shape + (1,) * (values.ndim - weights.ndim))
         return np.where(weights > 0, weights * values, 0.0).sum(axis=1)
-
-
-def arguments_of(function: Callable[..., Any]) -> list[str]:
-    """Nodes that a query reads; arguments with a default are none, as for the functions of nodes."""
-    parameters = inspect.signature(function).parameters.values()
-    return [p.name for p in parameters if p.default is inspect.Parameter.empty]
 
 
 def answer_queries(answers: SliceAnswers, queries: Queries | None) -> dict[str, np.ndarray]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, Series, Slices
+from bayesmc.engines.averages import as_event
 from bayesmc.engines.discrete.answers import SliceAnswers
 from bayesmc.engines.discrete.run import Run
 from bayesmc.errors import QueryError
@@ -83,14 +84,27 @@ class DiscreteBelief:
         """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
         return self._posterior.probabilities(name)[0]
 
-    @cached_property
-    def _posterior(self) -> SeriesPosterior:
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Mean of a function of nodes of the slice, whose arguments have a leading axis of states."""
+        return self._slice.expectation(function)[-1]
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probability of an event (a function that returns booleans)."""
+        return self._slice.expectation(function, as_event)[-1]
+
+    @property
+    def _slice(self) -> SliceAnswers:
         if self.run is None:
             raise QueryError(
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
             )
-        slices = self.run.plan.slices
-        found = SliceAnswers(self.run).of(slices.dynamic)
+        return SliceAnswers(self.run)
+
+    @cached_property
+    def _posterior(self) -> SeriesPosterior:
+        answers = self._slice
+        slices = answers.plan.slices
+        found = answers.of(slices.dynamic)
         return SeriesPosterior(
             slices.first, None, "filter", None, tables=found.tables, means=found.means,
             variances=found.variances, steps=1, start=self.t,

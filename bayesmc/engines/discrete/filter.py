@@ -6,20 +6,21 @@ Options, refusals and the calls; tables of slices are made in ``slices``, passed
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, arguments_of, best_path
+from bayesmc.engines.averages import arguments_of, as_event
+from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
 from bayesmc.engines.discrete.belief import DiscreteBelief, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
 from bayesmc.engines.discrete.path import path_values
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
-from bayesmc.engines.filtering import FilterEngine, Queries, observed_answers
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, observed_answers
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.progress import Progress
@@ -90,6 +91,21 @@ class DiscreteFilter(FilterEngine):
             return common
         error = self._why_not(problem)
         return None if error is None else str(error)
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        if reason is None and asked.queries:
+            try:
+                leaves = not self._asks_for_leaves(problem, asked.queries)
+                why = self._why_not(problem, leaves)
+                if why is None:
+                    run = Run(self._plan(problem, leaves), problem.series)
+                    for function in asked.queries.values():
+                        SliceAnswers(run).check(function)
+            except BayesmcError as error:
+                why = UnsupportedError(str(error))
+            reason = None if why is None else f"queries={list(asked.queries)}: {why}"
+        return reason
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         plan, series = self._plan(problem), problem.series
@@ -302,6 +318,19 @@ class DiscretePosterior(SeriesPosterior):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_answers": None}
 
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Means of a function of nodes of a slice, time first, its arguments with an axis of states first.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError, UnsupportedError, BudgetError
+        """
+        return self._asked("expectation").expectation(function)
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probabilities of an event (a function that returns booleans), time first."""
+        return self._asked("probability").expectation(function, as_event)
+
     def pairs(self, name: str) -> np.ndarray:
         """Joint tables of a node in two slices in a row, ``(time - 1, *plates, states before, states)``.
 
@@ -314,17 +343,20 @@ class DiscretePosterior(SeriesPosterior):
         """
         if name not in self.model.nodes:
             raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
-        answers = self._answers
-        if answers is None:
-            raise QueryError(
-                f"pairs({name!r}): joint tables need the run behind the answers, which neither a forecast "
-                "nor a pickle carries; ask the result of filter or smooth itself"
-            )
+        answers = self._asked(f"pairs({name!r})")
         if (1, name, 0) not in answers.plan.cards or not answers.hands_on(name):
             raise QueryError(
                 f"pairs({name!r}): the node is no hidden finite node that the next slice reads"
             )
         return answers.pairs(name)
+
+    def _asked(self, what: str) -> SliceAnswers:
+        if self._answers is None:
+            raise QueryError(
+                f"{what}: joint tables need the run behind the answers, which neither a forecast nor a "
+                "pickle carries; ask the result of filter or smooth itself, or give queries= to the call"
+            )
+        return self._answers
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
+from bayesmc.dbn import PREVIOUS
+from bayesmc.engines.averages import arguments_of, over_line
+from bayesmc.engines.grid.refined import Fine, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
@@ -55,6 +57,10 @@ class Answers:
         states = np.arange(node.domain.size)
         value = self._value(name)
         if value is not None:
+            if not node.is_stochastic:
+                found = self._computed(node, lambda v: v[..., None] == states)
+                if found is not None:
+                    return found
             hits = (value[..., None] == states).astype(float)
             return self._average(node, hits, 1)
         dist = self.model.evaluate(self.first, name, self.base)
@@ -73,6 +79,12 @@ class Answers:
                 return None
             value = node.decode(value)
         if value is not None:
+            if not node.is_stochastic and node.angles is None:
+                mean = self._computed(node, lambda v: v)
+                if mean is not None:
+                    var = self._computed(node, lambda v: (v - mean) ** 2)
+                    assert var is not None
+                    return mean, var
             return self._moments(node, value, None)
         try:
             dist = self.model.evaluate(self.first, name, self.base)
@@ -123,47 +135,167 @@ class Answers:
             out[seen.mask] = np.nan
         return out
 
-    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
-        """Mean of a function of nodes of the slice, whose arguments have a leading axis of cells."""
-        names = list(inspect.signature(function).parameters)
-        values = {}
+    def expectation(
+        self,
+        function: Callable[..., Any],
+        read: Callable[[Any], np.ndarray] = np.asarray,
+    ) -> np.ndarray:
+        """Mean of a function of nodes of the slice, whose arguments have a leading axis of cells.
+
+        ``read`` makes an array of what it returns. Where it reads one number on even cells, finite nodes
+        beside, the cells are cut into finer ones.
+        """
+        names = arguments_of(function)
         for name in names:
             if name not in self.model.slices.dynamic and name not in self.model.static:
                 raise UnknownNodeError(f"a query reads {name!r}, which is no node of a slice")
-            value = self._value(name)
-            if value is None:
+            if self._value(name) is None:
                 raise QueryError(
                     f"a query reads {name!r}, which is hidden and not on the grid, since nothing depends on "
                     f"it; give it one, grid={{{name!r}: (low, high, cells)}}"
                 )
-            values[name] = value
-        count = self._batch
-        labels = self._used([(self._node(n), v, 0) for n, v in values.items()])
+        nodes = [self._node(n) for n in names]
+
+        def called(values: Sequence[np.ndarray], cells: int) -> np.ndarray:
+            result = read(
+                function(*(node.decode(v) for node, v in zip(nodes, values, strict=True)))
+            )
+            apart = self.model.lead
+            if result.shape[: 1 + len(apart)] != (cells, *apart):
+                more = f", the plates {self.model.apart} next" if apart else ""
+                raise QueryError(
+                    f"a query returns shape {result.shape}; it must return one value per cell, the axis of "
+                    f"{cells} cells first{more}"
+                )
+            return result
+
+        return self._averaged(names, called)
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles of a node of one number on the grid, shape ``(*q.shape, *plates)``."""
+        levels = np.asarray(q, dtype=float)
+        if not ((levels >= 0) & (levels <= 1)).all():
+            raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+        node = self._node(name)
+        label = (name, 0)
+        fine = self._fine(label, {label})
+        if fine is None or node.domain is not None or self.model.elements(name) != 1:
+            raise UnsupportedError(
+                f"quantile({name!r}): a grid has quantiles of a node of one number that is hidden, on even "
+                "cells; finite nodes have probabilities"
+            )
+        found = quantiles(fine, levels)
+        apart = self.model.apart
+        order = [apart.index(p) for p in node.plates if p in apart]
+        found = found.transpose(*range(levels.ndim), *(levels.ndim + k for k in order))
+        return found.reshape(*levels.shape, *node.value_shape)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _averaged(
+        self, names: Sequence[str], called: Callable[[Sequence[np.ndarray], int], np.ndarray]
+    ) -> np.ndarray:
+        """The average of a function over all cells, of arguments ``(cells, *value_shape)``."""
+        values = {n: self._value(n) for n in names}
+        kept = [(self._node(n), v, 0) for n, v in values.items() if v is not None]
+        labels = self._used(kept)
+        found = self._over_fine(names, called, labels)
+        if found is not None:
+            return found
         sizes = self._sizes()
         grid = tuple(sizes[x] if x in labels else 1 for x in self._labels())
         cells = math.prod(grid)
-        arguments = []
-        for name, value in values.items():
-            node = self._node(name)
-            lead = value.ndim - len(node.value_shape)
-            full = (1,) * (count - lead) + value.shape
-            shape = (*grid, *node.value_shape)
-            wide = np.broadcast_to(value.reshape(full), shape).reshape(cells, *node.value_shape)
-            arguments.append(node.decode(wide))
-        result = np.asarray(function(*arguments), dtype=float)
-        apart = self.model.lead
-        if result.shape[: 1 + len(apart)] != (cells, *apart):
-            more = f", the plates {self.model.apart} next" if apart else ""
-            raise QueryError(
-                f"a query returns shape {result.shape}; it must return one value per cell, the axis of "
-                f"{cells} cells first{more}"
-            )
+        arguments = [self._wide(node, value, grid) for node, value, _ in kept]
+        result = called(arguments, cells).astype(float)
         weights = self._marginal(labels).reshape(
-            (cells, *apart) + (1,) * (result.ndim - 1 - len(apart))
+            (cells, *self.model.lead) + (1,) * (result.ndim - 1 - len(self.model.lead))
         )
         return np.where(weights > 0, weights * result, 0.0).sum(axis=0)
 
-    # ---- private -------------------------------------------------------------------------------
+    def _wide(self, node: CompiledNode, value: np.ndarray, grid: Sequence[int]) -> np.ndarray:
+        """Values over the grid with one axis for all its cells."""
+        lead = value.ndim - len(node.value_shape)
+        full = (1,) * (len(grid) - lead) + value.shape
+        wide = np.broadcast_to(value.reshape(full), (*grid, *node.value_shape))
+        return wide.reshape(math.prod(grid), *node.value_shape)
+
+    def _over_fine(
+        self,
+        names: Sequence[str],
+        called: Callable[[Sequence[np.ndarray], int], np.ndarray],
+        labels: set[Label],
+    ) -> np.ndarray | None:
+        """The same on finer cells of the one number that is read; None where there is none, or several."""
+        first = self.model.slices.first
+        numbers = [x for x in labels if first[str(x[0]).removesuffix(PREVIOUS)].domain is None]  # type: ignore[index]
+        fine = self._fine(numbers[0], labels) if len(numbers) == 1 else None
+        if fine is None:
+            return None
+        name, spot = str(numbers[0][0]), self._labels().index(numbers[0])  # type: ignore[index]
+        node, sizes = self._node(name), self._sizes()
+        others = [sizes[x] if x in labels and x != numbers[0] else 1 for x in self._labels()]
+        carried = {n for n in self.now.values if n not in self.model.own}
+        base = {n: v for n, v in self.base.items() if n not in carried}
+        states, behind = math.prod(others), len(self._labels()) - spot - 1
+
+        def evaluate(_: np.ndarray, points: np.ndarray) -> np.ndarray:
+            x = np.asarray(fine.number(points)).reshape(
+                -1, *(1,) * (behind + len(node.value_shape))
+            )
+            held = {**base, name: np.broadcast_to(x, (*x.shape[: behind + 1], *node.value_shape))}
+            grid = [*others[:spot], len(points), *others[spot + 1 :]]
+            arguments = []
+            for n in names:
+                own, value = self._node(n), held.get(n)
+                if value is None or n in self.model.leaves:
+                    value = self._value(n) if n in self.model.leaves else None
+                    if value is None:
+                        value = self.model.computed(self.first, n, held)
+                wide = self._wide(own, value, grid)
+                wide = wide.reshape(math.prod(grid[:spot]), len(points), -1, *own.value_shape)
+                arguments.append(np.moveaxis(wide, 1, 0).reshape(-1, *own.value_shape))
+            result = called(arguments, len(points) * states)
+            return result.reshape(len(points), states, *result.shape[1:])
+
+        masses = fine.masses.reshape(len(fine.points), states, *self.model.lead)
+        return over_line(evaluate, 1, fine.points, masses[None])[0].sum(axis=0)
+
+    def _fine(self, label: Label, labels: set[Label]) -> Fine | None:
+        """The belief on finer cells of a number, shape (J, *others, *apart); None where it has none."""
+        held = {s.label: s for s in self.now.scalars}
+        if any(x not in held for x in labels) or label not in held:
+            return None  # of the slice before, or seen
+        scalar = held[label]
+        axes = self.model.axes.of[str(label[0])]  # type: ignore[index]
+        number = int(label[1])  # type: ignore[index]
+        if scalar.points.size != scalar.size:  # some elements are seen
+            return None
+        order = [x for x in self._labels() if x in labels]
+        shares = self._marginal(labels)
+        shares = np.moveaxis(
+            shares.reshape(*(held[x].size for x in order), *self.model.lead), order.index(label), 0
+        )
+        return refined(axes[number % len(axes)], scalar, shares)
+
+    def _computed(
+        self, node: CompiledNode, function: Callable[[np.ndarray], np.ndarray]
+    ) -> np.ndarray | None:
+        """A function of a deterministic node, averaged on finer cells; None where that is not to be had."""
+        apart, plates = self.model.apart, node.plates
+        if any(p not in plates for p in apart):
+            return None
+        front = [1 + plates.index(p) for p in apart]
+
+        def called(values: Sequence[np.ndarray], cells: int) -> np.ndarray:
+            result = np.asarray(function(values[0]))
+            return np.moveaxis(result, front, range(1, 1 + len(front)))
+
+        value = self._value(node.name)
+        assert value is not None
+        found = self._over_fine([node.name], called, self._used([(node, value, 0)]))
+        return (
+            None if found is None else np.moveaxis(found, range(len(front)), [k - 1 for k in front])
+        )
 
     def _node(self, name: str) -> CompiledNode:
         return self.model.slices.model(self.now.row.t)[name]

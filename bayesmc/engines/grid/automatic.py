@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.filtering import in_slice
-from bayesmc.engines.grid.axes import Axis
+from bayesmc.engines.grid.axes import Axis, axis_of
 from bayesmc.engines.grid.lattice import Lattice, Line
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.tables import GridModel
@@ -30,6 +30,12 @@ MOST_CELLS, MOST_ENTRIES = 4000, 6e9
 ANEW = 20
 #: probability of one cell from which on cells are too wide for a belief
 _TOP = 0.5
+#: what may lie beyond an end in one slice: so that moments are good, too, where that can be had
+_DUST = 1e-6
+#: cells per width of the narrowest density, to begin with
+_FINE = 1.25
+#: what a halving of the cells that were asked for changes, times this, bounds their error
+_SAFE = 1.5
 #: bytes of beliefs that are kept for the answers, which are worked out again otherwise
 _KEPT = float(2**27)
 
@@ -87,20 +93,23 @@ def find_grid(
         No grid of a bounded size holds the beliefs.
     """
     search = _Search(name, make, rows)
-    lattice = search.first(line)
-    lattice, before = search.pilot(lattice, cells)
+    lattice, before = search.held(line, cells)
     if cells is not None:
-        before = search.passed(lattice.cut(max(cells // 2, 2))).increments
-        return search.answer(search.passed(lattice.cut(cells)), before)
+        finer = search.passed(lattice.cut(2 * cells)).increments
+        return search.answer(search.passed(lattice.cut(cells)), finer, _SAFE)
+    finer = lattice.cut(2 * lattice.cells)
     while True:
-        finer = lattice.cut(2 * lattice.cells)
         search.check_price(finer)
         found = search.passed(finer)
-        done = search.answer(found, before)
-        last = 2 * finer.cells > MOST_CELLS or line.kind == "integers"
-        if last or np.max(done.error) <= TARGET or search.price(finer.cut(2 * finer.cells)) > 1:
+        wider = finer.widened(*(found.ends.reshape(2, -1).max(axis=1) > TARGET / 4))
+        if wider != finer:  # the first pass saw too little of it
+            finer = wider
+            continue
+        done, half = search.answer(found, before), finer.cut(2 * finer.cells)
+        small = np.max(done.error) <= TARGET or line.kind == "integers"
+        if small or half.cells > MOST_CELLS or search.price(half) > 1:
             return done
-        lattice, before = finer, found.increments
+        finer, before = half, found.increments
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -113,7 +122,7 @@ class _Passed:
     axis: Axis
     mover: GridMover
     increments: np.ndarray
-    beyond: np.ndarray
+    ends: np.ndarray
     kept: list[Cells] | None
 
 
@@ -122,7 +131,23 @@ class _Search:
 
     def __init__(self, name: str, make: Callable[[Axis], GridModel], rows: Sequence[Row]) -> None:
         self.name, self.make, self.rows = name, make, rows
-        self.limit = TARGET / (4 * len(rows))
+        self.limit = _DUST
+
+    def held(self, line: Line, cells: int | None) -> tuple[Lattice, np.ndarray]:
+        """A lattice that holds all beliefs, and the log evidence of each row on it.
+
+        It ends where next to nothing is left, or, if that takes too many cells, where the evidence would not
+        tell.
+        """
+        loose = TARGET / (4 * len(self.rows))
+        for limit in (min(_DUST, loose), loose):
+            self.limit = limit
+            try:
+                return self.pilot(self.first(line), cells)
+            except UnsupportedError:
+                if limit == loose:
+                    raise
+        raise AssertionError
 
     # ---- where to begin -------------------------------------------------------------------------
 
@@ -151,7 +176,11 @@ class _Search:
             inside = len(share) * share > self.limit / 2  # as ``_reached`` judges ends
             some = np.flatnonzero(inside.reshape(len(share), -1).any(axis=1))
             width = lattice.step / (2.51 * float(tops.max()))
-            if line.kind in ("interval", "integers") or np.ptp(some) >= 0.7 * lattice.cells:
+            if (
+                line.kind == "integers"
+                or not any(line.grows)
+                or np.ptp(some) >= 0.7 * lattice.cells
+            ):
                 break
             ends = lattice.low + lattice.step * np.array([some[0] - 2, some[-1] + 3])
             lattice = Lattice(line, float(ends[0]), float(ends[1]), 256)
@@ -160,11 +189,11 @@ class _Search:
         if line.kind == "integers":
             return lattice
         width = min(width, self._narrowest(lattice))
-        return self._cut(lattice, (lattice.high - lattice.low) / width)
+        return self._cut(lattice, _FINE * (lattice.high - lattice.low) / width)
 
     def _guess(self, line: Line) -> tuple[float, float]:
         """Coordinates between which slice 0 may lie: draws from its density, and what was seen."""
-        if line.kind == "interval":
+        if not any(line.grows):
             return line.low, line.high
         start = 1.0 if line.kind == "real" else float(np.clip(1.0, line.low + 1, line.high - 1))
         point = float(line.number(np.asarray(0.0))) if line.kind in ("above", "below") else start
@@ -195,7 +224,7 @@ class _Search:
         """How wide the densities are that lead on from there, in the coordinate."""
         if len(self.rows) < 2:
             return np.inf
-        model = self.make(lattice.cut(64).axis())
+        model = self.make(axis_of(lattice.cut(64)))
         before, now = model.place(self.rows[0]), model.place(self.rows[1])
         dist = model.evaluate(False, self.name, model.base(before, now))
         centre: Any = None
@@ -245,7 +274,7 @@ class _Search:
         """A pass on one lattice."""
         mover, before = self._mover(lattice), None
         increments, kept = [], []
-        beyond: Any = 0.0
+        ends: Any = 0.0
         few = True
         for row in self.rows:
             with in_slice(row.t):
@@ -253,21 +282,20 @@ class _Search:
             increments.append(before.increment)
             share = self._shares(before)
             if share is not None:
-                ends = np.where(self._open(lattice), share[[0, -1]].T, 0.0).T
-                beyond = beyond + len(share) * ends.sum(axis=0)
+                open_ends = np.where(self._open(lattice), share[[0, -1]].T, 0.0).T
+                ends = ends + len(share) * open_ends
             few = few and 2 * before.probs.nbytes * len(self.rows) <= _KEPT
             if few:
                 kept.append(before)
         whole = np.array(increments)
-        return _Passed(
-            lattice.axis(), mover, whole, beyond * np.ones(whole.shape[1:]), kept if few else None
-        )
+        ends = ends * np.ones((2, *whole.shape[1:]))
+        return _Passed(axis_of(lattice), mover, whole, ends, kept if few else None)
 
-    def answer(self, found: _Passed, before: np.ndarray) -> FoundGrid:
-        """A grid with its error: what the last halving changed, and what may lie beyond the ends."""
-        off = np.abs(found.increments.sum(axis=0) - before.sum(axis=0))
+    def answer(self, found: _Passed, other: np.ndarray, times: float = 1.0) -> FoundGrid:
+        """A grid with its error: what a halving of cells changed, and what may lie beyond the ends."""
+        off = times * np.abs(found.increments.sum(axis=0) - other.sum(axis=0))
         rounding = 1e-15 * np.abs(found.increments).sum(axis=0)
-        error = off + found.beyond + rounding
+        error = off + found.ends.sum(axis=0) + rounding
         return FoundGrid(self.name, found.axis, error, found.mover, found.kept)
 
     def price(self, lattice: Lattice) -> float:
@@ -296,7 +324,7 @@ class _Search:
     # ---- private --------------------------------------------------------------------------------
 
     def _mover(self, lattice: Lattice) -> GridMover:
-        return GridMover(self.make(lattice.axis()), np.inf)
+        return GridMover(self.make(axis_of(lattice)), np.inf)
 
     def _tried(self, mover: GridMover, before: Cells | None, row: Row) -> Cells | None:
         try:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import Slices
+from bayesmc.engines.grid.lattice import Lattice, Line
 from bayesmc.network import CompiledNode
 from bayesmc.shapes import owned
 
@@ -35,10 +36,13 @@ class Axis:
         Stored values: positions for finite nodes.
     widths : ndarray, shape (n,)
         Quadrature weights: the length that a point stands for, 1 for isolated values.
+    lattice : Lattice or None
+        The even cells that it is made of, if it is.
     """
 
     points: np.ndarray
     widths: np.ndarray
+    lattice: Lattice | None = None
 
     @property
     def size(self) -> int:
@@ -108,6 +112,16 @@ def read_axes(slices: Slices, grid: Mapping[str, Any], cells: int, rule: str) ->
                 axis = _interval(name, *bounds, cells, rule)
                 found[name] = (axis,) * math.prod(node.event_shape)
     return Axes(found, frozenset(grid), missing)
+
+
+def axis_of(lattice: Lattice) -> Axis:
+    """Points and widths of even cells."""
+    if lattice.line.kind == "integers":
+        values = np.arange(round(lattice.low), round(lattice.high))
+        return Axis(owned(values, np.int64), owned(np.ones(len(values))))
+    u = lattice.low + lattice.step * (np.arange(lattice.cells) + 0.5)
+    points, widths = lattice.line.number(u), lattice.step * lattice.line.stretch(u)
+    return Axis(owned(points), owned(widths), lattice)
 
 
 def check_rule(rule: str) -> None:
@@ -204,8 +218,7 @@ def _bounds_and_cells(what: str, given: tuple[Any, ...]) -> tuple[float, float, 
 def _interval(name: str, low: float, high: float, cells: int, rule: str) -> Axis:
     """An interval by a rule; only the midpoint rule has cells, the others so many points."""
     if rule == "midpoint":
-        width = (high - low) / cells
-        return Axis(owned(low + width * (np.arange(cells) + 0.5)), owned(np.full(cells, width)))
+        return axis_of(Lattice(Line("real"), low, high, cells))
     if rule == "gauss-legendre":
         points, weights = np.polynomial.legendre.leggauss(cells)
         half = (high - low) / 2

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
+from bayesmc.engines.averages import as_event
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
@@ -104,6 +105,16 @@ class GridBelief:
         """Mean of a function of nodes of the slice, whose arguments have a leading axis of cells."""
         with self._quiet():
             return self._answers.expectation(function)
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probability of an event (a function that returns booleans)."""
+        with self._quiet():
+            return self._answers.expectation(function, as_event)
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles of a node of one number, shape ``(*q.shape, *plates)``."""
+        self._node(name)
+        return self._answers.quantile(name, q)
 
     def __repr__(self) -> str:
         if self.cells is None:

@@ -1,7 +1,7 @@
 """Lattices: cells that lie evenly on a line, in the coordinate that suits a node's support.
 
 On the whole line and on intervals that is the number itself, above or below a bound the logarithm of the
-distance from it. A lattice can be widened, made finer, and turned into an axis.
+distance from it. A lattice can be widened and made finer.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesmc.dbn import Slices
-from bayesmc.engines.grid.axes import Axis
-from bayesmc.shapes import owned
 
 
 @dataclass(frozen=True)
@@ -23,7 +21,7 @@ class Line:
     Attributes
     ----------
     kind : str
-        ``"real"``, ``"above"`` or ``"below"`` a bound, ``"interval"`` (circles, too), ``"integers"``.
+        ``"real"``, ``"above"`` or ``"below"`` a bound, ``"interval"``, ``"circle"``, ``"integers"``.
     low, high : float
         Bounds, possibly infinite.
     """
@@ -59,9 +57,8 @@ class Line:
     @property
     def grows(self) -> tuple[bool, bool]:
         """Whether cells may be added at the low and at the high end, whatever stands there now."""
-        if self.kind == "interval":
-            return False, False
-        return True, True
+        bounded = self.kind in ("interval", "circle")
+        return not bounded, not bounded
 
 
 @dataclass(frozen=True)
@@ -78,13 +75,11 @@ class Lattice:
         """The distance between neighbours, in the coordinate."""
         return (self.high - self.low) / self.cells
 
-    def axis(self) -> Axis:
-        """Points and widths."""
-        if self.line.kind == "integers":
-            points = np.arange(round(self.low), round(self.high))
-            return Axis(owned(points, np.int64), owned(np.ones(len(points))))
-        u = self.low + self.step * (np.arange(self.cells) + 0.5)
-        return Axis(owned(self.line.number(u)), owned(self.step * self.line.stretch(u)))
+    @property
+    def comes_round(self) -> bool:
+        """Whether the last cell is next to the first: a circle that is covered whole."""
+        turn = 2 * math.pi
+        return self.line.kind == "circle" and abs(self.high - self.low - turn) <= 1e-9 * turn
 
     def cut(self, cells: int) -> Lattice:
         """The same range in so many cells."""
@@ -114,7 +109,7 @@ def line_of(slices: Slices, name: str) -> Line | None:
         return None
     kinds = {s.kind for s in supports if s is not None}
     if kinds == {"circle"}:
-        return Line("interval", -math.pi, math.pi)
+        return Line("circle", -math.pi, math.pi)
     if not kinds <= {"real", "interval", "integers"}:
         return None
     low, high = -math.inf, math.inf

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.averages import as_event
 from bayesmc.engines.exact import readable_bytes
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
 
@@ -38,6 +41,7 @@ class GridRecord:
         self.variances: dict[str, np.ndarray] = {}
         self.densities: dict[str, np.ndarray] = {}
         self.unanswered: set[str] = set()
+        self.answers: dict[int, Answers] | None = {} if densities else None
         self.queries: dict[str, list[Any]] = {n: [None] * steps for n in queries}
         for name in problem.hidden:
             node = problem.model[name]
@@ -55,6 +59,8 @@ class GridRecord:
 
     def add(self, k: int, answers: Answers) -> None:
         """Take in the k-th slice."""
+        if self.answers is not None:
+            self.answers[k] = answers
         for name, table in self.tables.items():
             table[k] = answers.table(name)
         for name in list(self.means):
@@ -77,7 +83,7 @@ class GridRecord:
         seen = observed_answers(self.problem, k)
         axes = self.model.axes.of
         grids = {n: tuple(a.points for a in axes[n]) for n in self.densities}
-        return GridPosterior(
+        found = GridPosterior(
             self.problem.model,
             engine,
             kind,
@@ -90,6 +96,9 @@ class GridRecord:
             queries={n: np.stack(rows[:k]) for n, rows in self.queries.items()},
             start=self.problem.series.start,
         )
+        if self.answers is not None:
+            found.answers = [self.answers[t] for t in range(k)]
+        return found
 
 
 class GridPosterior(SeriesPosterior):
@@ -122,10 +131,38 @@ class GridPosterior(SeriesPosterior):
         super().__init__(model, engine, kind, increments, **answers)
         self._grids, self._densities = grids, densities
 
-    @property
-    def gridded(self) -> tuple[str, ...]:
-        """Nodes whose densities were kept."""
-        return tuple(self._grids)
+    #: what beliefs say of every slice; pickles travel without
+    answers: list[Answers] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "answers": None}
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Means of a function of nodes of a slice, time first, its arguments with an axis of cells first.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError
+        """
+        return self._of_all("expectation", lambda one: one.expectation(function))
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probabilities of an event (a function that returns booleans), time first."""
+        return self._of_all("probability", lambda one: one.expectation(function, as_event))
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles of a node of one number, shape ``(time, *q.shape, *plates)``."""
+        self._node(name)
+        return self._of_all(f"quantile({name!r})", lambda one: one.quantile(name, q))
+
+    def _of_all(self, what: str, ask: Callable[[Answers], np.ndarray]) -> np.ndarray:
+        if self.answers is None:
+            raise QueryError(
+                f'{what}: beliefs were not kept, since a pickle carries none and keep="summaries" keeps '
+                "none; give queries= to the call"
+            )
+        with marking_invalid(), np.errstate(all="ignore"):
+            return np.stack([ask(one) for one in self.answers])
 
     def density(self, name: str) -> np.ndarray:
         """Densities at the points of the grid, shape ``(time, *plates, *cells)``.
@@ -150,12 +187,14 @@ class GridPosterior(SeriesPosterior):
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
         cut = super().last(steps, kind)
-        return GridPosterior(
+        found = GridPosterior(
             self.model, self.engine, kind, None, self._grids,
             {n: v[-steps:] for n, v in self._densities.items()},
             tables=cut._tables, means=cut._means, variances=cut._variances, queries=cut.queries,
             steps=steps, start=cut.start,
         )  # fmt: skip
+        found.answers = None if self.answers is None else self.answers[-steps:]
+        return found
 
     def _kept(self, name: str, what: str, kept: dict[str, Any]) -> Any:
         if name not in kept:

@@ -12,6 +12,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.filtering import Asked, FilterEngine
 from bayesmc.engines.grid.automatic import TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
@@ -62,6 +63,23 @@ class GridSearch(FilterEngine):
             return f"the beliefs of {problem.steps} slices on {found.axis.size} cells do not fit max_bytes"
         return None
 
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        if reason is not None:
+            return reason
+        model = self.model_on_grid(problem.slices, known_static(problem))
+        for query, function in asked.queries.items():
+            for name in arguments_of(function):
+                if name in model.leaves and name in problem.hidden:
+                    return (
+                        f"queries={{{query!r}: ...}} reads {name!r}, which is hidden and not on the grid, "
+                        "since nothing depends on it"
+                    )
+        return None
+
+    def is_displaced(self, problem: SeriesProblem) -> bool:
+        return self.automatic(problem) is not None and super().is_displaced(problem)
+
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
         found = self.found(problem)
         if found is None:
@@ -76,11 +94,7 @@ class GridSearch(FilterEngine):
         if self.quadrature != "midpoint":
             return None
         model = self.model_on_grid(problem.slices, known_static(problem))
-        numbers = [
-            n
-            for n in problem.hidden
-            if n in model.own and n not in model.leaves and problem.model[n].domain is None
-        ]
+        numbers = _numbers(problem, model)
         if len(numbers) != 1 or numbers[0] in self.grid:
             return None
         name = numbers[0]
@@ -130,10 +144,19 @@ class GridSearch(FilterEngine):
                     GridWarning,
                     stacklevel=4,
                 )
-        elif any(problem.model[n].domain is None for n in posterior.gridded):
+        elif _numbers(problem, self.model_on_grid(problem.slices, known_static(problem))):
             nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
             posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
         return posterior
+
+
+def _numbers(problem: SeriesProblem, model: GridModel) -> list[str]:
+    """Hidden nodes that have cells and no states."""
+    return [
+        n
+        for n in problem.hidden
+        if n in model.own and n not in model.leaves and problem.model[n].domain is None
+    ]
 
 
 @contextmanager

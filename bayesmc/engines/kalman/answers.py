@@ -7,18 +7,23 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.filtering import observed_answers
+from bayesmc.engines.filtering import Queries, observed_answers
 from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.passes import Filtered, Smoothed
 from bayesmc.engines.kalman.posterior import GaussianSeries, Spreads, on_circle
+from bayesmc.engines.kalman.queries import View, expectation
 
 
 def filter_answers(
-    engine: Any, problem: SeriesProblem, data: SeriesData, found: Filtered
+    engine: Any,
+    problem: SeriesProblem,
+    data: SeriesData,
+    found: Filtered,
+    queries: Queries | None = None,
 ) -> GaussianSeries:
     """Every slice given the rows up to it; of the first so many, where no more were passed."""
     spreads = Spreads(found.factors, found.which)
-    return _answers(engine, problem, data, "filter", found, found.means, spreads)
+    return _answers(engine, problem, data, "filter", found, found.means, spreads, queries)
 
 
 def smooth_answers(
@@ -28,6 +33,7 @@ def smooth_answers(
     found: Filtered,
     smoothed: Smoothed,
     kind: str,
+    queries: Queries | None = None,
 ) -> GaussianSeries:
     """Every slice given later rows, too."""
     layout, roots = data.layouts[0], found.factors
@@ -36,7 +42,7 @@ def smooth_answers(
         left = left.reshape(len(left), *(1,) * len(layout.lead), *left.shape[1:])
     means = found.means + np.matvec(left, smoothed.noise)
     spreads = Spreads(roots, found.which, smoothed.spread)
-    return _answers(engine, problem, data, kind, found, means, spreads)
+    return _answers(engine, problem, data, kind, found, means, spreads, queries)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -50,6 +56,7 @@ def _answers(
     filtered: Filtered,
     means: np.ndarray,
     spreads: Spreads,
+    queries: Queries | None,
 ) -> GaussianSeries:
     variances = spreads.variances()
     layout, steps = data.layouts[0], len(means)
@@ -77,4 +84,17 @@ def _answers(
     found.layout, found.spreads = layout, spreads
     found.normalised = filtered.innovations
     found.predictive = filtered.innovations.predictive()
+    found.view = View(layout, means, spreads, _known(problem, data, steps))
+    for name, function in (queries or {}).items():
+        found.queries[name], found.queries_mcse[name] = expectation(found.view, function)
     return found
+
+
+def _known(problem: SeriesProblem, data: SeriesData, steps: int) -> dict[str, np.ndarray]:
+    """Stored values of nodes that are known in every slice."""
+    series = problem.series
+    found = {n: o.value for n, o in series.static.items()}
+    found |= {n: o.value[:steps] for n, o in series.observed.items() if o.mask is None}
+    computed = data.computed(steps).items()
+    sizes = {n: problem.slices.first[n].value_shape for n, _ in computed}
+    return found | {n: np.broadcast_to(v, (steps, *sizes[n])) for n, v in computed}

@@ -14,7 +14,8 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.filtering import FilterEngine, Queries, answer_so_far
+from bayesmc.engines.averages import arguments_of
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.kalman.answers import filter_answers, smooth_answers
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.passes import Filtered, State, backward
@@ -29,7 +30,6 @@ from bayesmc.results.predictive import warn_of_misfit
 class GaussianFilter(FilterEngine):
     """Base of ``KalmanFilter``, ``ExtendedKalmanFilter`` and ``UnscentedKalmanFilter``."""
 
-    takes_queries: ClassVar[bool] = False
     belief: ClassVar[type] = GaussianBelief
 
     def refusal(self, problem: SeriesProblem) -> str | None:
@@ -39,6 +39,18 @@ class GaussianFilter(FilterEngine):
         with quiet():
             why = self._own_refusal(problem, self._data(problem))
         return None if why is None else f"{type(self).__name__}: {why}"
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        silent = set(self.unanswered(problem)) if asked.queries and reason is None else set()
+        for query, function in asked.queries.items():
+            for name in arguments_of(function):
+                if name in silent:
+                    return (
+                        f"queries={{{query!r}: ...}} reads {name!r}, which takes no continuous values, and a "
+                        "Gaussian belief does not answer for it"
+                    )
+        return reason
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         silent = {n for layout in self._data(problem).layouts for n in layout.silent}
@@ -82,13 +94,12 @@ class GaussianFilter(FilterEngine):
                 f"keep={keep!r}: {type(self).__name__} has no particles; ask its result for mean, var and "
                 "cov, or use a ParticleFilter"
             )
-        self._check_queries(queries)
         data = self._data(problem)
         try:
             found = self._passed(problem, data, False, progress)
         except KeyboardInterrupt as stop:
             return answer_so_far(stop, self)
-        answers = filter_answers(self, problem, data, found)
+        answers = filter_answers(self, problem, data, found, queries)
         warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 4)
         return answers
 
@@ -101,12 +112,11 @@ class GaussianFilter(FilterEngine):
         queries: Queries | None = None,
         progress: bool | None = None,
     ) -> GaussianSeries:
-        self._check_queries(queries)
         data = self._data(problem)
         found = self._passed(problem, data, True, progress)
         smoothed = backward(data.layouts[0], found, lag)
         kind = "smooth" if lag is None else "fixed-lag"
-        answers = smooth_answers(self, problem, data, found, smoothed, kind)
+        answers = smooth_answers(self, problem, data, found, smoothed, kind, queries)
         warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 4)
         return answers
 
@@ -181,14 +191,6 @@ class GaussianFilter(FilterEngine):
             with quiet():
                 problem.cache["kalman data"] = SeriesData(problem)
         return problem.cache["kalman data"]
-
-    def _check_queries(self, queries: Queries | None) -> None:
-        if queries:
-            raise UnsupportedError(
-                f"queries={list(queries)}: {type(self).__name__} answers mean, var, std and cov of nodes; "
-                "declare a deterministic node for an affine function of them, or use a ParticleFilter, which "
-                "answers for any function"
-            )
 
 
 @contextmanager

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +12,7 @@ from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.filtering import refuse_forecast
 from bayesmc.engines.kalman.innovations import Innovations
+from bayesmc.engines.kalman.queries import View, expectation, quantiles
 from bayesmc.engines.kalman.rows import RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
@@ -102,7 +103,24 @@ class GaussianSeries(SeriesPosterior):
 
     layout: Layout
     spreads: Spreads
+    view: View
     normalised: Innovations | None = None
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Means of a function of nodes of a slice, time first, its arguments with an axis of points first.
+
+        One number is averaged to rounding, jumps included; several over 4,096 points that make cubic
+        functions exact (``queries=`` has the standard errors in ``queries_mcse``).
+        """
+        return expectation(self.view, function)[0]
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probabilities of an event (a function that returns booleans), time first."""
+        return expectation(self.view, function, event=True)[0]
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles, shape ``(time, *q.shape, *plates, *event)``; those of angles about the mean."""
+        return quantiles(self.mean(name), self.std(name), q, name)
 
     @property
     def nis(self) -> np.ndarray:
@@ -173,9 +191,11 @@ class GaussianSeries(SeriesPosterior):
         cut = super().last(steps, kind)
         found = GaussianSeries(
             self.model, self.engine, kind, None, tables=cut._tables, means=cut._means,
-            variances=cut._variances, steps=steps, start=cut.start,
+            variances=cut._variances, queries=cut.queries, steps=steps, start=cut.start,
         )  # fmt: skip
         found.layout, found.spreads = self.layout, self.spreads.last(steps)
+        found.queries_mcse = cut.queries_mcse
+        found.view = self.view.last(steps, found.spreads)
         return found
 
     def _node(self, name: str) -> CompiledNode:
@@ -285,6 +305,24 @@ class GaussianBelief:
         places = [self._place(n) for n in names]
         whole = self.factor @ np.matrix_transpose(self.factor)
         return joined(self.layout, places, whole[None], 1)[0]
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Mean of a function of nodes of the slice; see ``GaussianSeries.expectation``."""
+        return expectation(self._view, function)[0][0]
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probability of an event (a function that returns booleans)."""
+        return expectation(self._view, function, event=True)[0][0]
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles, shape ``(*q.shape, *plates, *event)``."""
+        return quantiles(self.mean(name)[None], self.std(name)[None], q, name)[0]
+
+    @property
+    def _view(self) -> View:
+        spreads = Spreads(self.factor[None], np.zeros(1, dtype=np.intp))
+        known = {n: np.asarray(v)[None] for n, v in self.known.items()}
+        return View(self.layout, self.vector[None], spreads, known)
 
     def __repr__(self) -> str:
         if self.taken is None:
