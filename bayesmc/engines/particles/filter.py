@@ -25,7 +25,7 @@ from bayesmc.engines.particles.mover import Mover
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.particles.smoothing import Backward, carried, lagged
+from bayesmc.engines.particles.smoothing import Backward, endless, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
@@ -241,7 +241,7 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return _NOT_SMOOTHED
-        sums = carried(problem.slices) if asked.what == "smooth" else ()
+        sums = endless(problem.slices) if asked.what == "smooth" else ()
         return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
@@ -298,7 +298,7 @@ class ParticleFilter(FilterEngine):
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
-        sums = carried(problem.slices)
+        sums = endless(problem.slices)
         if sums:
             raise UnsupportedError(_not_backwards(sums[0]))
         filtered = self._passed(problem, seed, True, {}, progress)
@@ -485,8 +485,9 @@ _NOT_SMOOTHED = (
 
 def _not_backwards(name: str) -> str:
     return (
-        f"ParticleFilter: {name!r} is computed from its own past, so trajectories cannot be drawn "
-        "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
+        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
+        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
+        "engine=ParticleGibbs())"
     )
 
 
