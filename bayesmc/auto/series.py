@@ -11,7 +11,7 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.series import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.particles.filter import ParticleFilter
@@ -232,6 +232,9 @@ def _choose(
         if reason is None:
             return engine, (_WHY[name],), refused
         refused[name] = reason
+    alike = common_refusal("no engine over time", problem)
+    if alike is not None:  # all of them say it
+        raise UnsupportedError(f"{asked.what}: {alike}")
     whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
 

@@ -20,6 +20,7 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine, same_question
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
+from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted import check_count, no_memory
 from bayesmc.errors import (
     BayesmcError,
@@ -230,6 +231,10 @@ class ChainEngine(Engine):
             warnings.warn(message, InterruptWarning, stacklevel=4)
         found = poor_mixing(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         band = getattr(sampler, "acceptance_band", _BAND)
+        problem = posterior.problem
+        timed = problem is not None and series_of(problem) is not None
+        if found and timed and "Particle" not in name:
+            found[0] += "; ParticleGibbs(draws) draws whole trajectories of a template at once"
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 

@@ -32,6 +32,7 @@ from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
 from bayesmc.network.forward import refuse_unsampled
+from bayesmc.network.store import meant
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -539,8 +540,8 @@ def _asked(queries: Queries, slices: Slices) -> list[str]:
         for name in inspect.signature(function).parameters:
             if name not in slices.dynamic:
                 raise UnknownNodeError(
-                    f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice; there are "
-                    f"{list(slices.dynamic)}"
+                    f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice"
+                    f"{meant(slices.dynamic, name)}; there are {list(slices.dynamic)}"
                 )
             found.append(name)
     return found
