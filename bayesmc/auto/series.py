@@ -235,7 +235,7 @@ def _choose(
     alike = common_refusal("no engine over time", problem)
     if alike is not None:  # all of them say it
         raise UnsupportedError(f"{asked.what}: {alike}")
-    whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
+    whys = ". ".join(w if w.startswith(n) else f"{n}: {w}" for n, w in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
 
 
