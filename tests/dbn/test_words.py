@@ -1,4 +1,4 @@
-"""What templates say of names that are not there, of bad parameters in a slice, and where no filter answers."""
+"""What templates say of names that are not there, of bad parameters, and where no filter answers."""
 
 from __future__ import annotations
 

@@ -263,6 +263,13 @@ def test_what_is_not_guided_is_named() -> None:
     assert caught[0].filename == __file__
 
 
+def test_proposals_of_the_user_are_told_as_such() -> None:
+    engine = bmc.ParticleFilter(9, proposal={"x": lambda x_prev: bmc.Normal(x_prev, 1.0)})
+    assert bmc.explain(issue(), {"y": [1]}, engine).nodes["x"] == "sampled from its proposal"
+    plain = bmc.explain(issue(), {"y": [1]}, bmc.ParticleFilter(9)).nodes
+    assert plain["x"] == "sampled given its parents"
+
+
 def test_a_net_in_which_nothing_is_guided_says_so() -> None:
     hmm = bmc.DynamicBayesNet()
     hmm.table("z", ["z_prev"], [[0.8, 0.2], [0.3, 0.7]], initial=[0.5, 0.5])
