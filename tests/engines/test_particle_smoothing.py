@@ -596,6 +596,29 @@ def test_a_lag_as_users_write_it_is_smoothed() -> None:
     assert (np.abs(runs.mean(axis=0) - exact.mean("x")) < 5 * error).all()
 
 
+def test_what_is_the_same_for_all_particles_may_go_on_without_end() -> None:
+    """A counter, and a running mean of what was seen, on which the state leans."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("n", lambda n_prev: n_prev + 1.0, initial=lambda: 1.0)
+    dbn.add("s", lambda s_prev, y_prev: 0.5 * s_prev + y_prev, initial=lambda: 0.0)
+    dbn.add(
+        "x",
+        lambda x_prev, s, n: bmc.Normal(0.5 * x_prev + 0.2 * s, 0.7 + 0.0 * n),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 0.6))
+    rows = {"y": np.array([0.5, 1.4, 0.3, 1.9, 2.2])}
+    engine = bmc.ParticleFilter(2000, trajectories=1000)
+    found = bmc.smooth(dbn, rows, engine=engine, rng=0)
+    exact = bmc.infer(dbn.unroll(5), dbn.unrolled_evidence(rows), engine=bmc.Exact())
+    wanted = np.array([float(exact.mean(f"x[{t}]")) for t in range(5)])
+    np.testing.assert_allclose(found.mean("x"), wanted, atol=0.1)  # some 5 standard errors
+    assert found.mean("n").tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    gap = {"y": [0.5, None, 0.3]}  # the sum is hidden then
+    with pytest.raises(UnsupportedError, match="'s' is computed from its own past without end"):
+        bmc.smooth(dbn, gap, engine=engine, rng=0)
+
+
 def test_running_sums_are_not_drawn_backwards() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 1.0), initial=bmc.Normal(0.0, 1.0))

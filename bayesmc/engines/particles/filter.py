@@ -242,7 +242,7 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return _NOT_SMOOTHED
-        sums = endless(problem.slices) if asked.what == "smooth" else ()
+        sums = endless(problem.slices, _seen(problem)) if asked.what == "smooth" else ()
         return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
@@ -299,7 +299,7 @@ class ParticleFilter(FilterEngine):
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
-        sums = endless(problem.slices)
+        sums = endless(problem.slices, _seen(problem))
         if sums:
             raise UnsupportedError(_not_backwards(sums[0]))
         filtered = self._passed(problem, seed, True, {}, progress)
@@ -308,7 +308,8 @@ class ParticleFilter(FilterEngine):
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
         count = self.particles if self.trajectories is None else self.trajectories
-        backward = Backward(mover.plan, mover.layout, self.backward == "rejection")
+        by_bound = self.backward == "rejection"
+        backward = Backward(mover.plan, mover.layout, by_bound, _seen(problem))
         with _quiet():
             rng = stream(seed, Purpose.SMOOTH)
             found = backward.trajectories(filtered.clouds, problem.series, count, rng)
@@ -482,6 +483,11 @@ _NOT_SMOOTHED = (
     "ParticleFilter: particles whose number changes (adapt=), or that begin anew (recovery=), are not "
     "smoothed; leave these out, and declare what can happen in the transition"
 )
+
+
+def _seen(problem: SeriesProblem) -> set[str]:
+    """Nodes that are seen in full in all slices."""
+    return {n for n, o in problem.series.observed.items() if o.mask is None}
 
 
 def _not_backwards(name: str) -> str:

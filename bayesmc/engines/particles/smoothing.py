@@ -31,7 +31,7 @@ inference, sec. 4 (models with memory).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from itertools import pairwise
 from typing import Any, NamedTuple
@@ -63,12 +63,20 @@ class Backward:
         Of the clouds.
     rejection : bool
         Accept draws by a bound where one is known.
+    seen : collection of str
+        Nodes that are seen in full in all slices.
     """
 
-    def __init__(self, plan: SlicePlan, layout: Layout, rejection: bool = True) -> None:
+    def __init__(
+        self,
+        plan: SlicePlan,
+        layout: Layout,
+        rejection: bool = True,
+        seen: Collection[str] = (),
+    ) -> None:
         self.plan, self.layout = plan, layout
         self.slices: Slices = plan.slices
-        self.layers = _layers(plan)
+        self.layers = _layers(plan, seen)
         self.crossing = self.layers[0].crossing
         one = len(self.layers) == 1
         self.rejection = rejection and one and _is_bounded(plan, self.crossing)
@@ -255,13 +263,13 @@ class Backward:
         return len(self.slices.later[name].value_shape)
 
 
-def endless(slices: Slices) -> tuple[str, ...]:
+def endless(slices: Slices, seen: Collection[str] = ()) -> tuple[str, ...]:
     """Computed nodes through which a value enters all later slices, such as running sums.
 
     Trajectories are not put together backwards through them: each particle would be held against all that
-    follows. Lags and chains of them forget.
+    follows. Lags and chains of them forget; what is computed of nodes ``seen`` in full is the same for all.
     """
-    found = set(slices.interface)
+    found = set(_entering(slices, seen))
     while True:
         further = _carried(slices, {n + PREVIOUS for n in found})
         if further == found or not further:
@@ -390,11 +398,26 @@ class _After:
         return other
 
 
-def _layers(plan: SlicePlan) -> list[_Layer]:
+def _entering(slices: Slices, seen: Collection[str]) -> set[str]:
+    """Nodes that the next slice reads and that particles may differ in."""
+    varying = {n for n in slices.stochastic if n not in seen}
+    before = -1
+    while len(varying) > before:
+        before = len(varying)
+        for name in slices.dynamic:
+            read = {p.removesuffix(PREVIOUS) for p in slices.later[name].parents}
+            if not slices.later[name].is_stochastic and varying & read:
+                varying.add(name)
+            elif not slices.first[name].is_stochastic and varying & set(slices.first[name].parents):
+                varying.add(name)
+    return varying & set(slices.interface)
+
+
+def _layers(plan: SlicePlan, seen: Collection[str]) -> list[_Layer]:
     """What slices do to those after them, as far as values are carried on."""
     model, slices = plan.slices.later, plan.slices
     found: list[_Layer] = []
-    entering = set(slices.interface)
+    entering = _entering(slices, seen)
     while entering and (not found or len(found) <= len(slices.interface)):
         reached = {n + PREVIOUS for n in entering}
         steps: list[Step] = []

@@ -29,7 +29,9 @@ def looks_told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) 
     found = dict(treated)
     for key in engine.proposal if isinstance(engine.proposal, Mapping) else ():
         for name in names_of(key):
-            found[name] = found[name].replace("sampled given its parents", "sampled from its proposal")
+            found[name] = found[name].replace(
+                "sampled given its parents", "sampled from its proposal"
+            )
     if engine.proposal == "optimal":
         told = guidance(slices, seen, plates_apart(slices), min(problem.steps - 1, 1))
         for name, by in told.guided.items():
