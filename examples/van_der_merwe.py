@@ -7,8 +7,8 @@ The template says it as it stands: the noise is a Gamma, moved by ``bmc.Affine``
 1.5 and its variance 0.75 where they need them. A bootstrap filter of 200 particles has one or two near the
 narrow measurement; filters *guided* by a Gaussian in the light of y_t put all of them there. A guide can be
 wrong and the answers are still right, as weights make up for it (weights p(y|x) p(x|x_prev) / q), as long as
-it covers the belief: both are mixed with the transition. (``proposal="optimal"`` derives a guide where hidden
-nodes are Normal; for this Gamma it is written out.)
+it covers the belief: both are mixed with the transition. (``proposal="optimal"`` derives one such guide from
+the mean and the variance of the Gamma; here two are written out, to compare them.)
 
 In the table of the paper the EKF's error is .374 and the UKF's .280, four times as much. That is what they
 come to if the mean of the noise is left out of the filters' model, as the last lines show. The paper's UKF

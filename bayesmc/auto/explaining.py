@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from bayesmc.auto.explanation import Explanation
@@ -10,6 +11,7 @@ from bayesmc.auto.series import explained_series
 from bayesmc.auto.static import explained
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
+from bayesmc.errors import UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph
 
 
@@ -45,6 +47,11 @@ def explain(
     UnsupportedError
         No engine can answer.
 
+    Notes
+    -----
+    Where no engine over time can answer for a template (static nodes are unknown, say), it says so, and
+    explains what ``infer`` does with the template unrolled.
+
     Examples
     --------
     >>> import bayesmc as bmc
@@ -56,8 +63,32 @@ def explain(
       a  eliminated
     """
     if isinstance(net, DynamicBayesNet) and not isinstance(engine, Engine):
-        explanation = explained_series(net, evidence, engine, inputs, question, keep, queries)
+        try:
+            explanation = explained_series(net, evidence, engine, inputs, question, keep, queries)
+        except UnsupportedError as error:
+            if engine is not None:
+                raise
+            explanation = _by_infer(net, evidence, inputs, question, error)
     else:
         explanation = explained(net, evidence, engine, inputs)
     print(explanation)
     return explanation
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _by_infer(
+    net: DynamicBayesNet,
+    observations: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None,
+    question: str,
+    refused: UnsupportedError,
+) -> Explanation:
+    """What ``infer`` does with a template that no engine over time answers for."""
+    try:
+        found = explained(net, observations, None, inputs)
+    except UnsupportedError:
+        raise refused from None
+    reasons = (f"this is what infer(dbn, observations) takes; {refused}", *found.reasons)
+    return replace(found, reasons=reasons)

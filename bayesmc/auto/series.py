@@ -12,7 +12,7 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.series import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.particles.filter import ParticleFilter
@@ -275,7 +275,10 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
         name = type(late[0]).__name__
         del refused[name]
         return _Chosen(late[0], (_WHY[name],), refused)
-    whys = ". ".join(f"{name}: {why}" for name, why in refused.items())
+    alike = common_refusal("no engine over time", problem)
+    if alike is not None:  # all of them say it
+        raise UnsupportedError(f"{asked.what}: {alike}")
+    whys = ". ".join(w if w.startswith(n) else f"{n}: {w}" for n, w in refused.items())
     raise UnsupportedError(f"{asked.what}: no engine can answer. {whys}")
 
 

@@ -21,7 +21,7 @@ from bayesmc.network.evidence import observe
 from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
-from bayesmc.network.store import unknown
+from bayesmc.network.store import meant
 from bayesmc.shapes import Shape, first_index, owned
 
 
@@ -227,7 +227,8 @@ def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarr
     for name in values:
         if name not in found:
             raise EvidenceError(
-                f"static= gives {name!r}, which is no static node with a density; there are {list(found)}"
+                f"static= gives {name!r}, which is no static node with a density{meant(found, name)}; there "
+                f"are {list(found)}"
             )
     return found
 
@@ -338,7 +339,7 @@ def _check_observed(template: Template, name: str) -> None:
     if name in template.inputs:
         raise EvidenceError(f"observations of {name!r}, which is an input; give it with inputs=")
     if name not in template.later:
-        raise EvidenceError(f"observations of {name!r}: {unknown(template.later, name)}")
+        raise EvidenceError(f"observations of {name!r}: {template.unknown(name)}")
 
 
 def _by_label(template: Template, name: str, value: Any, ahead: int = 0) -> Any:
@@ -356,8 +357,8 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
     for name in inputs:
         if name not in template.inputs:
             raise EvidenceError(
-                f"inputs= gives {name!r}, which is not a declared input; the inputs are "
-                f"{list(template.inputs)}"
+                f"inputs= gives {name!r}, which is not a declared input{meant(template.inputs, name)}; the "
+                f"inputs are {list(template.inputs)}"
             )
         _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
         if np.ndim(inputs[name]) == 0:

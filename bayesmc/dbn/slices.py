@@ -7,6 +7,7 @@ values for the second to be evaluated.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,7 +22,7 @@ from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.domain import Domain
 from bayesmc.network.node import Declaration
 from bayesmc.network.ordering import topological_order
-from bayesmc.network.store import ModelStore, unknown
+from bayesmc.network.store import ModelStore, meant
 from bayesmc.shapes import owned
 
 if TYPE_CHECKING:
@@ -35,6 +36,14 @@ TIME = "t"
 _CLOCK = {
     name: Declaration(name, "input", (), (), event_shape=()) for name in (TIME, TIME + PREVIOUS)
 }
+
+
+#: names by which one may try to look further back: x_prev2, x_prev_prev, x_2prev, x_lag2
+_FAR_BACK = re.compile(r"(.+?)_?(?:prev(?:_?prev)+|prev_?\d+|\d+_?prev|prev_?\d+_prev|lag_?\d+)")
+#: other ways to write that of the slice before
+_TURNED = re.compile(r"(?:prev|previous|last)_(.+)")
+#: names of nodes of the unrolled net
+_UNROLLED = re.compile(r"(.+)\[\d+\]")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +81,28 @@ class Template:
         read = {p for d in self.later.values() for p in d.parents if p.endswith(PREVIOUS)}
         return tuple(n for n in self.dynamic if n + PREVIOUS in read)
 
+    def unknown(self, name: str) -> str:
+        """That the template has no such node, and which one may be meant."""
+        slice_ = _UNROLLED.fullmatch(name)
+        if slice_ and slice_[1] in self.later:
+            return f"rows go under the name {slice_[1]!r}, time first: row k belongs to slice k"
+        before = [n + PREVIOUS for n in self.later if n not in self.static]
+        turned = _TURNED.fullmatch(name)
+        named = turned[1] + PREVIOUS if turned and turned[1] + PREVIOUS in before else name
+        return f"the template has no node {name!r}{meant([*self.later, *before, TIME], named)}"
+
+    def further_back(self, name: str) -> str | None:
+        """How to look more than one slice back, if that is what a name is meant for."""
+        far = _FAR_BACK.fullmatch(name)
+        if far is None or far[1] not in self.later or far[1] in self.static:
+            return None
+        own, lag = far[1], f"{far[1]}_lag"
+        how = f"dbn.add({lag!r}, lambda {own}{PREVIOUS}: {own}{PREVIOUS}, initial=...)"
+        return (
+            f"functions look one slice back. Carry what is further back on by a lag node, {how}, and read "
+            f'{lag + PREVIOUS!r} (docs/time.md, "Further back than one slice")'
+        )
+
     def check(self) -> None:
         """Refuse parents that are not there, and what has no slice before it in slice 0.
 
@@ -86,8 +117,13 @@ class Template:
                 stem = parent.removesuffix(PREVIOUS)
                 previous = stem != parent
                 if stem not in known or (previous and stem == TIME):
+                    far = self.further_back(parent)
+                    if far is not None:
+                        raise UnknownNodeError(
+                            f"node {name!r} has the parent {parent!r}, but {far}"
+                        )
                     raise UnknownNodeError(
-                        f"node {name!r} has the parent {parent!r}: {unknown(self.later, stem)}. Declare it, "
+                        f"node {name!r} has the parent {parent!r}: {self.unknown(parent)}. Declare it, "
                         "give the argument a default if it is no parent, or name the parents with parents="
                     )
                 if fixed and parent not in self.static:
@@ -114,7 +150,7 @@ class Template:
                     )
                 if parent not in known:
                     raise UnknownNodeError(
-                        f"node {name!r}: initial= has the parent {parent!r}: {unknown(self.later, parent)}"
+                        f"node {name!r}: initial= has the parent {parent!r}: {self.unknown(parent)}"
                     )
 
     def __getstate__(self) -> dict[str, Any]:

@@ -20,6 +20,7 @@ from bayesmc.network import BayesNet, Node
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import Parents
 from bayesmc.network.node import Declaration
+from bayesmc.network.store import meant
 from bayesmc.randomness import Purpose, seed_sequence, stream
 
 if TYPE_CHECKING:
@@ -367,7 +368,9 @@ class DynamicBayesNet:
 
     def __getitem__(self, name: str) -> Node:
         if name not in self._later:
-            raise UnknownNodeError(f"the template has no node {name!r}; its nodes are {list(self)}")
+            raise UnknownNodeError(
+                f"the template has no node {name!r}{meant(self, name)}; its nodes are {list(self)}"
+            )
         return self._store.record(name, self.plates)
 
     def __contains__(self, name: object) -> bool:

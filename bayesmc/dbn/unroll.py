@@ -11,7 +11,7 @@ import numpy as np
 from bayesmc.dbn.series import Compiled, check_steps, read_input_rows, read_series, sizes_of
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import UnsupportedError
+from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network import BayesNet
 from bayesmc.network.forward import Pass, Step, refuse_unsampled, step_for
 from bayesmc.network.node import Declaration
@@ -68,8 +68,12 @@ def sampled(
             known = {**static, **series.row(t).inputs}
             known |= {n + PREVIOUS: values[n] for n in slices.interface if t}
             state = Pass(rng, (int(draws),), known)
-            for step in _steps(slices, t):
-                step(state)
+            try:
+                for step in _steps(slices, t):
+                    step(state)
+            except BayesmcError as error:
+                error.args = (f"slice {t}: {error}", *error.args[1:])
+                raise
             values = state.values
             static = {n: values[n] for n in slices.template.static}
             for name in slices.dynamic:

@@ -22,6 +22,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
 from bayesmc.engines.funnels import missed_ends
 from bayesmc.engines.question import difference
+from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted import check_count, no_memory
 from bayesmc.errors import (
     BayesmcError,
@@ -236,6 +237,10 @@ class ChainEngine(Engine):
             warnings.warn(message, InterruptWarning, stacklevel=4)
         found = poor_mixing(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         band = getattr(sampler, "acceptance_band", _BAND)
+        problem = posterior.problem
+        timed = problem is not None and series_of(problem) is not None
+        if found and timed and "Particle" not in name:
+            found[0] += "; ParticleGibbs(draws) draws whole trajectories of a template at once"
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:

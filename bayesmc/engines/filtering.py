@@ -24,6 +24,7 @@ from bayesmc.errors import (
     ModelError,
     UnsupportedError,
 )
+from bayesmc.network.store import meant
 from bayesmc.results import SeriesPosterior
 
 #: functions whose expectation is wanted in every slice, by name
@@ -165,7 +166,8 @@ class FilterEngine:
         for name in given:
             if name not in known:
                 raise EvidenceError(
-                    f"static= gives {name!r}, which is no static node; there are {list(known)}"
+                    f"static= gives {name!r}, which is no static node{meant(known, name)}; there are "
+                    f"{list(known)}"
                 )
         return self._nothing(dbn.copy(), given, rng)
 
@@ -230,15 +232,19 @@ class FilterEngine:
         )
 
 
-def common_refusal(engine: FilterEngine, problem: SeriesProblem) -> str | None:
+def common_refusal(engine: FilterEngine | str, problem: SeriesProblem) -> str | None:
     """What no engine over time takes: static nodes whose value is not known."""
     if not problem.unknown_static:
         return None
     names = ", ".join(map(repr, problem.unknown_static))
+    if isinstance(engine, str):
+        takes = f"{engine} infers static nodes, and"
+    else:
+        takes = f"{type(engine).__name__} takes static nodes as known, and"
     return (
-        f"{type(engine).__name__} takes static nodes as known, and {names} is not observed; observe it (its "
-        "value in observations=), infer it by ParticleGibbs or ParticleMetropolis, or ask a static engine on "
-        "dbn.unroll(steps)"
+        f"{takes} {names} is not observed; observe it (its value in observations=), or infer it with the "
+        "trajectory: infer(dbn, observations), by itself or with engine=ParticleGibbs(draws), "
+        "ParticleMetropolis(draws) or another static engine"
     )
 
 

@@ -32,7 +32,6 @@ from bayesmc.network.forward import (
     nothing,
     summed,
 )
-from bayesmc.network.store import unknown
 from bayesmc.structure import Table
 
 #: numbers of a node that nothing reads that count as one
@@ -342,7 +341,7 @@ def check_target(slices: Slices, name: str, what: str) -> None:
     """
     template = slices.template
     if name not in template.later:
-        raise UnknownNodeError(f"{what}: {unknown(template.later, name)}")
+        raise UnknownNodeError(f"{what}: {template.unknown(name)}")
     node = slices.later[name]
     if name in template.static or not node.is_stochastic:
         kind = "static" if name in template.static else node.kind

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -120,6 +120,12 @@ def check_parents(
 
 def unknown(declarations: Mapping[str, Declaration], name: str) -> str:
     """That there is no such node, and which one may be meant."""
-    near = difflib.get_close_matches(str(name), declarations, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return f"the net has no node {name!r}{hint}"
+    return f"the net has no node {name!r}{meant(declarations, name)}"
+
+
+def meant(names: Iterable[str], name: object) -> str:
+    """Which of some names one that is not there may stand for, in brackets; empty if none is like it."""
+    known = list(names)
+    alike = [n for n in known if n.casefold() == str(name).casefold()]
+    near = alike or difflib.get_close_matches(str(name), known, n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.network.store import meant
 from bayesmc.results.posterior import table_variance
 from bayesmc.results.predictive import Predictive
 
@@ -268,7 +269,9 @@ class SeriesPosterior:
     def _node(self, name: str) -> CompiledNode:
         node = self.model.nodes.get(name)
         if node is None:
-            raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
+            raise UnknownNodeError(
+                f"there is no node {name!r}{meant(self.names, name)}; answered are {list(self.names)}"
+            )
         if name not in self._tables and name not in self._means:
             raise UnsupportedError(
                 f"{name!r} is not answered for by this result (answered are {list(self.names)}); ask with "

@@ -145,6 +145,59 @@ def test_guides_change_no_evidence_and_help(case: str) -> None:
     assert guided > gain * plain, (guided, plain)
 
 
+def random_case(seed: int) -> Any:
+    """A transition and an emission of families and parameters taken at random."""
+    rng = np.random.default_rng([43, session.seed(), seed])
+    back, drift, noise = rng.uniform(0.5, 0.95), rng.normal(0.0, 0.5), rng.uniform(0.2, 1.2)
+    share, shift, other = rng.uniform(0.1, 0.9), rng.normal(0.0, 2.0), rng.uniform(0.1, 1.0)
+    slope, size, count = rng.uniform(-1.0, 1.2), rng.uniform(0.2, 30.0), int(rng.integers(1, 300))
+    narrow, tail = rng.uniform(0.05, 0.8), rng.uniform(2.5, 6.0)
+    moves: list[Density] = [
+        lambda x_prev: bmc.Normal(back * x_prev + drift, noise),
+        lambda x_prev: bmc.Normal(back * x_prev, 0.2 + 0.3 * np.abs(x_prev)),
+        lambda x_prev: bmc.StudentT(tail, back * x_prev + drift, noise),
+        lambda x_prev: bmc.Truncated(bmc.Normal(back * x_prev + drift, noise), -6.0, 6.0),
+        lambda x_prev: bmc.Mixture(
+            [share, 1 - share],
+            bmc.Normal(back * x_prev[..., None] + np.array([0.0, shift]), np.array([noise, other])),
+        ),
+    ]
+    looks: list[Density] = [
+        lambda x: bmc.Binomial(count, logits=slope * x + drift),
+        lambda x: bmc.Poisson(size * np.exp(slope * x)),
+        lambda x: bmc.Gamma(size, np.exp(slope * x)),
+        lambda x: bmc.Weibull(1.0 + size / 4, np.exp(slope * x)),
+        lambda x: bmc.StudentT(tail, slope * x, narrow),
+        lambda x: bmc.Cauchy(x, narrow),
+        lambda x: bmc.LogNormal(slope * x, narrow),
+        lambda x: bmc.Bernoulli(1 / (1 + np.exp(-3 * x))),
+        lambda x: bmc.Truncated(bmc.Normal(slope * x, narrow), -1.0, 3.0),
+        lambda x: bmc.Mixture(
+            [share, 1 - share],
+            [bmc.Normal(slope * x, narrow), bmc.Normal(slope * x + shift, other)],
+        ),
+        lambda x: bmc.Mixture([0.9, 0.1], [bmc.Normal(x, narrow), bmc.Uniform(-40.0, 40.0)]),
+        lambda x: bmc.Mixture(
+            [0.3, 0.7], [bmc.Poisson(0.01 + 0.0 * x), bmc.Poisson(size * np.exp(slope * x))]
+        ),
+    ]
+    return level(looks[seed % len(looks)], moves[seed % len(moves)])
+
+
+@pytest.mark.parametrize(
+    "seed", [0, 4, *(pytest.param(k, marks=pytest.mark.thorough) for k in (1, 2, 3, *range(5, 60)))]
+)
+def test_guides_of_random_models_change_no_evidence(seed: int) -> None:
+    """Mean of Z-hat / Z within 4 standard errors of 1 (6e-5 each)."""
+    build = random_case(seed)
+    rows = build().sample(4, 1, rng=session.seed() + seed)["y"][0]
+    grid = bmc.GridFilter(grid={"x": (-25.0, 25.0, 2500)})
+    exact = float(bmc.filter(build(), {"y": rows}, engine=grid).log_marginal_likelihood)
+    for options in ({}, {"auxiliary": True}):
+        off, _ = deviation(build, rows, exact, proposal="optimal", **options)
+        assert abs(off) < 4, options
+
+
 @pytest.mark.parametrize("case", ["Binomial", "jumps", "outliers"])
 def test_wrong_weights_of_guided_draws_are_caught(
     case: str, monkeypatch: pytest.MonkeyPatch
@@ -261,6 +314,13 @@ def test_what_is_not_guided_is_named() -> None:
         bmc.filter(dbn, rows, engine=engine, rng=0)
     assert "'z'" not in str(caught[0].message)  # x beside it is guided
     assert caught[0].filename == __file__
+
+
+def test_proposals_of_the_user_are_told_as_such() -> None:
+    engine = bmc.ParticleFilter(9, proposal={"x": lambda x_prev: bmc.Normal(x_prev, 1.0)})
+    assert bmc.explain(issue(), {"y": [1]}, engine).nodes["x"] == "sampled from its proposal"
+    plain = bmc.explain(issue(), {"y": [1]}, bmc.ParticleFilter(9)).nodes
+    assert plain["x"] == "sampled given its parents"
 
 
 def test_a_net_in_which_nothing_is_guided_says_so() -> None:

@@ -184,7 +184,64 @@ def bridges() -> Case:
     return Case(dbn, observations, 4, unrolled(dbn, observations))
 
 
+def autoregression(order: int, runs: int = 0) -> bmc.DynamicBayesNet:
+    """AR(2) or AR(3) by lag nodes: values before slice 0 are hidden nodes of slice 0."""
+    dbn = bmc.DynamicBayesNet(plates={"run": runs} if runs else None)
+    own: Any = "run" if runs else ()
+    start = bmc.Normal(0.0, 1.2)
+
+    def x(x_prev: Any, l_prev: Any) -> bmc.Normal:
+        return bmc.Normal(1.2 * x_prev - 0.6 * l_prev, 0.8)
+
+    def x3(x_prev: Any, l_prev: Any, m_prev: Any) -> bmc.Normal:
+        return bmc.Normal(0.9 * x_prev - 0.5 * l_prev + 0.3 * m_prev, 0.8)
+
+    dbn.add("x", x if order == 2 else x3, initial=start, plates=own)
+    dbn.add("b", start, plates=own)
+    dbn.add("l", lambda x_prev: x_prev, initial=lambda b: b, plates=own)
+    if order == 2:
+        dbn.add("y", lambda x: bmc.Normal(x, 0.7), plates=own)
+        return dbn
+    dbn.add("c", start, plates=own)
+    dbn.add("m", lambda l_prev: l_prev, initial=lambda c: c, plates=own)
+    dbn.add("y", lambda x, m: bmc.Normal(x - 0.5 * m, 0.7), plates=own)
+    return dbn
+
+
+LAGGED = np.array([0.4, 1.5, np.nan, -1.0, 0.3, 1.4])
+
+
+def lags(order: int) -> Case:
+    dbn = autoregression(order)
+    return Case(dbn, {"y": LAGGED}, 6, unrolled(dbn, {"y": LAGGED}))
+
+
+def lags_in_a_plate() -> Case:
+    """Two series that never meet, with gaps of their own; the second ends a slice before."""
+    dbn, one = autoregression(2, 2), autoregression(2)
+    rows = np.stack([LAGGED, -LAGGED[::-1]], axis=1)
+    rows[-1, 1] = np.nan
+    exact = [unrolled(one, {"y": rows[:, k]}) for k in range(2)]
+    return Case(dbn, {"y": rows}, 6, lambda count, k: exact[k](count), elements=2)
+
+
+def second_order() -> Case:
+    """A chain of states of order two, and a sum over two slices that a reading sees one slice on."""
+    table = np.array([[[0.9, 0.1], [0.3, 0.7]], [[0.6, 0.4], [0.1, 0.9]]])
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("z", ["z_prev", "l_prev"], table, initial=[0.6, 0.4])
+    dbn.add("l", lambda z_prev: z_prev, initial=lambda z: z)
+    dbn.add("s", lambda z, l: z + l)  # noqa: E741
+    dbn.add("y", lambda z, s_prev: bmc.Normal(z + s_prev, 0.8), initial=bmc.Normal(0.0, 1.0))
+    rows = {"y": np.array([0.1, 1.8, np.nan, 2.9, 0.5, 2.2])}
+    return Case(dbn, rows, 6, unrolled(dbn, rows))
+
+
 CASES: dict[str, Callable[[], Case]] = {
+    "lags 2": lambda: lags(2),
+    "lags 3": lambda: lags(3),
+    "lags 2, a plate": lags_in_a_plate,
+    "second order": second_order,
     **{f"switching {k}": lambda k=k: switching_case(k) for k in range(4)},
     **{f"switching {k}, a plate": lambda k=k: switching_plate(k) for k in (4, 5)},
     **{f"linear {k}": lambda k=k: linear_case(k) for k in LINEAR},
@@ -278,7 +335,7 @@ BOUNDED = ("switching 0", "switching 2", "switching 4, a plate", "linear 0", "li
            "finite 3", "finite 5", "finite 7", "a team", "weather", "pinned 2", "bridges")  # fmt: skip
 #: templates much like others, which a thorough run alone smooths
 MORE = ("switching 1", "switching 3", "switching 5, a plate", "linear 3", "linear 14", "linear 18",
-        "finite 5", "finite 7", "finite 9", "pinned 1")  # fmt: skip
+        "finite 5", "finite 7", "finite 9", "pinned 1", "lags 2")  # fmt: skip
 TRIED = [
     (n, w)
     for n in CASES
@@ -313,6 +370,19 @@ def test_a_forgotten_transition_is_caught(name: str, monkeypatch: pytest.MonkeyP
         return np.zeros((draws, *cloud.weights.shape))
 
     monkeypatch.setattr(Backward, "log_densities", none)
+    assert rejected(compared(CASES[name](), "exactly"), ALPHA / len(TRIED))
+
+
+@pytest.mark.parametrize("name", ["lags 2", "lags 3", "second order"])
+def test_a_forgotten_lag_is_caught(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the slice right after says which particle it was."""
+    real = Backward.log_densities
+
+    def short(self: Backward, cloud: Any, after: Any, series: Any, k: int, draws: int) -> Any:
+        after = after._with(after.values[:1])
+        return real(self, cloud, after, series, k, draws)
+
+    monkeypatch.setattr(Backward, "log_densities", short)
     assert rejected(compared(CASES[name](), "exactly"), ALPHA / len(TRIED))
 
 
@@ -497,12 +567,66 @@ def test_draws_packed_to_the_front_stay_with_their_trajectories() -> None:
 # ---- computed nodes ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("order", [2, 3])
+def test_lags_on_a_trajectory_are_its_own_values(order: int) -> None:
+    engine = bmc.ParticleFilter(300, trajectories=50)
+    found = bmc.smooth(autoregression(order), {"y": LAGGED}, engine=engine, rng=0)
+    x = found.particles("x")
+    assert np.array_equal(found.particles("l")[1:], x[:-1])
+    assert np.array_equal(found.particles("l")[0], found.particles("b")[0])
+    if order == 3:
+        assert np.array_equal(found.particles("m")[2:], x[:-2])
+        assert np.array_equal(found.particles("m")[1], found.particles("b")[0])
+    assert len(np.unique(x[0])) > 20
+
+
+def test_a_lag_as_users_write_it_is_smoothed() -> None:
+    """The model of the issue: no value before slice 0. Against the Kalman smoother, by 5 standard errors."""
+    dbn = bmc.DynamicBayesNet()
+    start = bmc.Normal(0.0, 1.0)
+    dbn.add("x", lambda x_prev, l_prev: bmc.Normal(x_prev - 0.4 * l_prev, 0.5), initial=start)
+    dbn.add("l", lambda x_prev: x_prev, initial=lambda x: 0.0 * x)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    rows = {"y": dbn.sample(20, 1, rng=1)["y"][0]}
+    engine = bmc.ParticleFilter(500, trajectories=200)
+    assert bmc.explain(dbn, rows, engine, question="smooth").refused == {}
+    runs = np.stack([bmc.smooth(dbn, rows, engine=engine, rng=k).mean("x") for k in range(10)])
+    exact = bmc.smooth(dbn, rows, engine=bmc.KalmanFilter())
+    error = exact.std("x") / np.sqrt(10 * 100)  # 100 of 200 trajectories count as independent
+    assert (np.abs(runs.mean(axis=0) - exact.mean("x")) < 5 * error).all()
+
+
+def test_what_is_the_same_for_all_particles_may_go_on_without_end() -> None:
+    """A counter, and a running mean of what was seen, on which the state leans."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("n", lambda n_prev: n_prev + 1.0, initial=lambda: 1.0)
+    dbn.add("s", lambda s_prev, y_prev: 0.5 * s_prev + y_prev, initial=lambda: 0.0)
+    dbn.add(
+        "x",
+        lambda x_prev, s, n: bmc.Normal(0.5 * x_prev + 0.2 * s, 0.7 + 0.0 * n),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 0.6))
+    rows = {"y": np.array([0.5, 1.4, 0.3, 1.9, 2.2])}
+    engine = bmc.ParticleFilter(2000, trajectories=1000)
+    found = bmc.smooth(dbn, rows, engine=engine, rng=0)
+    exact = bmc.infer(dbn.unroll(5), dbn.unrolled_evidence(rows), engine=bmc.Exact())
+    wanted = np.array([float(exact.mean(f"x[{t}]")) for t in range(5)])
+    np.testing.assert_allclose(found.mean("x"), wanted, atol=0.1)  # some 5 standard errors
+    assert found.mean("n").tolist() == [1.0, 2.0, 3.0, 4.0, 5.0]
+    gap = {"y": [0.5, None, 0.3]}  # the sum is hidden then
+    with pytest.raises(UnsupportedError, match="'s' is computed from its own past without end"):
+        bmc.smooth(dbn, gap, engine=engine, rng=0)
+
+
 def test_running_sums_are_not_drawn_backwards() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
     dbn.add("p", lambda p_prev, v: p_prev + v, initial=lambda v: v)
     dbn.add("y", lambda p: bmc.Normal(p, 1.0))
-    with pytest.raises(UnsupportedError, match="'p' is computed from its own past.*lag="):
+    with pytest.raises(
+        UnsupportedError, match="'p' is computed from its own past without end.*lag="
+    ):
         bmc.smooth(dbn, {"y": [0.1, 0.2]}, engine=bmc.ParticleFilter(50), rng=0)
     lagged = bmc.smooth(dbn, {"y": [0.1, 0.2]}, engine=bmc.ParticleFilter(50), rng=0, lag=1)
     assert lagged.steps == 2

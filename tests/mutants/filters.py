@@ -18,6 +18,37 @@ def line() -> bmc.DynamicBayesNet:
     return dbn
 
 
+def lagged() -> bmc.DynamicBayesNet:
+    """A number that swings, by its value two slices back."""
+    dbn = bmc.DynamicBayesNet()
+    start = bmc.Normal(0.0, 1.0)
+    dbn.add("x", lambda x_prev, l_prev: bmc.Normal(1.2 * x_prev - 0.8 * l_prev, 0.5), initial=start)
+    dbn.add("b", start)
+    dbn.add("l", lambda x_prev: x_prev, initial=lambda b: b)
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    return dbn
+
+
+def counted() -> bmc.DynamicBayesNet:
+    """A number that walks, with counts."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.7), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Binomial(12, logits=x))
+    return dbn
+
+
+def jumping() -> bmc.DynamicBayesNet:
+    """A number that stays or jumps, with readings."""
+    dbn = bmc.DynamicBayesNet()
+
+    def move(x_prev: np.ndarray) -> bmc.Mixture:
+        return bmc.Mixture([0.7, 0.3], [bmc.Normal(x_prev, 0.3), bmc.Normal(x_prev + 2.0, 0.5)])
+
+    dbn.add("x", move, initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.6))
+    return dbn
+
+
 def machine() -> bmc.DynamicBayesNet:
     """Three states that follow each other, with readings."""
     dbn = bmc.DynamicBayesNet()
@@ -85,10 +116,34 @@ MUTANTS = [
     Mutant(
         "backward simulation leaves the transition out",
         (Edit("bayesmc.engines.particles.smoothing:Backward._drawn",
-              "self.log_densities(cloud, values, series, k, len(mine)) + cloud.log_weights",
+              "self.log_densities(cloud, drawn, series, k, len(mine)) + cloud.log_weights",
               "np.broadcast_to(cloud.log_weights, (len(mine), *cloud.log_weights.shape))"),),
         slices(bmc.smooth, line, RISING, bmc.ParticleFilter(300, backward="exact"), 20),
         "repeated_test of smooth, 20 runs of 300 particles",
+    ),
+    Mutant(
+        "backward simulation of lags looks at the next slice alone",
+        (Edit("bayesmc.engines.particles.smoothing:Backward._log",
+              "zip(self.layers, after.values, strict=False)",
+              "zip(self.layers[:1], after.values, strict=False)"),),
+        slices(bmc.smooth, lagged, {"y": [0.0, 2.0, 0.0, -2.0]}, bmc.ParticleFilter(300), 20),
+        "repeated_test of smooth, 20 runs of 300 particles",
+    ),
+    Mutant(
+        "a guided draw is weighed as if none came from its own density",
+        (Edit("bayesmc.engines.particles.guarded:Guarded.__call__",
+              "mixture = np.logaddexp(math.log1p(-SHARE) + log_q, math.log(SHARE) + log_p)",
+              "mixture = log_q"),),
+        evidence_of(counted, {"y": [9, 2]}, bmc.ParticleFilter(30, proposal="optimal"), 300),
+        "unbiased_evidence_test, 300 runs of 30 particles",
+    ),
+    Mutant(
+        "a guide made of cases forgets how likely each is",
+        (Edit("bayesmc.engines.particles.cases:ByCase.log_density",
+              "logs = [share + look.log_density(values, belief) for look, belief, share in each]",
+              "logs = [look.log_density(values, belief) for look, belief, _ in each]"),),
+        evidence_of(jumping, {"y": [0.5, 2.0]}, bmc.ParticleFilter(30, proposal="optimal"), 300),
+        "unbiased_evidence_test, 300 runs of 30 particles",
     ),
     Mutant(
         "backward simulation by rejection accepts everything",

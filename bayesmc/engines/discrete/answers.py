@@ -14,7 +14,7 @@ from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term
-from bayesmc.engines.discrete.run import Run
+from bayesmc.engines.discrete.run import Run, bad_parameters
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
 from bayesmc.engines.discrete.sums import Variable, groups, log_max, product
 from bayesmc.engines.filtering import Answers, Queries
@@ -131,6 +131,11 @@ class SliceAnswers:
                 scope = self.reader.scope(term, element)
                 weights = self.run.joint(scope, start, stop)
                 cards = len(self.reader.cards(term))
+                if parts[2] is not None:
+                    bad = self.reader.at_element(parts[2], node, cards, element, 0)
+                    wrong = _averaged(weights, bad, 0) > 0
+                    if wrong.any():
+                        raise bad_parameters(name, start + int(wrong.any(axis=1).argmax()))
                 own = self.reader.at_element(parts[0], node, cards, element, rest)
                 one = _averaged(weights, own, rest)
                 self._place(first, start, stop, node, element, one)
@@ -154,7 +159,20 @@ class SliceAnswers:
             found.variances[name] = np.where(angles, turns, second)
 
     def _moments(self, term: Term, rows: Rows) -> tuple[Any, ...]:
-        """What is averaged of a node: probabilities, or mean and variance (cosine and sine of angles)."""
+        """What is averaged of a node, and where its parameters are bad, as ones, if anywhere.
+
+        Probabilities, or mean and variance (cosine and sine of angles).
+        """
+        with marking_invalid(), np.errstate(all="ignore"):
+            result, _ = self.reader.evaluate(term, rows)
+        bad = result.invalid if isinstance(result, Distribution) else None
+        if bad is not None:
+            lead = 1 + len(self.reader.cards(term)) + len(self.model[term.name].plates)
+            bad = _padded(bad * 1.0, lead)
+        return *self._averaged_of(term, rows), bad
+
+    def _averaged_of(self, term: Term, rows: Rows) -> tuple[Any, ...]:
+        """Probabilities, or mean and variance (cosine and sine of angles)."""
         node = self.model[term.name]
         with marking_invalid(), np.errstate(all="ignore"):
             result, _ = self.reader.evaluate(term, rows)

@@ -76,7 +76,7 @@ class Run:
                 increments[start - self.first : stop - self.first] += piece.log
                 if piece.invalid is not None and piece.invalid.any():
                     row = int(np.argmax(piece.invalid.reshape(len(piece.invalid), -1).any(axis=1)))
-                    raise _bad_parameters(piece.node, start + row)
+                    raise bad_parameters(piece.node, start + row)
         for number, chain in enumerate(self.plan.chains):
             last = None if self.before is None else self.before[number]
             found = filtered(self.blocks(number), self.steps, self.sequences, chain.size, last)
@@ -215,7 +215,7 @@ class Run:
                     bad = piece.invalid & (self.joint(piece.scope, start, stop) > 0)
                     if bad.any():
                         row = int(np.argmax(bad.reshape(len(bad), -1).any(axis=1)))
-                        raise _bad_parameters(piece.node, start + row)
+                        raise bad_parameters(piece.node, start + row)
 
     def _refuse_impossible(self, increments: np.ndarray) -> None:
         """Say in which slice, and at which node, nothing is left."""
@@ -263,7 +263,8 @@ def _bytes(pieces: Sequence[Piece]) -> int:
     return sum(p.log.nbytes for p in pieces)
 
 
-def _bad_parameters(node: str, t: int) -> ParameterError:
+def bad_parameters(node: str, t: int) -> ParameterError:
+    """The error for bad parameters at a configuration that is possible."""
     return ParameterError(
         f"node {node!r}: the function gives bad parameters in slice {t} at a configuration that is possible",
         (t,),

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS
+from bayesmc.distributions import Distribution
 from bayesmc.engines.averages import arguments_of, over_line
+from bayesmc.engines.grid.moves import COUNTS
 from bayesmc.engines.grid.refined import Fine, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
 from bayesmc.engines.grid.sources import is_previous, previous
@@ -64,6 +66,7 @@ class Answers:
             hits = (value[..., None] == states).astype(float)
             return self._average(node, hits, 1)
         dist = self.model.evaluate(self.first, name, self.base)
+        self._refuse_bad(node, dist)
         found = self._average(node, dist.probs_table, 1)
         seen = self.now.row.seen.get(name)
         if seen is None or seen.mask is None:
@@ -88,6 +91,7 @@ class Answers:
             return self._moments(node, value, None)
         try:
             dist = self.model.evaluate(self.first, name, self.base)
+            self._refuse_bad(node, dist)
             mean, var = self._moments(node, dist.mean, dist.var)
         except UnsupportedError:
             return None
@@ -361,6 +365,22 @@ class Answers:
         with np.errstate(invalid="ignore"):
             product = np.where(weights > 0, weights * value, 0.0)
         return np.array(np.broadcast_to(product.sum(axis=tuple(range(self._batch))), full))
+
+    def _refuse_bad(self, node: CompiledNode, dist: Distribution) -> None:
+        """Bad parameters of what is missing are the user's to hear of, where cells that count have them."""
+        if dist.invalid is None:
+            return
+        ones = (1,) * len(node.event_shape)
+        mass = self._average(node, dist.invalid.reshape(dist.invalid.shape + ones) * 1.0)
+        seen = self.now.row.seen.get(node.name)
+        if seen is not None and seen.mask is not None:
+            mass = np.where(seen.mask.reshape(seen.mask.shape + ones), 0.0, mass)
+        if np.any(mass > COUNTS):
+            assert dist.problem is not None
+            raise type(dist.problem)(
+                f"node {node.name!r}: {dist.problem} in slice {self.now.row.t}, on cells of probability "
+                f"{float(np.max(mass)):.2g}; mend the function, or leave such cells out of the grid"
+            )
 
     def _aligned(self, used: set[Label], node: CompiledNode, tail: int) -> np.ndarray:
         """Probabilities with axes where a node's values have them."""

@@ -32,7 +32,7 @@ from bayesmc.errors import BudgetError, GridWarning, ZeroProbabilityError
 from bayesmc.shapes import Shape
 
 #: probability of bad parameters from which on they are the user's to hear of
-_COUNTS = 1e-8
+COUNTS = 1e-8
 #: predictions below which sums have underflowed, and the share of a slice that may be lost so
 _TINY, _LOST = 1e-290, 1e-9
 
@@ -299,7 +299,7 @@ class GridMover:
             spare = [s for s in now.scalars if s.label not in needed]
             size = float(np.prod([s.widths.sum(axis=0).max() for s in spare], initial=1.0))
             mass = contract(terms, self.model.apart).table / size
-            if np.any(mass > _COUNTS):
+            if np.any(mass > COUNTS):
                 assert factor.problem is not None
                 raise type(factor.problem)(
                     f"node {factor.name!r}: {factor.problem} in slice {now.row.t}, on cells of probability "

@@ -9,6 +9,7 @@ functions read the index of the slice, inputs or observed nodes, and once where 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -16,8 +17,9 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME
 from bayesmc.distributions import Normal
+from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, Moments, put_noise
-from bayesmc.errors import ModelError, UnsupportedError
+from bayesmc.errors import ModelError, ParameterError, UnsupportedError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.node import Declaration
 from bayesmc.structure.affine import affine_nodes, why_not_linear
@@ -182,12 +184,13 @@ def _together(
     """Slices in one call each of their functions, or one by one where these do not take arrays of slices."""
 
     def one(k: int) -> Linear:
-        return _composed(layout, fixed | {n: v[k, 0] for n, v in timed.items()}, ())
+        with in_slice(int(timed[TIME][k, 0])) if TIME in timed else nullcontext():
+            return _composed(layout, fixed | {n: v[k, 0] for n, v in timed.items()}, ())
 
     if count > 1:
         try:
             found = _composed(layout, fixed | timed, (count,))
-        except ModelError:
+        except (ModelError, ParameterError):  # one by one they say in which slice it is
             found = None
         if found is not None and all(_same(found, k, one(k)) for k in {0, count // 2, count - 1}):
             return found

@@ -26,6 +26,9 @@ _REACH, _CUTS = 4.0, 5
 #: by which a step is cut; by as much it is tried longer first, since Newton's own crawl along an exponential
 _CUT = 0.25
 
+#: logs from which on their differences may overflow
+_LARGE = 1e150
+
 #: points, shape ``(points, *shape, numbers)``, to logs, shape ``(points, *shape)``
 LogDensity = Callable[[np.ndarray], np.ndarray]
 
@@ -114,7 +117,7 @@ def _offsets(numbers: int) -> np.ndarray:
 
 def _derivatives(logs: np.ndarray, numbers: int) -> tuple[np.ndarray, np.ndarray]:
     """Slopes, and curvatures downwards; none where a log density is not finite nearby."""
-    good = np.isfinite(logs).all(axis=0)
+    good = (np.abs(logs) < _LARGE).all(axis=0)
     logs = np.where(good, logs, 0.0)
     above, below = logs[1 : 1 + numbers], logs[1 + numbers : 1 + 2 * numbers]
     slope = np.moveaxis((above - below) / (2 * _STEP), 0, -1)

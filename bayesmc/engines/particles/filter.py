@@ -43,7 +43,7 @@ from bayesmc.engines.particles.options import (
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.replicates import Replicates
-from bayesmc.engines.particles.smoothing import Backward, carried, lagged
+from bayesmc.engines.particles.smoothing import Backward, endless, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
@@ -278,7 +278,7 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return _NOT_SMOOTHED
-        sums = carried(problem.slices) if asked.what == "smooth" else ()
+        sums = endless(problem.slices, _seen(problem)) if asked.what == "smooth" else ()
         return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
@@ -340,7 +340,7 @@ class ParticleFilter(FilterEngine):
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         if lag is not None:
             return self._lagged(problem, seed, lag, queries or {}, progress)
-        sums = carried(problem.slices)
+        sums = endless(problem.slices, _seen(problem))
         if sums:
             raise UnsupportedError(_not_backwards(sums[0]))
         filtered = self._passed(problem, seed, True, {}, progress)
@@ -350,7 +350,8 @@ class ParticleFilter(FilterEngine):
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
         count = mover.particles if self.trajectories is None else self.trajectories
-        backward = Backward(mover.plan, mover.layout, self.backward == "rejection")
+        by_bound = self.backward == "rejection"
+        backward = Backward(mover.plan, mover.layout, by_bound, _seen(problem))
         with _quiet():
             rng = stream(seed, Purpose.SMOOTH)
             found = backward.trajectories(filtered.clouds, problem.series, count, rng)
@@ -550,10 +551,16 @@ _NOT_SMOOTHED = (
 )
 
 
+def _seen(problem: SeriesProblem) -> set[str]:
+    """Nodes that are seen in full in all slices."""
+    return {n for n, o in problem.series.observed.items() if o.mask is None}
+
+
 def _not_backwards(name: str) -> str:
     return (
-        f"ParticleFilter: {name!r} is computed from its own past, so trajectories cannot be drawn "
-        "backwards; smooth with lag=, or use infer(dbn, observations, engine=ParticleGibbs())"
+        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
+        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
+        "engine=ParticleGibbs())"
     )
 
 

@@ -12,6 +12,7 @@ from bayesmc.dbn import Slices
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.errors import UnknownNodeError
+from bayesmc.network.store import meant
 
 
 def check_count(option: str, given: Any, what: str) -> None:
@@ -79,7 +80,8 @@ def read_by(queries: Queries, slices: Slices) -> list[str]:
         for name in inspect.signature(function).parameters:
             if name not in slices.dynamic:
                 raise UnknownNodeError(
-                    f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice; there are "
+                    f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice"
+                    f"{meant(slices.dynamic, name)}; there are "
                     f"{list(slices.dynamic)}"
                 )
             found.append(name)

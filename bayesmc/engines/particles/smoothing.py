@@ -8,6 +8,16 @@ instead, and only what is still open after some rounds is drawn exactly.
 Elements of plates that are filtered separately have a past each: positions have shape ``(rows, *apart)``, and
 what is still open is packed to the front in every element for itself.
 
+Computed nodes that carry something on, such as lags (``l = x_prev``), make what comes after a slice depend on
+more than the slice before it. A particle of slice k is then drawn with its weight times the density of all
+drawn slices that its values still enter, what is computed there being computed anew:
+
+    p(x_k, l_k | x_{k+1:T}, y) ~ p(x_k, l_k | y_{1:k}) p(x_{k+1} | x_k, l_k) p(x_{k+2} | x_{k+1}, x_k) ...
+
+Of the pair x_k alone is kept: l_k, a draw of x_{k-1}, is integrated out by forgetting it, and the next step
+draws x_{k-1} given x_{k:T}. With lags up to p these are p factors; where a value is never forgotten (running
+sums) it would be all that follow, and drawing backwards is refused.
+
 Where a filter began anew (rejuvenation), nothing is known of how its particles came about: there both kinds
 of smoothing take the slice before as the filter left it.
 
@@ -15,13 +25,16 @@ References
 ----------
 Godsill, Doucet and West (2004), Monte Carlo smoothing for nonlinear time series, JASA 99; Douc, Garivier,
 Moulines and Olsson (2011), Ann. Appl. Probab. 21 (rejection); Taghavi et al. (2013), Adaptive stopping for
-fast particle smoothing.
+fast particle smoothing; Lindsten and Schön (2013), Backward simulation methods for Monte Carlo statistical
+inference, sec. 4 (models with memory).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
+from copy import copy
 from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -50,14 +63,23 @@ class Backward:
         Of the clouds.
     rejection : bool
         Accept draws by a bound where one is known.
+    seen : collection of str
+        Nodes that are seen in full in all slices.
     """
 
-    def __init__(self, plan: SlicePlan, layout: Layout, rejection: bool = True) -> None:
+    def __init__(
+        self,
+        plan: SlicePlan,
+        layout: Layout,
+        rejection: bool = True,
+        seen: Collection[str] = (),
+    ) -> None:
         self.plan, self.layout = plan, layout
         self.slices: Slices = plan.slices
-        self.steps, self.crossing = _crossing(plan)
-        self.computed = [step for step in self.steps if isinstance(step, Compute)]
-        self.rejection = rejection and _is_bounded(plan, self.crossing)
+        self.layers = _layers(plan, seen)
+        self.crossing = self.layers[0].crossing
+        one = len(self.layers) == 1
+        self.rejection = rejection and one and _is_bounded(plan, self.crossing)
         #: draws accepted by the bound, and drawn exactly
         self.accepted = self.exact = 0
 
@@ -70,15 +92,19 @@ class Backward:
         values = self._taken(last.values, _at_random(last, count, rng))
         found = [even_cloud(last.t, values, layout)]
         for k in range(len(clouds) - 2, -1, -1):
-            after = found[-1]
-            index = self._drawn(clouds[k], after, series, k, clouds[k + 1].rejuvenated, rng)
+            after = _After(found[: -1 - len(self.layers) : -1], clouds[k + 1 :])
+            index = self._drawn(clouds[k], after, series, k, rng)
             values = self._taken(clouds[k].values, index)
-            found[-1] = after._replace(values=self._computed(values, after.values, series, k))
+            before: Mapping[str, np.ndarray] = values
+            for m, layer in enumerate(self.layers[: len(found)]):
+                now = found[-1 - m]
+                before = self._computed(layer, before, now.values, series, k + m)
+                found[-1 - m] = now._replace(values=dict(before))
             found.append(even_cloud(clouds[k].t, values, layout))
         return found[::-1]
 
     def log_densities(
-        self, cloud: Cloud, after: Mapping[str, np.ndarray], series: Series, k: int, draws: int
+        self, cloud: Cloud, after: _After, series: Series, k: int, draws: int
     ) -> np.ndarray:
         """Log density of slices ``after`` the k-th given every particle, shape (draws, particles, *apart).
 
@@ -87,7 +113,7 @@ class Backward:
         before = {
             n: v[None] if v.ndim > self._trailing(n) else v for n, v in self._before(cloud).items()
         }
-        now = {n: v[:, None] if v.ndim > self._trailing(n) else v for n, v in after.items()}
+        now = after.each(lambda n, v: v[:, None] if v.ndim > self._trailing(n) else v)
         return self._log(before, now, series, k, (draws, self.layout.particles))
 
     # ---- private -------------------------------------------------------------------------------
@@ -95,17 +121,17 @@ class Backward:
     def _drawn(
         self,
         cloud: Cloud,
-        after: Cloud,
+        after: _After,
         series: Series,
         k: int,
-        anew: bool | np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
         """For every trajectory a particle of the k-th cloud, shape (draws, *apart).
 
-        Where the slice after began ``anew``, its density given the one before means nothing.
+        Where the slice after began anew, its density given the one before means nothing.
         """
-        shape = (len(after.weights), *self.layout.lead)
+        anew = after.anew[0]
+        shape = (after.draws, *self.layout.lead)
         found = np.empty(shape, dtype=np.intp)
         if np.any(anew):
             found[...] = _at_random(cloud, len(found), rng)
@@ -118,8 +144,8 @@ class Backward:
         block = max(1, _PAIRS // (self.layout.particles * max(size_of(self.slices), 1)))
         for low in range(0, len(rows), block):
             mine, asked = rows[low : low + block], wanted[low : low + block]
-            values = self._taken(after.values, mine)
-            log = self.log_densities(cloud, values, series, k, len(mine)) + cloud.log_weights
+            drawn = after.taken(self._taken, mine)
+            log = self.log_densities(cloud, drawn, series, k, len(mine)) + cloud.log_weights
             # where no particle explains what came after, there is only the filter's word
             explained = np.any(log > -np.inf, axis=1, keepdims=True)
             log = log if explained.all() else np.where(explained, log, cloud.log_weights)
@@ -130,7 +156,7 @@ class Backward:
     def _by_rejection(
         self,
         cloud: Cloud,
-        after: Cloud,
+        after: _After,
         series: Series,
         k: int,
         rows: np.ndarray,
@@ -145,7 +171,7 @@ class Backward:
         supply, before = _Supply(cloud.weights, len(rows), rng), self._before(cloud)
         for _ in range(_ROUNDS):
             tried = supply.take(len(rows))
-            old, new = self._taken(before, tried), self._taken(after.values, rows)
+            old, new = self._taken(before, tried), after.taken(self._taken, rows)
             log = self._log(old, new, series, k, (len(rows),))
             good = wanted & (-rng.standard_exponential(rows.shape) < log - bound)
             _put(found, rows, tried, good)
@@ -179,28 +205,36 @@ class Backward:
     def _log(
         self,
         before: Mapping[str, np.ndarray],
-        now: Mapping[str, np.ndarray],
+        after: _After,
         series: Series,
         k: int,
         batch: tuple[int, ...],
     ) -> np.ndarray:
-        """Log density of the slice after the k-th: factors that the slice before enters."""
-        state = self._passed(self.steps, before, now, series, k, batch)
-        return np.broadcast_to(
-            np.asarray(state.log_weight, dtype=float), (*batch, *self.layout.lead)
-        )
+        """Log density of the slices after the k-th: factors that the k-th enters."""
+        total: Any = 0.0
+        anew: Any = False
+        for m, (layer, now) in enumerate(zip(self.layers, after.values, strict=False)):
+            anew = anew | np.asarray(after.anew[m])
+            if np.all(anew):
+                break
+            state = self._passed(layer.steps, before, now, series, k + m, batch)
+            log = np.asarray(state.log_weight, dtype=float)
+            total = total + (np.where(anew, 0.0, log) if m and np.any(anew) else log)
+            before = {n: state.values[n] if n in layer.carried else now[n] for n in now}
+        return np.broadcast_to(total, (*batch, *self.layout.lead))
 
     def _computed(
         self,
+        layer: _Layer,
         before: Mapping[str, np.ndarray],
         now: Mapping[str, np.ndarray],
         series: Series,
         k: int,
-    ) -> dict[str, np.ndarray]:
+    ) -> Mapping[str, np.ndarray]:
         """Values of the slice after the k-th, with what is computed from the slice before as now drawn."""
-        if not self.computed:
-            return dict(now)
-        state = self._passed(self.computed, before, now, series, k, ())
+        if not layer.computed:
+            return now
+        state = self._passed(layer.computed, before, now, series, k, ())
         return {name: state.values[name] for name in now}
 
     def _passed(
@@ -229,20 +263,18 @@ class Backward:
         return len(self.slices.later[name].value_shape)
 
 
-def carried(slices: Slices) -> tuple[str, ...]:
-    """Deterministic nodes that carry something of the slice before on to the next, such as running sums.
+def endless(slices: Slices, seen: Collection[str] = ()) -> tuple[str, ...]:
+    """Computed nodes through which a value enters all later slices, such as running sums.
 
-    Trajectories cannot be put together backwards through them: what they were is settled by the past.
+    Trajectories are not put together backwards through them: each particle would be held against all that
+    follows. Lags and chains of them forget; what is computed of nodes ``seen`` in full is the same for all.
     """
-    reached = {n + PREVIOUS for n in slices.interface}
-    found = []
-    for name in slices.dynamic:
-        node = slices.later[name]
-        if not node.is_stochastic and reached & set(node.parents):
-            reached.add(name)
-            if name in slices.interface:
-                found.append(name)
-    return tuple(found)
+    found = set(_entering(slices, seen))
+    while True:
+        further = _carried(slices, {n + PREVIOUS for n in found})
+        if further == found or not further:
+            return tuple(n for n in slices.dynamic if n in further)
+        found = further
 
 
 def lagged(clouds: Sequence[Cloud], layout: Layout, slices: Slices) -> Cloud:
@@ -333,23 +365,87 @@ def _either(anew: np.ndarray, before: Cloud, after: Cloud) -> Cloud:
     )
 
 
-def _crossing(plan: SlicePlan) -> tuple[list[Step], frozenset[str]]:
-    """Steps for the factors of a slice that the one before enters, and the nodes whose factors they are."""
-    model = plan.slices.later
-    reached = {n + PREVIOUS for n in plan.slices.interface}
-    steps: list[Step] = []
-    crossing = set()
-    for name in plan.slices.dynamic:
-        node = model[name]
-        if not reached & set(node.parents):
-            continue
-        if node.is_stochastic:
-            steps.append(WeighDrawn(model, node, plan.apart))
-            crossing.add(name)
-        else:
-            steps.append(Compute(model, node))
+class _Layer(NamedTuple):
+    """What a slice does to one some slices later: factors that it enters, and what is computed on the way."""
+
+    steps: Sequence[Step]
+    computed: Sequence[Step]
+    #: nodes whose factors the slice enters
+    crossing: frozenset[str]
+    #: computed nodes that take something of it on to the next
+    carried: frozenset[str]
+
+
+class _After:
+    """Slices drawn after some slice, the next first: values, and where the filter began anew in them."""
+
+    def __init__(self, drawn: Sequence[Cloud], filtered: Sequence[Cloud]) -> None:
+        self.values: list[Mapping[str, np.ndarray]] = [cloud.values for cloud in drawn]
+        self.anew = [cloud.rejuvenated for cloud in filtered[: len(drawn)]]
+        self.draws = len(drawn[0].weights)
+
+    def each(self, change: Callable[[str, np.ndarray], np.ndarray]) -> _After:
+        """With other values."""
+        return self._with([{n: change(n, v) for n, v in now.items()} for now in self.values])
+
+    def taken(self, take: Callable[..., dict[str, np.ndarray]], rows: np.ndarray) -> _After:
+        """Of some trajectories only."""
+        return self._with([take(now, rows) for now in self.values])
+
+    def _with(self, values: list[dict[str, np.ndarray]]) -> _After:
+        other = copy(self)
+        other.values = list(values)
+        return other
+
+
+def _entering(slices: Slices, seen: Collection[str]) -> set[str]:
+    """Nodes that the next slice reads and that particles may differ in."""
+    varying = {n for n in slices.stochastic if n not in seen}
+    before = -1
+    while len(varying) > before:
+        before = len(varying)
+        for name in slices.dynamic:
+            read = {p.removesuffix(PREVIOUS) for p in slices.later[name].parents}
+            if not slices.later[name].is_stochastic and varying & read:
+                varying.add(name)
+            elif not slices.first[name].is_stochastic and varying & set(slices.first[name].parents):
+                varying.add(name)
+    return varying & set(slices.interface)
+
+
+def _layers(plan: SlicePlan, seen: Collection[str]) -> list[_Layer]:
+    """What slices do to those after them, as far as values are carried on."""
+    model, slices = plan.slices.later, plan.slices
+    found: list[_Layer] = []
+    entering = _entering(slices, seen)
+    while entering and (not found or len(found) <= len(slices.interface)):
+        reached = {n + PREVIOUS for n in entering}
+        steps: list[Step] = []
+        crossing = set()
+        for name in slices.dynamic:
+            node = model[name]
+            if not reached & set(node.parents):
+                continue
+            if node.is_stochastic:
+                steps.append(WeighDrawn(model, node, plan.apart))
+                crossing.add(name)
+            else:
+                steps.append(Compute(model, node))
+                reached.add(name)
+        entering = {n for n in reached if n in slices.interface}
+        computed = [step for step in steps if isinstance(step, Compute)]
+        found.append(_Layer(steps, computed, frozenset(crossing), frozenset(entering)))
+    return found or [_Layer([], [], frozenset(), frozenset())]
+
+
+def _carried(slices: Slices, entering: set[str]) -> set[str]:
+    """Computed nodes that take what enters a slice on to the next."""
+    reached = set(entering)
+    for name in slices.dynamic:
+        node = slices.later[name]
+        if not node.is_stochastic and reached & set(node.parents):
             reached.add(name)
-    return steps, frozenset(crossing)
+    return {n for n in reached if n in slices.interface}
 
 
 def _is_bounded(plan: SlicePlan, crossing: frozenset[str]) -> bool:

@@ -11,6 +11,7 @@ from bayesmc.engines.particles.optimal import guidance
 from bayesmc.engines.particles.stages import PluggedIn
 from bayesmc.engines.slice_steps import SlicePlan, plates_apart
 from bayesmc.errors import ProposalWarning
+from bayesmc.kernels.proposal import names_of
 from bayesmc.network import Observed
 
 
@@ -26,6 +27,11 @@ def looks_told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) 
     """
     slices, seen = problem.slices, problem.series.observed
     found = dict(treated)
+    for key in engine.proposal if isinstance(engine.proposal, Mapping) else ():
+        for name in names_of(key):
+            found[name] = found[name].replace(
+                "sampled given its parents", "sampled from its proposal"
+            )
     if engine.proposal == "optimal":
         told = guidance(slices, seen, plates_apart(slices), min(problem.steps - 1, 1))
         for name, by in told.guided.items():
