@@ -221,6 +221,10 @@ class GridWarning(BayesmcWarning):
     """A grid that is too small or too coarse for the densities on it."""
 
 
+class EvidenceWarning(BayesmcWarning):
+    """Evidence that is possible but hardly what was meant: degrees for radians, swapped columns."""
+
+
 class ModelMisfitWarning(BayesmcWarning):
     """Rows of a series are, as a whole, far less likely than the model says that rows are."""
 

@@ -21,7 +21,8 @@ from bayesmc.network.evidence import observe
 from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
-from bayesmc.network.store import meant
+from bayesmc.network.plausible import warn_of_doubts
+from bayesmc.network.store import meant, unknown
 from bayesmc.shapes import Shape, first_index, owned
 
 
@@ -146,6 +147,8 @@ def read_series(
         for n, v in given.items()
         if n in template.static
     }
+    for name in observed:
+        warn_of_doubts(slices.later, name, observed[name])
     return slices, Series(
         count,
         {n: o for n, o in observed.items() if o is not None},
@@ -360,6 +363,7 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
                 f"inputs= gives {name!r}, which is not a declared input{meant(template.inputs, name)}; the "
                 f"inputs are {list(template.inputs)}"
             )
+        _check_frame(f"inputs of {name!r}", inputs[name])
         _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
         if np.ndim(inputs[name]) == 0:
             raise EvidenceError(
@@ -376,12 +380,29 @@ def _rows(template: Template, name: str, value: Any) -> Any:
         shapes = {np.shape(v) for v in value if v is not None}
         if len(shapes) == 1 and (shape := shapes.pop()):
             return [np.full(shape, np.nan) if v is None else v for v in value]
+    _check_frame(f"observations of {name!r}", value)
     _check_even(f"observations of {name!r}", value, "a missing row is None")
     if np.ndim(value) == 0:
         raise EvidenceError(
             f"observations of {name!r}: {value!r} has no axis for time; give one row per slice"
         )
     return value
+
+
+def _check_frame(what: str, value: Any) -> None:
+    """Refuse a table whose labels say that time runs along its columns, square or not."""
+    columns, index = getattr(value, "columns", None), getattr(value, "index", None)
+    if columns is None or index is None:
+        return
+    kinds = [np.asarray(labels).dtype.kind for labels in (index, columns)]
+    names = [str(getattr(labels, "name", None) or "").lower() for labels in (index, columns)]
+    times = [
+        k == "M" or n in ("t", "time", "step", "slice") for k, n in zip(kinds, names, strict=True)
+    ]
+    if times == [False, True]:
+        raise EvidenceError(
+            f"{what}: by its labels the table has time along its columns; time comes first, so give its .T"
+        )
 
 
 def _check_even(what: str, value: Any, hint: str) -> None:
@@ -419,6 +440,7 @@ def _count(
         each = ", ".join(f"{n!r} {len(v)}" for n, v in {**observed, **inputs}.items())
         more = f"; asked for {steps} slices" if steps is not None else ""
         more += f"; inputs go on for {ahead} slices after the last row" if ahead else ""
+        more += _transposed({**observed, **inputs})
         raise EvidenceError(
             f"the data differ in length ({each}{more}); row k belongs to slice k, and a missing row is NaN "
             "or None"
@@ -431,6 +453,21 @@ def _count(
             f"the series of {', '.join(map(repr, {**observed, **inputs}))} have no rows; give one per slice"
         )
     return count
+
+
+def _transposed(data: Mapping[str, Any]) -> str:
+    """A hint where one series has along its second axis what the others have along the first."""
+    if len(data) < 2:
+        return ""
+    lengths = [len(v) for v in data.values()]
+    usual = max(set(lengths), key=lengths.count)
+    for name, value in data.items():
+        shape = np.shape(value)
+        if len(shape) > 1 and shape[0] != usual == shape[1]:
+            return (
+                f"; {name!r} has shape {shape}: is it transposed? time comes first, so give its .T"
+            )
+    return ""
 
 
 def _padded(found: Observed | None, node: CompiledNode, ahead: int) -> Observed | None:

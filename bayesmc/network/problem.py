@@ -13,6 +13,7 @@ from bayesmc.network.evidence import Observed, read_question
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.model import Model
 from bayesmc.network.net import BayesNet
+from bayesmc.network.plausible import warn_of_doubts
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,4 +50,7 @@ def pose(
         return Problem(*net.question(evidence, inputs))
     if not isinstance(net, BayesNet):
         raise ModelError(f"expected a BayesNet or a FactorGraph, not {type(net).__name__}")
-    return Problem(*read_question(net, evidence, inputs))
+    question = read_question(net, evidence, inputs)
+    for name, found in question[2].items():
+        warn_of_doubts(question[1], name, found)
+    return Problem(*question)

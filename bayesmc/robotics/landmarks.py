@@ -238,10 +238,31 @@ def range_and_bearing(
     >>> seen.mean.round(3).tolist()
     [[5.0, 0.927], [2.0, 1.571]]
     """
-    return AndAngle(
+    return RangeAndBearing(
         range_only(pose, landmark, range_scale, bias, df),
         bearing(pose, landmark, bearing_scale, outlier),
     )
+
+
+class RangeAndBearing(AndAngle):
+    """A range and a bearing side by side; rows whose columns are swapped do not pass unnoticed."""
+
+    def doubt(self, values: np.ndarray) -> str | None:
+        """What is strange about rows, shape (..., 2), or None; ``network.plausible`` asks.
+
+        Ranges are hardly ever negative, and bearings are as often as not: rows of which it is the other way
+        round are swapped.
+        """
+        ranges, bearings = values[..., 0].ravel(), values[..., 1].ravel()
+        if not ranges.size or np.abs(ranges).max() > 2 * np.pi or bearings.min() < 0:
+            return None
+        negative = (ranges < 0).mean()
+        if negative < 0.1 or (ranges.size < 5 and bearings.max() <= np.pi):
+            return None
+        return (
+            f"{int((ranges < 0).sum())} of {ranges.size} ranges are negative, and no bearing is; a row is "
+            "(range in m, bearing in rad): are they swapped? give values[..., ::-1]"
+        )
 
 
 def cone_range(pose: Any, points: Any, opening: Any, max_range: Any) -> np.ndarray:

@@ -20,7 +20,15 @@ from bayesmc.distributions import WrappedNormal
 from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.robotics.pose_distributions import PoseDistribution
-from bayesmc.robotics.poses import as_poses, compose, joined_pose, sin_cos, turned_back, wrap
+from bayesmc.robotics.poses import (
+    as_poses,
+    check_turns,
+    compose,
+    joined_pose,
+    sin_cos,
+    turned_back,
+    wrap,
+)
 from bayesmc.robotics.steps import sinc
 from bayesmc.shapes import Shape
 
@@ -199,7 +207,8 @@ class OdometryMotion(PoseDistribution):
     Raises
     ------
     ParameterError
-        A number is not finite, one of the ``alphas`` negative, ``floor`` not positive or ``least`` negative.
+        A number is not finite, one of the ``alphas`` negative, ``floor`` not positive or ``least`` negative;
+        ``motion`` turns by more than a full turn (in degrees, most likely).
     ShapeError
         The last axes are not 3, 3 and 4.
 
@@ -240,6 +249,7 @@ class OdometryMotion(PoseDistribution):
             raise ParameterError(
                 f"OdometryMotion(least={least!r}): give metres, nonnegative and finite"
             )
+        check_turns("OdometryMotion", "motion", motion)
         alphas, floor = _noise("OdometryMotion", alphas, 4, floor)
         self._set_batch(pose.shape[:-1], motion.shape[:-1], alphas.shape[:-1])
         self.pose_prev = self._finite_pose("pose_prev", pose)

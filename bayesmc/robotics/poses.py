@@ -358,6 +358,23 @@ def check_radians(call: str, name: str, angles: np.ndarray) -> None:
         )
 
 
+def check_turns(call: str, name: str, motion: np.ndarray) -> None:
+    """Nothing, where no motion, shape (..., 3), turns by more than a full turn: that of ``between`` does not.
+
+    Raises
+    ------
+    ParameterError
+        Degrees, most likely; it names the call.
+    """
+    turn = motion[..., 2]
+    most = max(float(turn.max()), -float(turn.min())) if turn.size else 0.0
+    if _FULL_TURN < most < np.inf:
+        raise ParameterError(
+            f"{call}: the turn of {name} is in radians; got {most:g}, more than a full turn; of degrees give "
+            "np.deg2rad(...), of two poses between(before, after)"
+        )
+
+
 def joined_pose(x: Any, y: Any, heading: Any) -> np.ndarray:
     """Poses from their components, which broadcast."""
     shape = broadcast_shapes(np.shape(x), np.shape(y), np.shape(heading))
