@@ -104,8 +104,5 @@ def _check(what: str, node: CompiledNode, stored: np.ndarray, hidden: np.ndarray
     if wrong.any():
         at = first_index(wrong)
         within = f" ({support.describe()})" if support is not None else ""
-        raise EvidenceError(
-            f"{what} is {stored[at]} at index {at if len(at) > 1 else at[0]}, which the node cannot be{within}"
-            if at
-            else f"{what} is {stored}, which the node cannot be{within}"
-        )
+        where = f" at index {at if len(at) > 1 else at[0]}" if at else ""
+        raise EvidenceError(f"{what} is {stored[at]}{where}, which the node cannot be{within}")

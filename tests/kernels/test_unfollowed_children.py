@@ -1,4 +1,4 @@
-"""Conjugacy is claimed of no child whose function hides its parents, in a closure or in an object of SciPy."""
+"""Conjugacy is claimed of no child whose function hides its parents in a closure or in an object of SciPy."""
 
 from __future__ import annotations
 
