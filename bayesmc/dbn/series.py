@@ -22,7 +22,7 @@ from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
 from bayesmc.network.plausible import warn_of_doubts
-from bayesmc.network.store import meant, unknown
+from bayesmc.network.store import meant
 from bayesmc.shapes import Shape, first_index, owned
 
 

@@ -22,6 +22,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
 from bayesmc.engines.funnels import missed_ends
 from bayesmc.engines.question import difference
+from bayesmc.engines.start_values import frozen_start, read_start
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted import check_count, no_memory
 from bayesmc.errors import (
@@ -54,7 +55,7 @@ class Sampler(Protocol):
     members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
     ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
-    where any rate will do.
+    where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
     which is exact if ``step`` writes into no array of the state it is given.
@@ -97,12 +98,15 @@ class ChainEngine(Engine):
     chains : int
     thinning : int
         Sweeps per kept draw.
+    start : dict or None
+        Node -> where its chains start.
     """
 
     draws: int
     warmup: int
     chains: int
     thinning: int = 1
+    start: Mapping[str, Any] | None = None
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
 
@@ -112,6 +116,7 @@ class ChainEngine(Engine):
             check_count(self, "warmup", self.warmup, "1000 (or 0 for none)")
         check_count(self, "chains", self.chains, "4")
         check_count(self, "thinning", self.thinning, "1")
+        object.__setattr__(self, "start", frozen_start(type(self).__name__, self.start))
 
     def sampler(self, problem: Problem) -> Sampler:
         """What moves the chains of a posed problem."""
@@ -143,6 +148,9 @@ class ChainEngine(Engine):
         if resume is not None:
             self._refuse_another(resume, problem, names, summed)
         sampler = self.sampler(problem)
+        if self.start and resume is None:
+            given = read_start(type(self).__name__, problem, self.start, self.chains)
+            sampler.given = given  # type: ignore[attr-defined]
         tied = self.tied(problem)
         if tied:
             _warn_of_ties(type(self).__name__, tied)

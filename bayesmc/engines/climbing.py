@@ -40,16 +40,37 @@ class Scores:
     ----------
     lost : ndarray, shape (rows,)
         Elements of terms with density zero.
+    far : ndarray, shape (rows,)
+        How far these are from the supports that leave them out, in logs.
     log : ndarray, shape (rows,)
         Sum of all others.
     """
 
     lost: np.ndarray
+    far: np.ndarray
     log: np.ndarray
 
+    def best_of(self, k: int) -> np.ndarray:
+        """The rows that are the best of ``k`` consecutive ones."""
+        columns = [c.reshape(-1, k) for c in (-self.log, self.far, self.lost)]
+        order = np.lexsort(columns, axis=1)[:, 0]
+        return np.arange(len(order)) * k + order
+
+    def at(self, rows: np.ndarray) -> Scores:
+        return Scores(self.lost[rows], self.far[rows], self.log[rows])
+
+    def where(self, better: np.ndarray, other: Scores) -> Scores:
+        """These scores where ``better``, else the others."""
+        return Scores(
+            np.where(better, self.lost, other.lost),
+            np.where(better, self.far, other.far),
+            np.where(better, self.log, other.log),
+        )
+
     def better_than(self, other: Scores) -> np.ndarray:
-        fewer = self.lost < other.lost
-        return fewer | ((self.lost == other.lost) & (self.log > other.log))
+        fewer, nearer = self.lost < other.lost, self.far < other.far
+        equal, as_near = self.lost == other.lost, self.far == other.far
+        return fewer | (equal & (nearer | (as_near & (self.log > other.log))))
 
 
 def row_logs(term: Term, values: Values, rows: int) -> np.ndarray:
@@ -188,17 +209,13 @@ class Climb:
     def _kept(self, tried: Values, best: Scores, k: int) -> Scores:
         """The best of ``k`` candidates of each row, where that is better."""
         values, scores = self._evaluated(tried, self.rows * k)
-        lost, log = scores.lost.reshape(self.rows, k), scores.log.reshape(self.rows, k)
-        order = np.lexsort((-log, lost), axis=1)[:, 0]
-        at = np.arange(self.rows) * k + order
-        found = Scores(scores.lost[at], scores.log[at])
+        at = scores.best_of(k)
+        found = scores.at(at)
         better = found.better_than(best)
         for store, new in ((self.free, tried), (self.values, values)):
             for name, array in new.items():
                 store[name] = np.where(_wide(better, array), array[at], store[name])
-        return Scores(
-            np.where(better, found.lost, best.lost), np.where(better, found.log, best.log)
-        )
+        return found.where(better, best)
 
     def _evaluated(self, free: Values, rows: int) -> tuple[Values, Scores]:
         """The values of free numbers, and all terms there."""
@@ -212,14 +229,16 @@ class Climb:
                 computed, _ = model.evaluate(name, values)
                 shape = (rows, *model[name].value_shape)
                 values[name] = np.array(np.broadcast_to(computed, shape))
-        lost, log = np.zeros(rows, dtype=int), np.zeros(rows)
+        lost, far, log = np.zeros(rows, dtype=int), np.zeros(rows), np.zeros(rows)
         for term in target.terms.values():
             part = row_logs(term, values, rows).reshape(rows, -1)
             dead = part == -np.inf
-            lost += dead.sum(axis=1)
+            if dead.any():
+                lost += dead.sum(axis=1)
+                far += np.where(dead, _distances(term, values, rows), 0.0).sum(axis=1)
             log += np.where(dead, 0.0, part).sum(axis=1)
         kept = {n: values[n] for n in (*target.chain, *target.links)}
-        return kept, Scores(lost, log)
+        return kept, Scores(lost, far, log)
 
     def _value(self, name: str, free: Values, values: Values, rows: int) -> np.ndarray:
         node = self.target.model[name]
@@ -286,6 +305,26 @@ def with_seen(target: Target, node: CompiledNode, value: np.ndarray) -> np.ndarr
 def _wide(rows: np.ndarray, like: np.ndarray) -> np.ndarray:
     """One number for each row, with the axes of an array."""
     return rows.reshape((-1,) + (1,) * (like.ndim - 1))
+
+
+def _distances(term: Term, values: Values, rows: int) -> np.ndarray:
+    """How far a term's values are from its support, in logs, shape ``(rows, elements)``."""
+    nowhere = np.zeros((rows, math.prod(term.shape)))
+    if term.is_potential or term.model[term.name].event_shape:
+        return nowhere
+    try:
+        dist, _ = term.distribution(values)
+        support = dist.support
+    except BayesmcError:
+        return nowhere
+    if support.kind not in ("interval", "integers"):
+        return nowhere
+    node, value = term.model[term.name], values[term.name]
+    value = value if node.domain is None else node.domain.to_support(value)
+    gap = np.maximum(np.maximum(support.low - value, value - support.high), 0.0)
+    lead = gap.shape[: max(gap.ndim - len(term.shape), 0)]
+    full = np.broadcast_to(np.broadcast_to(gap, lead + term.shape), (rows, *term.shape))
+    return np.log1p(np.nan_to_num(full, posinf=1e300)).reshape(rows, -1)
 
 
 def _rows(term: Term, values: Values, at: slice) -> Values:

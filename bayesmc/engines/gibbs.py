@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.chains import ChainEngine
@@ -36,6 +36,10 @@ class Gibbs(ChainEngine):
         Sweeps per kept draw.
     debug : bool
         Check every conjugate draw against the densities of the model (slow): an error names the node.
+    start : dict, optional
+        Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
+        ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
+        these. What nothing observed depends on is drawn forward, wherever it starts.
 
     References
     ----------
@@ -59,6 +63,7 @@ class Gibbs(ChainEngine):
     chains: int = 4
     thinning: int = 1
     debug: bool = False
+    start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Gibbs sampling"
 

@@ -18,7 +18,7 @@ from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_search import forest_blocks
-from bayesmc.kernels.gaussian_block import gaussian_blocks
+from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
 from bayesmc.kernels.joint_states import joint_states
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import label_kernel
@@ -163,6 +163,11 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     blankets = {name: Blanket(target, name) for name in names}
     blocks = gaussian_blocks(target, blankets, debug)
     joined = {n for b in blocks for n in b.names}
+    vectors = [
+        b for b in vector_blocks(target, blankets, joined, debug) if governing(target, b, blankets)
+    ]
+    blocks += vectors
+    joined |= {n for b in vectors for n in b.names}
     kernels, constraints = _finite(target, blankets, debug)
     refusals: dict[str, str] = {}
     numbers = []

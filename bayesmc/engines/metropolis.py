@@ -61,6 +61,10 @@ class MetropolisHastings(ChainEngine):
         whole.
     thinning : int
         Sweeps per kept draw.
+    start : dict, optional
+        Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
+        ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
+        these. What nothing observed depends on is drawn forward, wherever it starts.
 
     Raises
     ------
@@ -102,6 +106,7 @@ class MetropolisHastings(ChainEngine):
     chains: int = 4
     proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
     thinning: int = 1
+    start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Metropolis-Hastings"
 

@@ -78,27 +78,25 @@ def as_function(
     return given
 
 
-def check_targets(engine: str, problem: Problem, key: Key) -> None:
+def check_targets(engine: str, problem: Problem, key: Key, option: str = "proposal") -> None:
     """Refuse targets that are never drawn.
 
     Raises
     ------
     UnknownNodeError, ModelError, EvidenceError
     """
-    what = f"{engine}: proposal for {key!r}"
+    what = f"{engine}: {option} for {key!r}"
     for name in names_of(key):
         node = problem.model.nodes.get(name)
         if node is None:
             raise UnknownNodeError(f"{what}: {_unknown(problem.model, name)}")
         if node.kind != "stochastic":
             kind = {"fixed": "fixed by do()", "input": "an input"}.get(node.kind, "deterministic")
-            raise ModelError(
-                f"{what}: {name!r} is {kind} and never drawn; propose a stochastic node"
-            )
+            raise ModelError(f"{what}: {name!r} is {kind} and never drawn; name a stochastic node")
         seen = problem.observed.get(name)
         if seen is not None and seen.mask is None:
             raise EvidenceError(
-                f"{what}: {name!r} is observed, so there is nothing to draw; leave out the proposal or the "
+                f"{what}: {name!r} is observed, so there is nothing to draw; leave out the {option} or the "
                 "evidence"
             )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
@@ -12,13 +12,15 @@ from bayesmc.shapes import Shape, first_index
 from bayesmc.structure.target import Target, Term, Values
 
 
-def refuse_impossible(target: Target, tried: Values) -> None:
+def refuse_impossible(target: Target, tried: Values, given: Collection[str] = ()) -> None:
     """Raise for an observed element that no value of the hidden nodes makes possible.
 
     Parameters
     ----------
     tried : dict
         Some values of the chain's nodes and of what follows from them, shape ``(rows, *plates, *event)``.
+    given : collection of str
+        Nodes that are the same in all of them because the user says so.
 
     Raises
     ------
@@ -29,8 +31,9 @@ def refuse_impossible(target: Target, tried: Values) -> None:
     for name, term in target.terms.items():
         if term.is_potential or name in target.chain or name not in target.known:
             continue
-        if any(target.model[n].domain is not None for n in target.hidden_above(term)):
-            continue  # a state that was not drawn may allow it
+        above = target.hidden_above(term)
+        if any(n in given or target.model[n].domain is not None for n in above):
+            continue  # another value, or a state that was not drawn, may allow it
         dist, _ = term.distribution(values)
         support, value = dist.support, np.asarray(target.known[name])
         if support.kind not in ("interval", "integers") or target.model[name].event_shape:

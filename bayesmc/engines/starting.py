@@ -60,7 +60,7 @@ def start_states(
         if found.complete and not continuous:
             break
         if spread == 1.0 and not found.alive:
-            refuse_impossible(target, found.tried)
+            refuse_impossible(target, found.tried, found.given)
     free = [n for n in target.chain if n not in found.given]
     if search and continuous and free and not found.alive:
         found.climb()

@@ -37,6 +37,8 @@ class SweepSampler:
         by_name = dict(zip(bare.nodes, steps, strict=True))
         self._forward = [by_name[n] for n in target.forward]
         self.forward_nodes = target.forward
+        #: where the user wants chains to start: node -> stored values, shape (chains, *plates, *event)
+        self.given: Values = {}
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
         return self._started(rng, chains, chains)
@@ -68,10 +70,15 @@ class SweepSampler:
 
     def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:
         """A state of ``rows`` rows for ``chains`` chains."""
-        values = start_states(self.target, rows, rng)
+        values = start_states(self.target, rows, rng, self.given_rows(rows))
         inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
         memory = [kernel.start(values, rows) for kernel in self.kernels]
         return {"values": inside, "memory": memory, "chains": chains}
+
+    def given_rows(self, rows: int) -> Values:
+        """Where the user wants the rows of the state to start, those of a chain alike."""
+        inside = {n: v for n, v in self.given.items() if n in self.target.chain}
+        return {n: np.repeat(v, rows // len(v), axis=0) for n, v in inside.items()}
 
     def completed(
         self, values: Mapping[str, np.ndarray], chains: int, rng: np.random.Generator

@@ -14,7 +14,8 @@ Biometrika 82, on why one at a time mixes slowly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from operator import is_
 from typing import Any
@@ -187,7 +188,22 @@ def gaussian_blocks(
     able = [n for n, b in blankets.items() if _is_able(target, b)]
     found = []
     for names in _joint_groups(target, able, blankets):
-        found += _fitting(target, names, blankets, debug)
+        if len(names) > 1:
+            found += _fitting(target, names, blankets, debug)
+    return found
+
+
+def vector_blocks(
+    target: Target, blankets: Mapping[str, Blanket], joined: Collection[str], debug: bool = False
+) -> list[GaussianBlock]:
+    """Blocks of one Normal vector each, of those that are not ``joined`` to others.
+
+    Its components are coupled as scalars of their own would be.
+    """
+    found = []
+    for name, blanket in blankets.items():
+        if name not in joined and math.prod(blanket.event_shape) > 1 and _is_able(target, blanket):
+            found += _fitting(target, [name], blankets, debug)
     return found
 
 
@@ -252,12 +268,14 @@ def _fitting(
     target: Target, names: Sequence[str], blankets: Mapping[str, Blanket], debug: bool
 ) -> list[GaussianBlock]:
     """A group as one block, or cut into halves (each drawn given the other) where that is too large."""
-    if len(names) < 2:
+    if len(names) < 2 and not any(target.model[n].event_shape for n in names):
         return []
     own = {n: blankets[n] for n in names}
     layout = Layout(target, names, own, target.terms_of(names))
     if max(layout.width, layout.dg) <= MAX_DENSE and layout.entries <= _MAX_ENTRIES:
         return [GaussianBlock(target, own, debug, layout)]
+    if len(names) < 2:
+        return []
     half = len(names) // 2
     halves = names[:half], names[half:]
     return [block for part in halves for block in _fitting(target, part, blankets, debug)]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.gibbs_plan import Plan, plan_of
@@ -39,6 +39,8 @@ class ParticleGibbs(ParticleEngine):
         Two or more, of each chain; the trajectory that is kept is one of them.
     thinning : int
         Sweeps per kept draw.
+    start : dict, optional
+        Node -> where its chains start, as for `Gibbs`; of static nodes, since a filter draws trajectories.
 
     Raises
     ------
@@ -74,6 +76,7 @@ class ParticleGibbs(ParticleEngine):
     chains: int = 16
     particles: int = 50
     thinning: int = 1
+    start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "particle Gibbs"
 

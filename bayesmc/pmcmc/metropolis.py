@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from bayesmc.engines.weighted import treatment
@@ -74,6 +75,7 @@ class ParticleMetropolis(ParticleEngine):
     chains: int = 16
     particles: int | None = None
     thinning: int = 1
+    start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "particle Metropolis"
 

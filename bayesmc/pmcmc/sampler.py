@@ -75,7 +75,7 @@ class ParticleSampler(SweepSampler):
     def _begun(self, rng: np.random.Generator, rows: int) -> Values:
         """Static nodes and trajectories of positive density."""
         try:
-            values = start_states(self.target, rows, rng)
+            values = start_states(self.target, rows, rng, self.given_rows(rows), search=False)
         except ZeroProbabilityError as error:
             return self._searched(rng, rows, error)
         if not self.filter.trellis.names:
@@ -92,7 +92,8 @@ class ParticleSampler(SweepSampler):
         statics = tuple(n for n in self.target.chain if n not in inside)
         prior = prior_of(self.target, statics)
         for _ in range(_ATTEMPTS):
-            values = start_states(prior, rows, rng) if statics else dict(self.target.known)
+            given = self.given_rows(rows)
+            values = start_states(prior, rows, rng, given) if statics else dict(self.target.known)
             history = self.filter.run(values, rows, rng)
             good = np.flatnonzero(np.isfinite(history.log_likelihood))
             if not len(good):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 import warnings
+from typing import Any
 
 import numpy as np
 import pytest
@@ -298,3 +299,52 @@ def test_nodes_that_nothing_observed_depends_on_are_drawn_afresh() -> None:
     # 8,000 independent draws: five standard errors, a false alarm in two million
     assert posterior.ess("c") > 4000
     assert abs(posterior.mean("c") - 0.5) < 5 * 0.5 / np.sqrt(8000)
+
+
+# ---- vectors ------------------------------------------------------------------------------------
+
+
+def effects(likelihood: Any, as_vector: bool) -> bmc.BayesNet:
+    """Three effects of one scale, apart or as one vector."""
+    x = np.random.default_rng(0).normal(size=(60, 3))
+    net = bmc.BayesNet(plates={"i": 60})
+    net.add("tau", bmc.HalfNormal(5.0))
+    if as_vector:
+        net.add("b", lambda tau: bmc.MvNormal(np.zeros(3), scale_diag=tau[..., None] * np.ones(3)))
+        net.add("y", lambda b: likelihood(np.vecdot(x, b)), plates="i")
+        return net
+    for k in range(3):
+        net.add(f"b{k}", lambda tau: bmc.Normal(0.0, tau))
+    net.add(
+        "y",
+        lambda b0, b1, b2: likelihood(b0 * x[:, 0] + b1 * x[:, 1] + b2 * x[:, 2]),
+        plates="i",
+    )
+    return net
+
+
+LIKELIHOODS: dict[str, tuple[Any, Any]] = {
+    "normal": (lambda m: bmc.Normal(m, 20.0), lambda u: 20.0 * u),
+    "logistic": (lambda m: bmc.Bernoulli(logits=m), lambda u: u > 0),
+    "student": (lambda m: bmc.StudentT(4.0, m, 20.0), lambda u: 20.0 * u),
+}
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+@pytest.mark.parametrize(
+    "name",
+    ["normal", *(pytest.param(n, marks=pytest.mark.thorough) for n in list(LIKELIHOODS)[1:])],
+)
+def test_a_vector_mixes_as_its_components_apart_do(name: str) -> None:
+    """The normal one's scale had an effective size of a sixth."""
+    likelihood, data = LIKELIHOODS[name]
+    y = data(np.random.default_rng(1).normal(size=60))
+    engine = bmc.Gibbs(400, 400)
+    apart, vector = (
+        bmc.infer(effects(likelihood, v), {"y": y}, engine=engine, rng=0) for v in (False, True)
+    )
+    assert vector.ess("tau") > 0.5 * apart.ess("tau")
+    least = min(float(apart.ess(f"b{k}")) for k in range(3))
+    assert np.min(vector.ess("b")) > 0.5 * least
+    error = np.hypot(apart.mcse("tau"), vector.mcse("tau"))
+    assert abs(apart.mean("tau") - vector.mean("tau")) < 5.0 * error  # false alarm 6e-7

@@ -20,7 +20,7 @@ from bayesmc.testing.kernels.ranks import rank_test
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
-from tests.mutants.tests_of import matched
+from tests.mutants.tests_of import estimated, matched
 
 Make = Callable[[], Any]
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
@@ -119,6 +119,42 @@ def scales() -> bmc.BayesNet:
     net.add("s", bmc.Gamma(3.0, 3.0))
     net.add("y", lambda m, s: bmc.Normal(m, s))
     return net
+
+
+def veiled() -> bmc.BayesNet:
+    """A mean with a reading, and another whose density holds the mean in a closure."""
+
+    def reading(x: Any) -> bmc.Density:
+        return bmc.Density(
+            lambda z: -0.5 * ((z - x) / 0.5) ** 2 - np.log(0.5 * np.sqrt(2 * np.pi)),
+            lambda rng, shape: x + 0.5 * rng.standard_normal(shape + np.shape(x)),
+        )
+
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    net.add("z", reading)
+    return net
+
+
+def signed() -> bmc.BayesNet:
+    """A scale that may be negative."""
+    net = bmc.BayesNet()
+    net.add("s", bmc.Normal(0.5, 1.0))
+    net.add("y", lambda s: bmc.Normal(0.0, s))
+    return net
+
+
+def mean_scale(rng: np.random.Generator) -> dict[str, Any]:
+    """An estimate of the mean of that scale."""
+    engine = bmc.Gibbs(draws=60, warmup=20, chains=20)
+    return {"s": bmc.infer(signed(), {"y": 0.5}, engine=engine, rng=rng).mean("s")}
+
+
+def exact_mean_scale() -> float:
+    s = np.linspace(1e-4, 9.0, 100_001)
+    weights = np.exp(-0.5 * (s - 0.5) ** 2 - 0.5 * (0.5 / s) ** 2) / s
+    return float((s * weights).sum() / weights.sum())
 
 
 def count() -> bmc.BayesNet:
@@ -247,6 +283,19 @@ MUTANTS = [
               "for child in self.children:", "for child in self.children[:-1]:"),),
         ranks(lambda: bmc.Gibbs(), robust, warmup=20),
         "rank_test, 500 replications",
+    ),
+    Mutant(
+        "a child that hides its parent in a closure is left out of a closed form",
+        (Edit("bayesmc.structure.traced:_refuse_hidden", "if not _is_open(result):", "if False:"),),
+        ranks(lambda: bmc.Gibbs(), veiled, warmup=20),
+        "rank_test, 500 replications",
+    ),
+    Mutant(
+        "parameters out of range have the density of those put in their place",
+        (Edit("bayesmc.structure.target:Term.log_of",
+              "np.where(dist.invalid, -np.inf, result)", "result"),),
+        estimated(mean_scale, {"s": exact_mean_scale()}, 14),
+        "14 runs against a grid",
     ),
     Mutant(
         "slices: the first interval lies about the point, and does not step out",
