@@ -18,6 +18,7 @@ from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_search import forest_blocks
+from bayesmc.kernels.forest_sites import site_forest
 from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
 from bayesmc.kernels.joint_states import joint_states
 from bayesmc.kernels.jump import Jump
@@ -199,7 +200,11 @@ def _finite(
     if not names:
         return [], ()
     kernels: list[Kernel] = []
-    lattices = {n: k for n in names if (k := lattice_kernel(blankets[n])) is not None}
+    lattices: dict[str, Kernel] = {}
+    for name in names:
+        kernel = site_forest(blankets[name]) or lattice_kernel(blankets[name])
+        if kernel is not None:
+            lattices[name] = kernel
     kernels += lattices.values()
     tight = tuple(n for n, k in lattices.items() if getattr(k, "constrained", False))
     if len(lattices) == len(names):

@@ -84,7 +84,7 @@ class ForestBlock(Kernel):
         number = {e: i for i, e in enumerate(edges)}
         self.read = Readers(target, ordered, colour, self.candidates)
         self.places = [
-            np.array([number[m] if len(m) > 1 else place[m[0]] for m in reader.members])
+            _places([number[m] if len(m) > 1 else place[m[0]] for m in reader.members])
             for reader in self.read.all
         ]
         self.states = max(self.cards)
@@ -177,6 +177,15 @@ def members_of(target: Target, names: Sequence[str]) -> dict[str, tuple[str, ...
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _places(numbers: list[int]) -> slice | np.ndarray:
+    """Where to put what some terms say: as a slice, which is faster, where they stand at even distances."""
+    step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
+    end = numbers[0] + step * len(numbers)
+    if step > 0 and numbers == list(range(numbers[0], end, step)):
+        return slice(numbers[0], end, step)
+    return np.array(numbers)
 
 
 def _two_colours(names: Sequence[str], edges: Sequence[tuple[str, ...]]) -> dict[str, int]:

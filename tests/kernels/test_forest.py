@@ -17,9 +17,12 @@ from bayesmc.engines.gibbs_plan import plan_of
 from bayesmc.errors import ConvergenceWarning, ParameterError, ZeroProbabilityError
 from bayesmc.kernels.forest import Forest
 from bayesmc.kernels.forest_block import ForestBlock
+from bayesmc.kernels.forest_sites import SiteForest
 from bayesmc.network import pose
 from bayesmc.structure.target import Target
-from bayesmc.testing import invariant
+from bayesmc.testing import invariant, session
+from bayesmc.testing.posteriors.matching import assert_matches
+from bayesmc.testing.verdict import uncounted
 
 # ---- arrays -----------------------------------------------------------------------------------------
 
@@ -352,3 +355,33 @@ def test_nodes_without_finite_neighbours_are_left_to_others() -> None:
     mixture.add("x", lambda label, mean: bmc.Normal(mean[label], 1.0), plates="i")
     assert not _blocks(mixture, {"x": np.arange(5.0)})[1]
     assert not _blocks(small(), {"y": 1})[1]
+
+
+def sites(pairs: list[tuple[int, int]]) -> bmc.FactorGraph:
+    """Sites of three states with factors on pairs that are not symmetric, one of them stated twice."""
+    graph = bmc.FactorGraph(plates={"site": 4})
+    graph.variable("s", 3, plates="site")
+    first, second = zip(*pairs, strict=True)
+    graph.factor(lambda a, b: 0.8 * a - 0.5 * a * b, scope=("s", "s"), index=(first, second))
+    graph.factor(lambda a, b: 1.0 * (a > b), scope=("s", "s"), index=(first[:1], second[:1]))
+    graph.factor(lambda a: 0.3 * a, scope=("s",), index=([1],))
+    return graph
+
+
+def test_sites_of_a_factor_graph() -> None:
+    """Trees of sites are drawn at once, and right; a ring is left to other kernels."""
+    tree, ring = sites([(1, 0), (1, 2), (3, 1)]), sites([(0, 1), (1, 2), (2, 3), (3, 0)])
+    assert [type(k) for k in plan_of(pose(tree, {})).kernels] == [SiteForest]
+    assert SiteForest not in [type(k) for k in plan_of(pose(ring, {})).kernels]
+    exact = bmc.infer(tree, {}, engine=bmc.Exact())
+    engine = bmc.Gibbs(draws=2000, warmup=1, chains=4)
+    # false-alarm rate 1e-5
+    assert_matches(bmc.infer(tree, {}, engine=engine, rng=session.seed()), exact, alpha=1e-5)
+    seen = {"s": np.array([np.nan, 2.0, np.nan, np.nan])}
+    given = bmc.infer(tree, seen, engine=engine, rng=session.seed())
+    assert_matches(given, bmc.infer(tree, seen, engine=bmc.Exact()), alpha=1e-5)
+    assert given.probabilities("s")[1, 2] == 1.0
+    wrong = bmc.infer(sites([(0, 1), (1, 2), (3, 1)]), {}, engine=bmc.Exact())
+    with uncounted(), pytest.raises(AssertionError, match="'s'"):
+        found = bmc.infer(tree, {}, engine=engine, rng=session.seed())
+        assert_matches(found, wrong, alpha=1e-5)  # one factor the wrong way round
