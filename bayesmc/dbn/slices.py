@@ -133,6 +133,12 @@ class Template:
     def _around(self) -> list[Declaration]:
         return [d for d in (*self.later.values(), *self.first.values()) if d.captured]
 
+    @property
+    def has_functions(self) -> bool:
+        """Whether any density is given by a function; what is not are tables."""
+        declared = (*self.later.values(), *self.first.values())
+        return any(d.function is not None for d in declared)
+
     def slice_zero(self) -> dict[str, Declaration]:
         """Declarations of slice 0."""
         return {TIME: _CLOCK[TIME], **{n: self.first.get(n, d) for n, d in self.later.items()}}

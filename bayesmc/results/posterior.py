@@ -271,6 +271,15 @@ class Posterior:
     def _remedy(self) -> str:
         return "draw from it with resample(draws)"
 
+    def __copy__(self) -> Any:
+        """The same answers; unlike a pickle a copy keeps the model's functions."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        return self.__copy__()
+
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
         return {**self.__dict__, "problem": None, "model": self.model.without_functions()}

@@ -145,6 +145,15 @@ class SeriesPosterior:
             found.weight_ess = self.weight_ess[-steps:]
         return found
 
+    def __copy__(self) -> Any:
+        """The same answers; unlike a pickle a copy keeps the model's functions."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        return self.__copy__()
+
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
         return {**self.__dict__, "model": self.model.without_functions()}

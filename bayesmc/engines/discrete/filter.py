@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, arguments_of, best_path
-from bayesmc.engines.discrete.belief import DiscreteBelief, window
+from bayesmc.engines.discrete.belief import DiscreteBelief, Held, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
 from bayesmc.engines.discrete.path import path_values
 from bayesmc.engines.discrete.run import Run
@@ -163,8 +163,20 @@ class DiscreteFilter(FilterEngine):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> DiscreteBelief:
         return DiscreteBelief(dbn, dict(static))
 
+    def _bound(
+        self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
+    ) -> DiscreteBelief:
+        held = belief.held
+        plan = DiscreteSlices(
+            slices, plates_apart(slices), frozenset(), read_static(slices, belief.static)
+        )
+        run = Run(plan, held.series, belief.t, held.before)
+        run.forward()  # the slice once more, from the beliefs before it
+        return DiscreteBelief(dbn, belief.static, belief.t, belief.log_marginal_likelihood, run)
+
     def _absorbed(self, belief: DiscreteBelief, slices: Slices, row: Row) -> DiscreteBelief:
         t, run = belief.t + 1, belief.run
+        assert not isinstance(run, Held)
         if run is None:
             static = read_static(slices, belief.static)
             plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)

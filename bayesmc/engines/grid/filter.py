@@ -18,9 +18,10 @@ from bayesmc.engines.exact import readable_bytes
 from bayesmc.engines.filtering import FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import check_rule, read_axes
-from bayesmc.engines.grid.belief import GridBelief
+from bayesmc.engines.grid.belief import GridBelief, Kept
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
+from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
@@ -243,8 +244,25 @@ class GridFilter(FilterEngine):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
         return GridBelief(dbn, static, _quiet)
 
+    def _bound(self, belief: GridBelief, dbn: DynamicBayesNet, slices: Slices) -> GridBelief:
+        cells = belief.cells
+        assert cells is not None
+        with _quiet():
+            model = self._model(slices, read_static(slices, belief.static))
+            placed = model.place(cells.placed.row)
+        if not same_points(placed, cells.placed):
+            raise ValueError(
+                "GridFilter().start: the belief lies on another grid; go on with the engine that it was "
+                "started with"
+            )
+        return GridBelief(
+            dbn, belief.static, _quiet, GridMover(model, self.tolerance), cells, belief.before,
+            belief.log_marginal_likelihood, belief.inputs,
+        )  # fmt: skip
+
     def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
         mover = belief.mover
+        assert not isinstance(mover, Kept)
         with _quiet():
             if mover is None:
                 model = self._model(slices, read_static(slices, belief.static))

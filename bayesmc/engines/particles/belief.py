@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.beliefs import OnlineBelief
+from bayesmc.engines.particles.cloud import Bare, Cloud, Layout
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import circular_variance, table_variance
 
 
-class ParticleBelief:
+class ParticleBelief(OnlineBelief):
     """Particles of one slice, as ``ParticleFilter.start`` and ``step`` give them.
 
     Attributes
@@ -51,10 +52,10 @@ class ParticleBelief:
 
     def __init__(
         self,
-        dbn: DynamicBayesNet,
+        dbn: DynamicBayesNet | None,
         seed: np.random.SeedSequence,
         static: Mapping[str, Any],
-        mover: Mover | None = None,
+        mover: Mover | Bare | None = None,
         cloud: Cloud | None = None,
         log_marginal_likelihood: Any = 0.0,
         chance: Mapping[str, Any] | None = None,
@@ -65,6 +66,11 @@ class ParticleBelief:
         self.inputs = dict(inputs or {})
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if cloud is None else cloud.t
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        mover = None if self.mover is None else Bare(self.mover.slices, self.mover.layout)
+        return {**self.__dict__, "dbn": None, "mover": mover}
 
     @property
     def slices(self) -> Slices | None:
@@ -164,7 +170,7 @@ class ParticleBelief:
         return self.cloud
 
     @property
-    def _mover(self) -> Mover:
+    def _mover(self) -> Mover | Bare:
         assert self.mover is not None
         return self.mover
 

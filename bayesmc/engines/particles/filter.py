@@ -363,9 +363,24 @@ class ParticleFilter(FilterEngine):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
         return ParticleBelief(dbn, seed_sequence(rng), static)
 
+    def _bound(
+        self, belief: ParticleBelief, dbn: DynamicBayesNet, slices: Slices
+    ) -> ParticleBelief:
+        held = len(belief.weights)
+        if held > self.particles or (held < self.particles and self.adapt is None):
+            raise ValueError(
+                f"ParticleFilter({self.particles}).start: the belief has {held} particles; go on with the "
+                "engine that it was started with"
+            )
+        mover = self._mover(slices, read_static(slices, belief.static))
+        return ParticleBelief(
+            dbn, belief.seed, belief.static, mover, belief.cloud,
+            belief.log_marginal_likelihood, belief.chance, belief.inputs,
+        )  # fmt: skip
+
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
         mover = belief.mover
-        if mover is None:
+        if not isinstance(mover, Mover):
             mover = self._mover(slices, read_static(slices, belief.static))
         chance = belief.chance
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
