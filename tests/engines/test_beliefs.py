@@ -85,7 +85,9 @@ def test_belief_of_a_pickle_goes_on_given_the_template_again(name, after):
         again = pickle.loads(pickle.dumps(back))
         return engine.start(model()[0], belief=again)
 
-    for one, other in zip(run(engine, dbn, rows), run(engine, dbn, rows, travel, after), strict=True):
+    for one, other in zip(
+        run(engine, dbn, rows), run(engine, dbn, rows, travel, after), strict=True
+    ):
         same(one, other)
 
 
