@@ -19,7 +19,9 @@ from bayesmc.network.forward import (
     Pass,
     Step,
     potential_factors,
+    refuse_noiseless,
     refuse_unsampled,
+    whole,
     with_factors,
 )
 from bayesmc.progress import Progress
@@ -93,6 +95,7 @@ class Rejection(Engine):
 
     def refusal(self, problem: Problem) -> str | None:
         reason = refuse_unsampled(problem.model, problem.observed, "Rejection")
+        reason = reason or refuse_noiseless(problem.model, whole(problem.observed), "Rejection")
         if reason is not None:
             return reason
         missing = log_bounds(problem, self.bound or {})[1]

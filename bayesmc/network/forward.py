@@ -137,7 +137,7 @@ class Draw:
         self.model, self.node = model, node
 
     def __call__(self, state: Pass) -> None:
-        dist = current_distribution(self.model, self.node, state)
+        dist = current_distribution(self.model, self.node, state, drawn=True)
         state.values[self.node.name] = self.model.sample_stored(
             self.node.name, dist, state.rng, state.batch
         )
@@ -182,7 +182,7 @@ class DrawAndWeigh:
         self.mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
 
     def __call__(self, state: Pass) -> None:
-        dist = current_distribution(self.model, self.node, state)
+        dist = current_distribution(self.model, self.node, state, drawn=~self.elements)
         draws = self.model.sample_stored(self.node.name, dist, state.rng, state.batch)
         values = np.where(self.mask, self.seen.value, draws)
         values.flags.writeable = False
@@ -201,11 +201,16 @@ class Potential:
         state.weigh(self.model.potential(self.name, state.values))
 
 
-def current_distribution(model: Model, node: CompiledNode, state: Pass) -> Distribution:
-    """The node's distribution given its parents; bad parameters raise where the weight is positive."""
+def current_distribution(
+    model: Model, node: CompiledNode, state: Pass, drawn: bool | np.ndarray = False
+) -> Distribution:
+    """The node's distribution given its parents; bad parameters raise where the weight is positive.
+
+    Elements of the plates that are ``drawn`` may be without noise.
+    """
     dist, _ = model.evaluate(node.name, state.values)
     if dist.invalid is not None:
-        error = invalid_error(node, dist, state.alive, state.batch)
+        error = invalid_error(node, dist, state.alive, state.batch, drawn)
         if error is not None:
             raise error
     return dist
@@ -225,6 +230,24 @@ def summed(log: np.ndarray, node: CompiledNode, apart: tuple[str, ...]) -> np.nd
     if order != sorted(order):
         total = total.transpose(*range(count), *(count + k for k in order))
     return total
+
+
+def whole(observed: Mapping[str, Observed]) -> list[str]:
+    """Nodes that are observed in full; of others only some elements may have to have a density."""
+    return [name for name, seen in observed.items() if seen.mask is None]
+
+
+def refuse_noiseless(model: Model, names: Iterable[str], who: str) -> str | None:
+    """Why an engine that evaluates the densities of some nodes cannot: one is a point without noise."""
+    for name in names:
+        if model[name].noiseless:
+            return (
+                f"{who} evaluates the density of {name!r}, which has none: it is without noise (a scale of "
+                "0, or a singular covariance), and its value follows from its parents; declare a function "
+                "that returns the value instead of a distribution, give it a little noise, or use Exact() or "
+                "a Kalman filter where the model is linear-Gaussian"
+            )
+    return None
 
 
 def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None:

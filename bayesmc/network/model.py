@@ -40,7 +40,8 @@ _DETERMINISTIC_TABLE = 4096
 @dataclass(frozen=True, eq=False)
 class CompiledNode:
     """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
-    ``unsampled`` says that its density has no sampler."""
+    ``unsampled`` says that its density has no sampler, ``noiseless`` that some element has no noise
+    whatever its parents are, and so no density."""
 
     declaration: Declaration
     links: tuple[tuple[str, Aligner], ...]
@@ -52,6 +53,7 @@ class CompiledNode:
     support: Support | None = None
     table: np.ndarray | None = None
     unsampled: bool = False
+    noiseless: bool = False
 
     @property
     def name(self) -> str:
@@ -364,15 +366,23 @@ def lookup(node: CompiledNode, values: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def invalid_error(
-    node: CompiledNode, dist: Distribution, counts: np.ndarray, batch: Shape
+    node: CompiledNode,
+    dist: Distribution,
+    counts: np.ndarray,
+    batch: Shape,
+    noiseless: bool | np.ndarray = False,
 ) -> ParameterError | None:
     """The error for bad parameters at configurations that count, or None.
 
-    ``counts`` (shape ``batch``) tells which batch elements have positive probability.
+    ``counts`` (shape ``batch``) tells which batch elements have positive probability. Elements of the
+    plates that are ``noiseless`` may have no noise: they are drawn, or nobody asks for their density.
     """
     if dist.invalid is None:
         return None
-    full = np.broadcast_to(dist.invalid, batch + node.plate_shape)
+    invalid = dist.invalid
+    if dist.noiseless is not None:
+        invalid = invalid & ~(dist.noiseless & noiseless)
+    full = np.broadcast_to(invalid, batch + node.plate_shape)
     lead = np.asarray(counts).reshape(np.shape(counts) + (1,) * len(node.plate_shape))
     bad = full & lead
     if not bad.any():

@@ -22,6 +22,7 @@ from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.filtering import FilterEngine, Queries, observed_answers
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.network.forward import refuse_noiseless
 from bayesmc.progress import Progress
 from bayesmc.results import SeriesPosterior
 
@@ -88,6 +89,10 @@ class DiscreteFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        for compiled in (problem.slices.first, problem.slices.later):
+            reason = refuse_noiseless(compiled, problem.series.observed, "DiscreteFilter")
+            if reason is not None:
+                return reason
         error = self._why_not(problem)
         return None if error is None else str(error)
 

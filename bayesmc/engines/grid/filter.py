@@ -26,6 +26,7 @@ from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
 from bayesmc.errors import BayesmcError, BudgetError
+from bayesmc.network.forward import refuse_noiseless
 from bayesmc.progress import Progress
 
 
@@ -116,6 +117,11 @@ class GridFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        names = problem.slices.stochastic
+        for compiled in (problem.slices.first, problem.slices.later):
+            reason = refuse_noiseless(compiled, names, "GridFilter")
+            if reason is not None:
+                return reason
         try:
             with _quiet():
                 model = self._model(problem.slices, _static(problem))

@@ -30,7 +30,7 @@ from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
-from bayesmc.network.forward import refuse_unsampled
+from bayesmc.network.forward import refuse_noiseless, refuse_unsampled, whole
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -232,7 +232,9 @@ class ParticleFilter(FilterEngine):
             proposals.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
         for model in (problem.slices.first, problem.slices.later):
             inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
-            reason = refuse_unsampled(model, inside, "ParticleFilter")
+            reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
+                model, whole(problem.series.observed), "ParticleFilter"
+            )
             if reason is not None:
                 return reason
         return None
