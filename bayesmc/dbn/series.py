@@ -74,24 +74,29 @@ class Series:
     start: int = 0
 
     @cached_property
-    def _looked_at(self) -> dict[str, tuple[Any, Any, Any, Any]]:
-        """Node -> values, mask, and for each row whether all and whether some of it was seen."""
-        found: dict[str, tuple[Any, Any, Any, Any]] = {}
+    def _looked_at(self) -> dict[str, tuple[Any, Any, Any]]:
+        """Node -> what was seen, and for each row whether all and whether some of it was seen."""
+        found: dict[str, tuple[Any, Any, Any]] = {}
         for name, seen in self.observed.items():
             flat = None if seen.mask is None else seen.mask.reshape(self.steps, -1)
             full = None if flat is None else flat.all(axis=1).tolist()
-            some = None if flat is None else flat.any(axis=1).tolist()
-            found[name] = (seen.value, seen.mask, full, some)
+            some = None if flat is None else flat.any(axis=1)
+            if some is not None and seen.parts is not None:
+                some = some | seen.parts.reshape(self.steps, -1).any(axis=1)
+            found[name] = (seen, full, None if some is None else some.tolist())
         return found
 
     def row(self, k: int) -> Row:
         """What is known of the k-th slice here."""
         seen = {}
-        for name, (value, mask, full, some) in self._looked_at.items():
+        for name, (found, full, some) in self._looked_at.items():
             if full is None or full[k]:
-                seen[name] = Observed(value[k, ...])
+                seen[name] = Observed(found.value[k, ...])
             elif some[k]:
-                seen[name] = Observed(value[k, ...], mask[k])
+                parts = None if found.parts is None else found.parts[k, ...]
+                if parts is not None and not parts.any():
+                    parts = None
+                seen[name] = Observed(found.value[k, ...], found.mask[k, ...], parts)
         t = self.start + k
         inputs: dict[str, np.ndarray] = {TIME: np.asarray(t)}
         if t:
@@ -440,7 +445,9 @@ def _padded(found: Observed | None, node: CompiledNode, ahead: int) -> Observed 
     if mask is None:
         mask = np.ones((len(found.value), *node.plate_shape), dtype=bool)
     value = np.concatenate([found.value, np.repeat(found.value[:1], ahead, axis=0)])
-    return Observed(value, np.concatenate([mask, np.zeros((ahead, *mask.shape[1:]), dtype=bool)]))
+    masks = [None if m is None else np.concatenate([m, np.zeros((ahead, *m.shape[1:]), dtype=bool)])
+             for m in (mask, found.parts)]  # fmt: skip
+    return Observed(value, *masks)
 
 
 def _observed(node: CompiledNode, value: Any, steps: int) -> Observed | None:

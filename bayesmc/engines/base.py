@@ -99,6 +99,7 @@ def same_question(was: Problem, now: Problem) -> bool:
         and all(
             np.array_equal(o.value, now.observed[n].value)
             and _same_mask(o.mask, now.observed[n].mask)
+            and _same_mask(o.parts, now.observed[n].parts)
             for n, o in was.observed.items()
         )
         and all(np.array_equal(v, now.inputs[n]) for n, v in was.inputs.items())

@@ -20,7 +20,7 @@ from bayesmc.kernels.ensemble import BlockWalk, stragglers
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.structure.target import Values
 
 #: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
@@ -111,6 +111,9 @@ class MetropolisHastings(ChainEngine):
         object.__setattr__(self, "proposal", checked)
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, "MetropolisHastings")
+        if parts is not None:
+            return parts
         plan = self._plan(problem)
         terms = [n for n in plan.target.terms if n in problem.model.nodes]
         return plan.refusal or refuse_noiseless(problem.model, terms, "MetropolisHastings")

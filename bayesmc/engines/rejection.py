@@ -20,6 +20,7 @@ from bayesmc.network.forward import (
     Step,
     potential_factors,
     refuse_noiseless,
+    refuse_parts,
     refuse_unsampled,
     whole,
     with_factors,
@@ -94,6 +95,9 @@ class Rejection(Engine):
             object.__setattr__(self, "bound", _checked_bounds(self.bound))
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, "Rejection")
+        if parts is not None:
+            return parts
         reason = refuse_unsampled(problem.model, problem.observed, "Rejection")
         reason = reason or refuse_noiseless(problem.model, whole(problem.observed), "Rejection")
         if reason is not None:

@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesmc.distributions import Density, Distribution
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.components import splits
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import (
@@ -224,6 +225,7 @@ def _discover_stochastic(
         support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
         noiseless=_is_noiseless(dist, batch + plates, len(batch)),
+        splits=splits(dist),
     )
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)

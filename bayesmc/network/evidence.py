@@ -30,11 +30,15 @@ class Observed:
     value : ndarray
         Stored values, shape ``(*plates, *event)``; unobserved elements hold a filler.
     mask : ndarray of bool or None
-        Observed plate elements; None where all are.
+        Plate elements observed in full; None where all are.
+    parts : ndarray of bool or None
+        Of the other elements the components that are observed all the same, shape that of ``value``; None
+        where there are none.
     """
 
     value: np.ndarray
     mask: np.ndarray | None = None
+    parts: np.ndarray | None = None
 
 
 def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str, Observed]:
@@ -77,12 +81,13 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     event = tuple(range(len(node.plate_shape), array.ndim))
     some = missing.any(axis=event) if event else missing
     every = missing.all(axis=event) if event else missing
-    if (some & ~every).any():
-        at = first_index(missing & np.expand_dims(some & ~every, event))
+    partly = some & ~every
+    if partly.any() and not node.splits:
+        at = first_index(missing & np.expand_dims(partly, event))
         raise EvidenceError(
             f"evidence on {node.name!r}: of one vector the entry at {_index(at)} is missing and others are "
-            "not, which is not supported; split the vector into nodes of its parts, leave all of it out, or "
-            "put in what stands for no reading (of ranges: robotics.clean_ranges)"
+            "not, which is answered for MvNormal and Joint only; split the vector into nodes of its parts, "
+            "leave all of it out, or put in what stands for no reading (of ranges: robotics.clean_ranges)"
         )
     if every.all() and array.size:
         return None
@@ -90,9 +95,10 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     if missing.any():
         filled = np.where(missing, array[first_index(~missing)], array)
     stored = store(node, filled)
-    observed = np.asarray(~every)
-    _check_support(node, stored, observed)
-    return Observed(stored, None if observed.all() else observed)
+    observed = np.asarray(~some)
+    _check_support(node, stored, np.asarray(~every))
+    parts = np.expand_dims(partly, event) & ~missing if partly.any() else None
+    return Observed(stored, None if observed.all() else observed, parts)
 
 
 def read_question(
@@ -231,7 +237,7 @@ def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:
                 f"({_allowed(node)})"
             )
         missing = np.isnan(array) if array.dtype.kind == "f" else np.zeros(array.shape, dtype=bool)
-    if missing.any() and not node.plates:
+    if missing.any() and not node.plates and (missing.all() or not node.event_shape):
         raise EvidenceError(
             f"evidence on {node.name!r} is {_peek(data)}, which means nothing for a node without "
             "plates; leave it out (or give None) if it is unobserved"

@@ -41,7 +41,7 @@ _DETERMINISTIC_TABLE = 4096
 class CompiledNode:
     """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
     ``unsampled`` says that its density has no sampler, ``noiseless`` that some element has no noise
-    whatever its parents are, and so no density."""
+    whatever its parents are, and so no density, ``splits`` that some components may be seen alone."""
 
     declaration: Declaration
     links: tuple[tuple[str, Aligner], ...]
@@ -54,6 +54,7 @@ class CompiledNode:
     table: np.ndarray | None = None
     unsampled: bool = False
     noiseless: bool = False
+    splits: bool = False
 
     @property
     def name(self) -> str:

@@ -153,6 +153,9 @@ def _add(
     part.invalid.extend(reading.invalid_rows())
     hidden = hidden_elements(reading.node, seen)
     part.conditionals.extend(reading.conditional(e, states) for e in hidden)
+    if seen is not None and seen.parts is not None:
+        for e in hidden:
+            _add_parts(part, (reading.node.name, e), reading.d, seen)
     rest = np.delete(np.arange(reading.count), hidden)
     if not len(rest):
         return
@@ -171,6 +174,16 @@ def _add(
             part.likelihoods.append(factor)
         else:
             part.tables.append((factor.scope, LogTable(factor.log_scale)))
+
+
+def _add_parts(part: LinearGaussian, block: Variable, d: int, seen: Observed) -> None:
+    """Append some components of a block, seen as they are."""
+    assert seen.parts is not None
+    at = np.flatnonzero(seen.parts.reshape(-1, d)[block[1]])
+    if len(at):
+        m = len(at)
+        itself = Conditional(block, (), (block,), np.zeros(m), np.eye(d)[at], np.zeros((m, m)))
+        part.exact.append((itself, seen.value.reshape(-1, d)[block[1]][at]))
 
 
 def _add_exact(part: LinearGaussian, given: Conditional, value: np.ndarray) -> None:

@@ -22,7 +22,7 @@ from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.filtering import FilterEngine, Queries, observed_answers
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, QueryError, UnknownNodeError, UnsupportedError
-from bayesmc.network.forward import refuse_noiseless
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 from bayesmc.results import SeriesPosterior
 
@@ -89,6 +89,9 @@ class DiscreteFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        parts = refuse_parts(problem.series.observed, "DiscreteFilter")
+        if parts is not None:
+            return parts
         for compiled in (problem.slices.first, problem.slices.later):
             reason = refuse_noiseless(compiled, problem.series.observed, "DiscreteFilter")
             if reason is not None:

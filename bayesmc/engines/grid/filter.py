@@ -26,7 +26,7 @@ from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
 from bayesmc.errors import BayesmcError, BudgetError
-from bayesmc.network.forward import refuse_noiseless
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 
 
@@ -117,6 +117,9 @@ class GridFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        parts = refuse_parts(problem.series.observed, "GridFilter")
+        if parts is not None:
+            return parts
         names = problem.slices.stochastic
         for compiled in (problem.slices.first, problem.slices.later):
             reason = refuse_noiseless(compiled, names, "GridFilter")

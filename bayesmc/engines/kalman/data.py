@@ -202,6 +202,8 @@ def given_values(
         full = np.broadcast_to(
             seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape)), seen.value.shape
         )
+        if seen.parts is not None:
+            full = full | seen.parts
         values[..., layout.rows[name]] = layout.packed(node, seen.value.astype(float))
         mask[..., layout.rows[name]] = layout.packed(node, full)
     return values, mask

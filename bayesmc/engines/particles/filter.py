@@ -30,7 +30,7 @@ from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
-from bayesmc.network.forward import refuse_noiseless, refuse_unsampled, whole
+from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -212,6 +212,12 @@ class ParticleFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(self, o)]
+        parts = (
+            refuse_parts(problem.series.observed, f"ParticleFilter({looks[0]}=)") if looks else None
+        )
+        if parts is not None:
+            return parts
         apart = plates_apart(problem.slices)
         for option in ("adapt", "recovery"):
             if getattr(self, option) is not None and apart:
