@@ -6,7 +6,6 @@ entries are settled here once, so that engines never look at user values.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network.labelled import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration
@@ -126,7 +125,8 @@ def read_inputs(
     for name in given:
         if name not in wanted:
             raise EvidenceError(
-                f"inputs= gives {name!r}, which is not a declared input; the inputs are {list(wanted)}"
+                f"inputs= gives {name!r}, which is not a declared input{did_you_mean(name, wanted)}; the "
+                f"inputs are {list(wanted)}"
             )
     read = {}
     for name, declaration in wanted.items():
@@ -315,10 +315,7 @@ def _at(index: Shape) -> str:
 
 
 def _close(name: str, model: Model) -> str:
-    near = difflib.get_close_matches(str(name), model.nodes, n=1)
-    return (
-        f" (did you mean {near[0]!r}?)" if near else f"; its nodes are {_some(list(model.nodes))}"
-    )
+    return did_you_mean(name, model.nodes) or f"; its nodes are {_some(list(model.nodes))}"
 
 
 def _some(names: list[str]) -> str:

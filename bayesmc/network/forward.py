@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.components import completed, log_prob_of
+from bayesmc.errors import UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
 from bayesmc.shapes import Shape
@@ -270,6 +271,19 @@ def refuse_parts(observed: Mapping[str, Observed], who: str) -> str | None:
 def whole(observed: Mapping[str, Observed]) -> list[str]:
     """Nodes that are observed in full; of others only some elements may have to have a density."""
     return [name for name, seen in observed.items() if seen.mask is None]
+
+
+def refuse_bare(model: Model, observed: Mapping[str, Observed], who: str) -> None:
+    """Refuse nodes without noise, and vectors seen in part, on behalf of an oracle.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    reason = refuse_parts(observed, who)
+    reason = reason or refuse_noiseless(model, model.nodes, who)
+    if reason is not None:
+        raise UnsupportedError(reason)
 
 
 def refuse_noiseless(model: Model, names: Iterable[str], who: str) -> str | None:

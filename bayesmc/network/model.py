@@ -9,6 +9,7 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,6 +24,7 @@ from bayesmc.errors import (
     DensityError,
     ModelError,
     ParameterError,
+    PlateError,
     ShapeError,
 )
 from bayesmc.network.align import Aligner, RowAligner
@@ -337,8 +339,11 @@ def call(
             )
         return array
     except BayesmcError as error:
-        raise _renamed(error, f"node {name!r}: {error}") from error
+        raise _renamed(error, f"node {name!r}: {_with_name(str(error), links)}") from error
     except Exception as error:
+        own = _own_plate_reduced(declaration, error, links)
+        if own is not None:
+            raise PlateError(f"node {name!r}: {own}") from error
         raise ModelError(f"node {name!r}: {_explain(error, arguments)}") from error
 
 
@@ -418,6 +423,48 @@ def _table_rows(declaration: Declaration, arguments: Sequence[Any]) -> Distribut
     for card, positions in zip(probs.shape[:-1], arguments, strict=True):
         rows = rows * card + positions.astype(np.intp)
     return Categorical(Gathered(probs.reshape(-1, probs.shape[-1]), rows))
+
+
+def to_mix(declaration: Declaration, parents: Sequence[str], plate: str) -> str:
+    """The lines that mix the elements of a plate, for a node of that plate that does so itself."""
+    rest = tuple(p for p in declaration.plates if p != plate)
+    plates = f", plates={rest if len(rest) > 1 else rest[0]!r}" if rest else ""
+    parent = parents[0] if parents else "x"
+    total = f"{parent}_total"
+    others = ", ".join(dict.fromkeys([*parents, total]))
+    return (
+        "to mix elements (a mean, a cumulative sum), use an unplated deterministic node that reads the "
+        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.sum({plate!r}){plates}), and read that: "
+        f"lambda {others}: ... in {declaration.name!r}"
+    )
+
+
+def _own_plate_reduced(
+    declaration: Declaration, error: Exception, links: Sequence[tuple[str, Aligner]]
+) -> str | None:
+    """What to write instead of ``x.sum("plate")`` on a plate of the node's own, if that is what failed."""
+    named = isinstance(error, TypeError) and "'str' object cannot be interpreted" in str(error)
+    shared = [
+        name
+        for name, link in links
+        if isinstance(link, Aligner) and link.trailing - link.event_ndim > len(link.foreign)
+    ]
+    if not (named and shared):
+        return None
+    plate = declaration.plates[0]
+    return (
+        f"{shared[0]!r} arrives as a plain array, element by element, since {plate!r} is a plate of the "
+        f"node itself, so .sum({plate!r}) has nothing to reduce; "
+        + to_mix(declaration, list(dict.fromkeys(n for n, _ in links)), plate)
+    )
+
+
+def _with_name(message: str, links: Sequence[tuple[str, Aligner]]) -> str:
+    """A message about ``v`` as one about the only parent that it can be."""
+    foreign = list(dict.fromkeys(n for n, link in links if link.foreign))
+    if len(foreign) != 1:
+        return message
+    return re.sub(r"\bv(?=\[index\]|\[i\]|\.sum\(|\.mean\(|\.array\b)", foreign[0], message)
 
 
 def _renamed(error: BayesmcError, message: str) -> BayesmcError:

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import DensityError, ModelError, ParameterError, UnknownNodeError
+from bayesmc.errors import (
+    DensityError,
+    ModelError,
+    ParameterError,
+    UnknownNodeError,
+    did_you_mean,
+)
 from bayesmc.network.captured import check_captured
 from bayesmc.network.compile import compile_model
 from bayesmc.network.model import Model
@@ -120,6 +125,4 @@ def check_parents(
 
 def unknown(declarations: Mapping[str, Declaration], name: str) -> str:
     """That there is no such node, and which one may be meant."""
-    near = difflib.get_close_matches(str(name), declarations, n=1)
-    hint = f" (did you mean {near[0]!r}?)" if near else ""
-    return f"the net has no node {name!r}{hint}"
+    return f"the net has no node {name!r}{did_you_mean(name, declarations)}"
