@@ -123,7 +123,9 @@ class Template:
         def bare(declarations: Mapping[str, Declaration]) -> dict[str, Declaration]:
             return {n: replace(d, function=None, captured=()) for n, d in declarations.items()}
 
-        return {**self.__dict__, "later": bare(self.later), "first": bare(self.first)}
+        state = {**self.__dict__, "later": bare(self.later), "first": bare(self.first)}
+        state.pop("_around", None)
+        return state
 
     def check_captured(self) -> None:
         """Refuse functions that read a name which has changed since they were declared."""

@@ -12,10 +12,10 @@ from bayesmc.errors import EvidenceError, ModelError, QueryError
 
 def level():
     """A level under two sensors, one of which drops out, and an input."""
-    dbn = bmc.DynamicBayesNet(plates={"sensor": ["left", "right"]})
+    dbn, noise = bmc.DynamicBayesNet(plates={"sensor": ["left", "right"]}), 0.5
     dbn.input("u")
     dbn.add("x", lambda x_prev, u: bmc.Normal(0.9 * x_prev + u, 1.0), initial=bmc.Normal(0.0, 1.0))
-    dbn.add("y", lambda x: bmc.Normal(x, 0.5), plates="sensor")
+    dbn.add("y", lambda x: bmc.Normal(x, noise), plates="sensor")
     dbn.add("step", lambda x, x_prev: bmc.Normal(x - x_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
     return dbn, [{"y": [1.0, np.nan]}, {"y": [0.5, 1.5], "step": 0.1}, {"y": [2.0, 1.0]}]
 
