@@ -15,6 +15,7 @@ from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.shapes import first_index
 
 _SMALL = 16  # rows of a matrix whose factor is kept
+_ROUNDING = 1e-14  # of a variance: what rounding leaves of a pivot that is zero
 _SYMMETRY = 1e-8  # of sqrt(a_ii a_jj): what rounding leaves of a product such as H S H'
 
 
@@ -152,6 +153,46 @@ def try_cholesky(cov: Any) -> tuple[np.ndarray, np.ndarray | None]:
     if not faulty.any():
         return factor, None
     return np.where(faulty[..., None, None], np.eye(cov.shape[-1]), factor), faulty
+
+
+def singular_cholesky(cov: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Lower roots of covariances that may be singular, and which matrices have none (identities there).
+
+    A pivot that is nothing but rounding is 0, and so is its column.
+
+    References
+    ----------
+    Golub and Van Loan, Matrix Computations, 4th ed., section 4.2.8 (semidefinite matrices).
+
+    Examples
+    --------
+    >>> from bayesmc.gaussian import singular_cholesky
+    >>> root, bad = singular_cholesky([[4.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
+    >>> root.tolist(), bool(bad)
+    ([[2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 3.0]], False)
+    """
+    cov = np.asarray(cov, dtype=float)
+    d = cov.shape[-1]
+    scale = np.abs(np.linalg.diagonal(cov))
+    bad = ~_is_symmetric(cov) | ~np.isfinite(cov).all(axis=(-2, -1))
+    factor = np.zeros_like(cov)
+    with np.errstate(all="ignore"):
+        for j in range(d):
+            row = factor[..., j, :j]
+            pivot = cov[..., j, j] - np.vecdot(row, row)
+            below = cov[..., j + 1 :, j] - np.matvec(factor[..., j + 1 :, :j], row)
+            rounding = _ROUNDING * d * scale[..., j]
+            none = np.abs(pivot) <= rounding
+            bad |= pivot < -rounding
+            # what a component without noise of its own leaves of the others must be nothing, too
+            left = np.abs(below) > np.sqrt(
+                _ROUNDING * d * scale[..., j, None] * scale[..., j + 1 :]
+            )
+            bad |= none & left.any(axis=-1)
+            root = np.sqrt(np.where(none | (pivot <= 0), 1.0, pivot))
+            factor[..., j, j] = np.where(none, 0.0, root)
+            factor[..., j + 1 :, j] = np.where(none[..., None], 0.0, below / root[..., None])
+    return np.where(bad[..., None, None], np.eye(d), factor), bad
 
 
 @functools.lru_cache(maxsize=256)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import StateError
+from bayesmc.errors import StateError, did_you_mean
 
 #: NumPy functions that move elements about without changing them, so that labels survive
 _MOVERS = frozenset(
@@ -175,7 +175,9 @@ def label_code(states: Sequence[Any], label: Any) -> int:
         for code, state in enumerate(states):
             if not isinstance(state, str) and state == label:
                 return code
-    raise StateError(f"{label!r} is not a state; the states are {', '.join(map(repr, states))}")
+    known = ", ".join(map(repr, states))
+    hint = did_you_mean(label, states)
+    raise StateError(f"{label!r} is not a state; the states are {known}{hint}")
 
 
 def _refuse_labels(values: Any) -> None:

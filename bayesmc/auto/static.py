@@ -16,7 +16,7 @@ from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.gibbs_plan import plan_of
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighting import LikelihoodWeighting
-from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.randomness import seed_sequence
 from bayesmc.results import Posterior
@@ -202,4 +202,5 @@ def _check_keep(keep: Any, problem: Problem) -> None:
         raise ValueError(f'infer(keep={keep!r}): give "draws", "summaries" or a list of node names')
     for name in keep:
         if name not in problem.model.nodes:
-            raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node")
+            hint = did_you_mean(name, problem.model.nodes)
+            raise UnknownNodeError(f"infer: keep= names {name!r}, which is not a node{hint}")

@@ -15,14 +15,13 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
-from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network import Observed
 from bayesmc.network.evidence import observe
 from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
 from bayesmc.network.plausible import warn_of_doubts
-from bayesmc.network.store import meant
 from bayesmc.shapes import Shape, first_index, owned
 
 
@@ -75,24 +74,29 @@ class Series:
     start: int = 0
 
     @cached_property
-    def _looked_at(self) -> dict[str, tuple[Any, Any, Any, Any]]:
-        """Node -> values, mask, and for each row whether all and whether some of it was seen."""
-        found: dict[str, tuple[Any, Any, Any, Any]] = {}
+    def _looked_at(self) -> dict[str, tuple[Any, Any, Any]]:
+        """Node -> what was seen, and for each row whether all and whether some of it was seen."""
+        found: dict[str, tuple[Any, Any, Any]] = {}
         for name, seen in self.observed.items():
             flat = None if seen.mask is None else seen.mask.reshape(self.steps, -1)
             full = None if flat is None else flat.all(axis=1).tolist()
-            some = None if flat is None else flat.any(axis=1).tolist()
-            found[name] = (seen.value, seen.mask, full, some)
+            some = None if flat is None else flat.any(axis=1)
+            if some is not None and seen.parts is not None:
+                some = some | seen.parts.reshape(self.steps, -1).any(axis=1)
+            found[name] = (seen, full, None if some is None else some.tolist())
         return found
 
     def row(self, k: int) -> Row:
         """What is known of the k-th slice here."""
         seen = {}
-        for name, (value, mask, full, some) in self._looked_at.items():
+        for name, (found, full, some) in self._looked_at.items():
             if full is None or full[k]:
-                seen[name] = Observed(value[k, ...])
+                seen[name] = Observed(found.value[k, ...])
             elif some[k]:
-                seen[name] = Observed(value[k, ...], mask[k])
+                parts = None if found.parts is None else found.parts[k, ...]
+                if parts is not None and not parts.any():
+                    parts = None
+                seen[name] = Observed(found.value[k, ...], found.mask[k, ...], parts)
         t = self.start + k
         inputs: dict[str, np.ndarray] = {TIME: np.asarray(t)}
         if t:
@@ -230,8 +234,8 @@ def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarr
     for name in values:
         if name not in found:
             raise EvidenceError(
-                f"static= gives {name!r}, which is no static node with a density{meant(found, name)}; there "
-                f"are {list(found)}"
+                f"static= gives {name!r}, which is no static node with a density"
+                f"{did_you_mean(name, found)}; there are {list(found)}"
             )
     return found
 
@@ -360,8 +364,8 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
     for name in inputs:
         if name not in template.inputs:
             raise EvidenceError(
-                f"inputs= gives {name!r}, which is not a declared input{meant(template.inputs, name)}; the "
-                f"inputs are {list(template.inputs)}"
+                f"inputs= gives {name!r}, which is not a declared input"
+                f"{did_you_mean(name, template.inputs)}; the inputs are {list(template.inputs)}"
             )
         _check_frame(f"inputs of {name!r}", inputs[name])
         _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
@@ -478,7 +482,9 @@ def _padded(found: Observed | None, node: CompiledNode, ahead: int) -> Observed 
     if mask is None:
         mask = np.ones((len(found.value), *node.plate_shape), dtype=bool)
     value = np.concatenate([found.value, np.repeat(found.value[:1], ahead, axis=0)])
-    return Observed(value, np.concatenate([mask, np.zeros((ahead, *mask.shape[1:]), dtype=bool)]))
+    masks = [None if m is None else np.concatenate([m, np.zeros((ahead, *m.shape[1:]), dtype=bool)])
+             for m in (mask, found.parts)]  # fmt: skip
+    return Observed(value, *masks)
 
 
 def _observed(node: CompiledNode, value: Any, steps: int) -> Observed | None:

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, UnknownNodeError
+from bayesmc.errors import ModelError, UnknownNodeError, did_you_mean
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.domain import Domain
 from bayesmc.network.node import Declaration
 from bayesmc.network.ordering import topological_order
-from bayesmc.network.store import ModelStore, meant
+from bayesmc.network.store import ModelStore
 from bayesmc.shapes import owned
 
 if TYPE_CHECKING:
@@ -89,7 +89,9 @@ class Template:
         before = [n + PREVIOUS for n in self.later if n not in self.static]
         turned = _TURNED.fullmatch(name)
         named = turned[1] + PREVIOUS if turned and turned[1] + PREVIOUS in before else name
-        return f"the template has no node {name!r}{meant([*self.later, *before, TIME], named)}"
+        return (
+            f"the template has no node {name!r}{did_you_mean(named, [*self.later, *before, TIME])}"
+        )
 
     def further_back(self, name: str) -> str | None:
         """How to look more than one slice back, if that is what a name is meant for."""
@@ -159,7 +161,9 @@ class Template:
         def bare(declarations: Mapping[str, Declaration]) -> dict[str, Declaration]:
             return {n: replace(d, function=None, captured=()) for n, d in declarations.items()}
 
-        return {**self.__dict__, "later": bare(self.later), "first": bare(self.first)}
+        state = {**self.__dict__, "later": bare(self.later), "first": bare(self.first)}
+        state.pop("_around", None)
+        return state
 
     def check_captured(self) -> None:
         """Refuse functions that read a name which has changed since they were declared."""
@@ -168,6 +172,12 @@ class Template:
     @cached_property
     def _around(self) -> list[Declaration]:
         return [d for d in (*self.later.values(), *self.first.values()) if d.captured]
+
+    @property
+    def has_functions(self) -> bool:
+        """Whether any density is given by a function; what is not are tables."""
+        declared = (*self.later.values(), *self.first.values())
+        return any(d.function is not None for d in declared)
 
     def slice_zero(self) -> dict[str, Declaration]:
         """Declarations of slice 0."""

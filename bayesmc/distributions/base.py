@@ -53,6 +53,8 @@ class Distribution:
     #: batch elements with parameters out of range (only while these are marked), else None
     invalid: np.ndarray | None = None
     problem: ParameterError | None = None
+    #: batch elements without noise: they can be drawn, but their density is none; ``invalid``, too
+    noiseless: np.ndarray | None = None
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """A new distribution; of traced parameters, a record of the call in its place."""
@@ -93,6 +95,7 @@ class Distribution:
 
         ``x`` has shape ``(..., *event_shape)``; the result broadcasts ``...`` and the batch.
         """
+        self._require_noise()
         # Outside the support a density takes logarithms of zero and worse: that is no accident.
         try:
             with np.errstate(all="ignore"):
@@ -338,6 +341,32 @@ class Distribution:
         self.invalid = bad if self.invalid is None else self.invalid | bad
         self.problem = self.problem or error
 
+    def _require_noise(self) -> None:
+        """Raise for elements without noise, unless these are marked only."""
+        if self.noiseless is not None and not _mark_invalid.get():
+            assert self.problem is not None
+            raise self.problem
+
+    def _without_noise(self, name: str, none: np.ndarray) -> None:
+        """Note elements whose distribution is a point; what asks for their density hears of it.
+
+        Call it after ``_set_batch`` and after other checks.
+        """
+        if self.invalid is not None:
+            none = none & ~self.invalid
+        if not none.any():
+            return
+        index = first_index(none)
+        error = ParameterError(
+            f"{self._family}: {name} is 0{_at(index)}: a point without noise, which has no density; declare "
+            "a function that returns the value, or give it a little noise (Exact() and Kalman filters take "
+            "it as it is)", index, 0.0,
+        )  # fmt: skip
+        none = np.broadcast_to(none, self.batch_shape)
+        self.noiseless = none
+        self.invalid = none if self.invalid is None else self.invalid | none
+        self.problem = self.problem or error
+
     def _finite(self, name: str, value: np.ndarray) -> np.ndarray:
         """A scalar parameter that must be finite."""
         if all_finite(value):  # cheaper than looking at every element
@@ -359,6 +388,7 @@ class Distribution:
         """Take over the marks of a ``part`` of this distribution (``mask`` in our batch)."""
         if part.invalid is None:
             return
+        part._require_noise()
         bad = np.broadcast_to(part.invalid if mask is None else mask, self.batch_shape)
         self.invalid = bad if self.invalid is None else self.invalid | bad
         self.problem = self.problem or part.problem

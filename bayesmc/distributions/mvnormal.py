@@ -9,7 +9,7 @@ import numpy as np
 from bayesmc.distributions.base import Distribution, all_finite, as_float
 from bayesmc.distributions.support import Support, real_vector
 from bayesmc.errors import ParameterError, ShapeError
-from bayesmc.gaussian import solve_lower, try_cholesky
+from bayesmc.gaussian import singular_cholesky, solve_lower, try_cholesky
 from bayesmc.shapes import Shape
 
 _LOG_2PI = np.log(2 * np.pi)
@@ -25,16 +25,18 @@ class MvNormal(Distribution):
     loc : array_like, shape (..., d)
         Mean.
     cov : array_like, shape (..., d, d)
-        Covariance, symmetric positive definite.
+        Covariance, symmetric positive definite, or singular: then values lie on a plane, can be drawn, and
+        exact engines take them, but there is no density.
     scale_tril : array_like, shape (..., d, d)
-        Lower Cholesky factor of the covariance, with a positive diagonal.
+        Lower Cholesky factor of the covariance, whose diagonal is not negative.
     scale_diag : array_like, shape (..., d)
         Standard deviations of independent components.
 
     Raises
     ------
     ParameterError
-        ``loc`` not finite, or a scale that is not positive definite; ``index`` is the first one.
+        ``loc`` not finite, or a scale that is indefinite or not finite; ``index`` is the first one. The
+        density of a singular one is asked for.
     ShapeError
         The last axes do not fit each other.
 
@@ -157,6 +159,7 @@ class MvNormal(Distribution):
         if singular.any():
             factor = np.where(singular[..., None] & np.eye(rows, dtype=bool), 0.0, factor)
         mapped = MvNormal(np.matvec(matrix, self.loc) + as_float(offset), scale_tril=factor)
+        mapped._require_noise()
         mapped._adopt(self)
         return mapped
 
@@ -192,14 +195,15 @@ class MvNormal(Distribution):
 
     def _set_diag(self, loc: np.ndarray, scales: np.ndarray) -> None:
         self._set_shapes(loc, scales.shape[:-1], scales.shape[-1:], scales.ndim < 1)
-        ok = ((scales > 0) & (scales < np.inf)).all(axis=-1)
+        ok = ((scales >= 0) & (scales < np.inf)).all(axis=-1)
         self._diag = self._check("scale_diag", scales, ok, 1.0, "positive and finite")
+        self._note_singular("scale_diag", self._diag)
 
     def _set_tril(self, loc: np.ndarray, factor: np.ndarray) -> None:
         square = factor.ndim >= 2 and factor.shape[-1] == factor.shape[-2]
         self._set_shapes(loc, factor.shape[:-2], factor.shape[-1:], not square)
         diagonal = np.linalg.diagonal(factor)
-        ok = (diagonal > 0).all(axis=-1) & np.isfinite(factor).all(axis=(-2, -1))
+        ok = (diagonal >= 0).all(axis=-1) & np.isfinite(factor).all(axis=(-2, -1))
         ok &= (np.triu(factor, 1) == 0).all(axis=(-2, -1))
         self._tril = self._check(
             "scale_tril",
@@ -208,15 +212,25 @@ class MvNormal(Distribution):
             np.eye(factor.shape[-1]),
             "lower triangular and finite with a positive diagonal",
         )
+        self._note_singular("scale_tril", np.linalg.diagonal(self._tril))
 
     def _set_cov(self, loc: np.ndarray, cov: np.ndarray) -> None:
         square = cov.ndim >= 2 and cov.shape[-1] == cov.shape[-2]
         self._set_shapes(loc, cov.shape[:-2], cov.shape[-1:], not square)
         self._tril, bad = try_cholesky(cov)
         self._cov = cov
-        if bad is not None:
-            identity = np.eye(cov.shape[-1])
-            self._cov = self._check("cov", cov, ~bad, identity, "symmetric positive definite")
+        if bad is None:
+            return
+        root, indefinite = singular_cholesky(cov)
+        identity = np.eye(cov.shape[-1])
+        self._tril = np.where(bad[..., None, None], root, self._tril)
+        self._cov = self._check("cov", cov, ~indefinite, identity, "symmetric positive definite")
+        self._note_singular("cov", np.linalg.diagonal(self._tril))
+
+    def _note_singular(self, name: str, pivots: np.ndarray) -> None:
+        """Note elements with a component that follows from those before it."""
+        if not (pivots > 0).all():
+            self._without_noise(f"a pivot of {name}", (pivots == 0).any(axis=-1))
 
     def _set_shapes(self, loc: np.ndarray, batch: Shape, size: Shape, malformed: bool) -> None:
         if malformed or loc.ndim < 1 or loc.shape[-1:] != size:

@@ -24,12 +24,13 @@ class Normal(Distribution):
     loc : array_like
         Mean, any shape.
     scale : array_like
-        Standard deviation, positive; broadcasts with ``loc``.
+        Standard deviation, not negative; broadcasts with ``loc``. With 0 it is the point ``loc``, which can
+        be drawn and which exact engines take, but which has no density.
 
     Raises
     ------
     ParameterError
-        ``loc`` not finite, or ``scale`` not positive and finite.
+        ``loc`` not finite, ``scale`` negative or not finite, or the density of a point is asked for.
 
     References
     ----------
@@ -55,7 +56,11 @@ class Normal(Distribution):
                 return
         self._set_batch(loc.shape, scale.shape)
         self.loc = self._finite("loc", loc)
-        self.scale = self._positive("scale", scale)
+        self.scale = scale
+        if not ((scale > 0) & (scale < np.inf)).all():
+            ok = (scale >= 0) & (scale < np.inf)
+            self.scale = self._check("scale", scale, ok, 1.0, "positive and finite")
+            self._without_noise("scale", self.scale == 0)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.standard_normal(shape))
@@ -89,8 +94,12 @@ class Normal(Distribution):
         return real
 
     def cdf(self, x: Any) -> np.ndarray:
+        off = np.asarray(x) - self.loc
+        if self.noiseless is not None:
+            some = np.where(self.scale == 0, 1.0, self.scale)
+            return np.where(self.scale == 0, 1.0 * (off >= 0), special.ndtr(off / some))
         with np.errstate(over="ignore"):
-            return special.ndtr((np.asarray(x) - self.loc) / self.scale)
+            return special.ndtr(off / self.scale)
 
     def ppf(self, q: Any) -> np.ndarray:
         return self.loc + self.scale * special.ndtri(np.asarray(q))

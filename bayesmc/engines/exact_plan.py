@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.exact_noise import clusters
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree, LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, likelihood_rows
 from bayesmc.factors.moments import Moments, mixture_scopes
@@ -111,12 +112,16 @@ class HybridPlan:
         model, observed, inputs = problem.model, problem.observed, problem.inputs
         self.part: LinearGaussian = linear_gaussian(model, observed, inputs)
         self.net: DiscreteNet = discrete_net(model, observed, inputs, self.part.nodes)
-        self.barren, self.informed = _split(self.part)
+        self.barren, informed = _split(self.part)
+        self.clusters, self.informed, self.likelihoods = clusters(
+            informed, self.part.likelihoods, self.part.exact
+        )
         dims = self.part.dims
-        shapes = [(f.scope, f.blocks, f.rows.shape[-2]) for f in self.part.likelihoods]
+        shapes = [(f.scope, f.blocks, f.rows.shape[-2]) for f in self.likelihoods]
         shapes += [(c.scope, (c.block, *c.parents), dims[c.block]) for c in self.informed]
         blocks = {c.block: dims[c.block] for c in self.informed}
-        key = (tuple(shapes), tuple(s for s, _ in self.part.tables), frozenset(self.part.nodes))
+        tables = [s for s, _ in self.part.tables] + [c.scope for c in self.clusters]
+        key = (tuple(shapes), tuple(tables), frozenset(self.part.nodes))
         kept = model.cache.setdefault("exact hybrid plans", {})
         found = kept.get(key)
         if found is None:
@@ -128,6 +133,10 @@ class HybridPlan:
         self.strong, self.tree = found
         links: dict[Any, Any] = {s.block: (s.scope, s.parents) for s in self.strong.steps}
         links.update({c.block: (c.scope, c.parents) for c in self.barren})
+        for cluster in self.clusters:
+            links[cluster.noise] = ((), ())
+            blocks_of = (c.block for c in cluster.conditionals)
+            links.update(dict.fromkeys(blocks_of, (cluster.scope, (cluster.noise,))))
         self.mixtures = mixture_scopes(links)
         self.cost = self._cost()
 
@@ -136,18 +145,24 @@ class HybridPlan:
         dims = {**self.part.dims, **{c.block: c.offset.shape[-1] for c in self.part.computed}}
         with marking_invalid(), np.errstate(all="ignore"):
             extra, invalid = self.net.evidence_factors(problem.observed)
-        factors = [*self.part.likelihoods, *(_as_factor(c, dims) for c in self.informed)]
+        factors = [*self.likelihoods, *(_as_factor(c, dims) for c in self.informed)]
         conditionals, tables = integrate(self.strong, factors, dims, cards)
+        solved = [cluster.solve(dims, cards) for cluster in self.clusters]
         bound = self.tree.bind(
             [
                 *self.net.static,
                 *extra,
                 *(table for _, table in self.part.tables),
+                *(table for _, table, _ in solved),
                 *(LogTable(table) for table in tables),
             ]
         )
         calibrated = bound.calibrate(states)
-        read_off = [*conditionals, *self.barren, *self.part.computed]
+        dims.update(
+            {c.noise: width for c, (_, _, width) in zip(self.clusters, solved, strict=True)}
+        )
+        noisy = [c for blocks, _, _ in solved for c in blocks]
+        read_off = [*conditionals, *noisy, *self.barren, *self.part.computed]
         moments = Moments(read_off, dims, cards, calibrated.joint)
         return Solved(self.net, calibrated, moments, self.net.invalid + invalid + self.part.invalid)
 
@@ -155,14 +170,17 @@ class HybridPlan:
         """How to integrate blocks out, and the clique tree of what that leaves."""
         cards = self.net.cards
         strong = strong_plan(blocks, cards, shapes)
-        scopes = [*self.net.scopes, *(s for s, _ in self.part.tables), *strong.table_scopes]
+        scopes = [*self.net.scopes, *(s for s, _ in self.part.tables)]
+        scopes += [*(c.scope for c in self.clusters), *strong.table_scopes]
         return strong, CliqueTree(cards, scopes)
 
     def _cost(self) -> Cost:
         cards = self.net.cards
         dims = self.part.dims
         size = self.tree.cost.bytes + self.strong.bytes
-        words = f"{len(self.informed)} continuous elements integrated out"
+        size += sum(c.bytes(dims, cards) for c in self.clusters)
+        elements = len(self.informed) + sum(len(c.conditionals) for c in self.clusters)
+        words = f"{elements} continuous elements integrated out"
         if cards:
             words += (
                 f", induced width {self.tree.cost.induced_width}, "
@@ -252,6 +270,7 @@ def plan_for(problem: Problem) -> Plan:
 def _split(part: LinearGaussian) -> tuple[list[Conditional], list[Conditional]]:
     """Conditionals of blocks that nothing observed depends on, and of the others."""
     needed = {b for f in part.likelihoods for b in f.blocks}
+    needed |= {b for c, _ in part.exact for b in c.parents}
     of = {c.block: c for c in part.conditionals}
     todo = list(needed)
     while todo:

@@ -17,14 +17,15 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
+from bayesmc.engines.beliefs import refuse_unbound, slices_like
 from bayesmc.errors import (
     BayesmcError,
     EvidenceError,
     InterruptWarning,
     ModelError,
     UnsupportedError,
+    did_you_mean,
 )
-from bayesmc.network.store import meant
 from bayesmc.results import SeriesPosterior
 
 #: functions whose expectation is wanted in every slice, by name
@@ -130,9 +131,14 @@ class FilterEngine:
         raise self._cannot("find the most likely trajectory")
 
     def start(
-        self, dbn: DynamicBayesNet, *, static: Mapping[str, Any] | None = None, rng: Any = None
+        self,
+        dbn: DynamicBayesNet,
+        *,
+        static: Mapping[str, Any] | None = None,
+        rng: Any = None,
+        belief: Any = None,
     ) -> Any:
-        """A belief that has absorbed nothing yet.
+        """A belief that has absorbed nothing yet, or one from a pickle that goes on.
 
         Parameters
         ----------
@@ -140,6 +146,9 @@ class FilterEngine:
             Values of the static nodes.
         rng : seed, SeedSequence, Generator or None
             For filters that draw.
+        belief : optional
+            One of this kind of filter, which pickles without functions: it gets those of ``dbn`` and goes
+            on with the same random numbers. Whether the functions are the same, nobody can tell.
 
         Raises
         ------
@@ -161,12 +170,14 @@ class FilterEngine:
                 f"{type(self).__name__}().start: expected a DynamicBayesNet, not {type(dbn).__name__}"
             )
         dbn.validate()
+        if belief is not None:
+            return self._resumed(dbn, belief, static, rng)
         given = dict(static or {})
         known = dbn.template.static
         for name in given:
             if name not in known:
                 raise EvidenceError(
-                    f"static= gives {name!r}, which is no static node{meant(known, name)}; there are "
+                    f"static= gives {name!r}, which is no static node{did_you_mean(name, known)}; there are "
                     f"{list(known)}"
                 )
         return self._nothing(dbn.copy(), given, rng)
@@ -191,12 +202,8 @@ class FilterEngine:
         ------
         EvidenceError, UnsupportedError, DegeneracyError, ZeroProbabilityError
         """
-        family: Any = self.belief
-        if not isinstance(belief, family):
-            raise TypeError(
-                f"{type(self).__name__}().step: the belief is a {type(belief).__name__}; give what start or "
-                "step of this kind of filter returned"
-            )
+        self._check_family("step", belief)
+        refuse_unbound(self, belief)
         belief.dbn.template.check_captured()
         slices, row = read_row(
             belief.dbn, belief.slices, belief.t + 1, observations, inputs, belief.inputs
@@ -216,6 +223,34 @@ class FilterEngine:
             return self.refusal(problem)
         except BayesmcError as error:  # options that do not fit the template
             return str(error)
+
+    def _check_family(self, what: str, belief: Any) -> None:
+        family: Any = self.belief
+        if not isinstance(belief, family):
+            raise TypeError(
+                f"{type(self).__name__}().{what}: the belief is a {type(belief).__name__}; give what start "
+                "or step of this kind of filter returned"
+            )
+
+    def _resumed(self, dbn: DynamicBayesNet, belief: Any, static: Any, rng: Any) -> Any:
+        """A belief bound to a template."""
+        self._check_family("start", belief)
+        if static is not None or rng is not None:
+            raise ValueError(
+                f"{type(self).__name__}().start: belief= brings its own static values and random numbers; "
+                "leave static= and rng= out"
+            )
+        slices = slices_like(dbn, belief)
+        if slices is None:
+            found = self._nothing(dbn.copy(), belief.static, None)
+            if hasattr(belief, "seed"):  # as it is: seeds that are read anew count on
+                found.seed = belief.seed
+            return found
+        return self._bound(belief, dbn.copy(), slices)
+
+    def _bound(self, belief: Any, dbn: DynamicBayesNet, slices: Slices) -> Any:
+        """A family's belief with the functions of a template that fits it."""
+        raise self._cannot("go row by row")
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> Any:
         """A family's belief before the first row."""

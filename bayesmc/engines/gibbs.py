@@ -12,6 +12,8 @@ from bayesmc.engines.gibbs_plan import plan_of
 from bayesmc.engines.sweep import SweepSampler
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Problem
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
+from bayesmc.structure.target import target_of
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,14 @@ class Gibbs(ChainEngine):
     label: ClassVar[str] = "Gibbs sampling"
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, "Gibbs")
+        if parts is not None:
+            return parts
         try:
+            terms = [n for n in target_of(problem).terms if n in problem.model.nodes]
+            reason = refuse_noiseless(problem.model, terms, "Gibbs")
+            if reason is not None:
+                return reason
             plan_of(problem, self.debug)
         except UnsupportedError as error:
             return f"Gibbs has no kernel for this net: {error}"

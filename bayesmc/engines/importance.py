@@ -22,7 +22,7 @@ from bayesmc.engines.weighted import WeightedEngine, check_count, treatment
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.network import Problem
-from bayesmc.network.forward import Step, refuse_unsampled
+from bayesmc.network.forward import Step, refuse_noiseless, refuse_parts, refuse_unsampled, whole
 from bayesmc.network.sameness import same
 
 
@@ -89,10 +89,15 @@ class Importance(WeightedEngine):
         object.__setattr__(self, "proposal", checked)
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, "Importance")
+        if parts is not None:
+            return parts
         self.steps(problem)  # raises where a proposal does not fit the net or the evidence
         given = {n for key in self.proposal for n in names_of(key)}
         reason = refuse_unsampled(problem.model, given | problem.observed.keys(), "Importance")
-        return None if reason is None else f"{reason}, or propose it"
+        if reason is not None:
+            return f"{reason}, or propose it"
+        return refuse_noiseless(problem.model, {*given, *whole(problem.observed)}, "Importance")
 
     def describe(self, problem: Problem) -> dict[str, str]:
         found = {name: treatment(problem, name) for name in problem.model.nodes}

@@ -20,6 +20,7 @@ from bayesmc.kernels.ensemble import BlockWalk, stragglers
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.network import Problem
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.network.sameness import same
 from bayesmc.structure.target import Values
 
@@ -116,7 +117,12 @@ class MetropolisHastings(ChainEngine):
         object.__setattr__(self, "proposal", checked)
 
     def refusal(self, problem: Problem) -> str | None:
-        return self._plan(problem).refusal
+        parts = refuse_parts(problem.observed, "MetropolisHastings")
+        if parts is not None:
+            return parts
+        plan = self._plan(problem)
+        terms = [n for n in plan.target.terms if n in problem.model.nodes]
+        return plan.refusal or refuse_noiseless(problem.model, terms, "MetropolisHastings")
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return self._plan(problem).describe()

@@ -111,7 +111,8 @@ def _data(was: Mapping[str, Observed], now: Mapping[str, Observed]) -> Iterator[
             yield f"{name!r} is observed in one of the two only"
         else:
             a, b = was[name], now[name]
-            if not (np.array_equal(a.value, b.value) and _same_mask(a.mask, b.mask)):
+            masks = _same_mask(a.mask, b.mask) and _same_mask(a.parts, b.parts)
+            if not (np.array_equal(a.value, b.value) and masks):
                 yield f"the evidence of {name!r} is another one"
 
 

@@ -19,7 +19,10 @@ from bayesmc.network.forward import (
     Pass,
     Step,
     potential_factors,
+    refuse_noiseless,
+    refuse_parts,
     refuse_unsampled,
+    whole,
     with_factors,
 )
 from bayesmc.progress import Progress
@@ -92,7 +95,11 @@ class Rejection(Engine):
             object.__setattr__(self, "bound", _checked_bounds(self.bound))
 
     def refusal(self, problem: Problem) -> str | None:
+        parts = refuse_parts(problem.observed, "Rejection")
+        if parts is not None:
+            return parts
         reason = refuse_unsampled(problem.model, problem.observed, "Rejection")
+        reason = reason or refuse_noiseless(problem.model, whole(problem.observed), "Rejection")
         if reason is not None:
             return reason
         missing = log_bounds(problem, self.bound or {})[1]

@@ -8,7 +8,7 @@ from typing import ClassVar
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.weighted import WeightedEngine, check_count, treatment
 from bayesmc.network import Problem
-from bayesmc.network.forward import Step, refuse_unsampled
+from bayesmc.network.forward import Step, refuse_noiseless, refuse_unsampled, whole
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,9 @@ class LikelihoodWeighting(WeightedEngine):
 
     def refusal(self, problem: Problem) -> str | None:
         reason = refuse_unsampled(problem.model, problem.observed, "LikelihoodWeighting")
-        return None if reason is None else f"{reason}, or propose it (Importance)"
+        if reason is not None:
+            return f"{reason}, or propose it (Importance)"
+        return refuse_noiseless(problem.model, whole(problem.observed), "LikelihoodWeighting")
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return {name: treatment(problem, name) for name in problem.model.nodes}

@@ -44,12 +44,16 @@ class Conditioned(NamedTuple):
     turn : ndarray, shape (..., carried, k), or None
         Noise of the slice before as a combination of the transformed noise: p standardised innovations, n
         entries that ``factor`` multiplies, and what neither of them touches.
+    certain : ndarray of bool, shape (..., p), or None
+        Observed quantities that follow from those before them, without noise; None where none does. They
+        stand in ``root`` with a noise of their own, which tells nothing of anything else.
     """
 
     root: np.ndarray
     gain: np.ndarray
     factor: np.ndarray
     turn: np.ndarray | None = None
+    certain: np.ndarray | None = None
 
 
 def condition(rows: np.ndarray, observed: int, carried: int | None = None) -> Conditioned:
@@ -77,15 +81,13 @@ def condition(rows: np.ndarray, observed: int, carried: int | None = None) -> Co
         rows = np.concatenate([rows, np.zeros((*rows.shape[:-1], r - k))], axis=-1)
         k = r
     p = observed
-    if rows.ndim == 2 and rows.size:
-        lower, turn = _by_lapack(rows, carried)
-        return Conditioned(lower[:p, :p], lower[p:, :p], lower[p:, p:], turn)
-    lower, turn = _by_numpy(rows, carried)
-    signs = np.copysign(1.0, lower.diagonal(0, -2, -1))[..., None, :]
-    lower *= signs
-    if turn is not None:
-        turn[..., :r] *= signs
-    return Conditioned(lower[..., :p, :p], lower[..., p:, :p], lower[..., p:, p:], turn)
+    whole = rows.copy() if p else rows
+    lower, turn = _triangular(rows, carried)
+    certain = None
+    if _has_tiny_pivot(lower):
+        lower, turn, certain = _without_certain(whole, lower, turn, p, carried)
+        _forget_rounding(lower, p)
+    return Conditioned(lower[..., :p, :p], lower[..., p:, :p], lower[..., p:, p:], turn, certain)
 
 
 def standardised(root: np.ndarray, innovation: np.ndarray) -> np.ndarray:
@@ -98,10 +100,19 @@ def standardised(root: np.ndarray, innovation: np.ndarray) -> np.ndarray:
     return solve_lower(root, innovation)
 
 
-def log_densities(root: np.ndarray, eta: np.ndarray, seen: Any = None) -> np.ndarray:
-    """Log density of a row from its standardised innovations; ``seen`` counts them, if not all."""
+def log_densities(
+    root: np.ndarray, eta: np.ndarray, seen: Any = None, certain: np.ndarray | None = None
+) -> np.ndarray:
+    """Log density of a row from its standardised innovations; ``seen`` counts them, if not all.
+
+    What is ``certain`` given the rest counts as a probability, which is one.
+    """
     count = eta.shape[-1] if seen is None else seen
-    log_det = np.log(root.diagonal(0, -2, -1)).sum(axis=-1)
+    diagonal = root.diagonal(0, -2, -1)
+    if certain is not None:
+        count = count - certain.sum(axis=-1)
+        eta, diagonal = np.where(certain, 0.0, eta), np.where(certain, 1.0, diagonal)
+    log_det = np.log(diagonal).sum(axis=-1)
     return -0.5 * np.vecdot(eta, eta) - log_det - count * HALF_LOG_2PI
 
 
@@ -152,6 +163,66 @@ def _lapack() -> Any:
     from scipy.linalg import lapack
 
     return lapack
+
+
+#: what rounding leaves of a row that is a combination of those before it, relative to its size
+_ROUNDING = 16 * float(np.finfo(float).eps)
+#: ratio of pivots from which on it is worth a look
+_SUSPECT = 1e-13
+
+
+def _has_tiny_pivot(lower: np.ndarray) -> bool:
+    pivots = np.abs(lower.diagonal(0, -2, -1))
+    return bool(pivots.size) and not pivots.min() > _SUSPECT * pivots.max()
+
+
+def _without_certain(
+    rows: np.ndarray,
+    lower: np.ndarray,
+    turn: np.ndarray | None,
+    observed: int,
+    carried: int | None,
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """The triangle once observed rows that follow from those before have got noise of their own.
+
+    One after the other: what comes after such a row is only right once it is out of the way.
+    """
+    p, lead = observed, rows.shape[:-2]
+    size = np.sqrt(np.vecdot(rows, rows)[..., :p])
+    size = np.where(size > 0, size, 1.0)
+    certain = np.zeros((*lead, p), dtype=bool)
+    places = np.arange(p)
+    for i in range(p):
+        follows = lower[..., i, i] <= _ROUNDING * size[..., i]
+        follows |= ~lower[..., i, :].any(axis=-1)
+        if not (follows & ~certain[..., i]).any():
+            continue
+        certain[..., i] |= follows
+        fresh = np.zeros((*lead, rows.shape[-2], p))
+        fresh[..., places, places] = np.where(certain, size, 0.0)
+        lower, turn = _triangular(np.concatenate([rows, fresh], axis=-1), carried)
+    return lower, turn, certain if certain.any() else None
+
+
+def _forget_rounding(lower: np.ndarray, observed: int) -> None:
+    """What is known without noise has a root of exactly zero, in place."""
+    left = lower[..., observed:, observed:]
+    below = lower[..., observed:, :]
+    none = np.vecdot(left, left) <= _ROUNDING**2 * np.vecdot(below, below)
+    left[none] = 0.0
+
+
+def _triangular(rows: np.ndarray, carried: int | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Rows as a lower triangle whose diagonal is not negative, and what turned the noise; overwrites them."""
+    r = rows.shape[-2]
+    if rows.ndim == 2 and rows.size:
+        return _by_lapack(rows, carried)
+    lower, turn = _by_numpy(rows, carried)
+    signs = np.copysign(1.0, lower.diagonal(0, -2, -1))[..., None, :]
+    lower *= signs
+    if turn is not None:
+        turn[..., :r] *= signs
+    return lower, turn
 
 
 @functools.cache

@@ -11,6 +11,7 @@ import numpy as np
 
 from bayesmc.distributions import Density, Distribution
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.components import splits
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import (
@@ -229,9 +230,18 @@ def _discover_stochastic(
         domain,
         support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
+        noiseless=_is_noiseless(dist, batch + plates, len(batch)),
+        splits=splits(dist),
     )
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
+
+
+def _is_noiseless(dist: Distribution, lead: Shape, batch: int) -> bool:
+    """Whether some element of the plates has no noise at any value of the parents."""
+    if dist.noiseless is None:
+        return False
+    return bool(np.broadcast_to(dist.noiseless, lead).all(axis=tuple(range(batch))).any())
 
 
 def _refuse_parameters(
@@ -241,7 +251,7 @@ def _refuse_parameters(
     for some draws of the parents, or for all of those tried where the arithmetic says so itself (then they
     may be NaN as well).
     """
-    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch)
+    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch, noiseless=True)
     if bad is None:
         return
     assert dist.invalid is not None and dist.problem is not None

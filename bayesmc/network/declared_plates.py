@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, PlateError
+from bayesmc.errors import ModelError, PlateError, did_you_mean
 
 
 @dataclass(frozen=True)
@@ -70,8 +70,9 @@ class DeclaredPlates:
         for plate in names:
             if plate not in self.sizes:
                 raise PlateError(
-                    f"{what} is in plate {plate!r}, which is not declared (plates: "
-                    f"{list(self.sizes) or 'none'}); declare {self.owner}(plates={{{plate!r}: size}})"
+                    f"{what} is in plate {plate!r}, which is not declared"
+                    f"{did_you_mean(plate, self.sizes)} (plates: {list(self.sizes) or 'none'}); "
+                    f"declare {self.owner}(plates={{{plate!r}: size}})"
                 )
         if len(set(names)) != len(names):
             raise PlateError(f"{what}: plates={names} names a plate twice")

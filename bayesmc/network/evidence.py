@@ -6,7 +6,6 @@ entries are settled here once, so that engines never look at user values.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network.labelled import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration
@@ -30,11 +29,15 @@ class Observed:
     value : ndarray
         Stored values, shape ``(*plates, *event)``; unobserved elements hold a filler.
     mask : ndarray of bool or None
-        Observed plate elements; None where all are.
+        Plate elements observed in full; None where all are.
+    parts : ndarray of bool or None
+        Of the other elements the components that are observed all the same, shape that of ``value``; None
+        where there are none.
     """
 
     value: np.ndarray
     mask: np.ndarray | None = None
+    parts: np.ndarray | None = None
 
 
 def read_evidence(model: Model, evidence: Mapping[str, Any] | None) -> dict[str, Observed]:
@@ -77,12 +80,13 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     event = tuple(range(len(node.plate_shape), array.ndim))
     some = missing.any(axis=event) if event else missing
     every = missing.all(axis=event) if event else missing
-    if (some & ~every).any():
-        at = first_index(missing & np.expand_dims(some & ~every, event))
+    partly = some & ~every
+    if partly.any() and not node.splits:
+        at = first_index(missing & np.expand_dims(partly, event))
         raise EvidenceError(
             f"evidence on {node.name!r}: of one vector the entry at {_index(at)} is missing and others are "
-            "not, which is not supported; split the vector into nodes of its parts, leave all of it out, or "
-            "put in what stands for no reading (of ranges: robotics.clean_ranges)"
+            "not, which is answered for MvNormal and Joint only; split the vector into nodes of its parts, "
+            "leave all of it out, or put in what stands for no reading (of ranges: robotics.clean_ranges)"
         )
     if every.all() and array.size:
         return None
@@ -90,9 +94,10 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     if missing.any():
         filled = np.where(missing, array[first_index(~missing)], array)
     stored = store(node, filled)
-    observed = np.asarray(~every)
-    _check_support(node, stored, observed)
-    return Observed(stored, None if observed.all() else observed)
+    observed = np.asarray(~some)
+    _check_support(node, stored, np.asarray(~every))
+    parts = np.expand_dims(partly, event) & ~missing if partly.any() else None
+    return Observed(stored, None if observed.all() else observed, parts)
 
 
 def read_question(
@@ -120,7 +125,8 @@ def read_inputs(
     for name in given:
         if name not in wanted:
             raise EvidenceError(
-                f"inputs= gives {name!r}, which is not a declared input; the inputs are {list(wanted)}"
+                f"inputs= gives {name!r}, which is not a declared input{did_you_mean(name, wanted)}; the "
+                f"inputs are {list(wanted)}"
             )
     read = {}
     for name, declaration in wanted.items():
@@ -231,7 +237,7 @@ def _missing(node: CompiledNode, value: Any) -> tuple[np.ndarray, np.ndarray]:
                 f"({_allowed(node)})"
             )
         missing = np.isnan(array) if array.dtype.kind == "f" else np.zeros(array.shape, dtype=bool)
-    if missing.any() and not node.plates:
+    if missing.any() and not node.plates and (missing.all() or not node.event_shape):
         raise EvidenceError(
             f"evidence on {node.name!r} is {_peek(data)}, which means nothing for a node without "
             "plates; leave it out (or give None) if it is unobserved"
@@ -309,10 +315,7 @@ def _at(index: Shape) -> str:
 
 
 def _close(name: str, model: Model) -> str:
-    near = difflib.get_close_matches(str(name), model.nodes, n=1)
-    return (
-        f" (did you mean {near[0]!r}?)" if near else f"; its nodes are {_some(list(model.nodes))}"
-    )
+    return did_you_mean(name, model.nodes) or f"; its nodes are {_some(list(model.nodes))}"
 
 
 def _some(names: list[str]) -> str:

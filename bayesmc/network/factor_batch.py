@@ -12,7 +12,14 @@ import numpy as np
 
 from bayesmc.distributions import Density
 from bayesmc.distributions.support import Support, as_support, integers
-from bayesmc.errors import BayesmcError, DensityError, ModelError, ShapeError, UnknownNodeError
+from bayesmc.errors import (
+    BayesmcError,
+    DensityError,
+    ModelError,
+    ShapeError,
+    UnknownNodeError,
+    did_you_mean,
+)
 from bayesmc.network.captured import captured
 from bayesmc.network.domain import Domain, domain_with_states
 from bayesmc.network.node import Declaration, Potential, bind, plain_states
@@ -162,7 +169,8 @@ def _scope(
             known = ", ".join(map(repr, variables)) or "none"
             raise UnknownNodeError(
                 f"factor {name!r}: its scope names {variable!r}, which is no variable of the graph "
-                f"({known}); declare it before the factor, with fg.variable({variable!r}, ...)"
+                f"({known}){did_you_mean(variable, variables)}; declare it before the factor, with "
+                f"fg.variable({variable!r}, ...)"
             )
     return names
 

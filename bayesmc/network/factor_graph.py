@@ -25,6 +25,7 @@ from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.evidence import Observed, read_evidence, read_inputs
 from bayesmc.network.factor_batch import read_factor, variable_declaration
 from bayesmc.network.factor_scope import factor_scopes, hidden_elements
+from bayesmc.network.forward import refuse_parts
 from bayesmc.network.full_conditional import full_conditional
 from bayesmc.network.graph_view import FactorRecord, GraphView, VariableRecord
 from bayesmc.network.model import Model
@@ -92,6 +93,9 @@ class FactorGraph:
         inputs: Mapping[str, np.ndarray],
     ) -> FactorGraph:
         """The graph of a net given evidence, both read already; ``net.to_factor_graph`` is the way in."""
+        parts = refuse_parts(observed, "a factor graph")
+        if parts is not None:
+            raise EvidenceError(parts)
         graph = cls(model.name)
         graph._plates = DeclaredPlates("FactorGraph", dict(model.sizes), dict(model.labels))
         graph._question = (net, model, dict(observed), dict(inputs))

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import ParameterError
+from bayesmc.distributions.components import completed, log_prob_of
+from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
 from bayesmc.network.probing import depends_on_numbers
@@ -139,7 +140,7 @@ class Draw:
         self.model, self.node = model, node
 
     def __call__(self, state: Pass) -> None:
-        dist = current_distribution(self.model, self.node, state)
+        dist = current_distribution(self.model, self.node, state, drawn=True)
         state.values[self.node.name] = self.model.sample_stored(
             self.node.name, dist, state.rng, state.batch
         )
@@ -182,15 +183,37 @@ class DrawAndWeigh:
         assert seen.mask is not None
         self.elements = seen.mask
         self.mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
+        self.unseen = ~seen.mask if seen.parts is None else ~(seen.mask | seen.parts.any(axis=-1))
 
     def __call__(self, state: Pass) -> None:
-        dist = current_distribution(self.model, self.node, state)
+        dist = current_distribution(self.model, self.node, state, drawn=self.unseen)
         draws = self.model.sample_stored(self.node.name, dist, state.rng, state.batch)
+        partial: Any = 0.0
+        if self.seen.parts is not None:
+            draws, partial = self._in_part(dist, draws, state)
         values = np.where(self.mask, self.seen.value, draws)
         values.flags.writeable = False
         density = self.model.log_density(self.node.name, dist, values)
-        state.weigh(summed(np.where(self.elements, density, 0.0), self.node, self.apart))
+        total = np.where(self.elements, density, partial)
+        state.weigh(summed(total, self.node, self.apart))
         state.values[self.node.name] = values
+
+    def _in_part(
+        self, dist: Distribution, draws: np.ndarray, state: Pass
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Vectors seen in part: the rest of them drawn given that, and the log density of what was seen."""
+        parts = self.seen.parts
+        assert parts is not None
+        value, shape = self.seen.value, state.batch + self.node.plate_shape
+        log = np.zeros(shape)
+        for pattern in np.unique(parts.reshape(-1, parts.shape[-1]), axis=0):
+            if not pattern.any():
+                continue
+            here = (parts == pattern).all(axis=-1)
+            log = np.where(here, log_prob_of(dist, value, pattern), log)
+            full = completed(dist, state.rng, shape, value, pattern)
+            draws = np.where(here[..., None], full, draws)
+        return draws, log
 
 
 class Potential:
@@ -203,11 +226,16 @@ class Potential:
         state.weigh(self.model.potential(self.name, state.values))
 
 
-def current_distribution(model: Model, node: CompiledNode, state: Pass) -> Distribution:
-    """The node's distribution given its parents; bad parameters raise where the weight is positive."""
+def current_distribution(
+    model: Model, node: CompiledNode, state: Pass, drawn: bool | np.ndarray = False
+) -> Distribution:
+    """The node's distribution given its parents; bad parameters raise where the weight is positive.
+
+    Elements of the plates that are ``drawn`` may be without noise.
+    """
     dist, _ = model.evaluate(node.name, state.values)
     if dist.invalid is not None:
-        error = invalid_error(node, dist, state.alive, state.batch)
+        error = invalid_error(node, dist, state.alive, state.batch, drawn)
         if error is not None:
             raise _advised(error, node, model)
     return dist
@@ -238,6 +266,49 @@ def summed(log: np.ndarray, node: CompiledNode, apart: tuple[str, ...]) -> np.nd
     if order != sorted(order):
         total = total.transpose(*range(count), *(count + k for k in order))
     return total
+
+
+def refuse_parts(observed: Mapping[str, Observed], who: str) -> str | None:
+    """Why an engine that takes vectors whole cannot answer: of one only some components are observed."""
+    for name, seen in observed.items():
+        if seen.parts is not None:
+            return (
+                f"{who} takes vectors observed in full, and of {name!r} some components are missing and "
+                "others are not; use Exact(), a Kalman filter, LikelihoodWeighting(draws) or "
+                "ParticleFilter(particles), split the vector into nodes of its parts, or leave all of it out"
+            )
+    return None
+
+
+def whole(observed: Mapping[str, Observed]) -> list[str]:
+    """Nodes that are observed in full; of others only some elements may have to have a density."""
+    return [name for name, seen in observed.items() if seen.mask is None]
+
+
+def refuse_bare(model: Model, observed: Mapping[str, Observed], who: str) -> None:
+    """Refuse nodes without noise, and vectors seen in part, on behalf of an oracle.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    reason = refuse_parts(observed, who)
+    reason = reason or refuse_noiseless(model, model.nodes, who)
+    if reason is not None:
+        raise UnsupportedError(reason)
+
+
+def refuse_noiseless(model: Model, names: Iterable[str], who: str) -> str | None:
+    """Why an engine that evaluates the densities of some nodes cannot: one is a point without noise."""
+    for name in names:
+        if model[name].noiseless:
+            return (
+                f"{who} evaluates the density of {name!r}, which has none: it is without noise (a scale of "
+                "0, or a singular covariance), and its value follows from its parents; declare a function "
+                "that returns the value instead of a distribution, give it a little noise, or use Exact() or "
+                "a Kalman filter where the model is linear-Gaussian"
+            )
+    return None
 
 
 def refuse_unsampled(model: Model, known: Iterable[str], who: str) -> str | None:

@@ -7,13 +7,12 @@ taken as such.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import EvidenceError
+from bayesmc.errors import EvidenceError, did_you_mean
 
 Labels = Mapping[str, tuple[Any, ...]]
 
@@ -160,10 +159,9 @@ def _order(what: str, plate: str, own: list[Any], wanted: tuple[Any, ...]) -> li
     known = set(wanted)
     strange = [label for label in own if label not in known]
     if strange:
-        near = difflib.get_close_matches(str(strange[0]), map(str, wanted), n=1)
-        hint = f"did you mean {near[0]!r}?" if near else f"its labels are {_some(list(wanted))}"
+        hint = did_you_mean(strange[0], wanted) or f" (its labels are {_some(list(wanted))})"
         raise EvidenceError(
-            f"{what}: plate {plate!r} has no element labelled {strange[0]!r} ({hint}); what is labelled goes "
+            f"{what}: plate {plate!r} has no element labelled {strange[0]!r}{hint}; what is labelled goes "
             "by label, .to_numpy() by position"
         )
     missing = [label for label in wanted if label not in where]

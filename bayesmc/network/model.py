@@ -9,6 +9,7 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -23,6 +24,7 @@ from bayesmc.errors import (
     DensityError,
     ModelError,
     ParameterError,
+    PlateError,
     ShapeError,
 )
 from bayesmc.network.align import Aligner, RowAligner
@@ -40,7 +42,8 @@ _DETERMINISTIC_TABLE = 4096
 @dataclass(frozen=True, eq=False)
 class CompiledNode:
     """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
-    ``unsampled`` says that its density has no sampler."""
+    ``unsampled`` says that its density has no sampler, ``noiseless`` that some element has no noise
+    whatever its parents are, and so no density, ``splits`` that some components may be seen alone."""
 
     declaration: Declaration
     links: tuple[tuple[str, Aligner], ...]
@@ -52,6 +55,8 @@ class CompiledNode:
     support: Support | None = None
     table: np.ndarray | None = None
     unsampled: bool = False
+    noiseless: bool = False
+    splits: bool = False
 
     @property
     def name(self) -> str:
@@ -334,8 +339,11 @@ def call(
             )
         return array
     except BayesmcError as error:
-        raise _renamed(error, f"node {name!r}: {error}") from error
+        raise _renamed(error, f"node {name!r}: {_with_name(str(error), links)}") from error
     except Exception as error:
+        own = _own_plate_reduced(declaration, error, links)
+        if own is not None:
+            raise PlateError(f"node {name!r}: {own}") from error
         raise ModelError(f"node {name!r}: {_explain(error, arguments)}") from error
 
 
@@ -364,15 +372,23 @@ def lookup(node: CompiledNode, values: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def invalid_error(
-    node: CompiledNode, dist: Distribution, counts: np.ndarray, batch: Shape
+    node: CompiledNode,
+    dist: Distribution,
+    counts: np.ndarray,
+    batch: Shape,
+    noiseless: bool | np.ndarray = False,
 ) -> ParameterError | None:
     """The error for bad parameters at configurations that count, or None.
 
-    ``counts`` (shape ``batch``) tells which batch elements have positive probability.
+    ``counts`` (shape ``batch``) tells which batch elements have positive probability. Elements of the
+    plates that are ``noiseless`` may have no noise: they are drawn, or nobody asks for their density.
     """
     if dist.invalid is None:
         return None
-    full = np.broadcast_to(dist.invalid, batch + node.plate_shape)
+    invalid = dist.invalid
+    if dist.noiseless is not None:
+        invalid = invalid & ~(dist.noiseless & noiseless)
+    full = np.broadcast_to(invalid, batch + node.plate_shape)
     lead = np.asarray(counts).reshape(np.shape(counts) + (1,) * len(node.plate_shape))
     bad = full & lead
     if not bad.any():
@@ -407,6 +423,48 @@ def _table_rows(declaration: Declaration, arguments: Sequence[Any]) -> Distribut
     for card, positions in zip(probs.shape[:-1], arguments, strict=True):
         rows = rows * card + positions.astype(np.intp)
     return Categorical(Gathered(probs.reshape(-1, probs.shape[-1]), rows))
+
+
+def to_mix(declaration: Declaration, parents: Sequence[str], plate: str) -> str:
+    """The lines that mix the elements of a plate, for a node of that plate that does so itself."""
+    rest = tuple(p for p in declaration.plates if p != plate)
+    plates = f", plates={rest if len(rest) > 1 else rest[0]!r}" if rest else ""
+    parent = parents[0] if parents else "x"
+    total = f"{parent}_total"
+    others = ", ".join(dict.fromkeys([*parents, total]))
+    return (
+        "to mix elements (a mean, a cumulative sum), use an unplated deterministic node that reads the "
+        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.sum({plate!r}){plates}), and read that: "
+        f"lambda {others}: ... in {declaration.name!r}"
+    )
+
+
+def _own_plate_reduced(
+    declaration: Declaration, error: Exception, links: Sequence[tuple[str, Aligner]]
+) -> str | None:
+    """What to write instead of ``x.sum("plate")`` on a plate of the node's own, if that is what failed."""
+    named = isinstance(error, TypeError) and "'str' object cannot be interpreted" in str(error)
+    shared = [
+        name
+        for name, link in links
+        if isinstance(link, Aligner) and link.trailing - link.event_ndim > len(link.foreign)
+    ]
+    if not (named and shared):
+        return None
+    plate = declaration.plates[0]
+    return (
+        f"{shared[0]!r} arrives as a plain array, element by element, since {plate!r} is a plate of the "
+        f"node itself, so .sum({plate!r}) has nothing to reduce; "
+        + to_mix(declaration, list(dict.fromkeys(n for n, _ in links)), plate)
+    )
+
+
+def _with_name(message: str, links: Sequence[tuple[str, Aligner]]) -> str:
+    """A message about ``v`` as one about the only parent that it can be."""
+    foreign = list(dict.fromkeys(n for n, link in links if link.foreign))
+    if len(foreign) != 1:
+        return message
+    return re.sub(r"\bv(?=\[index\]|\[i\]|\.sum\(|\.mean\(|\.array\b)", foreign[0], message)
 
 
 def _renamed(error: BayesmcError, message: str) -> BayesmcError:

@@ -18,6 +18,7 @@ from bayesmc.errors import (
     ModelError,
     PlateError,
     UnknownNodeError,
+    did_you_mean,
 )
 from bayesmc.network.captured import captured
 from bayesmc.network.declared_plates import DeclaredPlates
@@ -465,7 +466,8 @@ class BayesNet:
         for plate, size in (plates or {}).items():
             if plate not in self._plates.sizes:
                 raise PlateError(
-                    f"plates= gives {plate!r}; the net's plates are {list(self._plates.sizes)}"
+                    f"plates= gives {plate!r}{did_you_mean(plate, self._plates.sizes)}; the net's plates are "
+                    f"{list(self._plates.sizes)}"
                 )
             if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
                 raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")

@@ -15,7 +15,14 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, BroadcastError, ModelError
 from bayesmc.network.compile import entry
-from bayesmc.network.model import CompiledNode, Model, arguments_of, call, potential_shape
+from bayesmc.network.model import (
+    CompiledNode,
+    Model,
+    arguments_of,
+    call,
+    potential_shape,
+    to_mix,
+)
 from bayesmc.network.node import Declaration
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, masks, nearly_equal
@@ -59,7 +66,11 @@ def _check_node(model: Model, node: CompiledNode) -> None:
         )
     if not node.links:
         return
-    _check_entries(model, node, whole, batch)
+    try:
+        _check_entries(model, node, whole, batch)
+    except BroadcastError:
+        _check_mixing(model, node)  # which says more, where that is what it is
+        raise
     _check_mixing(model, node)
 
 
@@ -165,8 +176,7 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
                     raise BroadcastError(
                         f"{_what(node)}: changing some elements of {sharing} along plate {plate!r} "
                         "moves other elements too; a function acts element by element on a shared "
-                        "plate. To mix elements (a mean, a cumulative sum), use an unplated "
-                        "deterministic node that reads the whole plate"
+                        f"plate; {to_mix(node.declaration, [*sharing, *node.parents], plate)}"
                     )
 
 

@@ -11,7 +11,7 @@ from bayesmc.engines.unrolled import pose_any, series_of
 from bayesmc.engines.weighted import check_count
 from bayesmc.errors import BayesmcError
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_unsampled
+from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled
 from bayesmc.pmcmc.trellis import Trellis
 from bayesmc.structure.target import Target, target_of
 
@@ -60,6 +60,9 @@ class ParticleEngine(ChainEngine):
 
     def refusal(self, problem: Problem) -> str | None:
         name = type(self).__name__
+        parts = refuse_parts(problem.observed, name)
+        if parts is not None:
+            return parts
         if series_of(problem) is None:
             return (
                 f"{name} runs particle filters on a template, and this is a plain net; give the template: "
@@ -72,7 +75,10 @@ class ParticleEngine(ChainEngine):
                 "LikelihoodWeighting(draws) draws from what is left"
             )
         given = {*problem.observed, *question.statics}
-        return refuse_unsampled(problem.model, given, name)
+        evaluated = (n for n in question.target.terms if n in problem.model.nodes)
+        return refuse_unsampled(problem.model, given, name) or refuse_noiseless(
+            problem.model, evaluated, name
+        )
 
     def _question(self, problem: Problem) -> Question:
         """The question, read once."""

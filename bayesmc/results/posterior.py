@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import UnknownNodeError, UnsupportedError
+from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.table import Summary
@@ -238,8 +238,10 @@ class Posterior:
             )
         node = self.model.nodes.get(name) if isinstance(name, str) else None
         if node is None:
+            known = list(self.model.nodes)
             raise UnknownNodeError(
-                f"posterior: no node {name!r}; its nodes are {', '.join(list(self.model.nodes)[:12])}"
+                f"posterior: no node {name!r}{did_you_mean(name, known)}; its nodes are "
+                f"{', '.join(known[:12])}"
             )
         return node
 

@@ -15,6 +15,7 @@ from bayesmc.errors import (
     ShapeError,
     UnknownNodeError,
     UnsupportedError,
+    did_you_mean,
 )
 from bayesmc.network import Model
 from bayesmc.network.align import Aligner
@@ -53,7 +54,8 @@ class Query:
         for plate in self.plates:
             if plate not in model.sizes:
                 raise UnknownNodeError(
-                    f"query: no plate {plate!r}; the plates are {list(model.sizes)}"
+                    f"query: no plate {plate!r}{did_you_mean(plate, model.sizes)}; the plates are "
+                    f"{list(model.sizes)}"
                 )
         if isinstance(function, str):
             self.nodes: tuple[str, ...] = (function,)
@@ -64,8 +66,8 @@ class Query:
         for name in self.nodes:
             if name not in model.nodes:
                 raise UnknownNodeError(
-                    f"query: argument {name!r} is not a node; name nodes by argument, or map them with "
-                    "names={argument: node}"
+                    f"query: argument {name!r} is not a node{did_you_mean(name, model.nodes)}; name nodes by "
+                    "argument, or map them with names={argument: node}"
                 )
         self.model = model
         self.plate_shape = tuple(model.sizes[p] for p in self.plates)

@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.store import meant
 from bayesmc.results.posterior import table_variance
 from bayesmc.results.predictive import Predictive
 
@@ -255,6 +254,15 @@ class SeriesPosterior:
         found.queries_mcse = cut(self.queries_mcse)
         return found
 
+    def __copy__(self) -> Any:
+        """The same answers; unlike a pickle a copy keeps the model's functions."""
+        other = object.__new__(type(self))
+        other.__dict__.update(self.__dict__)
+        return other
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        return self.__copy__()
+
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
         return {**self.__dict__, "model": self.model.without_functions()}
@@ -270,7 +278,7 @@ class SeriesPosterior:
         node = self.model.nodes.get(name)
         if node is None:
             raise UnknownNodeError(
-                f"there is no node {name!r}{meant(self.names, name)}; answered are {list(self.names)}"
+                f"there is no node {name!r}{did_you_mean(name, self.names)}; answered are {list(self.names)}"
             )
         if name not in self._tables and name not in self._means:
             raise UnsupportedError(

@@ -10,7 +10,8 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BudgetError
+from bayesmc.distributions.noiseless import plane_log_density
+from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors import FactorLike, LogTable
 from bayesmc.network import Model, Observed
 from bayesmc.network.model import potential_shape
@@ -335,15 +336,35 @@ def _table(
         assert node.domain is not None
         one_hot = np.asarray(result)[..., None] == np.arange(node.domain.size)
         return np.broadcast_to(one_hot, (*shape, node.domain.size)).astype(float), False, None
-    invalid = result.invalid
+    invalid, points = result.invalid, None
+    if result.noiseless is not None and node.domain is None:
+        assert invalid is not None
+        points = _point_densities(source.name, result, values[source.name], shape, len(cards))
+        invalid = invalid & ~result.noiseless
     invalid = None if invalid is None or not invalid.any() else np.broadcast_to(invalid, shape)
     if node.domain is not None:
         table = result.probs_table
         assert table is not None
         return np.broadcast_to(table, (*shape, node.domain.size)), False, invalid
-    density = model.log_density(source.name, result, values[source.name])
+    density = points
+    if density is None:
+        density = model.log_density(source.name, result, values[source.name])
     density = np.broadcast_to(density, shape)
     return (density if invalid is None else np.where(invalid, 0.0, density)), True, invalid
+
+
+def _point_densities(
+    name: str, result: Distribution, value: np.ndarray, shape: Shape, axes: int
+) -> np.ndarray | None:
+    """Log densities where some elements have no noise, which must be the same at all configurations."""
+    assert result.noiseless is not None
+    full = np.broadcast_to(result.noiseless, shape).reshape(-1, *shape[axes:])
+    if (full != full[:1]).any():
+        raise UnsupportedError(
+            f"node {name!r} is observed with noise at some configurations of the finite nodes and without at "
+            "others, and densities do not compare with probabilities; give it a little noise at all of them"
+        )
+    return plane_log_density(result, value)
 
 
 def _parents_of(model: Model, source: FactorSource) -> tuple[str, ...]:

@@ -12,7 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import BudgetError
+from bayesmc.distributions import MvNormal
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.noiseless import plane_log_density
+from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors import LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor
 from bayesmc.network import Model, Observed
@@ -38,6 +41,8 @@ class LinearGaussian:
         Observed elements, those that depend on the same blocks in one factor.
     tables : list of (scope, LogTable)
         Observed elements that turn out to depend on discrete variables alone.
+    exact : list of (Conditional, ndarray)
+        Observed elements of which some component has no noise, given their parents, and their values.
     computed : list of Conditional
         Elements of deterministic nodes that are affine in blocks, without noise.
     invalid : list
@@ -49,6 +54,7 @@ class LinearGaussian:
     conditionals: list[Conditional] = field(default_factory=list)
     likelihoods: list[GaussianFactor] = field(default_factory=list)
     tables: list[tuple[tuple[Variable, ...], LogTable]] = field(default_factory=list)
+    exact: list[tuple[Conditional, np.ndarray]] = field(default_factory=list)
     computed: list[Conditional] = field(default_factory=list)
     invalid: list[InvalidRows] = field(default_factory=list)
 
@@ -147,14 +153,53 @@ def _add(
     part.invalid.extend(reading.invalid_rows())
     hidden = hidden_elements(reading.node, seen)
     part.conditionals.extend(reading.conditional(e, states) for e in hidden)
+    if seen is not None and seen.parts is not None:
+        for e in hidden:
+            _add_parts(part, (reading.node.name, e), reading.d, seen)
     rest = np.delete(np.arange(reading.count), hidden)
     if not len(rest):
         return
     assert seen is not None
     values = seen.value.reshape(reading.count, reading.d)
+    bare = reading.without_noise(rest)
+    if bare.any():
+        for e in rest[bare].tolist():
+            _add_exact(part, reading.conditional(e, states), values[e])
+        rest = rest[~bare]
+        if not len(rest):
+            return
     for group in reading.alike(rest):
         factor = reading.likelihood(group, values[group], states)
         if factor.blocks:
             part.likelihoods.append(factor)
         else:
             part.tables.append((factor.scope, LogTable(factor.log_scale)))
+
+
+def _add_parts(part: LinearGaussian, block: Variable, d: int, seen: Observed) -> None:
+    """Append some components of a block, seen as they are."""
+    assert seen.parts is not None
+    at = np.flatnonzero(seen.parts.reshape(-1, d)[block[1]])
+    if len(at):
+        m = len(at)
+        itself = Conditional(block, (), (block,), np.zeros(m), np.eye(d)[at], np.zeros((m, m)))
+        part.exact.append((itself, seen.value.reshape(-1, d)[block[1]][at]))
+
+
+def _add_exact(part: LinearGaussian, given: Conditional, value: np.ndarray) -> None:
+    """Append an observed element without noise; one that depends on discrete variables alone is a table."""
+    if given.parents:
+        part.exact.append((given, value))
+        return
+    pivots = np.linalg.diagonal(given.root) == 0
+    flat = pivots.reshape(-1, pivots.shape[-1])
+    if (flat != flat[:1]).any():
+        raise UnsupportedError(
+            f"{given.block[0]!r} is observed with noise at some configurations of the finite nodes and "
+            "without at others, and densities do not compare with probabilities; give it a little noise at "
+            "all of them"
+        )
+    with marking_invalid():
+        log = plane_log_density(MvNormal(given.offset, scale_tril=given.root), value)
+    assert log is not None
+    part.tables.append((given.scope, LogTable(log)))

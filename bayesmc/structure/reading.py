@@ -115,6 +115,11 @@ class Reading:
         scope, arrays = _reduced(self.scope(e), [rows, log_scale], states)
         return GaussianFactor(scope, blocks, arrays[0], arrays[1])
 
+    def without_noise(self, elements: np.ndarray) -> np.ndarray:
+        """Which of some elements have a component without noise, at some configuration."""
+        pivots = np.linalg.diagonal(self.tril)[..., elements, :]
+        return (pivots == 0).reshape(-1, len(elements), self.d).any(axis=(0, 2))
+
     def invalid_rows(self) -> Iterator[InvalidRows]:
         """Elements and configurations with bad parameters."""
         if not self.invalid.any():
@@ -344,6 +349,8 @@ def _parameters(result: Any, shape: Shape, d: int) -> tuple[np.ndarray, np.ndarr
     else:
         tril = np.broadcast_to(result.scale_tril, (*shape, d, d))
     bad = False if result.invalid is None else result.invalid
+    if result.noiseless is not None:  # exact answers take it as it is
+        bad = bad & ~result.noiseless
     return result.loc, tril, np.broadcast_to(bad, shape)
 
 

@@ -73,7 +73,9 @@ class Term:
         try:
             return self.log_of(dist, batch, values[self.name])
         except DensityError as error:
-            raise DensityError(f"{error}{self.shown_at(values, error.index)}", error.index) from error
+            raise DensityError(
+                f"{error}{self.shown_at(values, error.index)}", error.index
+            ) from error
 
     def shown_at(self, values: Mapping[str, np.ndarray], index: Shape) -> str:
         """The values of the node and its parents at a place of its batch and plates, in words."""

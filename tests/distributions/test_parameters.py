@@ -18,9 +18,9 @@ NOT_PD = np.array([[1.0, 2.0], [2.0, 1.0]])
 FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
     (lambda: d.Normal(0.0, -1.0), (), "Normal: scale must be positive and finite; got -1."),
     (
-        lambda: d.Normal(0.0, [1.0, 0.0]),
+        lambda: d.Normal(0.0, [1.0, -1.0]),
         (1,),
-        "scale must be positive and finite; got 0. at index 1",
+        "scale must be positive and finite; got -1. at index 1",
     ),
     (
         lambda: d.Normal([[0, 1], [NAN, 2]], 1.0),
@@ -142,7 +142,7 @@ FAULTS: list[tuple[Callable[[], d.Distribution], tuple[int, ...], str]] = [
     (lambda: d.MvNormal(np.zeros(2), scale_tril=[[1.0, 0.5], [0.0, 1.0]]), (), "lower triangular"),
     (lambda: d.MvNormal(np.zeros(2), scale_tril=-np.eye(2)), (), "positive diagonal"),
     (
-        lambda: d.MvNormal(np.zeros(2), scale_diag=[[1.0, 1.0], [1.0, 0.0]]),
+        lambda: d.MvNormal(np.zeros(2), scale_diag=[[1.0, 1.0], [1.0, -1.0]]),
         (1,),
         "scale_diag must be",
     ),

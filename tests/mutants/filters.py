@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import pickle
+from typing import Any
+
 import numpy as np
 
 import bayesmc as bmc
+from bayesmc.testing.posteriors.repeated import repeated_test
+from bayesmc.testing.verdict import Verdict
 from tests.mutants.faults import Edit
-from tests.mutants.mutant import Mutant
-from tests.mutants.tests_of import evidence_of, matched, slices
+from tests.mutants.mutant import ALPHA, Mutant
+from tests.mutants.tests_of import Test, evidence_of, matched, slices
 
 
 def line() -> bmc.DynamicBayesNet:
@@ -75,7 +80,49 @@ PARTICLES = "unbiased_evidence_test, 100 runs of 30 particles"
 MILD = {"y": [0.3, 0.8, 1.2, 0.7]}
 ALWAYS = bmc.ParticleFilter(30, ess_threshold=2.0)
 
+
+def after_pickle(engine: Any, rows: list[float] | None, runs: int) -> Test:
+    """A belief that goes through a pickle after its first row.
+
+    Of given rows its evidence is judged; of drawn ones (None) its error, which is free of what was seen.
+    """
+
+    def test(seed: int) -> Verdict:
+        dbn = line()
+        log = 0.0 if rows is None else bmc.filter(dbn, {"y": rows}).log_marginal_likelihood
+
+        def estimate(rng: np.random.Generator) -> float:
+            drawn = dbn.sample(2, rng=rng)
+            seen = drawn["y"][0] if rows is None else rows
+            belief = engine.step(engine.start(dbn, rng=rng), {"y": seen[0]})
+            belief = engine.start(dbn, belief=pickle.loads(pickle.dumps(belief)))
+            for row in seen[1:]:
+                belief = engine.step(belief, {"y": row})
+            if rows is None:
+                return float((drawn["x"][0, -1] - belief.mean("x")) * seen[0])
+            return float(np.exp(belief.log_marginal_likelihood - log))
+
+        right = 0.0 if rows is None else 1.0
+        return repeated_test(estimate, right, replications=runs, alpha=ALPHA, rng=seed)
+
+    return test
+
+
 MUTANTS = [
+    Mutant(
+        "a belief out of a pickle forgets the evidence so far",
+        (Edit("bayesmc.engines.particles.filter:ParticleFilter._bound",
+              "belief.log_marginal_likelihood, belief.chance", "0.0, belief.chance"),),
+        after_pickle(bmc.ParticleFilter(200), MILD["y"], 100),
+        "repeated_test, 100 runs of 200 particles",
+    ),
+    Mutant(
+        "a belief out of a pickle expects the opposite",
+        (Edit("bayesmc.engines.kalman.base:GaussianFilter._bound",
+              "taken._replace(layout=layout)", "taken._replace(layout=layout, mean=-taken.mean)"),),
+        after_pickle(bmc.KalmanFilter(), None, 200),
+        "repeated_test, 200 series",
+    ),
     Mutant(
         "weights are not reset after resampling",
         (Edit("bayesmc.engines.particles.mover:Mover._selected",

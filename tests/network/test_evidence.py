@@ -162,8 +162,8 @@ REFUSED = {
         r"evidence on 'share'.*outside its support \(vectors of probabilities that sum to 1\)",
     ),
     "part of a vector": (
-        {"v": [[1.0, np.nan], [0, 0], [0, 0]]},
-        r"evidence on 'v': of one vector the entry at \(0, 1\) is missing.*split the vector",
+        {"share": [0.5, np.nan, 0.2]},
+        r"evidence on 'share': of one vector the entry at 1 is missing.*split the vector",
     ),
 }
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, Series, Slices
 from bayesmc.engines.averages import as_event
+from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.discrete.answers import SliceAnswers
 from bayesmc.engines.discrete.run import Run
 from bayesmc.errors import QueryError
@@ -21,8 +22,28 @@ from bayesmc.results import SeriesPosterior
 _ROWS = 3
 
 
+class Held(NamedTuple):
+    """What a belief goes on with once it has its functions again.
+
+    Attributes
+    ----------
+    slices : Slices
+    series : Series
+        The last rows.
+    before : list of ndarray or None
+        Logs of the beliefs in the slice before, by chain.
+    answers : SeriesPosterior or None
+        What it says of its slice, for a belief without functions.
+    """
+
+    slices: Slices
+    series: Series
+    before: Sequence[np.ndarray] | None
+    answers: SeriesPosterior | None = None
+
+
 @dataclass(frozen=True, eq=False)
-class DiscreteBelief:
+class DiscreteBelief(OnlineBelief):
     """Probabilities of the nodes of one slice.
 
     Attributes
@@ -45,23 +66,40 @@ class DiscreteBelief:
     (0, [0.182, 0.818])
     """
 
-    dbn: DynamicBayesNet = field(repr=False)
+    dbn: DynamicBayesNet | None = field(repr=False)
     static: Mapping[str, Any] = field(repr=False)
     t: int = -1
     log_marginal_likelihood: Any = 0.0
-    run: Run | None = field(default=None, repr=False)
+    run: Run | Held | None = field(default=None, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        if self.dbn is not None and not self.dbn.template.has_functions:
+            return {**self.__dict__}  # tables alone travel
+        run = None if self.run is None else self.held._replace(answers=self._posterior)
+        state = {**self.__dict__, "dbn": None, "run": run}
+        state.pop("_posterior", None)
+        return state
+
+    @property
+    def held(self) -> Held:
+        """The last rows, and the beliefs before them."""
+        if isinstance(self.run, Held):
+            return self.run
+        assert self.run is not None
+        return Held(self.run.plan.slices, self.run.series, self.run.before)
 
     @property
     def slices(self) -> Slices | None:
         """What rows are read against; None before the first."""
-        return None if self.run is None else self.run.plan.slices
+        return None if self.run is None else self.held.slices
 
     @property
     def inputs(self) -> dict[str, np.ndarray]:
         """Inputs of the slice."""
         if self.run is None:
             return {}
-        return {n: v[-1] for n, v in self.run.series.inputs.items()}
+        return {n: v[-1] for n, v in self.held.series.inputs.items()}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -98,10 +136,19 @@ class DiscreteBelief:
             raise QueryError(
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
             )
+        if isinstance(self.run, Held):
+            raise QueryError(
+                "this belief was unpickled, and pickles carry no functions: it says means, variances and "
+                "probabilities of nodes; for the rest give it the template again, engine.start(dbn, "
+                "belief=belief)"
+            )
         return SliceAnswers(self.run)
 
     @cached_property
     def _posterior(self) -> SeriesPosterior:
+        if isinstance(self.run, Held):
+            assert self.run.answers is not None
+            return self.run.answers
         answers = self._slice
         slices = answers.plan.slices
         found = answers.of(slices.dynamic)

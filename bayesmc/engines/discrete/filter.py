@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.averages import arguments_of, as_event
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
-from bayesmc.engines.discrete.belief import DiscreteBelief, window
+from bayesmc.engines.discrete.belief import DiscreteBelief, Held, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
 from bayesmc.engines.discrete.path import path_values
 from bayesmc.engines.discrete.run import Run
@@ -23,6 +23,7 @@ from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, observed_answers
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 from bayesmc.results import SeriesPosterior
 
@@ -89,6 +90,13 @@ class DiscreteFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        parts = refuse_parts(problem.series.observed, "DiscreteFilter")
+        if parts is not None:
+            return parts
+        for compiled in (problem.slices.first, problem.slices.later):
+            reason = refuse_noiseless(compiled, problem.series.observed, "DiscreteFilter")
+            if reason is not None:
+                return reason
         error = self._why_not(problem)
         return None if error is None else str(error)
 
@@ -179,8 +187,20 @@ class DiscreteFilter(FilterEngine):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> DiscreteBelief:
         return DiscreteBelief(dbn, dict(static))
 
+    def _bound(
+        self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
+    ) -> DiscreteBelief:
+        held = belief.held
+        plan = DiscreteSlices(
+            slices, plates_apart(slices), frozenset(), read_static(slices, belief.static)
+        )
+        run = Run(plan, held.series, belief.t, held.before)
+        run.forward()  # the slice once more, from the beliefs before it
+        return DiscreteBelief(dbn, belief.static, belief.t, belief.log_marginal_likelihood, run)
+
     def _absorbed(self, belief: DiscreteBelief, slices: Slices, row: Row) -> DiscreteBelief:
         t, run = belief.t + 1, belief.run
+        assert not isinstance(run, Held)
         if run is None:
             static = read_static(slices, belief.static)
             plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)

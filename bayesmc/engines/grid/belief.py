@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.engines.averages import as_event
+from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
@@ -18,7 +19,24 @@ from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import table_variance
 
 
-class GridBelief:
+class Kept(NamedTuple):
+    """What a belief without functions still says of its slice.
+
+    Attributes
+    ----------
+    slices : Slices
+    tables, moments, densities, points : dict
+        By node, for those that have them.
+    """
+
+    slices: Slices
+    tables: dict[str, np.ndarray]
+    moments: dict[str, tuple[np.ndarray, np.ndarray]]
+    densities: dict[str, np.ndarray]
+    points: dict[str, Any]
+
+
+class GridBelief(OnlineBelief):
     """Probabilities of cells of one slice.
 
     Attributes
@@ -43,10 +61,10 @@ class GridBelief:
 
     def __init__(
         self,
-        dbn: DynamicBayesNet,
+        dbn: DynamicBayesNet | None,
         static: Mapping[str, Any],
         quiet: Callable[[], AbstractContextManager[None]],
-        mover: GridMover | None = None,
+        mover: GridMover | Kept | None = None,
         cells: Cells | None = None,
         before: Cells | None = None,
         log_marginal_likelihood: Any = 0.0,
@@ -58,15 +76,25 @@ class GridBelief:
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if cells is None else cells.placed.row.t
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        state = {**self.__dict__, "dbn": None}
+        state.pop("_answers", None)
+        if self.slices is not None:
+            state["mover"] = self._kept(self.slices)
+        return state
+
     @property
     def slices(self) -> Slices | None:
         """What rows are read against; None before the first."""
+        if isinstance(self.mover, Kept):
+            return self.mover.slices
         return None if self.mover is None else self.mover.model.slices
 
     @property
     def names(self) -> tuple[str, ...]:
         """Nodes of the slice, parents first."""
-        return () if self.mover is None else self.mover.model.slices.dynamic
+        return () if self.slices is None else self.slices.dynamic
 
     def mean(self, name: str) -> np.ndarray:
         """Mean, shape ``(*plates, *event)``; circular for angles; labels have none."""
@@ -87,16 +115,22 @@ class GridBelief:
             raise QueryError(
                 f"probabilities({name!r}): the node has no finite set of states; use mean, var or density"
             )
+        if isinstance(self.mover, Kept):
+            return self.mover.tables[name]
         with self._quiet():
             return self._answers.table(name)
 
     def density(self, name: str) -> np.ndarray:
         """Density at the points of the grid, shape ``(*plates, *cells)``; NaN where the node is seen."""
+        if isinstance(self.mover, Kept) and name in self.mover.densities:
+            return self.mover.densities[name]
         self._axes(name)
         return self._answers.density(name)
 
     def grid(self, name: str) -> Any:
         """The points of a node's grid; of a vector a tuple, one per component."""
+        if isinstance(self.mover, Kept) and name in self.mover.points:
+            return self.mover.points[name]
         axes = self._axes(name)
         points = tuple(a.points for a in axes)
         return points if self._node(name).event_shape else points[0]
@@ -125,6 +159,12 @@ class GridBelief:
 
     @cached_property
     def _answers(self) -> Answers:
+        if isinstance(self.mover, Kept):
+            raise QueryError(
+                "this belief was unpickled, and pickles carry no functions: it says means, variances, "
+                "probabilities and densities; for the rest give it the template again, engine.start(dbn, "
+                "belief=belief)"
+            )
         if self.cells is None or self.mover is None:
             raise QueryError(
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
@@ -139,11 +179,28 @@ class GridBelief:
         with self._quiet():
             return Answers(mover.model, placed, cells.placed, cells.probs, pair)
 
+    def _kept(self, slices: Slices) -> Kept:
+        """Its answers, for a pickle."""
+        if isinstance(self.mover, Kept):
+            return self.mover
+        kept = Kept(slices, {}, {}, {}, {})
+        for name in self.names:
+            node = slices.first[name]
+            if node.domain is not None:
+                kept.tables[name] = self.probabilities(name)
+            if node.domain is None or node.domain.labels is None:
+                with suppress(UnsupportedError):  # it has neither
+                    kept.moments[name] = self._moments(name)
+            with suppress(UnsupportedError):  # it has no grid
+                kept.densities[name], kept.points[name] = self.density(name), self.grid(name)
+        return kept
+
     def _node(self, name: str) -> CompiledNode:
-        answers = self._answers
+        if self.slices is None:
+            return self._answers.model.slices.first[name]  # says that there are none
         if name not in self.names:
             raise UnknownNodeError(f"{name!r} is no node of a slice; there are {list(self.names)}")
-        return answers.model.slices.first[name]
+        return self.slices.first[name]
 
     def _axes(self, name: str) -> Any:
         node, model = self._node(name), self._answers.model
@@ -156,6 +213,8 @@ class GridBelief:
 
     def _moments(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         node = self._node(name)
+        if isinstance(self.mover, Kept) and name in self.mover.moments:
+            return self.mover.moments[name]
         with self._quiet():
             if node.domain is not None:
                 if node.domain.labels is not None:

@@ -16,14 +16,16 @@ from bayesmc.engines.exact import readable_bytes
 from bayesmc.engines.filtering import Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
-from bayesmc.engines.grid.belief import GridBelief
+from bayesmc.engines.grid.belief import GridBelief, Kept
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
 from bayesmc.engines.grid.search import GridSearch, known_static, quiet
+from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
 from bayesmc.errors import BayesmcError, BudgetError
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
 
 
@@ -116,6 +118,14 @@ class GridFilter(GridSearch):
         common = super().refusal(problem)
         if common is not None:
             return common
+        parts = refuse_parts(problem.series.observed, "GridFilter")
+        if parts is not None:
+            return parts
+        names = problem.slices.stochastic
+        for compiled in (problem.slices.first, problem.slices.later):
+            reason = refuse_noiseless(compiled, names, "GridFilter")
+            if reason is not None:
+                return reason
         try:
             with quiet():
                 model = self.model_on_grid(problem.slices, known_static(problem))
@@ -270,8 +280,25 @@ class GridFilter(GridSearch):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
         return GridBelief(dbn, static, quiet)
 
+    def _bound(self, belief: GridBelief, dbn: DynamicBayesNet, slices: Slices) -> GridBelief:
+        cells = belief.cells
+        assert cells is not None
+        with quiet():
+            model = self.model_on_grid(slices, read_static(slices, belief.static))
+            placed = model.place(cells.placed.row)
+        if not same_points(placed, cells.placed):
+            raise ValueError(
+                "GridFilter().start: the belief lies on another grid; go on with the engine that it was "
+                "started with"
+            )
+        return GridBelief(
+            dbn, belief.static, quiet, GridMover(model, self.tolerance), cells, belief.before,
+            belief.log_marginal_likelihood, belief.inputs,
+        )  # fmt: skip
+
     def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
         mover = belief.mover
+        assert not isinstance(mover, Kept)
         with quiet():
             if mover is None:
                 model = self.model_on_grid(slices, read_static(slices, belief.static))

@@ -64,6 +64,14 @@ class Placed:
         return tuple(s.size for s in self.scalars)
 
 
+def same_points(one: Placed, other: Placed) -> bool:
+    """Whether two slices have the same hidden numbers at the same points."""
+    return one.labels == other.labels and all(
+        np.array_equal(a.points, b.points) and np.array_equal(a.widths, b.widths)
+        for a, b in zip(one.scalars, other.scalars, strict=True)
+    )
+
+
 class GridSlices(GridStructure):
     """Places the scalars of slices and evaluates nodes on them.
 

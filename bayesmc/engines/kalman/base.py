@@ -130,6 +130,19 @@ class GaussianFilter(FilterEngine):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GaussianBelief:
         return GaussianBelief(dbn, static)
 
+    def _bound(
+        self, belief: GaussianBelief, dbn: DynamicBayesNet, slices: Slices
+    ) -> GaussianBelief:
+        taken = belief.taken
+        assert taken is not None
+        old = taken.layout
+        layout = Layout(slices, old.apart, old.first, old.before, old.unknown)
+        taker = RowTaker(self, slices, read_static(slices, belief.static))
+        return GaussianBelief(
+            dbn, belief.static, belief.t, taker, taken._replace(layout=layout),
+            belief.log_marginal_likelihood, belief.inputs,
+        )  # fmt: skip
+
     def _absorbed(self, belief: GaussianBelief, slices: Slices, row: Row) -> GaussianBelief:
         taker = belief.taker
         if taker is None:

@@ -167,10 +167,28 @@ def by_pattern(patterns: Sequence[int] | np.ndarray) -> list[np.ndarray]:
 def stacked_fields(records: Sequence[Any], field: str) -> np.ndarray:
     """A field of records of one pattern, with the axes of plates where any has them."""
     arrays = [getattr(record, field) for record in records]
+    if (
+        field == "turn" and len({a.shape[-1] for a in arrays}) > 1
+    ):  # what is certain makes them wider
+        widest = max(a.shape[-1] for a in arrays)
+        arrays = [
+            np.concatenate([a, np.zeros((*a.shape[:-1], widest - a.shape[-1]))], axis=-1)
+            for a in arrays
+        ]
     if len({a.ndim for a in arrays}) > 1:
         lead = max((a.shape[:-2] for a in arrays), key=len)
         arrays = [np.broadcast_to(a, lead + a.shape[-2:]) for a in arrays]
     return np.stack(arrays)
+
+
+def certain_of(records: Sequence[Conditioned]) -> np.ndarray | None:
+    """Which observed numbers follow from others, by kind, shape (kinds, [*lead], p); None where none does."""
+    if all(record.certain is None for record in records):
+        return None
+    arrays = [
+        np.zeros(1, dtype=bool) if record.certain is None else record.certain for record in records
+    ]
+    return np.stack(np.broadcast_arrays(*arrays))
 
 
 def at(array: np.ndarray, index: int) -> np.ndarray:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, SeriesProblem
+from bayesmc.distributions.noiseless import plane_log_density
 from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.slice_steps import plates_apart, summed
@@ -201,6 +202,8 @@ def given_values(
         full = np.broadcast_to(
             seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape)), seen.value.shape
         )
+        if seen.parts is not None:
+            full = full | seen.parts
         values[..., layout.rows[name]] = layout.packed(node, seen.value.astype(float))
         mask[..., layout.rows[name]] = layout.packed(node, full)
     return values, mask
@@ -242,7 +245,11 @@ def certain_density(layout: Layout, at: Mapping[str, np.ndarray]) -> Any:
             at[name] = result
             continue
         node = layout.model[name]
-        log = layout.model.log_density(name, result, at[name])
+        log = None
+        if result.noiseless is not None:
+            log = plane_log_density(result, at[name])
+        if log is None:
+            log = layout.model.log_density(name, result, at[name])
         total = total + summed(np.asarray(log), node, layout.apart)
     return total
 

@@ -17,7 +17,7 @@ from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.levels import why_not_matched
 from bayesmc.engines.kalman.passes import Filtered, State, forward
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
-from bayesmc.engines.kalman.rows import Memory
+from bayesmc.engines.kalman.rows import Memory, impossible_row
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.kernels.kalman import multiplied
@@ -91,7 +91,11 @@ class KalmanFilter(GaussianFilter):
         finite = np.isfinite(found.increments).reshape(data.steps, -1).all(axis=1)
         if not finite.all():
             k = int(np.argmin(finite))
-            error = DegeneracyError(f"the row of slice {k} has no density given those before", k)
+            error: Exception = DegeneracyError(
+                f"the row of slice {k} has no density given those before", k
+            )
+            if (found.increments[k] == -np.inf).any():
+                error = impossible_row(k)
             if k:
                 hand_over(error, filter_answers(self, problem, data, found.first(k)))
             raise error

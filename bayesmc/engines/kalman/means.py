@@ -14,11 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.distributions.circular import wrap_angle
+from bayesmc.distributions.noiseless import ALLOWED, FLOOR
 from bayesmc.engines.kalman.covariances import (
     Chosen,
     Covariances,
     at,
     by_pattern,
+    certain_of,
     stacked_fields,
 )
 from bayesmc.engines.kalman.data import Pattern, SeriesData
@@ -95,7 +97,12 @@ def absorbed(
     eta = standardised(found.root, off)
     after = mean[..., p:] + multiplied(found.gain, eta)
     after = _placed(layout, pattern, after, given)
-    return after, eta, log_densities(found.root, eta, seen)
+    log = log_densities(found.root, eta, seen, found.certain)
+    if found.certain is not None:
+        log = np.where(
+            _contradicts(found.certain, found.root, eta, row, mean[..., :p]), -np.inf, log
+        )
+    return after, eta, log
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -113,6 +120,7 @@ class _Part(NamedTuple):
     gain: np.ndarray
     row: np.ndarray
     given: np.ndarray | None
+    certain: np.ndarray | None
 
 
 class _Work:
@@ -185,8 +193,12 @@ class _Work:
             slices, pattern, kinds, offset[..., pattern.chosen],
             self._wide(moves[..., pattern.chosen, :], 2), whole("root"), whole("gain"),
             self._row(layout, pattern, slices),
-            None if self.data.given is None else self.data.given[0][slices],
+            None if self.data.given is None else self.data.given[0][slices], self._certain(records, inverse),
         )  # fmt: skip
+
+    def _certain(self, records: list[Any], inverse: np.ndarray) -> np.ndarray | None:
+        found = certain_of(records)
+        return None if found is None else self._wide(found, 1, inverse)
 
     def _wide(self, array: np.ndarray, tail: int, inverse: np.ndarray | None = None) -> np.ndarray:
         """With axes for the plates apart, and one entry per slice where there are several."""
@@ -222,7 +234,11 @@ class _Work:
         eta = _solved(_single(part.root), off)
         after = expected[..., p:] + _times(part.gain, eta)
         self.found.means[part.slices] = _placed(layout, part.pattern, after, part.given)
-        self.found.increments[part.slices] += log_densities(part.root, eta, seen)
+        log = log_densities(part.root, eta, seen, part.certain)
+        if part.certain is not None:
+            wrong = _contradicts(part.certain, part.root, eta, part.row, expected[..., :p])
+            log = np.where(wrong, -np.inf, log)
+        self.found.increments[part.slices] += log
         self.found.innovations.put(part.slices, layout, part.pattern, part.root, eta)
         if self.found.shifts is not None:
             records = [self.covariances.conditioned[k] for k in part.kinds]
@@ -238,6 +254,15 @@ class _Work:
             return seen
         places = pattern.observed[layout.p :] - layout.p
         return np.concatenate([seen, self.data.given[0][slices][..., places]], axis=-1)
+
+
+def _contradicts(
+    certain: np.ndarray, root: np.ndarray, eta: np.ndarray, row: np.ndarray, mean: np.ndarray
+) -> np.ndarray:
+    """Whether something observed is not what it must be given the rest, shape (..., *lead)."""
+    off = np.abs(eta) * root.diagonal(0, -2, -1)
+    allowed = ALLOWED * (np.abs(row) + np.abs(mean)) + FLOOR
+    return (certain & (off > allowed)).any(axis=-1)
 
 
 def _followed(

@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.distributions.circular import wrap_angle
+from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.filtering import refuse_forecast
 from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.queries import View, expectation, quantiles
@@ -209,7 +210,7 @@ class GaussianSeries(SeriesPosterior):
         return place_of(self.layout, name, name in self._tables)
 
 
-class GaussianBelief:
+class GaussianBelief(OnlineBelief):
     """A Gaussian belief about one slice, as ``start`` and ``step`` of the Kalman filters give it.
 
     Attributes
@@ -234,7 +235,7 @@ class GaussianBelief:
 
     def __init__(
         self,
-        dbn: DynamicBayesNet,
+        dbn: DynamicBayesNet | None,
         static: Mapping[str, Any],
         t: int = -1,
         taker: RowTaker | None = None,
@@ -247,10 +248,14 @@ class GaussianBelief:
         self.log_marginal_likelihood = log_marginal_likelihood
         self.inputs = dict(inputs or {})
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        return {**self.__dict__, "dbn": None, "taker": None}
+
     @property
     def slices(self) -> Slices | None:
         """What rows are read against; None before the first."""
-        return None if self.taker is None else self.taker.slices
+        return None if self.taken is None else self.taken.layout.slices
 
     @property
     def layout(self) -> Layout:

@@ -18,11 +18,19 @@ from bayesmc.engines.kalman.means import absorbed
 from bayesmc.engines.kalman.passes import State, start_state
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.slice_steps import plates_apart
-from bayesmc.errors import DegeneracyError, UnsupportedError
+from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityError
 from bayesmc.kernels.kalman import Conditioned, condition
 
 #: kinds of rows of which something is remembered
 _KEPT = 64
+
+
+def impossible_row(t: int) -> ZeroProbabilityError:
+    """What is seen is not what it must be: the error that says so."""
+    return ZeroProbabilityError(
+        f"the row of slice {t} has probability zero given those before: it contradicts what is known without "
+        "noise (a scale of 0, or a singular covariance); check the row, or give the node a little noise"
+    )
 
 
 class Family(Protocol):
@@ -122,6 +130,8 @@ class RowTaker:
         angles = _angles(layout, pattern)
         after, eta, log = absorbed(layout, pattern, made, mean, target, given, angles)
         log = log + certain_density(layout, values)
+        if (log == -np.inf).any():
+            raise impossible_row(row.t)
         if not (np.isfinite(after).all() and np.isfinite(log).all()):
             raise DegeneracyError(
                 f"the row of slice {row.t} has no density given those before", row.t

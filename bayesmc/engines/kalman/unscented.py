@@ -119,7 +119,7 @@ class UnscentedKalmanFilter(NonlinearFilter):
         if scale.ndim == 2 + lead:
             squared = scale**2
             found = squared[0] + weight * (squared[1:] - squared[0]).sum(axis=0)
-            root = np.sqrt(found) if (found > 0).all() else None
+            root = np.sqrt(found) if (found >= 0).all() else None
         else:
             middle = 1.0 - weight * (len(scale) - 1)
             root = _joint_root(scale[0], middle, scale[1:], weight)

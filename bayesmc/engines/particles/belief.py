@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
+from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.particles.accuracy import node_errors, value_errors
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.cloud import Bare, Cloud, Layout
 from bayesmc.engines.particles.families import Families, evidence_error
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.errors import QueryError, UnknownNodeError
@@ -18,7 +19,7 @@ from bayesmc.network import CompiledNode, Model
 from bayesmc.results.posterior import circular_variance, table_variance
 
 
-class ParticleBelief:
+class ParticleBelief(OnlineBelief):
     """Particles of one slice, as ``ParticleFilter.start`` and ``step`` give them.
 
     Attributes
@@ -55,10 +56,10 @@ class ParticleBelief:
 
     def __init__(
         self,
-        dbn: DynamicBayesNet,
+        dbn: DynamicBayesNet | None,
         seed: np.random.SeedSequence,
         static: Mapping[str, Any],
-        mover: Mover | None = None,
+        mover: Mover | Bare | None = None,
         cloud: Cloud | None = None,
         log_marginal_likelihood: Any = 0.0,
         chance: Mapping[str, Any] | None = None,
@@ -71,6 +72,11 @@ class ParticleBelief:
         self.families = families
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if cloud is None else cloud.t
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        mover = None if self.mover is None else Bare(self.mover.slices, self.mover.layout)
+        return {**self.__dict__, "dbn": None, "mover": mover}
 
     @property
     def slices(self) -> Slices | None:
@@ -199,7 +205,7 @@ class ParticleBelief:
         return self.cloud
 
     @property
-    def _mover(self) -> Mover:
+    def _mover(self) -> Mover | Bare:
         assert self.mover is not None
         return self.mover
 

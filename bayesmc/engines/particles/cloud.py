@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.dbn import Slices
 from bayesmc.engines.particles.recovery import Averages
 
 #: numbers of the largest node in a block of particles: its temporaries stay in cache
@@ -104,6 +105,13 @@ class Layout:
     apart: tuple[str, ...]
     lead: tuple[int, ...]
     block: int = BLOCK
+
+
+class Bare(NamedTuple):
+    """What of a mover describes its clouds: it goes with a pickle, and moves none."""
+
+    slices: Slices
+    layout: Layout
 
 
 def even_cloud(t: int, values: dict[str, np.ndarray], layout: Layout) -> Cloud:

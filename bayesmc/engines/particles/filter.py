@@ -48,7 +48,7 @@ from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
-from bayesmc.network.forward import refuse_unsampled
+from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -254,6 +254,12 @@ class ParticleFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
+        looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(self, o)]
+        parts = (
+            refuse_parts(problem.series.observed, f"ParticleFilter({looks[0]}=)") if looks else None
+        )
+        if parts is not None:
+            return parts
         apart = plates_apart(problem.slices)
         for option in ("adapt", "recovery"):
             if getattr(self, option) is not None and apart:
@@ -270,7 +276,9 @@ class ParticleFilter(FilterEngine):
             proposals.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
         for model in (problem.slices.first, problem.slices.later):
             inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
-            reason = refuse_unsampled(model, inside, "ParticleFilter")
+            reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
+                model, whole(problem.series.observed), "ParticleFilter"
+            )
             if reason is not None:
                 return reason
         return None
@@ -416,9 +424,26 @@ class ParticleFilter(FilterEngine):
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
         return ParticleBelief(dbn, seed_sequence(rng), static)
 
+    def _bound(
+        self, belief: ParticleBelief, dbn: DynamicBayesNet, slices: Slices
+    ) -> ParticleBelief:
+        held, sized = len(belief.weights), self._sized(START)
+        most = sized.particles
+        assert most is not None
+        if held > most or (held < most and self.adapt is None):
+            raise ValueError(
+                f"ParticleFilter({most}).start: the belief has {held} particles; go on with the "
+                "engine that it was started with"
+            )
+        mover = sized._mover(slices, read_static(slices, belief.static))
+        return ParticleBelief(
+            dbn, belief.seed, belief.static, mover, belief.cloud,
+            belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
+        )  # fmt: skip
+
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
         mover = belief.mover
-        if mover is None:
+        if not isinstance(mover, Mover):
             mover = self._sized(START)._mover(slices, read_static(slices, belief.static))
             warn_of_what_is_not_guided(self, slices, row.seen)
         chance = belief.chance

@@ -11,8 +11,7 @@ import numpy as np
 from bayesmc.dbn import Slices
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
-from bayesmc.errors import UnknownNodeError
-from bayesmc.network.store import meant
+from bayesmc.errors import UnknownNodeError, did_you_mean
 
 
 def check_count(option: str, given: Any, what: str) -> None:
@@ -81,7 +80,7 @@ def read_by(queries: Queries, slices: Slices) -> list[str]:
             if name not in slices.dynamic:
                 raise UnknownNodeError(
                     f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice"
-                    f"{meant(slices.dynamic, name)}; there are "
+                    f"{did_you_mean(name, slices.dynamic)}; there are "
                     f"{list(slices.dynamic)}"
                 )
             found.append(name)

@@ -21,6 +21,7 @@ from bayesmc.dbn.unroll import indexed
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
 from bayesmc.network import BayesNet, Model, Problem, pose
+from bayesmc.network.forward import refuse_bare
 from bayesmc.network.joint import node_log_prob
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
 from bayesmc.testing.oracles.enumeration import Enumerated, averaged, enumerate_posterior
@@ -275,6 +276,7 @@ def exact(
             f"exact: expected a BayesNet or a DynamicBayesNet, not {type(net).__name__}"
         )
     problem = pose(net, evidence, inputs)
+    refuse_bare(problem.model, problem.observed, "exact")
     observed = frozenset(n for n, seen in problem.observed.items() if seen.mask is None)
     log_static = None if static is None else _log_static(problem, static)
     oracles: dict[str, Callable[[], Enumerated | GaussianAnswer]] = {

@@ -25,6 +25,7 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.network import BayesNet, CompiledNode, Model, Observed, Problem, pose
+from bayesmc.network.forward import refuse_bare
 from bayesmc.randomness import seed_sequence
 from bayesmc.results.posterior import circular_variance
 
@@ -201,6 +202,7 @@ def enumerate_posterior(
     if points < 8:
         raise ValueError(f"enumerate_posterior(points={points}): give at least 8")
     problem = pose(net, evidence, inputs)
+    refuse_bare(problem.model, problem.observed, "enumerate_posterior")
     fine = _enumerate(problem, points, _REACH, max_configurations)
     if not fine.has_quadrature:
         return fine.result(0.0)

@@ -19,6 +19,7 @@ import scipy.special
 from bayesmc.distributions import Distribution, marking_invalid
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import BayesNet, CompiledNode, Problem, pose
+from bayesmc.network.forward import refuse_bare
 from bayesmc.testing.oracles.enumeration import Configurations, Enumerated, difference, visit
 from bayesmc.testing.oracles.hidden import HiddenPart
 from bayesmc.testing.oracles.integral import REACH, Integral
@@ -236,6 +237,7 @@ def quadrature_posterior(
     """
     _check(rtol, max_evaluations, starts)
     problem = pose(net, evidence, inputs)
+    refuse_bare(problem.model, problem.observed, "quadrature_posterior")
     try:
         hidden = HiddenPart(problem, max_configurations)
     except UnsupportedError as error:

@@ -1,0 +1,121 @@
+"""Beliefs that travel: what goes on after a pickle, and whether a belief fits a template.
+
+Pickles carry no functions. A belief that comes out of one answers as before, and goes on once ``start(dbn,
+belief=...)`` has given it the template again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, DynamicBayesNet, Slices
+from bayesmc.errors import ModelError
+from bayesmc.network import CompiledNode, Model
+
+
+class OnlineBelief:
+    """Base of the beliefs about one slice: values that never change, so a copy is the belief itself."""
+
+    def __copy__(self) -> Any:
+        return self
+
+    def __deepcopy__(self, memo: Any) -> Any:
+        return self
+
+
+def refuse_unbound(engine: Any, belief: Any) -> None:
+    """Refuse a belief that was unpickled and has no functions to go on with.
+
+    Raises
+    ------
+    ModelError
+    """
+    if belief.dbn is None:
+        who = type(engine).__name__
+        raise ModelError(
+            f"{who}().step: this belief was unpickled, and pickles carry no functions; give it the template "
+            "again, belief = engine.start(dbn, belief=belief), and go on"
+        )
+
+
+def slices_like(dbn: DynamicBayesNet, belief: Any) -> Slices | None:
+    """A template compiled for the plates of a belief; None where that has absorbed nothing.
+
+    Raises
+    ------
+    ModelError
+        The belief is one about another template.
+    """
+    old: Slices | None = belief.slices
+    if old is None:
+        return None
+    if old.template.inputs != dbn.inputs:
+        raise _other(f"its inputs are {_names(old.template.inputs)}, not {_names(dbn.inputs)}")
+    if old.template.static != dbn.static_nodes:
+        raise _other(
+            f"its static nodes are {_names(old.template.static)}, not {_names(dbn.static_nodes)}"
+        )
+    held = old.later.sizes
+    if set(held) != set(dbn.plates):
+        raise _other(f"its plates are {_names(held)}, not {_names(dbn.plates)}")
+    sizes = {p: n if n is not None else held[p] for p, n in dbn.plates.items()}
+    if sizes != held:
+        plate = next(p for p in sizes if sizes[p] != held[p])
+        raise _other(f"its plate {plate!r} has size {held[plate]}, not {sizes[plate]}")
+    if old.template.plates.labels != dbn.template.plates.labels:
+        raise _other("its plates have other labels")
+    names = [*dbn.template.later]
+    if {*old.template.later} != {*names}:
+        raise _other(f"its nodes are {_names(old.template.later)}, not {_names(names)}")
+    inputs = {**belief.inputs, **{n + PREVIOUS: v for n, v in belief.inputs.items()}}
+    new = dbn.slices(sizes, inputs)
+    for a, b, where in ((old.first, new.first, "slice 0"), (old.later, new.later, "later slices")):
+        _check_alike(a, b, where)
+    return new
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _check_alike(old: Model, new: Model, where: str) -> None:
+    for name, node in old.nodes.items():
+        if name not in new.nodes:
+            raise _other(f"it has {name!r} in {where}")
+        for what, (a, b) in _differences(node, new.nodes[name]).items():
+            raise _other(f"in {where} {what} of {name!r} is {a}, not {b}")
+
+
+def _differences(old: CompiledNode, new: CompiledNode) -> Mapping[str, tuple[Any, Any]]:
+    """What tells two nodes apart, as far as it can be told without their functions."""
+    faces: dict[str, tuple[Any, Any]] = {
+        "the kind": (old.kind, new.kind),
+        "the list of parents": (list(old.parents), list(new.parents)),
+        "the list of plates": (list(old.plates), list(new.plates)),
+        "the shape of a value": (old.value_shape, new.value_shape),
+        "the list of states": (_states(old), _states(new)),
+    }
+    found = {what: both for what, both in faces.items() if both[0] != both[1]}
+    tables = old.declaration.probs, new.declaration.probs
+    if not found and any(t is not None for t in tables):
+        one, other = (np.zeros(()) if t is None else t for t in tables)
+        if not np.array_equal(one, other):
+            found["the table"] = (one.tolist(), other.tolist())
+    return found
+
+
+def _states(node: CompiledNode) -> list[Any] | None:
+    return None if node.domain is None else list(node.domain.states)
+
+
+def _names(names: Any) -> str:
+    return ", ".join(map(repr, names)) or "none"
+
+
+def _other(why: str) -> ModelError:
+    return ModelError(
+        f"start(dbn, belief=...): the belief is one about another template: {why}; give the template that "
+        "the belief was started with"
+    )

@@ -1,0 +1,191 @@
+"""A vector of which some components are missing is conditioned on those present, or refused by name."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import bayesmc as bmc
+from bayesmc.errors import EvidenceError, UnsupportedError
+
+COV = np.array([[2.0, 0.8, 0.3], [0.8, 1.0, 0.2], [0.3, 0.2, 1.5]])
+NAN = np.nan
+
+
+def sensors():
+    """Two vectors that depend on one number; of one a component is missing, of the other all are."""
+    net = bmc.BayesNet(plates={"p": 2})
+    net.add("m", bmc.Normal(0.0, 2.0))
+    net.add("v", lambda m: bmc.MvNormal(m[..., None] * np.array([1.0, 2.0, 0.0]), COV), plates="p")
+    net.add("w", lambda v: bmc.Normal(v[..., 1], 1.0), plates="p")
+    return net
+
+
+def dense():
+    """Moments of (m, v[0], v[1], w[0]) from first principles."""
+    rows = np.zeros((8, 9))
+    rows[0, 0] = 2.0
+    root = np.linalg.cholesky(COV)
+    for k in (0, 1):
+        own = slice(1 + 3 * k, 4 + 3 * k)
+        rows[own, 0] = 2.0 * np.array([1.0, 2.0, 0.0])
+        rows[own, own] = root
+    rows[7] = rows[2]
+    rows[7, 8] = 1.0
+    return rows @ rows.T
+
+
+def given(cov, seen, values):
+    rest = [k for k in range(len(cov)) if k not in seen]
+    gain = cov[np.ix_(rest, seen)] @ np.linalg.inv(cov[np.ix_(seen, seen)])
+    mean, var = np.zeros(len(cov)), np.zeros(len(cov))
+    mean[seen], mean[rest] = values, gain @ values
+    var[rest] = np.diag(cov[np.ix_(rest, rest)] - gain @ cov[np.ix_(seen, rest)])
+    return mean, var, stats.multivariate_normal(cov=cov[np.ix_(seen, seen)]).logpdf(values)
+
+
+EVIDENCE = {"v": [[1.0, NAN, 0.5], [NAN, NAN, NAN]], "w": [0.3, NAN]}
+
+
+def test_exact_answers():
+    mean, var, log = given(dense(), [1, 3, 7], np.array([1.0, 0.5, 0.3]))
+    found = bmc.infer(sensors(), EVIDENCE, engine=bmc.Exact())
+    assert found.mean("m") == pytest.approx(mean[0])
+    assert found.mean("v").ravel() == pytest.approx(mean[1:7])
+    assert found.var("v").ravel() == pytest.approx(var[1:7], abs=1e-12)
+    assert found.log_marginal_likelihood == pytest.approx(log)
+    whole = {"v": [[1.0, 0.0, 0.5], [NAN, NAN, NAN]], "w": [0.3, NAN]}  # zero is not missing
+    assert abs(bmc.infer(sensors(), whole).log_marginal_likelihood - log) > 0.1
+
+
+def test_masked_arrays_and_nodes_without_plates():
+    net = bmc.BayesNet()
+    net.add("v", bmc.MvNormal(np.zeros(3), COV))
+    mean, var, log = given(COV, [1], np.array([1.0]))
+    masked = np.ma.MaskedArray([9.0, 1.0, 9.0], mask=[True, False, True])
+    for value in ([NAN, 1.0, NAN], masked):
+        found = bmc.infer(net, {"v": value})
+        assert found.mean("v") == pytest.approx(mean)
+        assert found.var("v") == pytest.approx(var)
+        assert found.log_marginal_likelihood == pytest.approx(log)
+
+
+def test_weighted_draws():
+    """Within five standard errors: an alarm in two million for each of seven figures."""
+    mean, _, log = given(dense(), [1, 3, 7], np.array([1.0, 0.5, 0.3]))
+    found = bmc.infer(sensors(), EVIDENCE, engine=bmc.LikelihoodWeighting(50_000), rng=2)
+    off = np.abs(found.mean("v").ravel() - mean[1:7])
+    assert (off <= 5 * found.mcse("v").ravel() + 1e-12).all()
+    assert abs(found.log_marginal_likelihood - log) < 5 * found.log_marginal_likelihood_mcse
+    assert (found["v"][..., 0, [0, 2]] == [1.0, 0.5]).all()
+    assert found["v"][..., 0, 1].std() > 0.5
+
+
+def test_weighted_draws_of_independent_parts():
+    """Five standard errors, as above: parts of a Joint that are there, or are not, or only in part."""
+    net = bmc.BayesNet()
+    net.add("v", bmc.MvNormal(np.zeros(3), COV))
+    net.add(
+        "j", lambda v: bmc.Joint(
+            bmc.Normal(v[..., 0], 1.0), bmc.Gamma(2.0, 1.0), bmc.MvNormal(v[..., :2], np.eye(2))
+        ),
+    )  # fmt: skip
+    rows = np.array([[1.0, 0, 0], [1.0, 0, 0]])
+    cov = np.block([[COV, COV @ rows.T], [rows @ COV, rows @ COV @ rows.T + np.eye(2)]])
+    mean, _, log = given(cov, [3, 4], np.array([1.0, 0.5]))
+    engine = bmc.LikelihoodWeighting(50_000)
+    found = bmc.infer(net, {"j": [1.0, NAN, 0.5, NAN]}, engine=engine, rng=1)
+    assert (np.abs(found.mean("v") - mean[:3]) <= 5 * found.mcse("v")).all()
+    assert abs(found.log_marginal_likelihood - log) < 5 * found.log_marginal_likelihood_mcse
+
+
+def moving():
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "x", lambda x_prev: bmc.MvNormal(0.9 * x_prev, np.eye(2)),
+        initial=bmc.MvNormal(np.zeros(2), np.eye(2)),
+    )  # fmt: skip
+    dbn.add("y", lambda x: bmc.MvNormal(x, [[0.5, 0.2], [0.2, 0.4]]))
+    return dbn
+
+
+ROWS = {"y": [[1.0, NAN], [0.5, 0.3], [NAN, NAN], [NAN, 1.0]]}
+
+
+@pytest.mark.parametrize(
+    "engine", [bmc.KalmanFilter(), bmc.ExtendedKalmanFilter(), bmc.UnscentedKalmanFilter()]
+)
+def test_gaussian_filters(engine):
+    """Over time, against each component of the rows as an unrolled net's evidence."""
+    dbn = moving()
+    exact = bmc.infer(dbn.unroll(4), dbn.unrolled_evidence(ROWS), engine=bmc.Exact())
+    smoothed = bmc.smooth(dbn, ROWS, engine=engine)
+    for t in range(4):
+        assert smoothed.mean("x")[t] == pytest.approx(exact.mean(f"x[{t}]"))
+        assert smoothed.var("x")[t] == pytest.approx(exact.var(f"x[{t}]"))
+    assert smoothed.log_marginal_likelihood == pytest.approx(exact.log_marginal_likelihood)
+    belief = engine.start(dbn)
+    for row in ROWS["y"]:
+        belief = engine.step(belief, {"y": row})
+    assert belief.log_marginal_likelihood == pytest.approx(exact.log_marginal_likelihood)
+
+
+def test_rows_of_two_numbers_say_the_same_as_two_nodes():
+    apart = bmc.DynamicBayesNet()
+    apart.add(
+        "x", lambda x_prev: bmc.MvNormal(0.9 * x_prev, np.eye(2)),
+        initial=bmc.MvNormal(np.zeros(2), np.eye(2)),
+    )  # fmt: skip
+    apart.add("a", lambda x: bmc.Normal(x[..., 0], 1.0))
+    apart.add("b", lambda x: bmc.Normal(x[..., 1], 2.0))
+    joint = bmc.DynamicBayesNet()
+    joint.add(
+        "x", lambda x_prev: bmc.MvNormal(0.9 * x_prev, np.eye(2)),
+        initial=bmc.MvNormal(np.zeros(2), np.eye(2)),
+    )  # fmt: skip
+    joint.add("y", lambda x: bmc.MvNormal(x, scale_diag=[1.0, 2.0]))
+    rows = np.array(ROWS["y"])
+    wanted = bmc.filter(apart, {"a": rows[:, 0], "b": rows[:, 1]})
+    found = bmc.filter(joint, {"y": rows})
+    np.testing.assert_allclose(found.mean("x"), wanted.mean("x"))
+    np.testing.assert_allclose(found.log_marginal_increments, wanted.log_marginal_increments)
+
+
+def test_particles():
+    """Twenty runs of 2,000 particles: their mean evidence within five standard errors."""
+    dbn, wanted = moving(), bmc.filter(moving(), ROWS)
+    runs = [bmc.filter(dbn, ROWS, engine=bmc.ParticleFilter(2000), rng=k) for k in range(20)]
+    ratios = np.exp([r.log_marginal_likelihood - wanted.log_marginal_likelihood for r in runs])
+    assert abs(ratios.mean() - 1) < 5 * ratios.std(ddof=1) / np.sqrt(20)
+    means = np.array([r.mean("x") for r in runs])
+    off = np.abs(means.mean(axis=0) - wanted.mean("x"))
+    assert (off < 5 * means.std(axis=0, ddof=1) / np.sqrt(20) + 2e-3).all()
+
+
+@pytest.mark.parametrize(
+    "engine",
+    [
+        bmc.Gibbs(50),
+        bmc.MetropolisHastings(50),
+        bmc.Rejection(50),
+        bmc.Importance(50, proposal={"m": lambda: bmc.Normal(0.0, 1.0)}),
+    ],
+)
+def test_other_engines_name_the_node(engine):
+    with pytest.raises(UnsupportedError, match="of 'v' some components are missing"):
+        bmc.infer(sensors(), EVIDENCE, engine=engine, rng=0)
+    with pytest.raises(EvidenceError, match="of 'v' some components are missing"):
+        sensors().to_factor_graph(EVIDENCE)
+
+
+def test_other_filters_name_the_node():
+    grid = bmc.GridFilter({"x": (-5.0, 5.0, 10)})
+    for engine in (grid, bmc.ParticleFilter(50, proposal="optimal")):
+        with pytest.raises(UnsupportedError, match="of 'y' some components are missing"):
+            bmc.filter(moving(), ROWS, engine=engine, rng=0)
+
+
+def test_families_without_marginals_are_refused():
+    net = bmc.BayesNet(plates={"p": 2})
+    net.add("d", bmc.Dirichlet(np.ones(3)), plates="p")
+    with pytest.raises(EvidenceError, match="answered for MvNormal and Joint only"):
+        bmc.infer(net, {"d": [[NAN, 0.5, 0.5], [0.2, 0.3, 0.5]]})
