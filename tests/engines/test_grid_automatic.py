@@ -103,7 +103,7 @@ def rates() -> Made:
         "x", lambda x_prev: bmc.Gamma(20.0, 20.0 / (0.8 * x_prev + 1)), initial=bmc.Gamma(5.0, 1.0)
     )
     dbn.add("y", lambda x: bmc.Poisson(x))
-    return dbn, rows_of(dbn, 60), np.geomspace(1e-6, 500.0, 1000)
+    return dbn, rows_of(dbn, 60), (0.0, 40.0, 2000)
 
 
 def shares() -> Made:
