@@ -28,10 +28,12 @@ from bayesmc.testing import exact, random_dbn, session
 from bayesmc.testing.makers.linear_dbns import random_linear_dbn
 from tests.matrix import DOUBTS, SHIFT
 
-#: "static": a static node is unknown, which particle chains alone answer
-KINDS = ("finite", "linear", "static")
+#: "static": a static node is unknown, which particle chains alone answer; "one number": linear ones of which
+#: the default grid finds its range and cells
+KINDS = ("finite", "linear", "static", "one number")
 #: templates of each kind for engines that compute, and for those with particles, which take longer
 MANY, FEW = session.scaled(5, 8), session.scaled(2, 15)
+GRID = bmc.GridFilter()
 #: runs of a particle filter
 RUNS = session.scaled(30, 10)
 #: spread of the logs of their estimates up to which so many runs have a mean with an error
@@ -60,6 +62,8 @@ def series(kind: str, seed: int) -> Series | None:
         if "level" not in data:
             return series(kind, seed + 10_000)
         del data["level"]
+    if kind == "one number" and GRID.unsupported(case.dbn, data, case.inputs or None) is not None:
+        return None
     try:
         answer = exact(case.dbn, data, case.inputs or None)
     except (UnsupportedError, BudgetError):
@@ -80,6 +84,7 @@ def cases(kind: str, count: int, first: int = 0) -> Iterator[tuple[int, Series]]
 COMPUTING: dict[str, tuple[Any, float, tuple[str, ...]]] = {
     "DiscreteFilter": (bmc.DiscreteFilter(), 1e-9, ("finite",)),
     "GridFilter": (bmc.GridFilter(), 1e-9, ("finite",)),
+    "GridFilter, found": (GRID, 1e-3, ("one number",)),
     "KalmanFilter": (bmc.KalmanFilter(), 1e-7, ("linear",)),
     "ExtendedKalmanFilter": (bmc.ExtendedKalmanFilter(), 1e-6, ("linear",)),
     "UnscentedKalmanFilter": (bmc.UnscentedKalmanFilter(), 1e-6, ("linear",)),

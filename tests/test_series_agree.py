@@ -15,7 +15,13 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import ConvergenceWarning, ZeroProbabilityError
+from bayesmc.errors import (
+    ConvergenceWarning,
+    EngineWarning,
+    QueryError,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from bayesmc.testing import (
     compare,
     repeated_test,
@@ -34,6 +40,7 @@ from tests.matrix_time import (
     RUNS,
     answered,
     cases,
+    hidden,
     unbiased,
 )
 
@@ -53,6 +60,42 @@ def test_filters_and_smoothers_match_exact_answers(engine: str) -> None:
             filtered = bmc.filter(case.dbn, case.observations, **given)
             found = compare(filtered, case.exact, ALPHA, rtol=rtol)
             assert found, (case.dbn, found)
+
+
+@pytest.mark.parametrize("engine", COMPUTING)
+def test_functions_of_nodes_match_exact_answers(engine: str) -> None:
+    """Second moments and shares of the nodes of every slice, as queries; there is no chance in it."""
+    engine_used, rtol, kinds = COMPUTING[engine]
+    asked = 0
+    for kind in kinds:
+        for _, case in cases(kind, 2):
+            given: dict[str, Any] = {"inputs": case.inputs, "engine": engine_used}
+            plain = bmc.smooth(case.dbn, case.observations, **given)
+            for name in plain.names:
+                if not hidden(case, name):
+                    continue
+                function, right = function_of(case.exact, plain.model[name])
+                queries = {name: function}
+                try:
+                    found = bmc.smooth(case.dbn, case.observations, queries=queries, **given)
+                except (UnsupportedError, QueryError, EngineWarning):
+                    continue  # a node that nothing reads has no table of its own, and this is said
+                answer = found.queries[name]
+                scale = np.abs(right).max()
+                np.testing.assert_allclose(answer, right, rtol=10 * rtol, atol=10 * rtol * scale)
+                asked += 1
+    assert asked
+
+
+def function_of(exact: Any, node: Any) -> tuple[Any, np.ndarray]:
+    """A function of a node, and its mean in every slice: whether it is in its last state, or its square."""
+    name, domain = node.name, node.domain
+    if domain is None:
+        return eval(f"lambda {name}: {name} ** 2"), exact.mean(name) ** 2 + exact.var(name)
+    last = (domain.numbers if domain.labels is None else domain.labels)[-1]
+    return eval(f"lambda {name}: {name} == last", {"last": last}), exact.probabilities(name)[
+        ..., -1
+    ]
 
 
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")

@@ -36,7 +36,7 @@ def rows_of(dbn: bmc.DynamicBayesNet, steps: int, seed: int = 1) -> dict[str, An
 
 
 def from_the_model() -> Made:
-    return counts(), rows_of(counts(), session.scaled(400, 7)), (-12.0, 5.0, 1000)
+    return counts(), rows_of(counts(), session.scaled(200, 15)), (-12.0, 5.0, 700)
 
 
 def with_shifts() -> Made:
@@ -45,13 +45,13 @@ def with_shifts() -> Made:
     rows["y"][150:220] = 40
     rows["y"][300] = 50
     rows["y"][350:360] = np.random.default_rng(0).integers(0, 50, 10)
-    return counts(), rows, (-12.0, 9.0, 1000)
+    return counts(), rows, (-12.0, 9.0, 700)
 
 
 def missing_rows() -> Made:
     rows = rows_of(counts(), 200)
     rows["y"][50:120] = np.nan
-    return counts(), rows, (-12.0, 5.0, 1000)
+    return counts(), rows, (-12.0, 5.0, 700)
 
 
 def volatility() -> Made:
@@ -61,7 +61,7 @@ def volatility() -> Made:
     rows = rows_of(dbn, 300)
     rows["y"][150] = 60.0
     rows["y"][200:210] = 1e-5
-    return dbn, rows, (-14.0, 14.0, 1000)
+    return dbn, rows, (-14.0, 14.0, 700)
 
 
 def growth() -> Made:
@@ -73,7 +73,7 @@ def growth() -> Made:
         return bmc.Normal(mean, np.sqrt(10.0))
 
     dbn.add("y", lambda x: bmc.Normal(x**2 / 20, 1.0))
-    return dbn, rows_of(dbn, 40, 4), (-60.0, 60.0, 1000)
+    return dbn, rows_of(dbn, 40, 4), (-60.0, 60.0, 1200)
 
 
 def heavy_tails() -> Made:
@@ -103,7 +103,7 @@ def rates() -> Made:
         "x", lambda x_prev: bmc.Gamma(20.0, 20.0 / (0.8 * x_prev + 1)), initial=bmc.Gamma(5.0, 1.0)
     )
     dbn.add("y", lambda x: bmc.Poisson(x))
-    return dbn, rows_of(dbn, 60), np.geomspace(1e-6, 500.0, 1000)
+    return dbn, rows_of(dbn, 60), (0.0, 40.0, 2000)
 
 
 def shares() -> Made:
@@ -141,14 +141,13 @@ def test_the_default_is_a_grid_with_its_error(make: Callable[[], Made]) -> None:
 
 
 def test_it_says_so() -> None:
-    dbn, rows, _ = with_shifts()
-    why = bmc.explain(dbn, rows)
+    why = bmc.explain(counts(), rows_of(counts(), 20))
     assert "'x' is the one hidden number of a slice" in why.reasons[0]
     assert "give the log evidence to within" in why.reasons[0]
     assert "on a grid of" in why.nodes["x"]
 
 
-@pytest.mark.parametrize("cells", [24, 28, 32])
+@pytest.mark.parametrize("cells", [24, 32])
 def test_too_few_cells_have_an_error_that_holds_and_half_of_it_does_not(cells: int) -> None:
     dbn, rows = counts(), rows_of(counts(), 100, 3)
     truth = on(dbn, rows, (-10.0, 4.0, 2000)).log_marginal_likelihood

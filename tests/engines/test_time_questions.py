@@ -42,7 +42,9 @@ def switching() -> bmc.DynamicBayesNet:
 def lagged() -> bmc.DynamicBayesNet:
     """Two hidden numbers a slice."""
     dbn = curved()
-    dbn.add("w", lambda x_prev, w_prev: bmc.Normal(np.cos(x_prev), 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add(
+        "w", lambda x_prev, w_prev: bmc.Normal(np.cos(x_prev), 1.0), initial=bmc.Normal(0.0, 1.0)
+    )
     dbn.add("v", lambda x, w: bmc.Normal(x * w, 0.5))
     return dbn
 

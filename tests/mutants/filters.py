@@ -74,6 +74,43 @@ def unknown_drift() -> bmc.DynamicBayesNet:
     return dbn
 
 
+def counts() -> bmc.DynamicBayesNet:
+    """A slow rate of trials."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "x",
+        lambda x_prev: bmc.Normal(-4 + 0.98 * (x_prev + 4), 0.15),
+        initial=bmc.Normal(-4.0, 0.754),
+    )
+    dbn.add("y", lambda x: bmc.Binomial(50, logits=x))
+    return dbn
+
+
+def grid_error(seed: int) -> Verdict:
+    """By how much the log evidence on few cells is off beyond its stated error: by nothing."""
+    rows = {"y": counts().sample(100, rng=3)["y"][0]}
+    fine = bmc.GridFilter({"x": (-10.0, 4.0, 1000)}, tolerance=np.inf)
+
+    def beyond(rng: np.random.Generator) -> float:
+        few = bmc.GridFilter(cells=28, tolerance=np.inf)
+        found, truth = (bmc.filter(counts(), rows, engine=e) for e in (few, fine))
+        off = abs(found.log_marginal_likelihood - truth.log_marginal_likelihood)
+        return max(off - found.log_marginal_likelihood_mcse, 0.0)
+
+    return repeated_test(beyond, 0.0, replications=2, alpha=ALPHA, rng=seed)
+
+
+def squares(seed: int) -> Verdict:
+    """A function of the state under the exact filter, by its mean and variance."""
+
+    def asked(rng: np.random.Generator) -> np.ndarray:
+        return bmc.filter(line(), ROWS, queries={"q": lambda x: x**2}).queries["q"]
+
+    plain = bmc.filter(line(), ROWS)
+    right = plain.mean("x") ** 2 + plain.var("x")
+    return repeated_test(asked, right, replications=2, alpha=ALPHA, rng=seed)
+
+
 ROWS = {"y": [0.5, 1.5, 3.0, 2.0]}
 RISING = {"y": [0.0, 2.0, 4.0]}
 PARTICLES = "unbiased_evidence_test, 100 runs of 30 particles"
@@ -214,6 +251,18 @@ MUTANTS = [
               "here = shifts[k] + link * here", "here = shifts[k]"),),
         slices(bmc.smooth, line, ROWS, bmc.KalmanFilter(), 2),
         "repeated_test of smooth (no draws)",
+    ),
+    Mutant(
+        "the stated error of a found grid is half as large",
+        (Edit("bayesmc.engines.grid.automatic:_Search.answer", "off = times *", "off = 0.5 *"),),
+        grid_error,
+        "repeated_test of what exceeds the stated error (no draws)",
+    ),
+    Mutant(
+        "queries under a Gaussian belief take it for narrower",
+        (Edit("bayesmc.engines.averages:over_normal", "-0.5 * points**2", "-0.6 * points**2"),),
+        squares,
+        "repeated_test of a query (no draws)",
     ),
     Mutant(
         "a discrete filter's transition is transposed",

@@ -192,7 +192,7 @@ class Answers:
         apart = self.model.apart
         order = [apart.index(p) for p in node.plates if p in apart]
         found = found.transpose(*range(levels.ndim), *(levels.ndim + k for k in order))
-        return found.reshape(*levels.shape, *node.value_shape)
+        return found.reshape((*levels.shape, *node.value_shape))
 
     # ---- private -------------------------------------------------------------------------------
 

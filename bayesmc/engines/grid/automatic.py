@@ -95,8 +95,8 @@ def find_grid(
     search = _Search(name, make, rows)
     lattice, before = search.held(line, cells)
     if cells is not None:
-        finer = search.passed(lattice.cut(2 * cells)).increments
-        return search.answer(search.passed(lattice.cut(cells)), finer, _SAFE)
+        halved = search.passed(lattice.cut(2 * cells)).increments
+        return search.answer(search.passed(lattice.cut(cells)), halved, _SAFE)
     finer = lattice.cut(2 * lattice.cells)
     while True:
         search.check_price(finer)

@@ -215,7 +215,7 @@ class GridFilter(GridSearch):
             with Progress(problem.steps, self.label, progress) as bar, quiet():
                 pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
         except KeyboardInterrupt as stop:
-            return answer_so_far(stop, self)
+            return self.with_error(problem, answer_so_far(stop, self))
         return self.with_error(problem, so_far())
 
     def smooth(

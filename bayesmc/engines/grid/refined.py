@@ -70,7 +70,7 @@ def quantiles(fine: Fine, levels: np.ndarray) -> np.ndarray:
     below = np.concatenate([np.zeros((1, flat.shape[1])), np.cumsum(flat, axis=0)])
     below = below / below[-1]
     found = [np.interp(levels.ravel(), below[:, k], edges) for k in range(flat.shape[1])]
-    at = np.stack(found, axis=-1).reshape(*levels.shape, *fine.masses.shape[1:])
+    at = np.stack(found, axis=-1).reshape((*levels.shape, *fine.masses.shape[1:]))
     return np.asarray(fine.number(at))
 
 
