@@ -6,9 +6,28 @@ models or engines: it only names what can go wrong.
 
 from __future__ import annotations
 
+import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
+
+
+def did_you_mean(name: Any, names: Iterable[Any]) -> str:
+    """``" (did you mean 'x'?)"`` for a name that is near one of some, upper and lower case apart; or nothing.
+
+    Examples
+    --------
+    >>> from bayesmc.errors import did_you_mean
+    >>> did_you_mean("Rian", ["rain", "wet"]), did_you_mean("a", ["b"])
+    (" (did you mean 'rain'?)", '')
+    """
+    known = list(dict.fromkeys(map(str, names)))
+    folded = {k.lower(): k for k in known}
+    same = folded.get(str(name).lower())
+    near = [same] if same is not None else difflib.get_close_matches(str(name), known, n=1)
+    if not near:
+        near = [folded[k] for k in difflib.get_close_matches(str(name).lower(), folded, n=1)]
+    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 class BayesmcError(Exception):

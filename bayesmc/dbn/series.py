@@ -15,12 +15,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
-from bayesmc.errors import EvidenceError, PlateError
+from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network import Observed
 from bayesmc.network.evidence import observe
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
-from bayesmc.network.store import meant
 from bayesmc.shapes import Shape, first_index, owned
 
 
@@ -209,8 +208,8 @@ def read_static(slices: Slices, values: Mapping[str, Any]) -> dict[str, np.ndarr
     for name in values:
         if name not in found:
             raise EvidenceError(
-                f"static= gives {name!r}, which is no static node with a density{meant(found, name)}; there "
-                f"are {list(found)}"
+                f"static= gives {name!r}, which is no static node with a density{did_you_mean(name, found)}; "
+                f"there are {list(found)}"
             )
     return found
 
@@ -331,8 +330,8 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
     for name in inputs:
         if name not in template.inputs:
             raise EvidenceError(
-                f"inputs= gives {name!r}, which is not a declared input{meant(template.inputs, name)}; the "
-                f"inputs are {list(template.inputs)}"
+                f"inputs= gives {name!r}, which is not a declared input"
+                f"{did_you_mean(name, template.inputs)}; the inputs are {list(template.inputs)}"
             )
         _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
         if np.ndim(inputs[name]) == 0:

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, UnknownNodeError
+from bayesmc.errors import ModelError, UnknownNodeError, did_you_mean
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.domain import Domain
 from bayesmc.network.node import Declaration
 from bayesmc.network.ordering import topological_order
-from bayesmc.network.store import ModelStore, meant
+from bayesmc.network.store import ModelStore
 from bayesmc.shapes import owned
 
 if TYPE_CHECKING:
@@ -88,7 +88,9 @@ class Template:
         before = [n + PREVIOUS for n in self.later if n not in self.static]
         turned = _TURNED.fullmatch(name)
         named = turned[1] + PREVIOUS if turned and turned[1] + PREVIOUS in before else name
-        return f"the template has no node {name!r}{meant([*self.later, *before, TIME], named)}"
+        return (
+            f"the template has no node {name!r}{did_you_mean(named, [*self.later, *before, TIME])}"
+        )
 
     def further_back(self, name: str) -> str | None:
         """How to look more than one slice back, if that is what a name is meant for."""

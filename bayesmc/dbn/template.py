@@ -15,12 +15,17 @@ from bayesmc.dbn.series import Series, read_series, unrolled
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
 from bayesmc.dbn.unroll import sampled, unroll
 from bayesmc.distributions import Distribution
-from bayesmc.errors import DuplicateNodeError, ModelError, ParameterError, UnknownNodeError
+from bayesmc.errors import (
+    DuplicateNodeError,
+    ModelError,
+    ParameterError,
+    UnknownNodeError,
+    did_you_mean,
+)
 from bayesmc.network import BayesNet, Node
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import Parents
 from bayesmc.network.node import Declaration
-from bayesmc.network.store import meant
 from bayesmc.randomness import Purpose, seed_sequence, stream
 
 if TYPE_CHECKING:
@@ -369,7 +374,7 @@ class DynamicBayesNet:
     def __getitem__(self, name: str) -> Node:
         if name not in self._later:
             raise UnknownNodeError(
-                f"the template has no node {name!r}{meant(self, name)}; its nodes are {list(self)}"
+                f"the template has no node {name!r}{did_you_mean(name, self)}; its nodes are {list(self)}"
             )
         return self._store.record(name, self.plates)
 

@@ -22,8 +22,8 @@ from bayesmc.errors import (
     InterruptWarning,
     ModelError,
     UnsupportedError,
+    did_you_mean,
 )
-from bayesmc.network.store import meant
 from bayesmc.results import SeriesPosterior
 
 #: functions whose expectation is wanted in every slice, by name
@@ -153,7 +153,7 @@ class FilterEngine:
         for name in given:
             if name not in known:
                 raise EvidenceError(
-                    f"static= gives {name!r}, which is no static node{meant(known, name)}; there are "
+                    f"static= gives {name!r}, which is no static node{did_you_mean(name, known)}; there are "
                     f"{list(known)}"
                 )
         return self._nothing(dbn.copy(), given, rng)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import DensityError, ModelError, ParameterError, UnknownNodeError
+from bayesmc.errors import (
+    DensityError,
+    ModelError,
+    ParameterError,
+    UnknownNodeError,
+    did_you_mean,
+)
 from bayesmc.network.compile import compile_model
 from bayesmc.network.model import Model
 from bayesmc.network.node import Declaration, Potential
@@ -112,12 +117,4 @@ def check_parents(
 
 def unknown(declarations: Mapping[str, Declaration], name: str) -> str:
     """That there is no such node, and which one may be meant."""
-    return f"the net has no node {name!r}{meant(declarations, name)}"
-
-
-def meant(names: Iterable[str], name: object) -> str:
-    """Which of some names one that is not there may stand for, in brackets; empty if none is like it."""
-    known = list(names)
-    alike = [n for n in known if n.casefold() == str(name).casefold()]
-    near = alike or difflib.get_close_matches(str(name), known, n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
+    return f"the net has no node {name!r}{did_you_mean(name, declarations)}"

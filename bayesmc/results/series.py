@@ -11,9 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.store import meant
 from bayesmc.results.posterior import table_variance
 
 
@@ -161,7 +160,7 @@ class SeriesPosterior:
         node = self.model.nodes.get(name)
         if node is None:
             raise UnknownNodeError(
-                f"there is no node {name!r}{meant(self.names, name)}; answered are {list(self.names)}"
+                f"there is no node {name!r}{did_you_mean(name, self.names)}; answered are {list(self.names)}"
             )
         if name not in self._tables and name not in self._means:
             raise UnsupportedError(

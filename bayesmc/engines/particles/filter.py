@@ -30,9 +30,8 @@ from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError
+from bayesmc.errors import LowEssWarning, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network.forward import refuse_unsampled
-from bayesmc.network.store import meant
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -547,7 +546,7 @@ def _asked(queries: Queries, slices: Slices) -> list[str]:
             if name not in slices.dynamic:
                 raise UnknownNodeError(
                     f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice"
-                    f"{meant(slices.dynamic, name)}; there are {list(slices.dynamic)}"
+                    f"{did_you_mean(name, slices.dynamic)}; there are {list(slices.dynamic)}"
                 )
             found.append(name)
     return found
