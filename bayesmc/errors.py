@@ -22,9 +22,10 @@ def did_you_mean(name: Any, names: Iterable[Any]) -> str:
     (" (did you mean 'rain'?)", '')
     """
     known = list(dict.fromkeys(map(str, names)))
-    near = difflib.get_close_matches(str(name), known, n=1)
+    folded = {k.lower(): k for k in known}
+    same = folded.get(str(name).lower())
+    near = [same] if same is not None else difflib.get_close_matches(str(name), known, n=1)
     if not near:
-        folded = {k.lower(): k for k in known}
         near = [folded[k] for k in difflib.get_close_matches(str(name).lower(), folded, n=1)]
     return f" (did you mean {near[0]!r}?)" if near else ""
 

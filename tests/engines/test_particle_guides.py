@@ -22,7 +22,7 @@ from bayesmc.testing import session
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 
 Density = Callable[..., Any]
-RUNS, PARTICLES, STEPS = session.scaled(150), 100, 5
+RUNS, PARTICLES, STEPS = session.scaled(120), 100, 5
 
 
 def level(seen: Density, moves: Density | None = None, first: Any = None) -> Any:
@@ -107,7 +107,10 @@ CASES: dict[str, tuple[Any, Any, float]] = {
 
 
 #: those much like others
-LIKE = {"NegativeBinomial", "Categorical", "Gamma", "Truncated", "StudentT, hidden"}
+LIKE = {
+    *("Poisson", "NegativeBinomial", "Categorical", "Gamma", "Truncated", "mixture"),
+    *("StudentT, hidden", "Gamma, hidden"),
+}
 
 
 def side_by_side(rows: Any, runs: int) -> dict[str, Any]:
@@ -185,7 +188,7 @@ def random_case(seed: int) -> Any:
 
 
 @pytest.mark.parametrize(
-    "seed", [0, 4, *(pytest.param(k, marks=pytest.mark.thorough) for k in (1, 2, 3, *range(5, 60)))]
+    "seed", [0, *(pytest.param(k, marks=pytest.mark.thorough) for k in range(1, 60))]
 )
 def test_guides_of_random_models_change_no_evidence(seed: int) -> None:
     """Mean of Z-hat / Z within 4 standard errors of 1 (6e-5 each)."""
