@@ -158,7 +158,9 @@ def hidden_chain() -> Model:
     net.add("level", bmc.Normal(CENTRES, 0.5), plates="k")
     for t in range(5):
         before = ["row"] + ([f"s{t - 1}"] if t else [])
-        moved = (lambda row, s: bmc.Categorical(row[s])) if t else (lambda row: bmc.Categorical(row[0]))
+        moved = (
+            (lambda row, s: bmc.Categorical(row[s])) if t else (lambda row: bmc.Categorical(row[0]))
+        )
         net.add(f"s{t}", moved, parents=before)
         net.add(f"y{t}", lambda s, m: bmc.Normal(m[s], 0.8), parents=[f"s{t}", "level"])
     return Model(net, tuple(f"y{t}" for t in range(5)), ("s0", "s2", "s4"))
