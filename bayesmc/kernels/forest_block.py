@@ -136,7 +136,7 @@ class ForestBlock(Kernel):
         return new, memory
 
     def _room(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
-        """Arrays to be filled, the same in every sweep: new ones would cost more than what is put into them."""
+        """Arrays to be filled, the same in every sweep: new ones cost more than filling them."""
         if self._kept is None or self._kept[0].shape[-1] != rows:
             single = np.empty((self.states, len(self.names), rows))
             self._kept = single, np.empty((self.states, self.states, self.forest.tables, rows))

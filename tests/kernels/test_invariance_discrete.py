@@ -374,9 +374,9 @@ CASES = {
         tied(False), joint(TableSweep), {"tempered": joint(TableSweep, power=0.6)}, how="moving"
     ),
     "forest": Case(
-        hidden_chain(), forest(), {"a factor is forgotten": forest(slice(1, None))},
+        hidden_chain(), forest(), {"factors are forgotten": forest(slice(3, None))},
         statistics={"pairs": lambda s, y: sum(s[f"s{t}"] * s[f"s{t + 1}"] for t in range(4)) * 1.0},
-        sizes={"replications": 300},
+        sizes={"replications": 400},
     ),
     "jump anywhere": Case(labels(), jump("z"), of_jumps("z")),
     "jump by colours": Case(
