@@ -95,20 +95,20 @@ class ForestBlock(Kernel):
             if seen is not None and seen.mask is not None:
                 for k in range(self.cards[i]):
                     self.possible[k, i][seen.mask & (seen.value != k)] = -np.inf
+        self._kept: tuple[np.ndarray, np.ndarray] | None = None
         size = f"{len(edges)} pairs of {len(names)} nodes, {self.states} states"
         self.match = f"filtering and sampling along {size}"
 
     def log_factors(self, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray, bool]:
         """Log factors on single nodes and on pairs, as ``Forest.draw`` takes them; are all proper?
 
-        Rows are chains, and elements of the plates within them.
+        Rows are chains, and elements of the plates within them. The arrays are good until the next call.
         """
         chains = len(values[self.names[0]])
         rows = chains * math.prod(self.plate_shape)
-        single = np.empty((self.states, len(self.names), chains, *self.plate_shape))
-        single[:] = self.possible[:, :, None]
-        single = single.reshape(self.states, len(self.names), rows)
-        pairs = np.zeros((self.states, self.states, self.forest.tables, rows))
+        single, pairs = self._room(rows)
+        single.reshape(*single.shape[:2], chains, *self.plate_shape)[:] = self.possible[:, :, None]
+        pairs[:, :, : self.forest.edges] = 0.0
         state = self.read.placed(values)
         proper = True
         for reader, at in zip(self.read.all, self.places, strict=True):
@@ -134,6 +134,13 @@ class ForestBlock(Kernel):
         if not proper:
             self._check({**values, **new})
         return new, memory
+
+    def _room(self, rows: int) -> tuple[np.ndarray, np.ndarray]:
+        """Arrays to be filled, the same in every sweep: new ones cost more than filling them."""
+        if self._kept is None or self._kept[0].shape[-1] != rows:
+            single = np.empty((self.states, len(self.names), rows))
+            self._kept = single, np.empty((self.states, self.states, self.forest.tables, rows))
+        return self._kept
 
     def _spread(self, drawn: np.ndarray) -> Values:
         """The values of each node, from positions ``(nodes, rows)``."""

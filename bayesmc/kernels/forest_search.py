@@ -21,8 +21,8 @@ from bayesmc.structure.target import Target
 
 #: states of a node of a forest
 _STATES = 64
-#: log factors on pairs that one term may make, for one chain
-_ENTRIES = 1 << 20
+#: log factors that one term may make, and all together, for one chain
+_ENTRIES, _TOTAL = 1 << 20, 1 << 22
 #: blocks for the nodes of the same plates: where more are needed, nodes are tied too densely for it to pay
 _BLOCKS = 8
 #: a node in plates that is mostly observed is drawn where it is hidden, and there alone
@@ -120,12 +120,13 @@ def _families(target: Target, names: Sequence[str]) -> dict[str, tuple[int, int]
 def _forests(target: Target, order: Sequence[str]) -> list[set[str]]:
     """Forests that together hold every node that shares a term with another, as large as they come."""
     members = members_of(target, order)
+    entries = [_entries(target, term, these) for term, these in members.items()]
+    if max(entries) > _ENTRIES or sum(entries) > _TOTAL:
+        return []
     touching: dict[str, list[tuple[str, ...]]] = {n: [] for n in order}
-    for term, these in members.items():
+    for these in members.values():
         for name in these:
             touching[name].append(these)
-            if _entries(target, term, these) > _ENTRIES:
-                return []
     left = [n for n in order if any(len(m) > 1 for m in touching[n])]
     found: list[set[str]] = []
     while left:

@@ -17,6 +17,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.forest_block import ForestBlock
 from bayesmc.kernels.joint_states import JointStates, TabulatedStates, joint_states
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
@@ -150,6 +151,21 @@ def ordered() -> Model:
     return Model(net, ("y",))
 
 
+def hidden_chain() -> Model:
+    """States of five slices under rates and levels that stay where they are."""
+    net = bmc.BayesNet(plates={"k": 3})
+    net.add("row", bmc.Dirichlet([2.0, 1.0, 3.0]), plates="k")
+    net.add("level", bmc.Normal(CENTRES, 0.5), plates="k")
+    for t in range(5):
+        before = ["row"] + ([f"s{t - 1}"] if t else [])
+        moved = (
+            (lambda row, s: bmc.Categorical(row[s])) if t else (lambda row: bmc.Categorical(row[0]))
+        )
+        net.add(f"s{t}", moved, parents=before)
+        net.add(f"y{t}", lambda s, m: bmc.Normal(m[s], 0.8), parents=[f"s{t}", "level"])
+    return Model(net, tuple(f"y{t}" for t in range(5)), ("s0", "s2", "s4"))
+
+
 def counts() -> Model:
     net = bmc.BayesNet(plates={"k": 3, "i": 8})
     net.add("n", bmc.Poisson([2.0, 3.0, 5.0]), plates="k")
@@ -262,6 +278,15 @@ def _around(target: Target) -> Any:
     return FiniteTerms(target).around(("z", "w"))
 
 
+def forest(readers: slice = slice(None)) -> Make:
+    def make(target: Target) -> Kernel:
+        block = ForestBlock(target, [f"s{t}" for t in range(5)])
+        block.read.all, block.places = block.read.all[readers], block.places[readers]
+        return block
+
+    return make
+
+
 class Upwards(Jump):
     """Jumps up five times as often as down; around a circle of states in one direction alone."""
 
@@ -347,6 +372,11 @@ CASES = {
     ),
     "joint states, one table": Case(
         tied(False), joint(TableSweep), {"tempered": joint(TableSweep, power=0.6)}, how="moving"
+    ),
+    "forest": Case(
+        hidden_chain(), forest(), {"factors are forgotten": forest(slice(3, None))},
+        statistics={"pairs": lambda s, y: sum(s[f"s{t}"] * s[f"s{t + 1}"] for t in range(4)) * 1.0},
+        sizes={"replications": 400},
     ),
     "jump anywhere": Case(labels(), jump("z"), of_jumps("z")),
     "jump by colours": Case(

@@ -294,6 +294,14 @@ MUTANTS = [
         "compare with exact(), 30 chains of 100 draws",
     ),
     Mutant(
+        "particle Metropolis takes steps to anywhere for symmetric",
+        (Edit("bayesmc.pmcmc.walk:ParameterWalk.step",
+              "(estimate - likelihood) + backward", "(estimate - likelihood)"),),
+        matched(unknown_drift, RISING,
+                bmc.ParticleMetropolis(draws=100, warmup=30, chains=30, particles=20)),
+        "compare with exact(), 30 chains of 100 draws",
+    ),
+    Mutant(
         "particle Gibbs does not keep the trajectory",
         (Edit("bayesmc.pmcmc.filters:ConditionalFilter._kept", "found[-1] = trajectory", "pass"),),
         matched(line, RISING, bmc.ParticleGibbs(draws=100, warmup=20, chains=40, particles=4)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from typing import Any
 
@@ -10,6 +11,7 @@ import pytest
 import scipy.special
 
 import bayesmc as bmc
+from bayesmc.distributions import marking_invalid
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import ConvergenceWarning, UnsupportedError
 from bayesmc.pmcmc import ParticleMetropolis
@@ -141,6 +143,62 @@ def test_noisy_estimates_are_warned_of() -> None:
     assert len(noisy) == 1
     assert issubclass(noisy[0].category, ConvergenceWarning)
     assert noisy[0].filename == __file__
+
+
+def logits(steps: int) -> tuple[bmc.DynamicBayesNet, dict[str, Any]]:
+    """Successes of 50 at a level that is pulled back to a mean: all of it unknown, and the prior far off."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("mu", bmc.Normal(5.0, 5.0))
+    dbn.add_static("phi", bmc.Uniform(0.0, 1.0))
+    dbn.add_static("sigma", bmc.HalfNormal(2.0))
+
+    def first(mu: Any, phi: Any, sigma: Any) -> Any:
+        return bmc.Normal(mu, sigma / np.sqrt(1 - phi**2))
+
+    def moved(x_prev: Any, mu: Any, phi: Any, sigma: Any) -> Any:
+        return bmc.Normal(mu + phi * (x_prev - mu), sigma)
+
+    dbn.add("x", moved, initial=first)
+    dbn.add("y", lambda x: bmc.Binomial(50, logits=x))
+    rng, x = np.random.default_rng(3), [-2.0]
+    while len(x) < steps:
+        x.append(-2.0 + 0.9 * (x[-1] + 2.0) + 0.3 * rng.standard_normal())
+    return dbn, {"y": rng.binomial(50, scipy.special.expit(x))}
+
+
+@pytest.mark.parametrize("steps", [20, pytest.param(80, marks=pytest.mark.thorough)])
+def test_chains_start_where_the_mass_is(steps: int) -> None:
+    """By a pilot, which chooses the number of particles, too: more for more rows and for the same error."""
+    dbn, rows = logits(steps)
+    problem = pose_any(dbn, rows)
+    sampler = ParticleMetropolis().sampler(problem)
+    with marking_invalid(), np.errstate(all="ignore"):
+        state = sampler.start(np.random.default_rng(0), 40)
+        mu = state["values"]["mu"]
+        assert np.abs(np.median(mu) + 2.0) < 0.8 and mu.std() < 2.0  # the prior says 5 +- 5
+        (walk,), (memory,) = sampler.kernels, state["memory"]
+        values = {**sampler.target.known, **state["values"]}
+        same = {n: np.repeat(v[:1], 40, axis=0) for n, v in state["values"].items()}
+        looks = walk.filter.of(memory["particles"]).run(
+            {**values, **same}, 40, np.random.default_rng(1)
+        )
+        error = looks.log_likelihood.std()
+    assert 50 <= memory["particles"] < 1000
+    assert 0.3 < error < 2.2  # aimed at is 1.2, at least 50 particles are taken
+    given = ParticleMetropolis(particles=70).sampler(problem)
+    with marking_invalid(), np.errstate(all="ignore"):
+        assert given.start(np.random.default_rng(0), 4)["memory"][0]["particles"] == 70
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("engine", [ParticleMetropolis(), bmc.ParticleGibbs()])
+def test_five_hundred_rows_of_counts(engine: Any) -> None:
+    """400 effective draws of each parameter at default settings; the time it takes stands in the message."""
+    dbn, rows = logits(500)
+    begin = time.process_time()
+    found = bmc.infer(dbn, rows, engine=engine, rng=0, keep=["mu", "phi", "sigma"])
+    ess = {n: float(found.ess(n)) for n in ("mu", "phi", "sigma")}
+    assert min(ess.values()) > 250, (ess, time.process_time() - begin)
 
 
 def test_refusals() -> None:
