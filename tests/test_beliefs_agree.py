@@ -48,7 +48,7 @@ def gone_through(case: Series, engine: Any, interrupt: Any) -> list[dict[str, An
 @pytest.mark.parametrize(("name", "kind"), [(n, k) for n in ONLINE for k in ONLINE[n][1]])
 def test_beliefs_go_on_after_a_pickle(name: str, kind: str) -> None:
     engine, tried = ONLINE[name][0], 0
-    for _, case in cases(kind, 2 * MANY):
+    for _, case in cases(kind, MANY):
         dbn = case.dbn
 
         def travel(belief: Any, dbn: Any = dbn) -> Any:
@@ -63,9 +63,7 @@ def test_beliefs_go_on_after_a_pickle(name: str, kind: str) -> None:
             for key, value in one.items():
                 assert np.array_equal(value, other[key], equal_nan=True), (case.dbn, key)
         tried += 1
-        if tried == MANY:
-            break
-    assert tried >= MANY / 2
+    assert tried >= MANY / 3
 
 
 def test_a_belief_with_other_random_numbers_is_seen() -> None:

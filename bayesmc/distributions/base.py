@@ -362,8 +362,7 @@ class Distribution:
             "a function that returns the value, or give it a little noise (Exact() and Kalman filters take "
             "it as it is)", index, 0.0,
         )  # fmt: skip
-        none = np.broadcast_to(none, self.batch_shape)
-        self.noiseless = none
+        self.noiseless = none = np.broadcast_to(none, self.batch_shape)
         self.invalid = none if self.invalid is None else self.invalid | none
         self.problem = self.problem or error
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import LogNormal, MvNormal
+from bayesmc.distributions.noiseless import with_noise
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.gaussian_layout import BlockSums, Layout
 from bayesmc.kernels.gaussian_order import elements_read
@@ -186,8 +187,8 @@ class BlockTerm:
         if self.dynamic is not None:
             child = self.children[self.dynamic]
             dist, _, keys = self.blankets[self.dynamic].distribution(child, state)
-            return dist, keys
-        return self.term.distribution(state)[0], ()
+            return with_noise(dist), keys
+        return with_noise(self.term.distribution(state)[0]), ()
 
     def _mark_invalid(self, dist: Any, sums: BlockSums) -> None:
         if dist.invalid is None:

@@ -85,8 +85,8 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
         at = first_index(missing & np.expand_dims(partly, event))
         raise EvidenceError(
             f"evidence on {node.name!r}: of one vector the entry at {_index(at)} is missing and others are "
-            "not, which is answered for MvNormal and Joint only; split the vector into nodes of its parts, "
-            "leave all of it out, or put in what stands for no reading (of ranges: robotics.clean_ranges)"
+            "not, which is not supported; split the vector into nodes of its parts, leave all of it out, or "
+            "put in what stands for no reading (of ranges: robotics.clean_ranges)"
         )
     if every.all() and array.size:
         return None

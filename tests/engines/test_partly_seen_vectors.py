@@ -72,7 +72,7 @@ def test_masked_arrays_and_nodes_without_plates():
 def test_weighted_draws():
     """Within five standard errors: an alarm in two million for each of seven figures."""
     mean, _, log = given(dense(), [1, 3, 7], np.array([1.0, 0.5, 0.3]))
-    found = bmc.infer(sensors(), EVIDENCE, engine=bmc.LikelihoodWeighting(50_000), rng=2)
+    found = bmc.infer(sensors(), EVIDENCE, engine=bmc.LikelihoodWeighting(20_000), rng=2)
     off = np.abs(found.mean("v").ravel() - mean[1:7])
     assert (off <= 5 * found.mcse("v").ravel() + 1e-12).all()
     assert abs(found.log_marginal_likelihood - log) < 5 * found.log_marginal_likelihood_mcse
@@ -92,7 +92,7 @@ def test_weighted_draws_of_independent_parts():
     rows = np.array([[1.0, 0, 0], [1.0, 0, 0]])
     cov = np.block([[COV, COV @ rows.T], [rows @ COV, rows @ COV @ rows.T + np.eye(2)]])
     mean, _, log = given(cov, [3, 4], np.array([1.0, 0.5]))
-    engine = bmc.LikelihoodWeighting(50_000)
+    engine = bmc.LikelihoodWeighting(20_000)
     found = bmc.infer(net, {"j": [1.0, NAN, 0.5, NAN]}, engine=engine, rng=1)
     assert (np.abs(found.mean("v") - mean[:3]) <= 5 * found.mcse("v")).all()
     assert abs(found.log_marginal_likelihood - log) < 5 * found.log_marginal_likelihood_mcse
@@ -187,5 +187,5 @@ def test_other_filters_name_the_node():
 def test_families_without_marginals_are_refused():
     net = bmc.BayesNet(plates={"p": 2})
     net.add("d", bmc.Dirichlet(np.ones(3)), plates="p")
-    with pytest.raises(EvidenceError, match="answered for MvNormal and Joint only"):
+    with pytest.raises(EvidenceError, match="of one vector.*is not supported; split"):
         bmc.infer(net, {"d": [[NAN, 0.5, 0.5], [0.2, 0.3, 0.5]]})

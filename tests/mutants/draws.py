@@ -100,7 +100,7 @@ MUTANTS = [
     Mutant(
         "a missing plate entry is weighted as if observed",
         (Edit("bayesmc.network.forward:DrawAndWeigh.__call__",
-              "np.where(self.elements, density, 0.0)", "density"),),
+              "np.where(self.elements, density, partial)", "density"),),
         matched(plated, {"y": [2.0, np.nan, np.nan]}, WEIGHTED),
         MATCHED,
     ),

@@ -17,7 +17,7 @@ from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.levels import why_not_matched
 from bayesmc.engines.kalman.passes import Filtered, State, forward
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
-from bayesmc.engines.kalman.rows import Memory, impossible_row
+from bayesmc.engines.kalman.rows import Memory, contradicts, impossible_row
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.kernels.kalman import multiplied
@@ -94,7 +94,7 @@ class KalmanFilter(GaussianFilter):
             error: Exception = DegeneracyError(
                 f"the row of slice {k} has no density given those before", k
             )
-            if (found.increments[k] == -np.inf).any():
+            if contradicts(data.layout(k), found.increments[k]):
                 error = impossible_row(k)
             if k:
                 hand_over(error, filter_answers(self, problem, data, found.first(k)))

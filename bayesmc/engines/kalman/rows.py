@@ -25,6 +25,14 @@ from bayesmc.kernels.kalman import Conditioned, condition
 _KEPT = 64
 
 
+def contradicts(layout: Layout, log: np.ndarray, made: Conditioned | None = None) -> bool:
+    """Whether a row without density is one that contradicts what is known without noise."""
+    bare = any(layout.model[n].noiseless for n in layout.order)
+    return bool((log == -np.inf).any()) and (
+        bare or (made is not None and made.certain is not None)
+    )
+
+
 def impossible_row(t: int) -> ZeroProbabilityError:
     """What is seen is not what it must be: the error that says so."""
     return ZeroProbabilityError(
@@ -130,7 +138,7 @@ class RowTaker:
         angles = _angles(layout, pattern)
         after, eta, log = absorbed(layout, pattern, made, mean, target, given, angles)
         log = log + certain_density(layout, values)
-        if (log == -np.inf).any():
+        if contradicts(layout, log, made):
             raise impossible_row(row.t)
         if not (np.isfinite(after).all() and np.isfinite(log).all()):
             raise DegeneracyError(
