@@ -43,8 +43,8 @@ def fit_odometry(motion: Any, moved: Any) -> tuple[float, float, float, float]:
     Returns
     -------
     tuple of four floats
-        ``alphas`` of ``OdometryMotion``, each between 1e-6 and 1, by turns and distances alone; steps that are
-        off by more than three deviations count as strays. Known poses are taken to be off by
+        ``alphas`` of ``OdometryMotion``, each between 1e-6 and 1, by turns and distances alone; steps
+        that are off by more than three deviations are strays. Known poses are taken to be off by
         1 cm and 0.01 rad themselves.
 
     Raises
