@@ -189,7 +189,9 @@ def draw_run(ax: Any, x: np.ndarray, y: np.ndarray) -> None:
         (MEAN, picture.FAINT, "mean left out"), (0.0, picture.OTHER, "as declared"),
     ):  # fmt: skip
         engine = bmc.ExtendedKalmanFilter()
-        belief = bmc.filter(template(1, left_out), {"y": y}, engine=engine)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ModelMisfitWarning)
+            belief = bmc.filter(template(1, left_out), {"y": y}, engine=engine)
         ax.plot(belief.mean("x")[:, 0] - x[:, 0], color=colour, lw=1.3, label=f"EKF, {label}")
     claimed = 2 * belief.std("x")[:, 0]
     ax.fill_between(np.arange(STEPS), -claimed, claimed, color=picture.DRAWS, alpha=0.6, lw=0,

@@ -194,7 +194,7 @@ class SeriesPosterior:
         >>> dbn.add("y", lambda x: bmc.Normal(x, 1.0))
         >>> filtered = bmc.filter(dbn, {"y": [0.0, 4.0, 4.5]}, engine=bmc.KalmanFilter())
         >>> filtered.predictive_ranks("y").round(3).tolist()
-        [0.5, 0.993, 0.872]
+        [0.5, 0.994, 0.904]
         """
         if name not in self.model.nodes:
             raise UnknownNodeError(f"there is no node {name!r}; there are {list(self.model.nodes)}")

@@ -10,6 +10,7 @@ from __future__ import annotations
 from bayesmc.robotics.aimed import AimedPoses, SensorPoses
 from bayesmc.robotics.beams import BeamFit, BeamModel, Beams, clean_ranges, fit_beams
 from bayesmc.robotics.brightness import Ceiling
+from bayesmc.robotics.calibration import FieldFit, fit_field, fit_odometry
 from bayesmc.robotics.field import FieldScan, LikelihoodField
 from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
 from bayesmc.robotics.landmarks import (
@@ -45,6 +46,7 @@ __all__ = [
     "BeamModel",
     "Beams",
     "Ceiling",
+    "FieldFit",
     "FieldScan",
     "FreeSpace",
     "LikelihoodField",
@@ -64,6 +66,8 @@ __all__ = [
     "cone_range",
     "euler_step",
     "fit_beams",
+    "fit_field",
+    "fit_odometry",
     "inverse",
     "mean_pose",
     "pose_errors",

@@ -138,6 +138,24 @@ class LikelihoodField:
         """
         return FieldScan(self, pose, angles)
 
+    def by_beam(self, pose: Any, angles: Any, ranges: Any) -> np.ndarray:
+        """Log density (tempered) of each range of scans, each from its own pose.
+
+        Parameters
+        ----------
+        pose : array_like, shape (scans, 3)
+        angles : array_like, shape (beams,)
+        ranges : array_like, shape (scans, beams)
+            Whatever they are; no returns are not left out here.
+
+        Returns
+        -------
+        ndarray, shape (scans, beams)
+        """
+        ranges = as_float(ranges)
+        found = self._table.along(as_float(pose), as_float(angles), ranges[..., None])
+        return np.asarray(found[..., 0], dtype=float)
+
     @property
     def log_random(self) -> float:
         """Log density (tempered) of an end point that no obstacle explains."""

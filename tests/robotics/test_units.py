@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import bayesmc as bmc
@@ -119,6 +118,7 @@ def test_turns_in_degrees_are_refused(engine: Any) -> None:
 
 def test_tables_that_are_transposed_are_named() -> None:
     """By their labels where they are square, by the length of the others where they are not."""
+    pd = pytest.importorskip("pandas")
     n = len(MARKS)
     dbn = bmc.DynamicBayesNet(plates={"mark": n})
     dbn.input("u", plates="mark")
