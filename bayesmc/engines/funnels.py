@@ -33,7 +33,7 @@ _AT_END = 100.0
 #: shares of the draws at an end that the functions h look at, and their width in standard deviations
 _ENDS, _WIDTH = (0.25, 0.1, 0.05), 0.25
 #: numbers that densities are evaluated of, at most; parameters looked at; draws below which none is judged
-_NUMBERS, _PARAMETERS, _FEW = 4_000_000, 12, 400
+_NUMBERS, _PARAMETERS, _FEW = 2_000_000, 12, 400
 #: step of the derivative, in standard deviations
 _STEP = 1e-4
 
@@ -58,8 +58,11 @@ def missed_ends(posterior: ChainsPosterior, forward: frozenset[str]) -> Iterator
         if stored is None:
             continue
         looked += 1
-        with marking_invalid(), np.errstate(all="ignore"):
-            found = _worst(problem.model, name, stored, forward, posterior.ensemble_size)
+        try:
+            with marking_invalid(), np.errstate(all="ignore"):
+                found = _worst(problem.model, name, stored, forward, posterior.ensemble_size)
+        except Exception:  # a function that minds being asked beside a draw must not cost a run
+            continue
         if found is None or not found[0] > _LIMIT:
             continue
         z, end, edge = found
@@ -113,16 +116,33 @@ def _ends(node: CompiledNode) -> tuple[float, float] | None:
 
 def _terms(model: Model, name: str) -> tuple[list[str], list[str], list[str]]:
     """Computed nodes that depend on a node, in order; nodes whose density does; and potentials."""
+    place, children = _children(model)
     moved, computed, terms = {name}, [], [name]
-    for other, node in model.nodes.items():
-        if moved & set(node.parents):
-            if node.kind == "deterministic":
-                moved.add(other)
-                computed.append(other)
-            elif node.is_stochastic:
-                terms.append(other)
+    todo = list(children[name])
+    while todo:
+        other = todo.pop()
+        if other in moved or other in terms:
+            continue
+        if model[other].kind == "deterministic":
+            moved.add(other)
+            computed.append(other)
+            todo += children[other]
+        elif model[other].is_stochastic:
+            terms.append(other)
+    computed.sort(key=place.__getitem__)
     factors = [n for n, (p, _) in model.potentials.items() if moved & set(p.parents)]
     return computed, terms, factors
+
+
+def _children(model: Model) -> tuple[dict[str, int], dict[str, list[str]]]:
+    """Place of every node in topological order, and its children; found once."""
+    if "children" not in model.cache:
+        children: dict[str, list[str]] = {n: [] for n in model.nodes}
+        for name, node in model.nodes.items():
+            for parent in dict.fromkeys(node.parents):
+                children[parent].append(name)
+        model.cache["children"] = {n: i for i, n in enumerate(model.nodes)}, children
+    return model.cache["children"]
 
 
 def _involved(model: Model, name: str, forward: frozenset[str]) -> list[str]:
