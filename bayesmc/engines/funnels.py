@@ -1,15 +1,16 @@
 """Whether chains have missed an end of a parameter that governs others: the neck of a funnel.
 
-Where effects are weak, their scale may be near zero, and the effects with it. Steps that suit the wide part are
-refused in the neck, so chains turn back at its mouth and look well mixed where they are. What shows it is an
-identity that holds for every density that vanishes at its ends: with u the parameter as a free number, s its
-score ``d log p / d u`` and h any smooth bounded function, ``E[h s + h'] = 0``. Draws that turn back at a wall
-violate it by the density at the wall, and most so with an h that looks at one end alone.
+Where effects are weak, their scale may be near zero, and the effects with it. Steps that suit the wide part
+are refused in the neck, so chains turn back at its mouth and look well mixed where they are. What shows it is
+an identity that holds for every density that vanishes at its ends: with u the parameter as a free number, s
+its score ``d log p / d u`` and h any smooth bounded function, ``E[h s + h'] = 0``. Draws that turn back at a
+wall violate it by the density at the wall, and most so with an h that looks at one end alone.
 
 References
 ----------
-Neal (2003), Slice sampling, Annals of Statistics 31, sec. 8; Gorham and Mackey (2015), Measuring sample quality
-with Stein's method, NIPS 28; Betancourt and Girolami (2015), Hamiltonian Monte Carlo for hierarchical models.
+Neal (2003), Slice sampling, Annals of Statistics 31, sec. 8; Gorham and Mackey (2015), Measuring sample
+quality with Stein's method, NIPS 28; Hall (1992), JRSS B 54, eq. 2.4; Betancourt and Girolami (2015),
+Hamiltonian Monte Carlo for hierarchical models.
 """
 
 from __future__ import annotations
@@ -25,12 +26,14 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results import ChainsPosterior
 
-#: standard errors that the identity may be off: a false alarm in some thousand parameters
+#: standard errors that the identity may be off: a false alarm in a thousand parameters of a right sampler
 _LIMIT = 4.0
+#: effective draws at an end below which it is not judged: squares of effects are skewed
+_AT_END = 100.0
 #: shares of the draws at an end that the functions h look at, and their width in standard deviations
 _ENDS, _WIDTH = (0.25, 0.1, 0.05), 0.25
 #: numbers that densities are evaluated of, at most; parameters looked at; draws below which none is judged
-_NUMBERS, _PARAMETERS, _FEW = 4_000_000, 12, 400
+_NUMBERS, _PARAMETERS, _FEW = 2_000_000, 12, 400
 #: step of the derivative, in standard deviations
 _STEP = 1e-4
 
@@ -55,17 +58,20 @@ def missed_ends(posterior: ChainsPosterior, forward: frozenset[str]) -> Iterator
         if stored is None:
             continue
         looked += 1
-        with marking_invalid(), np.errstate(all="ignore"):
-            found = _worst(problem.model, name, stored, forward, posterior.ensemble_size)
+        try:
+            with marking_invalid(), np.errstate(all="ignore"):
+                found = _worst(problem.model, name, stored, forward, posterior.ensemble_size)
+        except Exception:  # a function that minds being asked beside a draw must not cost a run
+            continue
         if found is None or not found[0] > _LIMIT:
             continue
         z, end, edge = found
         shown = ", ".join(map(repr, children[:3]))
         yield (
-            f"draws of {name!r} turn back at its {end} end, near {edge:.3g}, where their density goes on (its score "
-            f"is off by {z:.1f} standard errors): the chains have not entered a funnel, and what they say of {name!r} "
-            f"is wrong by more than its error; declare {shown} without it and scale afterwards (b = {name} * z, with z "
-            "of scale 1), or compare with another engine"
+            f"draws of {name!r} turn back at its {end} end, near {edge:.3g}, where their density goes on "
+            f"(its score is off by {z:.1f} standard errors): the chains have not entered a funnel, and what "
+            f"they say of {name!r} is wrong by more than its error; declare {shown} without it and scale "
+            f"afterwards (b = {name} * z, with z of scale 1), or compare with another engine"
         )
 
 
@@ -110,16 +116,33 @@ def _ends(node: CompiledNode) -> tuple[float, float] | None:
 
 def _terms(model: Model, name: str) -> tuple[list[str], list[str], list[str]]:
     """Computed nodes that depend on a node, in order; nodes whose density does; and potentials."""
+    place, children = _children(model)
     moved, computed, terms = {name}, [], [name]
-    for other, node in model.nodes.items():
-        if moved & set(node.parents):
-            if node.kind == "deterministic":
-                moved.add(other)
-                computed.append(other)
-            elif node.is_stochastic:
-                terms.append(other)
+    todo = list(children[name])
+    while todo:
+        other = todo.pop()
+        if other in moved or other in terms:
+            continue
+        if model[other].kind == "deterministic":
+            moved.add(other)
+            computed.append(other)
+            todo += children[other]
+        elif model[other].is_stochastic:
+            terms.append(other)
+    computed.sort(key=place.__getitem__)
     factors = [n for n, (p, _) in model.potentials.items() if moved & set(p.parents)]
     return computed, terms, factors
+
+
+def _children(model: Model) -> tuple[dict[str, int], dict[str, list[str]]]:
+    """Place of every node in topological order, and its children; found once."""
+    if "children" not in model.cache:
+        children: dict[str, list[str]] = {n: [] for n in model.nodes}
+        for name, node in model.nodes.items():
+            for parent in dict.fromkeys(node.parents):
+                children[parent].append(name)
+        model.cache["children"] = {n: i for i, n in enumerate(model.nodes)}, children
+    return model.cache["children"]
 
 
 def _involved(model: Model, name: str, forward: frozenset[str]) -> list[str]:
@@ -171,6 +194,7 @@ def _worst(
     score = (log[0] - log[1]) / (2 * step) + slope(u)
     if score.shape != u.shape or not np.isfinite(score).all():
         return None
+    effective = float(diagnostics.chain_statistic("ess", u, block))
     found = []
     for end, turned in (("lower", u), ("upper", -u)):
         sign = 1.0 if end == "lower" else -1.0
@@ -178,11 +202,21 @@ def _worst(
             t = (turned - np.quantile(turned, share)) / (_WIDTH * spread)
             h = 1.0 / (1.0 + np.exp(t))
             figure = h * sign * score - h * (1 - h) / (_WIDTH * spread)
-            error = float(diagnostics.chain_statistic("mcse", figure, block))
-            if error > 0:
+            if share * effective >= _AT_END:
                 edge = float(back(np.asarray(sign * turned.min())))
-                found.append((-float(figure.mean()) / error, end, edge))
+                found.append((_errors_below(figure, block), end, edge))
     return max(found, default=None)
+
+
+def _errors_below(figure: np.ndarray, block: int) -> float:
+    """Standard errors by which a mean lies below zero, or fewer where skewness explains it (Hall 1992)."""
+    error = float(diagnostics.chain_statistic("mcse", figure, block))
+    if not error > 0:
+        return 0.0
+    z = -float(figure.mean()) / error
+    skewness = -float(((figure - figure.mean()) ** 3).mean()) / float(figure.std()) ** 3
+    a = skewness * error / float(figure.std())  # over the root of the effective draws
+    return min(z, z + a * (z * z / 3 + 1 / 6) + a * a * z**3 / 27)
 
 
 def _free(low: float, high: float) -> tuple[Any, Any, Any]:

@@ -186,10 +186,10 @@ class ChainsPosterior(_Chains, DrawsPosterior):
         >>> net.add("mean", bmc.Normal(0.0, 10.0), plates="cluster")
         >>> net.add("label", bmc.Bernoulli(0.5), plates="point")
         >>> net.add("x", lambda label, mean: bmc.Normal(mean[label], 1.0), plates="point")
-        >>> data = {"x": [-3.0, -2.0, -2.5, 2.0, 3.0, 2.5]}
+        >>> data = {"x": [-3.2, -2.8, -3.0, 1.8, 2.2, 2.0]}
         >>> posterior = bmc.infer(net, data, engine=bmc.Gibbs(500, warmup=200), rng=0)
         >>> posterior.relabelled("mean").mean("mean").round()
-        array([-2.,  2.])
+        array([-3.,  2.])
         """
         self._node(by)
         problem = self._live("relabelled")
