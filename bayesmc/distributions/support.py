@@ -291,7 +291,6 @@ _NAMED = {
 }
 
 
-
 def is_half_line(support: Support) -> bool:
     """Whether a support is everything above one constant."""
     if support.kind != "interval" or not support.is_single:

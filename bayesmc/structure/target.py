@@ -73,7 +73,9 @@ class Term:
         try:
             return self.log_of(dist, batch, values[self.name])
         except DensityError as error:
-            raise DensityError(f"{error}{self.shown_at(values, error.index)}", error.index) from error
+            raise DensityError(
+                f"{error}{self.shown_at(values, error.index)}", error.index
+            ) from error
 
     def shown_at(self, values: Mapping[str, np.ndarray], index: Shape) -> str:
         """The values of the node and its parents at a place of its batch and plates, in words."""
@@ -104,14 +106,20 @@ class Term:
                 return result if self.mask is None else np.where(self.mask, result, 0.0)
         result = self.model.log_density(self.name, dist, value)
         if dist.invalid is not None:
-            lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
-            tolerated = self.rejects or (dist.problem is not None and dist.problem.is_overflow)
-            if not tolerated:
-                error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
-                if error is not None:
-                    raise error
+            if not self.rejects:
+                self.refuse_out_of_range(dist, batch, value)
             result = np.where(dist.invalid, -np.inf, result)
         return result if self.mask is None else np.where(self.mask, result, 0.0)
+
+    def refuse_out_of_range(self, dist: Distribution, batch: Shape, value: np.ndarray) -> None:
+        """Raise for parameters out of range, unless they over- or underflowed, where a chain is."""
+        if dist.problem is not None and dist.problem.is_overflow:
+            return
+        node = self.model[self.name]
+        lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
+        error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
+        if error is not None:
+            raise error
 
 
 @dataclass(frozen=True, eq=False)
