@@ -56,7 +56,14 @@ CHILDREN: dict[str, tuple[Callable[..., Any], Callable[[np.ndarray], np.ndarray]
 }
 
 
-@pytest.mark.parametrize("name", CHILDREN)
+@pytest.mark.parametrize(
+    "name",
+    ["density", "scipy, normal"]
+    + [
+        pytest.param(n, marks=pytest.mark.thorough)
+        for n in ("scipy, not normal", "density in another")
+    ],
+)
 def test_two_normal_parents(name: str) -> None:
     child, log = CHILDREN[name]
     net = effects(child)
