@@ -111,7 +111,7 @@ class _Search:
         def draw(count: int) -> Values:
             spread = float(self.rng.choice(_SPREADS))
             filled = {n: np.repeat(v, count // rows, axis=0) for n, v in given.items()}
-            return _drawn_all(self.target, count, spread, self.rng, filled)
+            return _drawn_all(self.target, count, spread, self.rng, filled)[0]
 
         try:
             values, scores = Climb(self.target, given, rows, self.rng, draw).climbed()
@@ -182,8 +182,12 @@ def _attempt(
     given: Values,
 ) -> tuple[Values, np.ndarray]:
     """Forward draws of the chain's nodes, and the log density of what was seen given them."""
-    values = _drawn_all(target, count, spread, rng, given)
+    values, undefined = _drawn_all(target, count, spread, rng, given)
     log = np.zeros(count)
+    for name, wrong in undefined.items():
+        log = np.where(wrong, -np.inf, log)
+        if wrong.all():
+            culprits[name] = culprits.get(name, 0) + 1
     inside = set(target.chain)
     for term in target.terms.values():
         if term.name in inside and target.seen(term.name) is None and term.name not in given:
@@ -199,22 +203,26 @@ def _attempt(
 
 def _drawn_all(
     target: Target, count: int, spread: float, rng: np.random.Generator, given: Values
-) -> Values:
-    """Values of all nodes: forward draws of the chain's, and what follows from them."""
+) -> tuple[Values, dict[str, np.ndarray]]:
+    """Values of all nodes: forward draws of the chain's, and what follows from them.
+
+    With them, by node, the draws whose own parameters are out of range, shape ``(count,)``.
+    """
     model = target.model
     values: Values = dict(target.known)
+    undefined: dict[str, np.ndarray] = {}
     inside = set(target.chain)
     for name in model.nodes:
         if name in inside:
             value = given[name] if name in given else None
             if value is None:
-                value = _drawn(target, model[name], values, count, spread, rng)
+                value = _drawn(target, model[name], values, count, spread, rng, undefined)
             values[name] = with_seen(target, model[name], value)
         elif name in target.links:
             computed, _ = model.evaluate(name, values)
             shape = (count, *model[name].value_shape)
             values[name] = np.array(np.broadcast_to(computed, shape))
-    return values
+    return values, undefined
 
 
 def _drawn(
@@ -224,6 +232,7 @@ def _drawn(
     count: int,
     spread: float,
     rng: np.random.Generator,
+    undefined: dict[str, np.ndarray],
 ) -> np.ndarray:
     if node.name not in target.terms:
         log = _alone(target, node, values, count)
@@ -231,6 +240,9 @@ def _drawn(
             return _of_support(node, count, rng)
         return draw_states(log, rng, node.name).astype(node.domain.dtype)  # type: ignore[union-attr]
     dist, _ = target.model.evaluate(node.name, values)
+    if dist.invalid is not None:
+        wrong = np.broadcast_to(dist.invalid, (count, *node.plate_shape)).reshape(count, -1)
+        undefined[node.name] = np.asarray(wrong.any(axis=1))
     try:
         draws = target.model.sample_stored(node.name, dist, rng, (count,))
     except UnsupportedError:

@@ -153,7 +153,7 @@ class Partner:
         """The distribution, and the index by which it read the node; raises where the model is at fault."""
         dist, batch, keys = self._distribution(state)
         if dist.invalid is not None:
-            self.term.log_of(dist, batch, self._value(state))
+            self.term.refuse_out_of_range(dist, batch, self._value(state))
         return dist, keys
 
     def _full(self, candidate: np.ndarray, members: np.ndarray | None) -> np.ndarray:

@@ -66,7 +66,7 @@ class ByLabel:
         if dist.invalid is not None and (dist.invalid & (data.count > 0)).any():
             state = self.blanket.placed(values, candidate)
             full, batch, _ = self.blanket.distribution(self.child, state)
-            term.log_of(full, batch, values[term.name])  # raises where that is the model's fault
+            term.refuse_out_of_range(full, batch, values[term.name])
         collector = Collector(self.child.relation, self.shape, keys, None)
         return Evaluated(dist, steps, len(self.shape), data, collector)
 

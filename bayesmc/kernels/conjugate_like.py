@@ -80,7 +80,7 @@ class LikePartner(Partner):
         except BayesmcError:
             for child in self.children:  # the group knows the first one's name only
                 dist, batch, _ = self.blanket.distribution(child, state)
-                child.term.log_of(dist, batch, state[child.term.name])
+                child.term.refuse_out_of_range(dist, batch, state[child.term.name])
             raise
 
     def _distribution(self, state: Values) -> tuple[Distribution, Shape, tuple[Any, ...]]:

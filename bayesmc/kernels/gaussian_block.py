@@ -255,7 +255,7 @@ def _is_affine(
     except Untraceable:
         return False
     if not isinstance(result, TracedCall):
-        return not isinstance(result, Tracer)  # it names the nodes and does nothing with them
+        return type(result) in families  # it names the nodes and does nothing with them
     if result.function not in families:
         return False
     traced = result.traced

@@ -106,14 +106,20 @@ class Term:
                 return result if self.mask is None else np.where(self.mask, result, 0.0)
         result = self.model.log_density(self.name, dist, value)
         if dist.invalid is not None:
-            lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
-            tolerated = self.rejects or (dist.problem is not None and dist.problem.is_overflow)
-            if not tolerated:
-                error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
-                if error is not None:
-                    raise error
+            if not self.rejects:
+                self.refuse_out_of_range(dist, batch, value)
             result = np.where(dist.invalid, -np.inf, result)
         return result if self.mask is None else np.where(self.mask, result, 0.0)
+
+    def refuse_out_of_range(self, dist: Distribution, batch: Shape, value: np.ndarray) -> None:
+        """Raise for parameters out of range, unless they over- or underflowed, where a chain is."""
+        if dist.problem is not None and dist.problem.is_overflow:
+            return
+        node = self.model[self.name]
+        lead = broadcast_shapes(batch, value.shape[: value.ndim - len(node.value_shape)])
+        error = invalid_error(node, dist, np.broadcast_to(True, lead), lead)
+        if error is not None:
+            raise error
 
 
 @dataclass(frozen=True, eq=False)

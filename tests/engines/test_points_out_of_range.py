@@ -67,6 +67,32 @@ def test_a_scale_in_a_plate_with_many_elements() -> None:
     assert posterior["s"].min() > 0.0
 
 
+@pytest.mark.parametrize("engine", [bmc.Gibbs(250, 100), bmc.ParticleGibbs(200, 50, 4, 20)])
+def test_a_scale_of_hidden_states_that_may_be_negative(engine: Any) -> None:
+    """No observed node has it: its chains must not start where states have no density."""
+    y = np.array([0.2, 2.9, 0.4])
+    dbn = bmc.DynamicBayesNet()
+    dbn.add_static("s", bmc.Normal(1.0, 1.0))
+    dbn.add("x", lambda x_prev, s: bmc.Normal(0.5 * x_prev, s), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    posterior = bmc.infer(dbn, {"y": y}, engine=engine, rng=0)
+    s = np.linspace(1e-4, 9.0, 2001)
+    log = -0.5 * (s - 1.0) ** 2
+    power = 0.5 ** np.arange(3)
+    for k, scale in enumerate(s):  # covariance of the states, then of the rows
+        cov = np.empty((3, 3))
+        var = np.array([1.0, 0.25 + scale**2, 0.25 * (0.25 + scale**2) + scale**2])
+        for i in range(3):
+            for j in range(3):
+                cov[i, j] = var[min(i, j)] * power[abs(i - j)]
+        cov += np.eye(3)
+        log[k] += -0.5 * y @ np.linalg.solve(cov, y) - 0.5 * np.linalg.slogdet(cov)[1]
+    weights = np.exp(log - log.max())
+    exact = (s * weights).sum() / weights.sum()
+    assert abs(posterior.mean("s") - exact) < 5.0 * posterior.mcse("s")  # false alarm 1e-6
+    assert posterior["s"].min() > 0.0
+
+
 def test_what_is_wrong_at_every_point_is_named() -> None:
     net = bmc.BayesNet(plates={"g": 4})
     sign = np.array([1.0, 1.0, -1.0, 1.0])

@@ -11,6 +11,9 @@ from scipy import stats
 
 import bayesmc as bmc
 
+# few draws, of which the errors tell
+pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+
 TIMES = np.array([0.5, 1.0, 0.2, 2.0, 0.3])
 POINTS = np.linspace(-4.0, 4.0, 161)
 
@@ -53,7 +56,14 @@ CHILDREN: dict[str, tuple[Callable[..., Any], Callable[[np.ndarray], np.ndarray]
 }
 
 
-@pytest.mark.parametrize("name", CHILDREN)
+@pytest.mark.parametrize(
+    "name",
+    ["density", "scipy, normal"]
+    + [
+        pytest.param(n, marks=pytest.mark.thorough)
+        for n in ("scipy, not normal", "density in another")
+    ],
+)
 def test_two_normal_parents(name: str) -> None:
     child, log = CHILDREN[name]
     net = effects(child)
@@ -91,6 +101,19 @@ def test_a_child_that_hides_its_parent_is_not_left_out(child: Callable[..., Any]
     assert abs(posterior.mean("a") - exact) < error
     assert abs(0.5 - exact) > error  # what the other reading alone says would be seen
     assert "Normal with Normal" not in str(bmc.explain(net, evidence, engine=bmc.Gibbs()))
+
+
+@pytest.mark.parametrize(
+    ("child", "seen"),
+    [(lambda a, b: bmc.Poisson(2.0), 3), (lambda a, b: bmc.Uniform(0.0, 1.0), 0.3)],
+)
+def test_a_child_that_does_nothing_with_its_parents(child: Callable[..., Any], seen: Any) -> None:
+    """It has no mean that a block of Normal nodes could read."""
+    net = effects(lambda a, b: bmc.Normal(a + b, 1.0))
+    net.add("k", child)
+    posterior = bmc.infer(net, {"t": TIMES, "k": seen}, engine=bmc.Gibbs(200, 50), rng=0)
+    mean = on_a_grid(lambda s: stats.norm.logpdf(TIMES, s))
+    assert abs(posterior.mean("a") - mean) < 5.0 * posterior.mcse("a")  # false alarm 6e-7
 
 
 def test_a_child_that_is_followed_keeps_its_closed_form() -> None:
