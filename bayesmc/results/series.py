@@ -96,6 +96,8 @@ class SeriesPosterior:
         if increments is not None:
             total = increments.sum(axis=0)
             self.log_marginal_likelihood = total if increments.ndim > 1 else float(total)
+            if getattr(engine, "is_exact", False):
+                self.log_marginal_likelihood_mcse = 0.0 * self.log_marginal_likelihood
         answered = next(iter([*self._tables.values(), *self._means.values()]), None)
         if steps is None:
             found = increments if increments is not None else answered
