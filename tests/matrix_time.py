@@ -179,6 +179,7 @@ def stated(case: Series, engine: bmc.ParticleFilter, part: float = 1.0) -> tuple
     t = case.exact.steps - 1
     one = ask_once(case, engine)
     names = [n for n in one.names if hidden(case, n)] if one is not None else []
+    nodes = one.model.nodes if one is not None else {}
     log_exact = float(case.exact.log_marginal_likelihood - case.exact.log_static)
     right: dict[str, Any] = {}
     places: dict[str, Any] = {}
@@ -189,7 +190,7 @@ def stated(case: Series, engine: bmc.ParticleFilter, part: float = 1.0) -> tuple
         return found
 
     for name in names:
-        node = case.exact.model.nodes[name]
+        node = nodes[name]
         if node.domain is not None and node.domain.labels is None:
             continue  # a mean of numbers that may be one number in every run
         value = figure(case.exact, name, node.domain is not None)[t]
@@ -199,7 +200,7 @@ def stated(case: Series, engine: bmc.ParticleFilter, part: float = 1.0) -> tuple
     def figures(found: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         values = {}
         for name in right:
-            finite = case.exact.model.nodes[name].domain is not None
+            finite = nodes[name].domain is not None
             value, error = figure(found, name, finite)[t], found.mcse(name)[t]
             values[name] = value[places[name]], part * error[places[name]]
         return values
@@ -212,9 +213,7 @@ def ask_once(case: Series, engine: bmc.ParticleFilter) -> SeriesPosterior | None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", LowEssWarning)
         try:
-            return bmc.filter(
-                case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=0
-            )
+            return bmc.filter(case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=0)
         except (DegeneracyError, ZeroProbabilityError):
             return None
 

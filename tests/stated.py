@@ -55,7 +55,10 @@ def stated_errors_test(
             error = np.sqrt(np.sum(np.square(found.log_marginal_likelihood_mcse)))
             rows["log evidence"].append(np.where(error > 0, off / error, np.nan))
             for key, (value, stated) in figures(found).items():
-                ratio = np.where(stated > 0, (value - right[key]) / stated, np.nan)
+                drawn = stated > 1e-9 * (
+                    1.0 + np.abs(value)
+                )  # what is seen has no error but rounding
+                ratio = np.where(drawn, (value - right[key]) / stated, np.nan)
                 rows[key].append(np.where(np.isfinite(stated), ratio, np.nan))
     comparisons = []
     for key, ratios in rows.items():

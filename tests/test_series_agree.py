@@ -90,10 +90,10 @@ def test_particle_filters_state_their_errors(variant: str, kind: str) -> None:
     engine = bmc.ParticleFilter(400, **PARTICLES[variant])
     chosen = list(cases(kind, 3 * FEW))
     if not session.is_thorough():  # variants take turns at templates
-        chosen = chosen[list(PARTICLES).index(variant) :: len(PARTICLES)]
+        chosen = chosen[list(PARTICLES).index(variant) :: len(PARTICLES)][:1]
     judged = caught = 0
     for seed, case in chosen:
-        options: dict[str, Any] = {"runs": 80, "alpha": ALPHA, "rng": [seed, 6, session.seed()]}
+        options: dict[str, Any] = {"runs": 60, "alpha": ALPHA, "rng": [seed, 6, session.seed()]}
         found = stated_errors_test(*stated(case, engine), **options)
         assert found, (case.dbn, found)
         judged += len(found.comparisons) > 0
