@@ -235,10 +235,9 @@ def test_a_budget_that_is_spent_says_so(kind: str) -> None:
 
 
 def test_a_number_of_particles_is_kept_and_warns() -> None:
+    rows_given, engine = {"y": series("far outliers", 100)}, bmc.ParticleFilter(300)
     with pytest.warns(LowEssWarning, match="300 particles cannot tell.*use more particles"):
-        found = bmc.filter(
-            replicated(binomial), {"y": series("step", 100)}, engine=bmc.ParticleFilter(300), rng=0
-        )
+        found = bmc.filter(replicated(binomial), rows_given, engine=engine, rng=0)
     assert found.counts[0] == 300
 
 
