@@ -281,7 +281,12 @@ def _variance(families: Families, weights: np.ndarray) -> np.ndarray:
 
 def _explained(cloud: Cloud) -> np.ndarray:
     """Variance of the log of the mean weight of a slice, and again, as 0 where they have a tail."""
-    n, ess = len(cloud.weights), np.asarray(cloud.ess)
+    n = len(cloud.weights)
+    if (
+        isinstance(cloud.ess, float) and cloud.ess >= FEW * n
+    ):  # the rest would cost more than it says
+        return np.full(2, 1.0 / cloud.ess - 1.0 / n)
+    ess = np.asarray(cloud.ess)
     variance = 1.0 / ess - 1.0 / n
     few = ess < FEW * n
     if not few.any():
