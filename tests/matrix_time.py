@@ -179,6 +179,50 @@ def unbiased(case: Series, engine: bmc.ParticleFilter) -> tuple[Callable[[Any], 
     return estimate, right
 
 
+def stated(case: Series, engine: bmc.ParticleFilter, part: float = 1.0) -> tuple[Any, ...]:
+    """What ``stated_errors_test`` takes: filtered figures of the last slice; a part of the stated errors."""
+    t = case.exact.steps - 1
+    one = ask_once(case, engine)
+    names = [n for n in one.names if hidden(case, n)] if one is not None else []
+    nodes = one.model.nodes if one is not None else {}
+    log_exact = float(case.exact.log_marginal_likelihood - case.exact.log_static)
+    right: dict[str, Any] = {}
+    places: dict[str, Any] = {}
+
+    def ask(seed: Any) -> SeriesPosterior:
+        found = bmc.filter(case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=seed)
+        found.log_marginal_likelihood_mcse *= part
+        return found
+
+    for name in names:
+        node = nodes[name]
+        if node.domain is not None and node.domain.labels is None:
+            continue  # a mean of numbers that may be one number in every run
+        value = figure(case.exact, name, node.domain is not None)[t]
+        places[name] = place = common(value, node.domain is not None)
+        right[name] = value[place]
+
+    def figures(found: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        values = {}
+        for name in right:
+            finite = nodes[name].domain is not None
+            value, error = figure(found, name, finite)[t], found.mcse(name)[t]
+            values[name] = value[places[name]], part * error[places[name]]
+        return values
+
+    return ask, log_exact, right, figures
+
+
+def ask_once(case: Series, engine: bmc.ParticleFilter) -> SeriesPosterior | None:
+    """One run; None where no particle is possible."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", LowEssWarning)
+        try:
+            return bmc.filter(case.dbn, case.observations, inputs=case.inputs, engine=engine, rng=0)
+        except (DegeneracyError, ZeroProbabilityError):
+            return None
+
+
 def hidden(case: Series, name: str) -> bool:
     """Whether some of the node is not data."""
     rows = case.observations.get(name)

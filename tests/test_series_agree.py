@@ -41,8 +41,10 @@ from tests.matrix_time import (
     answered,
     cases,
     hidden,
+    stated,
     unbiased,
 )
+from tests.stated import stated_errors_test
 
 ALPHA = 1e-4
 
@@ -123,6 +125,25 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
         assert found, (case.dbn, found)
         tried += 1
     assert tried
+
+
+@pytest.mark.parametrize("kind", ["finite", "linear"])
+@pytest.mark.parametrize("variant", PARTICLES)
+def test_particle_filters_state_their_errors(variant: str, kind: str) -> None:
+    """Of the evidence and of the filtered figures of the last slice; half of them would be caught."""
+    engine = bmc.ParticleFilter(400, **PARTICLES[variant])
+    chosen = list(cases(kind, 3 * FEW))
+    if not session.is_thorough():  # variants take turns at templates
+        chosen = chosen[list(PARTICLES).index(variant) :: len(PARTICLES)][:1]
+    judged = caught = 0
+    for seed, case in chosen:
+        options: dict[str, Any] = {"runs": 60, "alpha": ALPHA, "rng": [seed, 6, session.seed()]}
+        found = stated_errors_test(*stated(case, engine), **options)
+        assert found, (case.dbn, found)
+        judged += len(found.comparisons) > 0
+        with uncounted():
+            caught += not stated_errors_test(*stated(case, engine, 0.5), **options)
+    assert caught >= judged / 2
 
 
 @pytest.mark.parametrize(("engine", "kind"), [(e, k) for e in CHAINS for k in CHAINS[e][1]])

@@ -63,6 +63,8 @@ class FilterEngine:
     #: what its ``start`` and ``step`` return
     belief: ClassVar[type] = object
     takes_queries: ClassVar[bool] = True
+    #: whether its answers are the model's, up to rounding
+    is_exact: ClassVar[bool] = False
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         """Why this engine cannot answer, or None; a family's own reasons come after the common ones."""

@@ -36,7 +36,7 @@ class SeriesPosterior:
     log_marginal_likelihood_mcse : float, ndarray or None
         Its error: the root mean square error of filters that draw (bias included, infinite where the
         particles cannot tell it), a bound for a grid that was found (NaN for one that was given), 0 where it
-        is computed; what tangents and sigma points leave out is no part of it.
+        is exact, None where nothing is known of it (tangents and sigma points).
     weight_ess : ndarray or None, shape (time,) or (time, *plates)
         Equally weighted particles that those of each slice are worth, before they are resampled.
     resampled : ndarray of bool or None
@@ -105,7 +105,8 @@ class SeriesPosterior:
         if increments is not None:
             total = increments.sum(axis=0)
             self.log_marginal_likelihood = total if increments.ndim > 1 else float(total)
-            self.log_marginal_likelihood_mcse = np.zeros(total.shape) if total.ndim else 0.0
+            if getattr(engine, "is_exact", False):
+                self.log_marginal_likelihood_mcse = np.zeros(total.shape) if total.ndim else 0.0
         answered = next(iter([*self._tables.values(), *self._means.values()]), None)
         if steps is None:
             found = increments if increments is not None else answered

@@ -12,7 +12,7 @@ from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
-from tests.mutants.tests_of import Test, evidence_of, matched, slices
+from tests.mutants.tests_of import Test, evidence_of, matched, slices, stated
 
 
 def line() -> bmc.DynamicBayesNet:
@@ -115,6 +115,10 @@ ROWS = {"y": [0.5, 1.5, 3.0, 2.0]}
 RISING = {"y": [0.0, 2.0, 4.0]}
 PARTICLES = "unbiased_evidence_test, 100 runs of 30 particles"
 MILD = {"y": [0.3, 0.8, 1.2, 0.7]}
+STATED = "stated_errors_test, 150 runs of 300 particles"
+LONG = {
+    "y": [0.3, 0.8, 1.2, 0.7, -0.4, -1.3, -0.5, 0.2, 0.9, 1.6, 1.1, 0.1, -0.7, 0.0, 0.6, 1.4] * 4
+}
 ALWAYS = bmc.ParticleFilter(30, ess_threshold=2.0)
 
 
@@ -196,6 +200,34 @@ MUTANTS = [
               'value.take(ancestors + 1, axis=0, mode="wrap")'),),
         slices(bmc.filter, line, ROWS, bmc.ParticleFilter(300, ess_threshold=2.0), 60),
         "repeated_test of filter, 60 runs of 300 particles",
+    ),
+    Mutant(
+        "the stated error of the evidence is halved",
+        (Edit("bayesmc.engines.particles.families:evidence_error",
+              "np.sqrt(total + 0.25 * total**2)", "0.5 * np.sqrt(total + 0.25 * total**2)"),),
+        stated(line, LONG, bmc.ParticleFilter(300), 150),
+        STATED,
+    ),
+    Mutant(
+        "the stated error of the evidence is that of the last families alone",
+        (Edit("bayesmc.engines.particles.families:evidence_error",
+              "np.maximum(families.settled + variance[OLD], variance[OLD])", "variance[YOUNG]"),),
+        stated(line, LONG, bmc.ParticleFilter(300), 150),
+        STATED,
+    ),
+    Mutant(
+        "families stay where they were",
+        (Edit("bayesmc.engines.particles.families:_moved",
+              "_searched(cloud.ancestors, families.bounds)", "families.bounds"),),
+        stated(line, LONG, bmc.ParticleFilter(300), 150),
+        STATED,
+    ),
+    Mutant(
+        "the stated error of a mean is halved",
+        (Edit("bayesmc.engines.particles.accuracy:_by_shares",
+              "(parts**2 /", "0.25 * (parts**2 /"),),
+        stated(line, LONG, bmc.ParticleFilter(300), 150),
+        STATED,
     ),
     Mutant(
         "backward simulation leaves the transition out",

@@ -14,6 +14,7 @@ from bayesmc.testing.posteriors.matching import compare
 from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.verdict import Verdict
 from tests.mutants.mutant import ALPHA
+from tests.stated import stated_errors_test
 
 Make = Callable[[], Any]
 Test = Callable[[int], Verdict]
@@ -55,6 +56,23 @@ def slices(ask: Callable[..., Any], dbn: Make, observations: Any, engine: Any, r
         return repeated_test(
             estimate, _exact_slices(ask, dbn(), observations),
             replications=runs, alpha=ALPHA, rng=seed,
+        )  # fmt: skip
+
+    return test
+
+
+def stated(dbn: Make, observations: Any, engine: Any, runs: int) -> Test:
+    """Stated errors of the evidence and of the means of the last slice."""
+
+    def test(seed: int) -> Verdict:
+        template = dbn()
+        right = bmc.filter(dbn(), observations)
+        figures = {n: right.mean(n)[-1] for n in right.names if n not in observations}
+        return stated_errors_test(
+            lambda rng: bmc.filter(template, observations, engine=engine, rng=rng),
+            right.log_marginal_likelihood, figures,
+            lambda found: {n: (found.mean(n)[-1], found.mcse(n)[-1]) for n in figures},
+            runs=runs, alpha=ALPHA, rng=seed,
         )  # fmt: skip
 
     return test

@@ -73,6 +73,7 @@ class DiscreteFilter(FilterEngine):
     max_bytes: float = 2.0 * 2**30
 
     label: ClassVar[str] = "discrete filter"
+    is_exact: ClassVar[bool] = True
     belief: ClassVar[type] = DiscreteBelief
 
     def __post_init__(self) -> None:

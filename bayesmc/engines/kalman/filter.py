@@ -63,6 +63,7 @@ class KalmanFilter(GaussianFilter):
     """
 
     label: ClassVar[str] = "Kalman filter"
+    is_exact: ClassVar[bool] = True
 
     def _own_refusal(self, problem: SeriesProblem, data: SeriesData) -> str | None:
         for later in (0, 1):

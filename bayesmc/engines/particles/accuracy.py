@@ -17,8 +17,9 @@ from bayesmc.network import CompiledNode
 
 #: particles above which families are taken one by one, without a copy
 MANY = 30_000
-#: even families below which the young origin is asked, too; if it has no more than so many, nobody knows
-ENOUGH, LAST = 8.0, 1.1
+#: even families below which the young origin is asked, too, and those that say nothing; if the young one has
+#: no more than these either, nobody knows
+ENOUGH, LAST = 8.0, 3.5
 
 
 class MeanErrors:
@@ -77,8 +78,8 @@ class MeanErrors:
                 at, sums, shares = parts.of(name)
                 if len(at):
                     found = _by_shares(sums - shares * mean[at, None], shares)
-                    if parts is self._parts[YOUNG]:
-                        found[(shares**2).sum(axis=1) > 1.0 / LAST] = np.inf
+                    if parts is self._parts[OLD]:
+                        found[np.isinf(found)] = 0.0  # the young origin says
                     variance[at] = np.maximum(variance[at], found)
             self._found[name] = np.sqrt(variance)
         return self._found
@@ -200,9 +201,9 @@ def _variances(weights: np.ndarray, off: np.ndarray, bounds: np.ndarray) -> np.n
     found, even = _of_families(weights, weighted, bounds[OLD], total)
     few = even < ENOUGH
     if few.any():
-        young, left = _of_families(weights[few], weighted[few], bounds[YOUNG][:, few], total[few])
-        young[left < LAST] = np.inf
-        found[few] = np.maximum(found[few], young)
+        young, _ = _of_families(weights[few], weighted[few], bounds[YOUNG][:, few], total[few])
+        old = np.where(np.isinf(found[few]), 0.0, found[few])
+        found[few] = np.maximum(old, young)
     return found
 
 
@@ -219,8 +220,15 @@ def _of_families(
 
 
 def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Variances by parts ``(rows, groups, *rest)`` of means, with what these owe to each family."""
-    return (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=1)
+    """Variances by parts ``(rows, groups, *rest)`` of means, with what these owe to each family.
+
+    They are as much larger as the square of Student's t is than that of a normal figure; infinite where too
+    few families are left to say.
+    """
+    even = 1.0 / (shares**2).sum(axis=1)
+    free = np.maximum(even - 1.0, LAST - 1.0)
+    found = (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=1) * (free / (free - 2.0))
+    return np.where(even < LAST, np.inf, found)
 
 
 def _plain_sums(weights: np.ndarray, value: np.ndarray, bounds: np.ndarray) -> np.ndarray:

@@ -46,6 +46,11 @@ RESTS = 4.0
 MATTERS, UNEVEN = (0.05, 0.15), 80.0
 #: times the variance that the slices' weights explain by themselves, above which the rest came from the edge
 EDGE = 4.0
+#: share of the particles below which the worth of a slice's has its weights looked at for a tail, and the
+#: mean log of the largest of them over the next from which on they have one (Hill's estimate)
+FEW, TAIL = 0.05, 0.7
+#: variance above which slices with a tail explain nothing
+LONG = 0.2
 #: variance between two origins beyond which the families that are left are too few to tell
 MOST = 1.0
 
@@ -64,8 +69,9 @@ class Families(NamedTuple):
     kept : ndarray, shape (2, groups, *apart)
         Logs of what a family's weight is worth: where resampling gave it more particles than its weight
         demands, it counts for less.
-    explained : ndarray, shape (2, *apart)
-        Variance of the log evidence that the weights of the slices since would make by themselves.
+    explained : ndarray, shape (2, 2, *apart)
+        Variance of the log evidence that the weights of the slices since would make by themselves: of all
+        slices, and of those whose weights have no tail.
     born : ndarray of int, shape (2, *apart)
         Slices of the origins.
     settled : ndarray, shape (*apart,)
@@ -90,7 +96,7 @@ def begun(cloud: Cloud, layout: Layout) -> Families:
         np.array(np.broadcast_to(bounds, (2, groups + 1, *lead))),
         np.array(np.broadcast_to(shares, (2, groups, *lead))),
         np.zeros((2, groups, *lead)),
-        np.zeros((2, *lead)),
+        np.zeros((2, 2, *lead)),
         np.full((2, *lead), cloud.t),
         np.where(rested, 0.0, np.inf),
     )
@@ -123,7 +129,7 @@ def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> 
 def evidence_error(families: Families, cloud: Cloud) -> Any:
     """Root mean square error of the log evidence, with its bias of minus half its variance."""
     variance = _variance(families, _weights(families, cloud))
-    explained = families.explained + _explained(cloud)
+    explained = families.explained + _explained(cloud)[None]
     at_edge = _at_edge(variance, explained, len(cloud.weights))
     total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
     found = np.sqrt(total + 0.25 * total**2)
@@ -177,10 +183,10 @@ def _moved(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Fa
     assert cloud.ancestors is not None
     bounds = _searched(cloud.ancestors, families.bounds)
     explained = families.explained
-    if bounds.ndim == 2:  # a call for each of these would cost as much as the rest
-        explained = explained + _explained(earlier) if cloud.resampled else explained
-    else:
-        explained = explained + np.where(cloud.resampled, _explained(earlier), 0.0)
+    if bounds.ndim > 2:
+        explained = explained + np.where(cloud.resampled, _explained(earlier), 0.0)[None]
+    elif cloud.resampled:
+        explained = explained + _explained(earlier)
     if steady:
         return families._replace(bounds=bounds, explained=explained)
     sums = [group_sums(earlier.weights, b) for b in families.bounds]
@@ -273,14 +279,34 @@ def _variance(families: Families, weights: np.ndarray) -> np.ndarray:
     return np.where(left > 1e-9, -np.log(np.maximum(left, 1e-9)), np.inf)
 
 
-def _explained(cloud: Cloud) -> Any:
-    """Variance of the log of the mean weight of a slice."""
-    return 1.0 / cloud.ess - 1.0 / len(cloud.weights)
+def _explained(cloud: Cloud) -> np.ndarray:
+    """Variance of the log of the mean weight of a slice, and again, as 0 where they have a tail."""
+    n = len(cloud.weights)
+    if (
+        isinstance(cloud.ess, float) and cloud.ess >= FEW * n
+    ):  # the rest would cost more than it says
+        return np.full(2, 1.0 / cloud.ess - 1.0 / n)
+    ess = np.asarray(cloud.ess)
+    variance = 1.0 / ess - 1.0 / n
+    few = ess < FEW * n
+    if not few.any():
+        return np.stack([variance, variance])
+    weights = cloud.weights.reshape(n, -1)
+    bounded = np.array(variance, ndmin=1).reshape(-1)
+    for at in np.flatnonzero(few):
+        count = max(int(ess.reshape(-1)[at]), 5)
+        top = np.partition(weights[:, at], max(n - count - 1, 0))[-count - 1 :]
+        least = np.maximum(top.min(), 1e-300)  # fewer have any weight
+        if np.log(np.maximum(top, least) / least).sum() > TAIL * count:
+            bounded[at] = 0.0
+    return np.stack([variance, bounded.reshape(variance.shape)])
 
 
 def _at_edge(variance: np.ndarray, explained: np.ndarray, n: int) -> np.ndarray:
     """Whether families differ by far more than the slices' weights explain."""
-    odd = (variance > _level(n)) & (variance > EDGE * explained)
+    every, bounded = explained[:, 0], explained[:, 1]
+    odd = (variance > _level(n)) & (variance > EDGE * every)
+    odd |= (variance > LONG) & (variance > EDGE * bounded)
     return np.any(odd | (variance > MOST), axis=0)
 
 

@@ -130,7 +130,8 @@ class ParticleFilter(FilterEngine):
         ``proposal="optimal"`` leaves a hidden number, or what is seen of it, out.
     LowEssWarning
         From the filter, where more than a tenth of the slices rest on little more than one particle, or the
-        stated error of the log evidence is above 1, or cannot be told.
+        stated error of the log evidence is above 1, or cannot be told (with a given number of particles: only
+        where a slice rests on fewer than four).
 
     Notes
     -----

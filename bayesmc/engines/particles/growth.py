@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bayesmc.engines.particles.families import RESTS
 from bayesmc.engines.particles.record import FilteredParticles
 
 if TYPE_CHECKING:
@@ -102,6 +103,8 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     ess = filtered.weight_ess.reshape(filtered.steps, -1)[:, int(errors.reshape(-1).argmax())]
     at = int(ess.argmin())
     if math.isinf(worst):
+        if engine.particles is not None and ess[at] >= RESTS:
+            return None  # who gives a number may ask for states alone, which these particles follow well
         said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
     else:
         said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
