@@ -149,7 +149,7 @@ def share_mcse(error: Any, count: Any, step: Any = 1.0) -> np.ndarray:
     return np.hypot(error, np.multiply(step, unseen))
 
 
-def weighted_share_count(share: Any, squares: Any, heaviest: float, all_squares: float) -> Any:
+def weighted_share_count(mine: Any, heavy: Any, heaviest: float) -> Any:
     """Effective draws behind shares of weighted draws, as far as what was not seen is concerned.
 
     What one more draw of the smaller side would weigh is guessed from those that are there: their mean
@@ -159,17 +159,13 @@ def weighted_share_count(share: Any, squares: Any, heaviest: float, all_squares:
 
     Parameters
     ----------
-    share, squares : array_like
-        Sum of the weights on one side, and of their squares; all weights sum to 1.
-    heaviest, all_squares : float
-        The largest weight, and the sum of all squares.
+    mine, heavy : array_like
+        Sum of the weights on the smaller side, and of their squares; all weights sum to 1.
+    heaviest : float
+        The largest weight.
     """
-    flipped = np.asarray(share) > 0.5
-    mine = np.clip(np.where(flipped, 1.0 - share, share), 0.0, 1.0)
-    heavy = np.maximum(np.where(flipped, all_squares - squares, squares), 0.0)
+    mine, heavy = np.asarray(mine, dtype=float), np.asarray(heavy, dtype=float)
     seen = (mine > 1e-300) & (heavy > 1e-300)
-    if np.any(flipped):  # what is left of a difference may be rounding
-        seen &= ~flipped | ((mine > 1e-13) & (heavy > 1e-13 * all_squares))
     mine, heavy = np.where(seen, mine, 1.0), np.where(seen, heavy, 1.0)
     typical = np.where(seen, np.minimum(heavy / mine, heaviest), heaviest)
     missed = np.where(seen, heaviest**2 * np.exp(-(mine**2) / heavy), 0.0)

@@ -360,6 +360,8 @@ def _by_label(template: Template, name: str, value: Any, ahead: int = 0) -> Any:
 def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[str, Any]:
     if inputs is not None and not isinstance(inputs, Mapping):
         raise EvidenceError(f"inputs is a {type(inputs).__name__}; give a dict from name to rows")
+    for name, given in (inputs or {}).items():
+        _check_frame(f"inputs of {name!r}", given)
     inputs = {n: _by_label(template, n, v, 1) for n, v in (inputs or {}).items()}
     for name in inputs:
         if name not in template.inputs:
@@ -367,7 +369,6 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
                 f"inputs= gives {name!r}, which is not a declared input"
                 f"{did_you_mean(name, template.inputs)}; the inputs are {list(template.inputs)}"
             )
-        _check_frame(f"inputs of {name!r}", inputs[name])
         _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
         if np.ndim(inputs[name]) == 0:
             raise EvidenceError(
@@ -379,12 +380,12 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
 def _rows(template: Template, name: str, value: Any) -> Any:
     """A series with None rows of vectors filled, so that it is an array."""
     refuse_backwards(f"observations of {name!r}", value)
+    _check_frame(f"observations of {name!r}", value)
     value = _by_label(template, name, value, 1)
     if isinstance(value, (list, tuple)) and any(v is None for v in value):
         shapes = {np.shape(v) for v in value if v is not None}
         if len(shapes) == 1 and (shape := shapes.pop()):
             return [np.full(shape, np.nan) if v is None else v for v in value]
-    _check_frame(f"observations of {name!r}", value)
     _check_even(f"observations of {name!r}", value, "a missing row is None")
     if np.ndim(value) == 0:
         raise EvidenceError(

@@ -11,7 +11,6 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 
 from bayesmc.resampling import systematic
@@ -133,8 +132,10 @@ def _log_mixture(
     x: np.ndarray, centres: np.ndarray, weights: np.ndarray, factor: np.ndarray
 ) -> np.ndarray:
     """Log density of Gaussian noise about weighted centres, up to a constant."""
+    from scipy.linalg import solve_triangular  # slow to import
+
     apart = (x[:, None] - centres[None]).reshape(-1, x.shape[1])
-    scaled = scipy.linalg.solve_triangular(factor, apart.T, lower=True)
+    scaled = solve_triangular(factor, apart.T, lower=True)
     square = np.square(scaled).sum(axis=0).reshape(len(x), len(centres))
     volume = np.log(np.diagonal(factor)).sum()
     return scipy.special.logsumexp(-0.5 * square, b=weights, axis=1) - volume

@@ -63,7 +63,8 @@ class ParticleSampler(SweepSampler):
         found = self.walk.located(values, rows, rng)
         if found is None:
             return None
-        moved, particles = found
+        moved = {n: v for n, v in found[0].items() if n not in self.given}  # the user's start stays
+        particles = found[1]
         state = {**values, **moved}
         self.target.refresh(state, self.walk.statics)
         history = self.filter.run(state, rows, rng)

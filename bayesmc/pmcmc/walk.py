@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import scipy.linalg
 import scipy.special
 
 from bayesmc.engines.starting import start_states
@@ -241,6 +240,8 @@ def _widened(cov: np.ndarray) -> np.ndarray:
 
 def _student(away: np.ndarray, factor: np.ndarray) -> np.ndarray:
     """Log density of a Student distribution up to a constant."""
-    scaled = scipy.linalg.solve_triangular(factor, away.T, lower=True)
+    from scipy.linalg import solve_triangular  # slow to import
+
+    scaled = solve_triangular(factor, away.T, lower=True)
     square = np.square(scaled).sum(axis=0)
     return -0.5 * (_DF + away.shape[1]) * np.log1p(square / _DF)

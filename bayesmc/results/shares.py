@@ -73,10 +73,12 @@ def weighted_count(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     heaviest, squares = float(weights.max()), float(np.sum(weights**2))
     alive, weight = values[weights > 0], weights[weights > 0]
     top, low = alive.max(axis=0), alive.min(axis=0)
-    upper = alive == top
+    upper, lower = alive == top, alive != top
     many = ~(upper | (alive == low)).all(axis=0) & (top > low)
-    share, heavy = (np.tensordot(w, upper, axes=(0, 0)) for w in (weight, weight**2))
-    two = diagnostics.weighted_share_count(share, heavy, heaviest, squares)
+    above, below = (np.tensordot(weight, side, axes=(0, 0)) for side in (upper, lower))
+    smaller = np.where(above > below, lower, upper)  # summed itself: a difference would be rounding
+    heavy = np.tensordot(weight**2, smaller, axes=(0, 0))
+    two = diagnostics.weighted_share_count(np.minimum(above, below), heavy, heaviest)
     return np.where(many, 1.0 / squares, two)
 
 

@@ -221,13 +221,21 @@ class SumsPosterior(Posterior):
         if node.domain is None:  # weights are in units of the heaviest
             return np.where(error**2 <= _NONE * squares / total**2, total, total**2 / squares)
         share, heavy = self._sums.counts(what)
-        found = diagnostics.weighted_share_count(
-            share / total, heavy / total**2, 1.0 / total, squares / total**2
+        others = 1.0 - np.eye(
+            node.domain.size
+        )  # summed: what is left of a difference may be rounding
+        rest, light = share @ others, heavy @ others
+        flipped = share > rest
+        mine, own = (
+            np.where(flipped, rest, share) / total,
+            np.where(flipped, light, heavy) / total**2,
         )
+        found = diagnostics.weighted_share_count(mine, own, 1.0 / total)
         if node.domain.labels is not None:
             return found
         several = (share > 0).sum(axis=-1) > 2
-        return np.where(several, total**2 / squares, found.max(axis=-1))
+        smallest = np.where(share > 0, found, -np.inf).max(axis=-1)
+        return np.where(several, total**2 / squares, smallest)
 
     def _step(self, what: str) -> Any:
         exact = what in self._sums.constant

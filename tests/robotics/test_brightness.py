@@ -79,7 +79,7 @@ def test_bad_places():
     with pytest.raises(ShapeError, match=r"places have shape \(1,\)"):
         ceiling.brightness([1.0])
     with pytest.raises(ParameterError, match="scale must be positive"):
-        ceiling.given([1.0, 1.0], 0.0)
+        ceiling.given([1.0, 1.0], -1.0)
 
 
 def test_nothing_is_shared():

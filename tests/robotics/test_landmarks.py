@@ -251,10 +251,19 @@ def test_unseen_rows_cost_nothing() -> None:
     nothing = np.full((1, 5, 2), np.nan)
     found = bmc.filter(dbn, {"z": nothing}, engine=bmc.ParticleFilter(500), rng=0)
     assert found.log_marginal_likelihood == 0.0
-    half = nothing.copy()
-    half[0, 2, 0] = 1.0
-    with pytest.raises(bmc.errors.EvidenceError, match="is missing and others are not"):
-        bmc.filter(dbn, {"z": half}, engine=bmc.ParticleFilter(500), rng=0)
+
+
+def test_a_range_without_its_bearing_is_a_range() -> None:
+    """Its two numbers are independent given the pose, so what is missing of a reading costs nothing, too."""
+    half, alone = np.full((1, 5, 2), np.nan), np.full((1, 5), np.nan)
+    half[0, 2, 0] = alone[0, 2] = 1.0
+    ranges = one_slice(lambda pose: range_only(pose, MARKS, 0.5, df=3.0))
+    found, right = (
+        bmc.filter(dbn, {"z": rows}, engine=bmc.ParticleFilter(500), rng=0)
+        for dbn, rows in ((one_slice(SENSORS["range and bearing"]), half), (ranges, alone))
+    )
+    assert right.log_marginal_likelihood < -0.1
+    assert found.log_marginal_likelihood == pytest.approx(right.log_marginal_likelihood)
 
 
 def test_robust_sensors_bear_a_wrong_landmark() -> None:

@@ -674,7 +674,7 @@ def test_a_net_error_is_still_a_net_error() -> None:
     """Reading evaluates impossible configurations; what fails there is the library's kind of error."""
     net = bmc.BayesNet()
     net.add("s", bmc.Bernoulli(0.0))
-    net.add("x", lambda s: bmc.Normal(0.0, 1.0 - s))
+    net.add("x", lambda s: bmc.Normal(0.0, 1.0 - 2.0 * s))
     problem = pose(net, {})
     try:
         part = linear_gaussian(problem.model, problem.observed, problem.inputs)

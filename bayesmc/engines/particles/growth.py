@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesmc.engines.particles.families import RESTS
 from bayesmc.engines.particles.record import FilteredParticles
 
 if TYPE_CHECKING:
@@ -28,6 +27,8 @@ TRUSTED = 1.5
 AIM = 0.6
 #: error of the log evidence above which a warning says so
 LARGE = 1.0
+#: the same where the number of particles is given
+LARGE_GIVEN = 3.0
 #: equally weighted particles below which a slice rests on a single one
 COLLAPSED = 2.0
 #: share of such slices from which on a warning says so
@@ -94,25 +95,33 @@ def collapsed(filtered: FilteredParticles) -> str | None:
 
 
 def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None:
-    """What is said where the log evidence is not known well."""
+    """What is said where the log evidence is not known well.
+
+    Who gives a number of particles may ask for states alone, which few may follow well: then it takes a larger
+    error, or a first row that next to no particle explains, since what is missing there is never found again.
+    """
     assert filtered.counts is not None and filtered.weight_ess is not None
+    given = engine.particles is not None
     errors = np.atleast_1d(np.asarray(filtered.log_marginal_likelihood_mcse, dtype=float))
     worst = float(errors.max())
-    if not worst > LARGE:
+    if not worst > (LARGE_GIVEN if given else LARGE):
         return None
     ess = filtered.weight_ess.reshape(filtered.steps, -1)[:, int(errors.reshape(-1).argmax())]
     at = int(ess.argmin())
     if math.isinf(worst):
-        if engine.particles is not None and ess[at] >= RESTS:
-            return None  # who gives a number may ask for states alone, which these particles follow well
+        weighed = np.flatnonzero(ess < 0.999 * filtered.counts)
+        if given:
+            at = int(weighed[0]) if len(weighed) else at
+            if ess[at] >= COLLAPSED:
+                return None
         said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
     else:
         said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
     more = "more particles"
-    if engine.particles is None and engine.adapt is None:
+    if not given and engine.adapt is None:
         more = f"a larger budget= than {engine.budget:_}"
     return (
         f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
-        f"be off as well (weight_ess is lowest in slice {filtered.start + at}: {ess[at]:.1f}); use {more}, a "
+        f"be off as well (weight_ess is {ess[at]:.1f} in slice {filtered.start + at}); use {more}, a "
         "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
     )
