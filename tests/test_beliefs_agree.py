@@ -45,6 +45,7 @@ def gone_through(case: Series, engine: Any, interrupt: Any) -> list[dict[str, An
     return found
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")
 @pytest.mark.parametrize(("name", "kind"), [(n, k) for n in ONLINE for k in ONLINE[n][1]])
 def test_beliefs_go_on_after_a_pickle(name: str, kind: str) -> None:
     engine, tried = ONLINE[name][0], 0

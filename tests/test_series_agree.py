@@ -127,6 +127,7 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
     assert tried
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ProposalWarning")
 @pytest.mark.parametrize("kind", ["finite", "linear"])
 @pytest.mark.parametrize("variant", PARTICLES)
 def test_particle_filters_state_their_errors(variant: str, kind: str) -> None:
