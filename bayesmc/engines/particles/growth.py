@@ -29,6 +29,8 @@ AIM = 0.6
 LARGE = 1.0
 #: the same where the number of particles is given
 LARGE_GIVEN = 3.0
+#: slices that rest on a single particle which are no accident any more, and their share of all
+SEVERAL, OFTEN = 5, 0.005
 #: equally weighted particles below which a slice rests on a single one
 COLLAPSED = 2.0
 #: share of such slices from which on a warning says so
@@ -98,7 +100,8 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     """What is said where the log evidence is not known well.
 
     Who gives a number of particles may ask for states alone, which few may follow well: then it takes a larger
-    error, or a first row that next to no particle explains, since what is missing there is never found again.
+    error; or a first row that next to no particle explains, since what is missing there is never found again,
+    or several rows of that kind.
     """
     assert filtered.counts is not None and filtered.weight_ess is not None
     given = engine.particles is not None
@@ -112,8 +115,10 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
         weighed = np.flatnonzero(ess < 0.999 * filtered.counts)
         if given:
             at = int(weighed[0]) if len(weighed) else at
-            if ess[at] >= COLLAPSED:
+            single = np.count_nonzero(ess < COLLAPSED)
+            if ess[at] >= COLLAPSED and single < max(SEVERAL, OFTEN * len(ess)):
                 return None
+            at = at if ess[at] < COLLAPSED else int(ess.argmin())
         said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
     else:
         said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
