@@ -198,6 +198,7 @@ def test_no_shift_carries_the_mosaic_onto_itself(above: robotics.Ceiling) -> Non
     assert most(np.tile(above.image[:300, :200], (2, 2))) > 0.95
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 def test_the_sensor_holds_the_robot_on_the_map_and_a_wrong_map_does_not(
     above: robotics.Ceiling,
 ) -> None:

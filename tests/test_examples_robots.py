@@ -122,6 +122,7 @@ def test_end_points_lie_on_walls_at_the_true_poses(log: Log) -> None:
 # ---- localisation on the made-up floor ----------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 def test_tracking_with_500_particles(log: Log) -> None:
     """Measured: .05 m; a laser mounted the wrong way round is lost."""
     found = [robot_logs.tracking(log, 500, seed) for seed in range(3)]

@@ -130,6 +130,7 @@ def test_innovations_of_angles_go_the_short_way_round() -> None:
 # ---- ranks -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 @pytest.mark.parametrize("engine", ALL, ids=NAMES)
 def test_ranks_are_uniform_where_the_model_is_right(engine: Any) -> None:
     found = bmc.filter(level(), {"y": drawn(level(), 600, 2)}, engine=engine, rng=3)
@@ -271,6 +272,7 @@ def turned(drive: Drive, by: float) -> Drive:
     "engine", [bmc.ExtendedKalmanFilter(), bmc.UnscentedKalmanFilter(), bmc.ParticleFilter(500)],
     ids=NAMES[1:],
 )  # fmt: skip
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 @pytest.mark.parametrize(
     "bias_is", [pytest.param("constant", marks=pytest.mark.thorough), "growing"]
 )
@@ -300,6 +302,7 @@ def test_headings_that_point_backwards_are_turned(plaza: Path, tmp_path: Path, b
     assert heading_offset(found.truth) == pytest.approx(-left, abs=0.1)
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 def test_plaza_1_points_forwards_and_turned_round_is_noticed(reference_data: Path) -> None:
     folder = reference_data / "robot" / "plaza"
     assert read_plaza(folder).turned == 0.0

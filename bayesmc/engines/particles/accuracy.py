@@ -14,6 +14,7 @@ import numpy as np
 from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.engines.particles.families import OLD, YOUNG, Families, group_sums, row_sums
 from bayesmc.network import CompiledNode
+from bayesmc.results.shares import is_share, steps
 
 #: particles above which families are taken one by one, without a copy
 MANY = 30_000
@@ -133,7 +134,7 @@ def node_errors(
         Its mean and variance, or its table and None, with an axis of length 1 in front.
     """
     mean, variance = centre
-    count = None
+    count, step = None, 1.0
     value = cloud.values[node.name][None]
     if node.domain is None:
         off = value - mean[:, None]
@@ -145,6 +146,7 @@ def node_errors(
     elif node.domain.labels is None:
         numbers = np.asarray(node.domain.numbers, dtype=float)
         off = numbers[value] - (mean @ numbers)[:, None]
+        count, step = mean.max(axis=-1), float(steps(node, None, False))
     else:
         off = (value[..., None] == np.arange(node.domain.size)) - mean[:, None]
         count = mean
@@ -154,7 +156,9 @@ def node_errors(
     else:
         found, ess = _of_plates(layout, cloud, bounds, node, off[0])
     if count is not None:
-        found = np.maximum(found, _unseen(count, _beside(ess, node, layout, count.ndim)))
+        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
+        worth = _beside(ess, node, layout, np.ndim(mean))
+        found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
     return np.sqrt(found[0])
 
 
@@ -168,7 +172,7 @@ def value_errors(
     rows = np.moveaxis(off.reshape(n, many, *rest), 1, 0)
     found = _variances(cloud.weights.reshape(n, many).T, rows, _flat(bounds, many))
     share = found.reshape(np.shape(mean))
-    if values.dtype.kind == "b":  # an event that no particle has seen may happen
+    if is_share(values):  # an event that no particle has seen may happen
         ess = np.asarray(cloud.ess, dtype=float)
         share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
     return np.sqrt(share)

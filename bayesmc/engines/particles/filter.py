@@ -130,8 +130,8 @@ class ParticleFilter(FilterEngine):
         ``proposal="optimal"`` leaves a hidden number, or what is seen of it, out.
     LowEssWarning
         From the filter, where more than a tenth of the slices rest on little more than one particle, or the
-        stated error of the log evidence is above 1, or cannot be told (with a given number of particles: only
-        where a slice rests on fewer than four).
+        stated error of the log evidence is above 1, or cannot be told (with a given number of particles:
+        above 3, or cannot be told since the first row that is seen, or several, leave fewer than two).
 
     Notes
     -----
@@ -343,18 +343,28 @@ class ParticleFilter(FilterEngine):
     ) -> FilteredParticles:
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
-        if self.particles is None:
-            options: dict[str, Any] = {"lag": lag, "queries": queries, "progress": progress}
-            return self._sized(START).smooth(problem, seed, **options)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
+        sized = self._sized(START)
         if lag is not None:
-            return self._lagged(problem, seed, lag, queries or {}, progress)
-        sums = endless(problem.slices, _seen(problem))
-        if sums:
-            raise UnsupportedError(_not_backwards(sums[0]))
-        filtered = self._passed(problem, seed, True, {}, progress)
+            found, filtered = sized._lagged(problem, seed, lag, queries or {}, progress)
+        else:
+            sums = endless(problem.slices, _seen(problem))
+            if sums:
+                raise UnsupportedError(_not_backwards(sums[0]))
+            found, filtered = sized._backwards(problem, seed, queries or {}, progress)
         self._warn(filtered)
         warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 4)
+        return found
+
+    def _backwards(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        queries: Queries,
+        progress: bool | None,
+    ) -> tuple[FilteredParticles, FilteredParticles]:
+        """Trajectories drawn backwards, and the filter's answer."""
+        filtered = self._passed(problem, seed, True, {}, progress)
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
@@ -365,10 +375,10 @@ class ParticleFilter(FilterEngine):
             rng = stream(seed, Purpose.SMOOTH)
             found = backward.trajectories(filtered.clouds, problem.series, count, rng)
             layout = Layout(count, mover.apart, mover.lead)
-            record = Record(problem, layout, queries or {}, True)
+            record = Record(problem, layout, queries, True)
             for k, cloud in enumerate(found):
                 record.add(k, cloud)
-        return self._given_filtered(record.posterior(self, "smooth"), filtered)
+        return self._given_filtered(record.posterior(self, "smooth"), filtered), filtered
 
     def _lagged(
         self,
@@ -377,8 +387,8 @@ class ParticleFilter(FilterEngine):
         lag: int,
         queries: Queries,
         progress: bool | None,
-    ) -> FilteredParticles:
-        """Slices by the particles of ``lag`` slices later, through their ancestors."""
+    ) -> tuple[FilteredParticles, FilteredParticles]:
+        """Slices by the particles ``lag`` slices later, through ancestors; and the filter's answer."""
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
         record = Record(problem, mover.layout, queries, False)
@@ -406,9 +416,7 @@ class ParticleFilter(FilterEngine):
             pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         whole = filtered.posterior(self)
         whole.predictive = looks.found()
-        self._warn(whole)
-        warn_of_misfit(whole.predictive, type(self).__name__, whole.start, 4)
-        return self._given_filtered(record.posterior(self, "fixed-lag"), whole)
+        return self._given_filtered(record.posterior(self, "fixed-lag"), whole), whole
 
     def _given_filtered(
         self, found: FilteredParticles, filtered: FilteredParticles

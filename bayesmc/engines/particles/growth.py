@@ -30,7 +30,7 @@ LARGE = 1.0
 #: the same where the number of particles is given
 LARGE_GIVEN = 3.0
 #: slices that rest on a single particle which are no accident any more, and their share of all
-SEVERAL, OFTEN = 5, 0.005
+SEVERAL, OFTEN = 3, 0.005
 #: equally weighted particles below which a slice rests on a single one
 COLLAPSED = 2.0
 #: share of such slices from which on a warning says so
@@ -99,9 +99,9 @@ def collapsed(filtered: FilteredParticles) -> str | None:
 def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None:
     """What is said where the log evidence is not known well.
 
-    Who gives a number of particles may ask for states alone, which few may follow well: then it takes a larger
-    error; or a first row that next to no particle explains, since what is missing there is never found again,
-    or several rows of that kind.
+    Who gives a number of particles may ask for states alone, which few may follow well: then it takes a
+    larger error; or a first row that next to no particle explains, since what is missing there is never found
+    again, or several rows of that kind.
     """
     assert filtered.counts is not None and filtered.weight_ess is not None
     given = engine.particles is not None
