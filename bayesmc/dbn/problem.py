@@ -12,6 +12,7 @@ from bayesmc.dbn.slices import Slices
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.errors import ModelError
 from bayesmc.network import Model
+from bayesmc.network.noiseless import observed_links
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,5 +75,7 @@ def pose_series(
     """
     if not isinstance(dbn, DynamicBayesNet):
         raise ModelError(f"expected a DynamicBayesNet, not {type(dbn).__name__}")
+    links = observed_links(dbn, observations if isinstance(observations, Mapping) else {})
+    dbn = dbn.with_links(links) if links else dbn
     slices, series = dbn.read(observations, inputs, ahead=ahead)
     return SeriesProblem(dbn.copy(), slices, series)

@@ -26,6 +26,7 @@ from bayesmc.network import BayesNet, Node
 from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.net import Parents
 from bayesmc.network.node import Declaration
+from bayesmc.network.noiseless import without_noise
 from bayesmc.randomness import Purpose, seed_sequence, stream
 
 if TYPE_CHECKING:
@@ -256,6 +257,15 @@ class DynamicBayesNet:
         other._plates = self._plates.copy()
         other._later, other._first = dict(self._later), dict(self._first)
         other._inputs, other._static = self._inputs, self._static
+        return other
+
+    def with_links(self, links: Mapping[str, int]) -> DynamicBayesNet:
+        """A copy in which some computed nodes have distributions without noise, so that they are observed."""
+        other = self.copy()
+        for name, rank in links.items():
+            for declared in (other._later, other._first):
+                if name in declared:
+                    declared[name] = without_noise(declared[name], rank)
         return other
 
     # ---- asking -----------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network.labelled import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration
+from bayesmc.network.noiseless import observed_links
 from bayesmc.shapes import Shape, first_index
 
 
@@ -104,11 +105,16 @@ def read_question(
     net: Any, evidence: Mapping[str, Any] | None, inputs: Mapping[str, Any] | None
 ) -> tuple[Any, Model, dict[str, Observed], dict[str, np.ndarray]]:
     """A snapshot of a net, its model for the data, and evidence and inputs as stored values."""
-    model = net.model(evidence if isinstance(evidence, Mapping) else None, inputs)
+    given = evidence if isinstance(evidence, Mapping) else {}
+    model = net.model(given, inputs)
+    links = observed_links(model.nodes, given)
+    if links:
+        net = net.with_links(links)
+        model = net.model(given, inputs)
     observed = read_evidence(model, evidence)
     declarations = {n: c.declaration for n, c in model.nodes.items()}
-    given = read_inputs(declarations, model.sizes, inputs, model.labels)
-    return net.snapshot(), model, observed, given
+    known = read_inputs(declarations, model.sizes, inputs, model.labels)
+    return net.snapshot(), model, observed, known
 
 
 def read_inputs(

@@ -35,6 +35,7 @@ from bayesmc.network.node import (
     checked_rows,
     plain_states,
 )
+from bayesmc.network.noiseless import without_noise
 from bayesmc.network.store import ModelStore, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
@@ -314,6 +315,13 @@ class BayesNet:
         """A copy that shares what is compiled already; what holds it never sees later declarations."""
         other = self.copy()
         other._kept_store = self._store
+        return other
+
+    def with_links(self, links: Mapping[str, int]) -> BayesNet:
+        """A copy in which some computed nodes have distributions without noise, so that they are observed."""
+        other = self.copy()
+        for name, rank in links.items():
+            other._declarations[name] = without_noise(self._declarations[name], rank)
         return other
 
     # ---- asking -----------------------------------------------------------------------------

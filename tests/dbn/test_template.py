@@ -17,6 +17,7 @@ from bayesmc.errors import (
     ParameterError,
     PlateError,
     UnknownNodeError,
+    UnsupportedError,
 )
 
 
@@ -325,8 +326,9 @@ BAD_DATA: dict[str, tuple[Callable[[bmc.DynamicBayesNet], Any], type[Exception],
         r"inputs= gives 'v'.*the inputs are \['u'\]",
     ),
     "a computed node": (
-        lambda d: bmc.filter(d, {"speed": [1.0]}, inputs={"u": [0.0]}), EvidenceError,
-        "observations of 'speed', which is a deterministic node",
+        lambda d: bmc.filter(d, {"speed": [1.0], "bias": 0.0}, inputs={"u": [0.0]},
+                             engine=bmc.ParticleFilter(10)),
+        UnsupportedError, "density of 'speed', which has none",
     ),
     "a list": (lambda d: bmc.filter(d, [1.0]), EvidenceError, "observations is a list"),
     "a wrong shape": (

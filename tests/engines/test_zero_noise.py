@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 import bayesmc as bmc
-from bayesmc.errors import ParameterError, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import EvidenceError, ParameterError, UnsupportedError, ZeroProbabilityError
 
 GAUSSIAN = (bmc.KalmanFilter(), bmc.ExtendedKalmanFilter(), bmc.UnscentedKalmanFilter())
 
@@ -296,3 +296,55 @@ def test_log_prob_names_the_node():
     assert point.cdf(0.0).tolist() == pytest.approx([1.0, stats.norm.cdf(-1.0)])
     with pytest.raises(ParameterError, match="scale is 0"):
         bmc.Mixture([0.5, 0.5], point)
+
+
+# ---- computed nodes that are observed -----------------------------------------------------------
+
+
+@pytest.mark.parametrize("offset", [1.0, -4.0, 250.0])
+def test_an_observed_computed_node_is_conditioned_on(offset: float) -> None:
+    """A sum that is known: the closed form, and the same net with the sum declared without noise."""
+    found = []
+    for sums in (lambda x, z: 2 * x + z + offset, lambda x, z: bmc.Normal(2 * x + z + offset, 0.0)):
+        net = bmc.BayesNet()
+        net.add("x", bmc.Normal(0.0, 1.0))
+        net.add("z", bmc.Normal(0.0, 1.0))
+        net.add("y", sums)
+        found.append(bmc.infer(net, {"y": offset + 2.0}, engine=bmc.Exact()))
+    for posterior in found:
+        assert posterior.mean("x") == pytest.approx(0.8)
+        assert posterior.var("x") == pytest.approx(0.2)
+        right = stats.norm.logpdf(2.0, 0.0, np.sqrt(5.0))
+        assert posterior.log_marginal_likelihood == pytest.approx(right)
+
+
+def test_observed_computed_nodes_in_plates_vectors_and_over_time() -> None:
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("e", bmc.Normal(0.0, 1.0), plates="i")
+    net.add("y", lambda x, e: x + e, plates="i")
+    assert bmc.infer(net, {"y": [1.0, 2.0, 3.0]}).mean("x") == pytest.approx(1.5)
+    net = bmc.BayesNet()
+    net.add("x", bmc.MvNormal(np.zeros(2), np.eye(2)))
+    net.add("y", lambda x: 3 * x)
+    np.testing.assert_allclose(bmc.infer(net, {"y": [3.0, 1.0]}).mean("x"), [1.0, 1 / 3])
+    answers = []
+    for computed in (True, False):
+        dbn = bmc.DynamicBayesNet()
+        dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+        if computed:
+            dbn.add("v", bmc.Normal(0.0, 1.0))
+            dbn.add("y", lambda x, v: x + v)
+        else:
+            dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+        answers.append(bmc.filter(dbn, {"y": [1.0, 2.0, np.nan, 1.0]}))
+    np.testing.assert_allclose(*(a.mean("x") for a in answers))
+    assert answers[0].log_marginal_likelihood == pytest.approx(answers[1].log_marginal_likelihood)
+
+
+def test_computed_nodes_that_are_counts_take_no_evidence() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Poisson(3.0))
+    net.add("s", lambda a: a + 1)
+    with pytest.raises(EvidenceError, match="'s', which is a deterministic node and takes none"):
+        bmc.infer(net, {"s": 5})

@@ -25,6 +25,7 @@ def net():
     net.add("count", bmc.Poisson(2.0), plates="p")
     net.add("share", bmc.Dirichlet(np.ones(3)))
     net.add("double", lambda x: 2 * x)
+    net.add("twice", lambda count: 2 * count, plates="p")
     net.input("u")
     return net
 
@@ -117,8 +118,8 @@ REFUSED = {
     "unknown": ({"zz": 1}, r"evidence on 'zz', which the net does not have"),
     "close": ({"rat": 1}, r"evidence on 'rat'.*did you mean 'rate'"),
     "deterministic": (
-        {"double": 1.0},
-        r"evidence on 'double', which is a deterministic node and takes none; observe",
+        {"twice": [2, 2, 2]},
+        r"evidence on 'twice', which is a deterministic node and takes none; observe",
     ),
     "input": ({"u": 1.0}, r"evidence on 'u', which is an input node"),
     "label": ({"z": "lo"}, r"'lo' is not a state; the states are 'low', 'mid', 'high'"),
