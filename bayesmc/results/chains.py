@@ -70,6 +70,12 @@ class _Chains(Posterior):
             return super()._reload()
         return "declare the net and call infer again (resume= this posterior adds to its draws)"
 
+    def __getstate__(self) -> dict[str, Any]:
+        state = super().__getstate__()
+        if self.checkpoint is not None and self.problem is not None:
+            state["checkpoint"] = self.checkpoint.noted(self.problem)
+        return state
+
 
 class ChainsPosterior(_Chains, DrawsPosterior):
     """Draws of Markov chains, shape ``(chain, draw, *plates, *event)``.

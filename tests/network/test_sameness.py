@@ -184,3 +184,14 @@ def test_a_name_of_the_module_that_has_changed(
     here["SCALE"][...] = 1.0
     monkeypatch.setitem(here, "helper", lambda x: 3.0 * x)
     refused(first, "another density")
+
+
+@pytest.mark.parametrize("engine", [bmc.Exact(), bmc.LikelihoodWeighting(2000)])
+def test_predictions_by_a_function_that_says_something_else(
+    engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = bmc.infer(of_the_module(), {"y": 0.5}, engine=engine, rng=0)
+    posterior.predict(["y"], rng=0)
+    monkeypatch.setitem(globals(), "SCALE", 100.0)
+    with pytest.raises(bmc.errors.ModelError, match=r"'y': .* reads 'SCALE' .* 100\.0 now"):
+        posterior.predict(["y"], rng=0)
