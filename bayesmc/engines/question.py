@@ -45,7 +45,7 @@ def difference(
     >>> print(difference(asked(1.0), asked(1.0)))
     None
     >>> difference(asked(1.0), asked(2.0))
-    "the function of node 'x' is another one"
+    "the function of node 'x' reads 'scale', which was 1.0 then and is 2.0 now"
     """
     for found in (
         _nodes(was, now),
