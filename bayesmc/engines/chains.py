@@ -162,7 +162,7 @@ class ChainEngine(Engine):
                 finished = loop.draw(state, held, self.draws, bar, stop)
         except MemoryError as error:
             raise no_memory(self, self.draws * self.chains, names) from error
-        posterior = self._posterior(problem, sampler, held, loop.last)
+        posterior = self._posterior(problem, sampler, held, loop.last.noted(problem))
         self._warn(posterior, sampler, finished)
         return posterior
 
@@ -222,7 +222,8 @@ class ChainEngine(Engine):
             elif set(kept) != set(names):
                 why = "this one kept other nodes"
             elif old.problem is not None:
-                why = difference(old.problem, problem, old.checkpoint.values)
+                point = old.checkpoint
+                why = difference(old.problem, problem, point.values, point.densities)
             elif old.checkpoint.fits(old.model, problem):
                 return
             if why is None:

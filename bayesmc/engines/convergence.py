@@ -100,7 +100,7 @@ def _but_for_labels(
     for symmetry in symmetries(posterior.problem, point.values):
         pivot = pivot_of(symmetry, posterior.model)
         if pivot is not None and pivot in stored:
-            stored = ordered(stored, symmetry, pivot)
+            stored = ordered(posterior.problem, stored, symmetry, pivot)
             of = f"plate {symmetry.plate!r}" if symmetry.plate else f"{pivot!r}"
             words.append(
                 f"the {symmetry.size} components of {of} are named differently from draw to draw, as the "
@@ -164,6 +164,8 @@ def _figures(
     block, chains = posterior.ensemble_size, posterior._chains_and_draws[0]
     names, columns = [], []
     for name, index in _some(_moving(posterior, forward), posterior.model):
+        if name not in stored:
+            continue
         at: tuple[Any, ...] = (slice(None), slice(None), *index)
         values = stored[name][at]
         if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by

@@ -4,7 +4,8 @@ Where effects are weak, their scale may be near zero, and the effects with it. S
 are refused in the neck, so chains turn back at its mouth and look well mixed where they are. What shows it is
 an identity that holds for every density that vanishes at its ends: with u the parameter as a free number, s
 its score ``d log p / d u`` and h any smooth bounded function, ``E[h s + h'] = 0``. Draws that turn back at a
-wall violate it by the density at the wall, and most so with an h that looks at one end alone.
+wall violate it by the density at the wall, and most so with an h that looks at one end alone. So do right
+draws where the density itself has an edge or a jump: before an alarm it is looked for one.
 
 References
 ----------
@@ -23,6 +24,7 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results import ChainsPosterior
 
@@ -34,6 +36,10 @@ _AT_END = 100.0
 _ENDS, _WIDTH = (0.25, 0.1, 0.05), 0.25
 #: numbers that densities are evaluated of, at most; parameters looked at; draws below which none is judged
 _NUMBERS, _PARAMETERS, _FEW = 2_000_000, 12, 400
+#: draws at each end, and as many between, around which a jump is looked for, and bisections to find it
+_LOOKED, _HALVES = 100, 32
+#: difference of a log density that is left at a jump; share of draws without a score that are left out
+_JUMP, _BAD = 1e-3, 0.01
 #: step of the derivative, in standard deviations
 _STEP = 1e-4
 
@@ -61,10 +67,12 @@ def missed_ends(posterior: ChainsPosterior, forward: frozenset[str]) -> Iterator
         try:
             with marking_invalid(), np.errstate(all="ignore"):
                 found = _worst(problem.model, name, stored, forward, posterior.ensemble_size)
-        except Exception:  # a function that minds being asked beside a draw must not cost a run
-            continue
-        if found is None or not found[0] > _LIMIT:
-            continue
+                if found is None or not found[0] > _LIMIT:
+                    continue
+                if _has_jump(problem.model, name, stored, forward):
+                    continue
+        except (BayesmcError, ValueError, FloatingPointError):
+            continue  # a function that minds being asked beside a draw must not cost a run
         z, end, edge = found
         shown = ", ".join(map(repr, children[:3]))
         yield (
@@ -186,14 +194,18 @@ def _worst(
         return None
     free, back, slope = _free(*ends)
     u = free(x)
-    spread = float(u.std())
-    if not (np.isfinite(u).all() and spread > 0):
+    spread = float(u[np.isfinite(u)].std()) if np.isfinite(u).any() else 0.0
+    if not spread > 0:
         return None
     step = _STEP * spread
     log = [_log_terms(model, name, {**stored, name: back(u + s)}, forward) for s in (step, -step)]
     score = (log[0] - log[1]) / (2 * step) + slope(u)
-    if score.shape != u.shape or not np.isfinite(score).all():
+    if score.shape != u.shape:
         return None
+    fit = np.isfinite(score) & np.isfinite(u)
+    if not fit.mean() > 1 - _BAD:
+        return None
+    u = np.where(fit, u, np.median(u[fit]))
     effective = float(diagnostics.chain_statistic("ess", u, block))
     found = []
     for end, turned in (("lower", u), ("upper", -u)):
@@ -202,10 +214,49 @@ def _worst(
             t = (turned - np.quantile(turned, share)) / (_WIDTH * spread)
             h = 1.0 / (1.0 + np.exp(t))
             figure = h * sign * score - h * (1 - h) / (_WIDTH * spread)
+            figure = np.where(fit, figure, figure[fit].mean())
             if share * effective >= _AT_END:
                 edge = float(back(np.asarray(sign * turned.min())))
                 found.append((_errors_below(figure, block), end, edge))
     return max(found, default=None)
+
+
+def _has_jump(
+    model: Model, name: str, stored: dict[str, np.ndarray], forward: frozenset[str]
+) -> bool:
+    """Whether the density jumps, or ends, near some of the draws as a parameter alone is moved.
+
+    An interval about a draw is halved again and again, towards where the log density differs more: at last
+    nothing is left of the difference but at a jump.
+    """
+    ends = _ends(model[name])
+    assert ends is not None
+    free, back, _ = _free(*ends)
+    u = free(stored[name])
+    shape = u.shape
+    order = np.argsort(u, axis=None)[: np.isfinite(u).sum()]
+    between = order[:: max(order.size // _LOOKED, 1)]
+    at = np.unravel_index(np.r_[order[:_LOOKED], between, order[-_LOOKED:]], shape)
+    few = {n: np.broadcast_to(v, shape + v.shape[2:])[at][None] for n, v in stored.items()}
+
+    def log(x: np.ndarray) -> np.ndarray:
+        return _log_terms(model, name, {**few, name: back(x)}, forward)
+
+    wide = _WIDTH * float(u.ravel()[order].std())
+    low, high = u[at][None] - wide, u[at][None] + wide
+    left, right = log(low), log(high)
+    for _ in range(_HALVES):
+        centre = 0.5 * (low + high)
+        middle = log(centre)
+        lower = _apart(left, middle) > _apart(middle, right)
+        low, left = np.where(lower, low, centre), np.where(lower, left, middle)
+        high, right = np.where(lower, centre, high), np.where(lower, middle, right)
+    return bool((_apart(left, right) > _JUMP).any())
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Distance of two log densities; none between two that are both minus infinity."""
+    return np.nan_to_num(np.abs(a - b), nan=0.0, posinf=np.inf)
 
 
 def _errors_below(figure: np.ndarray, block: int) -> float:
@@ -245,8 +296,15 @@ def _log_terms(
     for other in terms:
         if other not in forward:
             given, _ = model.evaluate(other, values)
-            log = model.log_density(other, given, values[other])
+            log = _log_density(model[other], given, values[other])
             total = total + log.sum(axis=tuple(range(2, log.ndim)))
     for factor in factors:
         total = total + model.potential(factor, values)
     return np.asarray(total)
+
+
+def _log_density(node: CompiledNode, given: Any, stored: np.ndarray) -> np.ndarray:
+    """Log density of stored values; NaN where there is none, so that one draw does not cost the others."""
+    value = node.domain.to_support(stored) if node.domain is not None else stored
+    log = given.log_prob_unchecked(np.asarray(value))
+    return log if given.invalid is None else np.where(given.invalid, -np.inf, log)

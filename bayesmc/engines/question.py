@@ -1,23 +1,27 @@
 """Whether two posed problems are the same question, so that the draws of one may be gone on with.
 
 The same net may have been declared anew: then functions are compared by what they say, and where that cannot
-be told, by the densities that they give at some draws.
+be told, by the densities that they give at some draws. What functions read from their module may have another
+value by now: what it was is known from their declarations, and densities from when the draws were made.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from bayesmc.network import Observed, Problem
+from bayesmc.network.captured import redeclared
 from bayesmc.network.sameness import same
-from bayesmc.results.chains import log_densities, outline
+from bayesmc.results.checkpoint import noted_densities, other_density, outline
 
 
 def difference(
-    was: Problem, now: Problem, values: Mapping[str, np.ndarray] | None = None
+    was: Problem,
+    now: Problem,
+    values: Mapping[str, np.ndarray] | None = None,
+    densities: Mapping[str, float] | None = None,
 ) -> str | None:
     """What differs between two questions, in words; None where they are the same.
 
@@ -26,6 +30,8 @@ def difference(
     was, now : Problem
     values : dict, optional
         Stored values of all nodes at some draws, at which densities are compared.
+    densities : dict, optional
+        ``log_densities`` of ``was`` at these values when the draws were made.
 
     Examples
     --------
@@ -39,9 +45,14 @@ def difference(
     >>> print(difference(asked(1.0), asked(1.0)))
     None
     >>> difference(asked(1.0), asked(2.0))
-    "the function of node 'x' is another one"
+    "the function of node 'x' reads 'scale', which was 1.0 then and is 2.0 now"
     """
-    for found in (_nodes(was, now), _data(was.observed, now.observed), _inputs(was, now)):
+    for found in (
+        _nodes(was, now),
+        _data(was.observed, now.observed),
+        _inputs(was, now),
+        _around(was, now),
+    ):
         for words in found:
             return words
     unknown: str | None = None
@@ -49,16 +60,14 @@ def difference(
         if known is False:
             return f"{words} is another one"
         unknown = unknown or (None if known else words)
-    if unknown is None:
+    if unknown is None and (values is None or densities is None):
         return None
-    if values is None:
+    if values is not None and densities is None:
+        densities = noted_densities(was, values)
+    if values is None or densities is None:
         return f"{unknown} was declared anew, and whether it is the same cannot be told"
-    before, after = log_densities(was, values), log_densities(now, values)
-    for name, value in before.items():
-        other = after.get(name, math.nan)
-        if not (other == value or math.isclose(other, value, rel_tol=1e-9, abs_tol=1e-9)):
-            return f"{name!r} has another density"
-    return None
+    other = other_density(now, values, densities)
+    return None if other is None else f"{other!r} has another density"
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -89,6 +98,19 @@ def _nodes(was: Problem, now: Problem) -> Iterator[str]:
                 yield f"node {name!r} has {other}"
     if list(old.potentials) != list(new.potentials):
         yield "the potentials have other names"
+
+
+def _around(was: Problem, now: Problem) -> Iterator[str]:
+    """Names read from around functions of both that stood for other values when these were declared."""
+    for name, node in now.model.nodes.items():
+        a, b = was.model[name].declaration, node.declaration
+        words = None if a is b else redeclared(a.captured, b.captured)
+        if words:
+            yield f"the function of node {name!r} reads {words}"
+    for name, (new, _) in now.model.potentials.items():
+        words = redeclared(was.model.potentials[name][0].captured, new.captured)
+        if words:
+            yield f"the potential {name!r} reads {words}"
 
 
 def _functions(was: Problem, now: Problem) -> Iterator[tuple[str, bool | None]]:

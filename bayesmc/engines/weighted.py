@@ -23,6 +23,7 @@ from bayesmc.network.forward import Pass, Step, run
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
+from bayesmc.results.checkpoint import noted_densities
 
 #: share of the draws above which weights are even enough to leave their tail unfitted
 _EVEN = 0.5
@@ -135,6 +136,8 @@ class WeightedEngine(Engine):
             independent=True,
             streams=before + len(chunk_sizes(problem.model, self.draws)),
         )
+        few = _first(stored, problem)
+        posterior.densities = None if few is None else noted_densities(problem, few)
         log_total = float(diagnostics.log_sum_exp(log_weights))
         self._set_evidence(posterior, log_total, total, weighted)
         return posterior
@@ -177,9 +180,7 @@ class WeightedEngine(Engine):
             return "this one kept other nodes"
         if (old.log_weights is not None) != self.is_weighted(problem):
             return "this one answers another question"
-        few = {n: v[0, :_COMPARED] for n, v in old._stored.items()}
-        whole = all(n in few or c.kind == "input" for n, c in problem.model.nodes.items())
-        return difference(old.problem, problem, few if whole else None)
+        return difference(old.problem, problem, _first(old._stored, problem), old.densities)
 
     def _refuse_zero(self, top: float, draws: int) -> None:
         if top == -np.inf:
@@ -300,6 +301,13 @@ def treatment(problem: Problem, name: str) -> str:
 def _sizes(model: Model, draws: int) -> Iterator[int]:
     """Sizes of chunks, not listed before there is memory for the draws."""
     yield from chunk_sizes(model, draws)
+
+
+def _first(stored: Mapping[str, np.ndarray], problem: Problem) -> dict[str, np.ndarray] | None:
+    """Values of all nodes at the first draws; None where some were not kept."""
+    if any(n not in stored and c.kind != "input" for n, c in problem.model.nodes.items()):
+        return None
+    return {n: v[0, :_COMPARED] for n, v in stored.items()}
 
 
 def _counted(chunks: Iterable[Pass], bar: Progress) -> Iterator[Pass]:

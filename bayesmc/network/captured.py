@@ -89,6 +89,25 @@ def check_captured(declarations: Iterable[Any], what: str = "node") -> None:
                 raise ModelError(_words(what, declaration, seen, now))
 
 
+def redeclared(was: Iterable[Captured], now: Iterable[Captured]) -> str | None:
+    """A name that stood for another value when a function was first declared than when it was anew, in words.
+
+    Two declarations by the same lines read the same names, and what these stand for by now says nothing of
+    what they stood for in between.
+    """
+    before: dict[tuple[str, str, str], list[Captured]] = {}
+    for seen in was:
+        before.setdefault(_place(seen), []).append(seen)
+    for seen in now:
+        known = before.get(_place(seen))
+        old = known.pop(0) if known else seen
+        if old.value is not seen.value and not _alike(old.value, seen.value):
+            return (
+                f"{seen.name!r}, which was {_peek(old.value)} then and is {_peek(seen.value)} now"
+            )
+    return None
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -99,6 +118,10 @@ class _Anything:
         return True
 
     __hash__ = object.__hash__
+
+
+def _place(seen: Captured) -> tuple[str, str, str]:
+    return seen.function.__module__, seen.function.__qualname__, seen.name
 
 
 def _collect(function: Any, depth: int, found: dict[tuple[int, str], Captured]) -> None:

@@ -9,15 +9,14 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import marking_invalid
 from bayesmc.errors import UnsupportedError
-from bayesmc.network import CompiledNode, Model, Observed, Problem
+from bayesmc.network import CompiledNode, Model, Problem
+from bayesmc.results.checkpoint import Checkpoint
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.relabelling import ordered, symmetries
@@ -31,50 +30,6 @@ _BUFFER = 32
 _BUFFER_ELEMENTS = 1 << 21
 #: numbers that the batch means of one node may take; a larger node has no errors in summaries
 _BATCH_ELEMENTS = 1 << 22
-
-
-@dataclass(frozen=True, eq=False)
-class Checkpoint:
-    """Where chains stand after their last kept draw, to go on from.
-
-    Attributes
-    ----------
-    state : dict
-        The sampler's state.
-    generator : dict
-        State of the bit generator.
-    values : dict
-        Stored values of the last draw.
-    observed : dict
-        The evidence, as stored.
-    densities : dict or None
-        Node or potential -> its log density at ``values`` (a deterministic node's sum); filled in by
-        pickling, which loses the functions, so that another function is noticed.
-    """
-
-    state: Mapping[str, Any]
-    generator: Mapping[str, Any]
-    values: Mapping[str, np.ndarray]
-    observed: Mapping[str, Observed]
-    densities: Mapping[str, float] | None = None
-
-    def fits(self, model: Model, problem: Problem) -> bool:
-        """Whether it belongs to this question, though the functions of its ``model`` are lost."""
-        if list(model.nodes) != list(problem.model.nodes) or model.sizes != problem.model.sizes:
-            return False
-        if any(outline(node) != outline(problem.model[n]) for n, node in model.nodes.items()):
-            return False
-        seen = problem.observed
-        if self.observed.keys() != seen.keys() or not all(
-            np.array_equal(o.value, seen[n].value) and np.array_equal(o.mask, seen[n].mask)  # type: ignore[arg-type]
-            for n, o in self.observed.items()
-        ):
-            return False
-        before, now = self.densities or {}, log_densities(problem, self.values)
-        return before.keys() == now.keys() and all(
-            math.isclose(now[n], value, rel_tol=1e-9, abs_tol=1e-9) or now[n] == value
-            for n, value in before.items()
-        )
 
 
 class _Chains(Posterior):
@@ -117,10 +72,8 @@ class _Chains(Posterior):
 
     def __getstate__(self) -> dict[str, Any]:
         state = super().__getstate__()
-        point = self.checkpoint
-        if point is not None and point.densities is None and self.problem is not None:
-            densities = log_densities(self.problem, point.values)
-            state["checkpoint"] = replace(point, densities=densities)
+        if self.checkpoint is not None and self.problem is not None:
+            state["checkpoint"] = self.checkpoint.noted(self.problem)
         return state
 
 
@@ -162,7 +115,8 @@ class ChainsPosterior(_Chains, DrawsPosterior):
 
         A model that does not tell its components apart leaves chains free to name them differently. What
         is asked of the answer here is about the component with the smallest value of ``by``, the next, and
-        so on.
+        so on. Nodes that are computed from others are computed again, and left out where ``keep=`` left out
+        what they are computed from.
 
         Parameters
         ----------
@@ -200,7 +154,7 @@ class ChainsPosterior(_Chains, DrawsPosterior):
                 new = object.__new__(type(self))
                 new.__dict__.update(twin)
                 new.__dict__.pop("_slowest", None)
-                new._stored = ordered(self._stored, found, by)
+                new._stored = ordered(problem, self._stored, found, by)
                 new.checkpoint = new.label_switching = None
                 return new
         raise UnsupportedError(
@@ -466,28 +420,3 @@ def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
     if node.domain.labels is None:
         return np.take(np.asarray(node.domain.numbers, dtype=float), draws)
     return (draws[..., None] == np.arange(node.domain.size)).astype(float)
-
-
-def outline(node: CompiledNode) -> tuple[Any, ...]:
-    """What can be compared of a node whose function is lost."""
-    arrays = (node.declaration.probs, node.declaration.value)
-    tables = tuple(None if a is None else (a.shape, a.tobytes()) for a in arrays)
-    states = None if node.domain is None else node.domain.states
-    return (node.kind, node.parents, node.plates, node.value_shape, states, *tables)
-
-
-def log_densities(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, float]:
-    """Log density of every node and potential at some draws, summed; a deterministic node's values."""
-    model = problem.model
-    at = {**problem.inputs, **values}
-    found = {name: float(np.sum(value)) for name, value in problem.inputs.items()}
-    with marking_invalid(), np.errstate(all="ignore"):
-        for name, node in model.nodes.items():
-            if node.is_stochastic and node.declaration.source in ("function", "table"):
-                given, _ = model.evaluate(name, at)
-                found[name] = float(np.sum(model.log_density(name, given, at[name])))
-            elif node.kind == "deterministic":
-                found[name] = float(np.sum(model.evaluate(name, at)[0], dtype=float))
-        for name in model.potentials:
-            found[f"potential {name}"] = float(np.sum(model.potential(name, at)))
-    return found

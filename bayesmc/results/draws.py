@@ -50,6 +50,8 @@ class DrawsPosterior(Posterior):
 
     #: members that a chain's draws come from in turn; 1 for an ordinary chain
     ensemble_size: int = 1
+    #: log densities at the first draws when they were made, so that ``resume`` notices other functions
+    densities: Mapping[str, float] | None = None
 
     def __init__(
         self,

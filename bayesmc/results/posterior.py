@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
+from bayesmc.network.captured import check_captured
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.table import Summary
 
@@ -275,6 +276,9 @@ class Posterior:
                 f"{what}: this posterior was unpickled, and pickles carry no functions; it misses those of "
                 f"the nodes {shown}: {self._reload()}"
             )
+        model = self.problem.model
+        check_captured(node.declaration for node in model.nodes.values())
+        check_captured((potential for potential, _ in model.potentials.values()), "factor")
         return self.problem
 
     def _reload(self) -> str:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import marking_invalid
+from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model, Problem
 
 #: vectors that may or may not belong to the components, each way of which is tried
@@ -94,11 +95,16 @@ def _is_simplex(node: CompiledNode) -> bool:
     return node.support is not None and node.support.kind == "simplex"
 
 
-def ordered(stored: Mapping[str, np.ndarray], symmetry: Symmetry, by: str) -> dict[str, np.ndarray]:
+def ordered(
+    problem: Problem, stored: Mapping[str, np.ndarray], symmetry: Symmetry, by: str
+) -> dict[str, np.ndarray]:
     """Draws whose components are named by the order of node ``by``, draw by draw.
+
+    Nodes that are computed from others are computed again; where these were not kept they are left out.
 
     Parameters
     ----------
+    problem : Problem
     stored : dict
         Node -> stored values, ``(chain, draw, *plates, *event)``.
     symmetry : Symmetry
@@ -120,10 +126,28 @@ def ordered(stored: Mapping[str, np.ndarray], symmetry: Symmetry, by: str) -> di
                 for a in np.ogrid[: codes.shape[0], : codes.shape[1]]
             )
             found[name] = rank[chain, draw, codes].astype(stored[name].dtype)
-    return found
+    return _computed_again(problem, found, set(symmetry.names))
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _computed_again(
+    problem: Problem, stored: dict[str, np.ndarray], changed: set[str]
+) -> dict[str, np.ndarray]:
+    """Draws with the values of nodes that are computed from changed ones."""
+    seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
+    at = {**problem.inputs, **seen, **stored}
+    for name, node in problem.model.nodes.items():
+        if node.kind != "deterministic" or not changed & set(node.parents):
+            continue
+        changed = changed | {name}
+        at.pop(name, None)
+        if all(parent in at for parent in node.parents):
+            with marking_invalid(), np.errstate(all="ignore"):
+                values = np.asarray(problem.model.evaluate(name, at)[0])
+            at[name] = values if name not in stored else values.astype(stored[name].dtype)
+    return {n: at[n] for n in stored if n in at}
 
 
 def _hidden(problem: Problem) -> dict[str, CompiledNode]:
@@ -212,7 +236,8 @@ def _log_joint(problem: Problem, values: Mapping[str, np.ndarray]) -> np.ndarray
                 total = total + log.sum(axis=tuple(range(log.ndim - len(node.plates), log.ndim)))
         for name in model.potentials:
             total = total + model.potential(name, at)
-    except Exception:  # a function that minds being asked where no draw was: nothing is known
+    except (BayesmcError, ValueError, FloatingPointError):
+        # a function that minds being asked where no draw was: nothing is known
         return None
     return np.atleast_1d(total)
 

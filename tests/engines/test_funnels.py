@@ -1,7 +1,8 @@
 """Chains that never entered the neck of a funnel say so, and right samplers of funnels do not.
 
-The identity is judged at 4 standard errors, at two ends and three widths: a false alarm in some thousand
-parameters of a right sampler.
+The identity is judged at 4 standard errors, at two ends and three widths. With a normal error a right sampler
+is judged wrong with a probability of at most 6 * 3.2e-5 = 1.9e-4 per parameter (Bonferroni); a thousandth is
+allowed for what is left of skewness and for estimated errors.
 """
 
 from __future__ import annotations
@@ -147,16 +148,74 @@ def test_a_missed_neck_is_an_alarm(name: str) -> None:
     assert len(found) == 1 and words in found[0]
 
 
-@pytest.mark.parametrize("name", CASES)
+def fixed_edge(hard: bool = True) -> bmc.BayesNet:
+    """A factor that ends the density of ``s`` at .4, where it is large, or lets it down there by two."""
+    net = bmc.BayesNet(plates={"i": 5})
+    net.add("s", bmc.Uniform(0.0, 2.0))
+    net.add("b", lambda s: bmc.Laplace(0.0, s), plates="i")
+    net.potential("edge", lambda s: np.where(s > 0.4, 0.0, -np.inf if hard else -2.0))
+    net.add("y", lambda b: bmc.Normal(0.0 * b, 1.0), plates="i")
+    return net
+
+
+def draws_of_step(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
+    def kept(s: np.ndarray) -> np.ndarray:
+        return rng.random(s.size) < np.where(s > 0.4, 1.0, np.exp(-2.0))
+
+    s = beyond(rng, count, lambda r, n: r.uniform(0, 2.0, n), kept)
+    return {"s": s, "b": rng.laplace(size=(count, 5)) * s[:, None]}
+
+
+def tops() -> bmc.BayesNet:
+    """Effects of which none may lie above the parameter."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("top", bmc.LogNormal(1.0, 0.5))
+    net.add("z", lambda top: bmc.Uniform(0.0, top), plates="i")
+    net.add("y", lambda z: bmc.Normal(0.0 * z, 0.5), plates="i")
+    return net
+
+
+def draws_of_tops(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
+    top = rng.lognormal(1.0, 0.5, count)
+    return {"top": top, "z": rng.random((count, 4)) * top[:, None]}
+
+
+RIGHT: dict[str, tuple[Callable[[], bmc.BayesNet], Draw, int]] = {
+    "neal": (neal, draws_of_neal(-np.inf), 9),
+    "precision": (precision, draws_of_precision(np.inf), 12),
+    "bounded": (bounded, draws_of_bounded(0.0), 5),
+    "a support that ends at the parameter": (tops, draws_of_tops, 4),
+    "a factor that ends": (fixed_edge, draws_of_bounded(0.4), 5),
+    "a factor with a step": (lambda: fixed_edge(False), draws_of_step, 5),
+}
+
+
+@pytest.mark.parametrize("name", RIGHT)
 def test_a_right_sampler_is_no_alarm(name: str) -> None:
-    """Ten runs each: a false alarm in any has a probability of some 1 %."""
-    make, draw, whole, _, _ = CASES[name]
-    net, size = make(), 12 if name == "precision" else 9 if name == "neal" else 5
+    """Ten runs each: a false alarm in any has a probability of 1 % at most, by normal errors of .2 %."""
+    make, draw, size = RIGHT[name]
+    net = make()
     for k in range(10):
-        _, found = warned(
-            net, {"y": np.zeros(size)}, Drawn(500, draw=draw(whole)), session.seed() + k
-        )
+        seed = session.seed() + k
+        _, found = warned(net, {"y": np.zeros(size)}, Drawn(500, draw=draw), seed)
         assert not any("turn back" in words for words in found)
+
+
+@pytest.mark.parametrize("bad", [1e200, np.nan])
+def test_an_alarm_is_not_lost_for_one_bad_draw(bad: float) -> None:
+    """One draw whose density overflows, or has none, leaves thousands to judge by."""
+    calls = []
+
+    def draw(rng: np.random.Generator, count: int) -> dict[str, np.ndarray]:
+        calls.append(0)
+        values = draws_of_neal(-4.0)(rng, count)
+        if len(calls) == 700:
+            values["x"][0, 0] = bad
+        return values
+
+    _, found = warned(neal(), {"y": np.zeros(9)}, Drawn(2000, draw=draw), 1)
+    assert len(calls) >= 2000
+    assert any("draws of 'v' turn back at its lower end" in words for words in found)
 
 
 # ---- samplers of this library ---------------------------------------------------------------------

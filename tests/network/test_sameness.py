@@ -134,3 +134,64 @@ def test_a_net_declared_anew_is_gone_on_with(engine: Any) -> None:
             bmc.infer(net, {"y": 0.5}, engine=engine, rng=0, resume=first)
     with pytest.raises(UnsupportedError, match=r"resume=.*; the evidence of 'y' is another one"):
         bmc.infer(declared(1.0), {"y": 0.6}, engine=engine, rng=0, resume=first)
+
+
+# ---- names of the module ---------------------------------------------------------------------------
+
+SCALE: Any = 1.0
+
+
+def helper(x: Any) -> Any:
+    return x
+
+
+def of_the_module(potential: bool = False) -> bmc.BayesNet:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    if potential:
+        net.add("y", lambda x: bmc.Normal(x, 1.0))
+        net.potential("pull", lambda x: -0.5 * (helper(x) / SCALE) ** 2)
+    else:
+        net.add("y", lambda x: bmc.Normal(helper(x), SCALE))
+    return net
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+@pytest.mark.parametrize("potential", [False, True])
+@pytest.mark.parametrize(
+    "engine",
+    [bmc.Gibbs(40, 10, 2), bmc.MetropolisHastings(40, 10, 2), bmc.LikelihoodWeighting(2000)],
+)
+def test_a_name_of_the_module_that_has_changed(
+    engine: Any, potential: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A constant, an array that is written over, and a function that is defined anew."""
+    here = globals()
+
+    def refused(first: Any, why: str) -> None:
+        with pytest.raises(UnsupportedError, match=rf"resume=.*; .*({why})"):
+            bmc.infer(of_the_module(potential), {"y": 0.5}, engine=engine, rng=0, resume=first)
+
+    first = bmc.infer(of_the_module(potential), {"y": 0.5}, engine=engine, rng=0)
+    again = bmc.infer(of_the_module(potential), {"y": 0.5}, engine=engine, rng=0, resume=first)
+    assert again["x"].shape[1] == 2 * engine.draws
+    monkeypatch.setitem(here, "SCALE", 100.0)
+    refused(first, r"reads 'SCALE', which was 1\.0 then and is 100\.0 now")
+    monkeypatch.setitem(here, "SCALE", np.array(1.0))
+    first = bmc.infer(of_the_module(potential), {"y": 0.5}, engine=engine, rng=0)
+    here["SCALE"][...] = 100.0
+    refused(first, "reads 'SCALE'")
+    here["SCALE"][...] = 1.0
+    monkeypatch.setitem(here, "helper", lambda x: 3.0 * x)
+    refused(first, "another density")
+
+
+@pytest.mark.parametrize("engine", [bmc.Exact(), bmc.LikelihoodWeighting(2000)])
+def test_predictions_by_a_function_that_says_something_else(
+    engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posterior = bmc.infer(of_the_module(), {"y": 0.5}, engine=engine, rng=0)
+    posterior.predict(["y"], rng=0)
+    monkeypatch.setitem(globals(), "SCALE", 100.0)
+    with pytest.raises(bmc.errors.ModelError, match=r"'y': .* reads 'SCALE' .* 100\.0 now"):
+        posterior.predict(["y"], rng=0)

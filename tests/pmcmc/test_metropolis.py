@@ -193,7 +193,7 @@ def test_chains_start_where_the_mass_is(steps: int) -> None:
 @pytest.mark.thorough
 @pytest.mark.parametrize("engine", [ParticleMetropolis(), bmc.ParticleGibbs()])
 def test_five_hundred_rows_of_counts(engine: Any) -> None:
-    """400 effective draws of each parameter at default settings; the time it takes stands in the message."""
+    """Over 250 effective draws of each parameter at default settings; the message says in what time."""
     dbn, rows = logits(500)
     begin = time.process_time()
     found = bmc.infer(dbn, rows, engine=engine, rng=0, keep=["mu", "phi", "sigma"])

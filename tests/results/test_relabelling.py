@@ -149,3 +149,32 @@ def test_groups_with_data_have_names() -> None:
     posterior, _ = asked(net, {"y": [0.0, 1.0, 2.0]}, bmc.Gibbs(50, 20, 4))
     with pytest.raises(UnsupportedError, match="no components"):
         posterior.relabelled("effect")
+
+
+# ---- what is computed from components -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("keep", ["draws", ["mean", "twice", "own", "gap"]])
+def test_computed_nodes_follow_their_components(keep: Any) -> None:
+    """In the plate of the components, in that of the points (through labels), and of both in turn."""
+    net = mixture()
+    net.add("twice", lambda mean: 2.0 * mean, plates="cluster")
+    net.add("thrice", lambda twice, mean: twice + mean, plates="cluster")
+    net.add("own", lambda label, mean: mean[label], plates="point")
+    net.add("gap", lambda mean: mean[1] - mean[0])
+    engine = bmc.Gibbs(200, 100, 6)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        posterior = bmc.infer(net, {"x": DATA}, engine=engine, rng=1, keep=keep)
+    named = posterior.relabelled("mean")
+    assert (posterior["mean"] != named["mean"]).any()  # the case is there
+    np.testing.assert_array_equal(named["twice"], 2.0 * named["mean"])
+    np.testing.assert_array_equal(named["gap"], np.diff(named["mean"], axis=-1)[..., 0])
+    assert (named["gap"] > 0).all() and (posterior["gap"] < 0).any()
+    if keep == "draws":
+        np.testing.assert_array_equal(named["thrice"], 3.0 * named["mean"])
+        np.testing.assert_array_equal(named["own"], posterior["own"])  # a point's mean has no name
+    else:  # computed from labels, which were not kept
+        assert "own" not in named.names
+        with pytest.raises(UnsupportedError, match="'own'"):
+            named.mean("own")
