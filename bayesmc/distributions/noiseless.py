@@ -18,6 +18,8 @@ from bayesmc.distributions.normal import Normal
 
 #: how far a value without noise may be off, relative to its size, and at least
 ALLOWED, FLOOR = 1e-9, 1e-12
+#: and relative to the terms that it is the sum of: a few thousand roundings of each
+ROUNDED = 1e-12
 
 
 def plane_log_density(dist: Distribution, x: np.ndarray) -> np.ndarray | None:

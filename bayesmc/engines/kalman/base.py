@@ -19,7 +19,7 @@ from bayesmc.engines.kalman.answers import filter_answers, smooth_answers
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.passes import Filtered, State, backward
 from bayesmc.engines.kalman.posterior import GaussianBelief, GaussianSeries
-from bayesmc.engines.kalman.rows import Memory, RowTaker
+from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
 from bayesmc.network.reading import nodes_read
@@ -169,7 +169,7 @@ class GaussianFilter(FilterEngine):
         state: State,
         pattern: Pattern,
         memory: Memory,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> Expected:
         """See ``rows.Family``."""
         raise NotImplementedError
 
