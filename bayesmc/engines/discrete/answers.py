@@ -85,7 +85,7 @@ class SliceAnswers:
             parts.append(self._expectation(function, names, kinds[rows.kind], rows, read))
         return np.concatenate(parts)
 
-    def check(self, function: Callable[..., Any]) -> tuple[list[str], dict[int, Term]]:
+    def check(self, function: Callable[..., Any]) -> tuple[tuple[str, ...], dict[int, Term]]:
         """What a query reads, in the three kinds of slices; raises ahead what ``expectation`` does."""
         names = nodes_read(function)
         for name in names:

@@ -141,7 +141,7 @@ def quantiles(mean: np.ndarray, std: np.ndarray, q: Any, name: str) -> np.ndarra
 def _called(
     view: View,
     function: Callable[..., Any],
-    names: list[str],
+    names: tuple[str, ...],
     at: np.ndarray,
     numbers: np.ndarray,
     event: bool,
