@@ -8,7 +8,6 @@ law, so that quadratic functions are exact; shifted sets give the error. Beliefs
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -31,12 +30,6 @@ _POINTS, _REACH = 1024, 8.5
 #: shifted sets for several numbers, points in each at least and at most, and in those of all beliefs;
 #: dimensions up to which they are Kronecker's
 _SETS, _FEW, _MANY, _ALL, _KRONECKER = 8, 512, 1 << 14, 1 << 22, 16
-
-
-def arguments_of(function: Callable[..., Any]) -> list[str]:
-    """Nodes that a query reads; arguments with a default are none, as for the functions of nodes."""
-    parameters = inspect.signature(function).parameters.values()
-    return [p.name for p in parameters if p.default is inspect.Parameter.empty]
 
 
 def as_event(values: Any) -> np.ndarray:

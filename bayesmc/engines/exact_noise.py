@@ -16,11 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.noiseless import ALLOWED, FLOOR
+from bayesmc.distributions.noiseless import ALLOWED, FLOOR, ROUNDED
 from bayesmc.errors import UnsupportedError
 from bayesmc.factors import LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, along
-from bayesmc.kernels.kalman import HALF_LOG_2PI, condition, log_densities, multiplied, standardised
+from bayesmc.kernels.kalman import (
+    HALF_LOG_2PI,
+    condition,
+    log_densities,
+    multiplied,
+    standardised,
+    went_in,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +78,7 @@ class NoiseCluster:
         """
         lead = tuple(cards[v] for v in self.scope)
         hidden, p = self._sizes(dims)
-        mean, rows, target, log = self._written(dims, lead, hidden, p)
+        mean, terms, rows, target, log = self._written(dims, lead, hidden, p)
         chosen = np.concatenate([rows[..., hidden:, :], rows[..., :hidden, :]], axis=-2)
         made = condition(chosen, p)
         eta = standardised(made.root, target - mean[..., hidden:])
@@ -82,7 +89,9 @@ class NoiseCluster:
                 raise self._unlike()
             off = np.abs(eta) * made.root.diagonal(0, -2, -1)
             size = np.abs(target) + np.abs(mean[..., hidden:])
-            wrong = (made.certain & (off > ALLOWED * size + FLOOR)).any(axis=-1)
+            terms = np.abs(target) + terms[..., hidden:]
+            allowed = ALLOWED * size + ROUNDED * went_in(made.root, terms) + FLOOR
+            wrong = (made.certain & (off > allowed)).any(axis=-1)
             log = np.where(wrong, -np.inf, log)
         after = mean[..., :hidden] + multiplied(made.gain, eta)
         width = made.factor.shape[-1]
@@ -110,10 +119,13 @@ class NoiseCluster:
 
     def _written(
         self, dims: Mapping[Any, int], lead: tuple[int, ...], hidden: int, p: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Any]:
-        """Means and rows of all numbers, hidden ones first; what was seen; logs of constant factors."""
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Any]:
+        """Means of all numbers, hidden ones first; how large their terms are; rows; what was seen; logs of
+        constant factors.
+        """
         total = hidden + p
         mean, rows = np.zeros((*lead, total)), np.zeros((*lead, total, total))
+        terms = np.zeros((*lead, total))
         target, log = np.zeros((*lead, p)), np.zeros(lead)
         places: dict[Any, np.ndarray] = {}
         at = 0
@@ -122,10 +134,11 @@ class NoiseCluster:
             nonlocal at
             own = slice(at, at + d)
             offset, gain, root = (along(a, c.scope, self.scope) for a in (c.offset, c.gain, c.root))
-            mean[..., own] = offset
+            mean[..., own], terms[..., own] = offset, np.abs(offset)
             if c.parents:
                 above = np.concatenate([places[b] for b in c.parents])
                 mean[..., own] += np.matvec(gain, mean[..., above])
+                terms[..., own] += np.matvec(np.abs(gain), terms[..., above])
                 rows[..., own, :] = gain @ rows[..., above, :]
             rows[..., own, own] += root
             at = own.stop
@@ -144,7 +157,7 @@ class NoiseCluster:
         for c, value in self.seen:
             target[..., at - hidden : at - hidden + len(value)] = value
             put(c, len(value))
-        return mean, rows, target, log
+        return mean, terms, rows, target, log
 
     def _unlike(self) -> UnsupportedError:
         names = ", ".join(dict.fromkeys(repr(c.block[0]) for c, _ in self.seen))

@@ -85,8 +85,9 @@ def condition(rows: np.ndarray, observed: int, carried: int | None = None) -> Co
     lower, turn = _triangular(rows, carried)
     certain = None
     if _has_tiny_pivot(lower):
-        lower, turn, certain = _without_certain(whole, lower, turn, p, carried)
-        _forget_rounding(lower, p)
+        size = np.sqrt(np.vecdot(whole, whole))
+        lower, turn, certain = _without_certain(whole, size, lower, turn, p, carried)
+        _forget_rounding(lower, size, p)
     return Conditioned(lower[..., :p, :p], lower[..., p:, :p], lower[..., p:, p:], turn, certain)
 
 
@@ -114,6 +115,28 @@ def log_densities(
         eta, diagonal = np.where(certain, 0.0, eta), np.where(certain, 1.0, diagonal)
     log_det = np.log(diagonal).sum(axis=-1)
     return -0.5 * np.vecdot(eta, eta) - log_det - count * HALF_LOG_2PI
+
+
+def went_in(root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """How large the terms are whose sum tells how far each quantity is from what those before it say.
+
+    What rounding leaves of a difference is relative to them, not to the difference.
+
+    Parameters
+    ----------
+    root : ndarray, shape (..., p, p)
+    sizes : ndarray, shape (..., p)
+        Absolute values of the quantities themselves.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> root = np.array([[1.0, 0.0], [3.0, 2.0]])  # the second is three times the first, and noise
+    >>> went_in(root, np.array([10.0, 1.0])).tolist()
+    [10.0, 31.0]
+    """
+    terms = root.diagonal(0, -2, -1)[..., None] * _inverse(root)
+    return np.matvec(np.abs(terms), sizes)
 
 
 def multiplied(matrix: np.ndarray, vectors: np.ndarray) -> np.ndarray:
@@ -167,17 +190,27 @@ def _lapack() -> Any:
 
 #: what rounding leaves of a row that is a combination of those before it, relative to its size
 _ROUNDING = 16 * float(np.finfo(float).eps)
-#: ratio of pivots from which on it is worth a look
-_SUSPECT = 1e-13
+#: pivots so small beside the largest entry are worth a look
+_SUSPECT = 1e-11
 
 
 def _has_tiny_pivot(lower: np.ndarray) -> bool:
-    pivots = np.abs(lower.diagonal(0, -2, -1))
-    return bool(pivots.size) and not pivots.min() > _SUSPECT * pivots.max()
+    pivots = lower.diagonal(0, -2, -1)
+    return bool(pivots.size) and not pivots.min() > _SUSPECT * np.abs(lower).max()
+
+
+def _inverse(root: np.ndarray) -> np.ndarray:
+    """Of lower triangles; rows from a pivot of zero on are not to be used."""
+    p = root.shape[-1]
+    pivots = root.diagonal(0, -2, -1)
+    filled = root + np.eye(p) * (pivots == 0)[..., None]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.matrix_transpose(solve_lower(filled[..., None, :, :], np.eye(p)))
 
 
 def _without_certain(
     rows: np.ndarray,
+    size: np.ndarray,
     lower: np.ndarray,
     turn: np.ndarray | None,
     observed: int,
@@ -188,12 +221,12 @@ def _without_certain(
     One after the other: what comes after such a row is only right once it is out of the way.
     """
     p, lead = observed, rows.shape[:-2]
-    size = np.sqrt(np.vecdot(rows, rows)[..., :p])
-    size = np.where(size > 0, size, 1.0)
+    size = np.where(size > 0, size, 1.0)[..., :p]
+    terms = went_in(lower[..., :p, :p], size)
     certain = np.zeros((*lead, p), dtype=bool)
     places = np.arange(p)
     for i in range(p):
-        follows = lower[..., i, i] <= _ROUNDING * size[..., i]
+        follows = lower[..., i, i] <= _ROUNDING * terms[..., i]
         follows |= ~lower[..., i, :].any(axis=-1)
         if not (follows & ~certain[..., i]).any():
             continue
@@ -201,15 +234,17 @@ def _without_certain(
         fresh = np.zeros((*lead, rows.shape[-2], p))
         fresh[..., places, places] = np.where(certain, size, 0.0)
         lower, turn = _triangular(np.concatenate([rows, fresh], axis=-1), carried)
+        terms = went_in(lower[..., :p, :p], size)
     return lower, turn, certain if certain.any() else None
 
 
-def _forget_rounding(lower: np.ndarray, observed: int) -> None:
+def _forget_rounding(lower: np.ndarray, size: np.ndarray, observed: int) -> None:
     """What is known without noise has a root of exactly zero, in place."""
-    left = lower[..., observed:, observed:]
-    below = lower[..., observed:, :]
-    none = np.vecdot(left, left) <= _ROUNDING**2 * np.vecdot(below, below)
-    left[none] = 0.0
+    p = observed
+    left = lower[..., p:, p:]
+    gains = lower[..., p:, :p] @ _inverse(lower[..., :p, :p])
+    terms = np.maximum(size[..., p:], np.matvec(np.abs(gains), size[..., :p]))
+    left[np.sqrt(np.vecdot(left, left)) <= _ROUNDING * terms] = 0.0
 
 
 def _triangular(rows: np.ndarray, carried: int | None) -> tuple[np.ndarray, np.ndarray | None]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -19,6 +18,7 @@ from bayesmc.errors import (
 )
 from bayesmc.network import Model
 from bayesmc.network.align import Aligner
+from bayesmc.network.reading import nodes_read
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, broadcasts_to, masks, nearly_equal, unused_sizes
 from bayesmc.states import StateArray, as_numbers
@@ -193,12 +193,7 @@ class Query:
 
 
 def _arguments(function: Callable[..., Any], names: Mapping[str, str]) -> tuple[str, ...]:
-    parameters = inspect.signature(function).parameters.values()
-    wanted = [p for p in parameters if p.default is p.empty]
-    for p in wanted:
-        if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL):
-            raise UnknownNodeError(f"query: the argument {p} names no node")
-    return tuple(names.get(p.name, p.name) for p in wanted)
+    return tuple(names.get(a, a) for a in nodes_read(function))
 
 
 def _identity(value: Any) -> Any:

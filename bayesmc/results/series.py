@@ -6,6 +6,7 @@ out while the slices passed by. What a family keeps besides (particles, joint co
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from typing import Any
 
@@ -261,8 +262,13 @@ class SeriesPosterior:
         other.__dict__.update(self.__dict__)
         return other
 
-    def __deepcopy__(self, memo: Any) -> Any:
-        return self.__copy__()
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        """With arrays of its own, so that what is done to them leaves this one; functions are kept."""
+        other = memo[id(self)] = self.__copy__()
+        for name, value in other.__dict__.items():
+            if name not in ("model", "engine"):
+                other.__dict__[name] = _with_own_arrays(value, memo)
+        return other
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without the model's functions."""
@@ -306,3 +312,15 @@ class SeriesPosterior:
                 f"{node.name!r} has labels, which have no mean; use probabilities({node.name!r})"
             )
         return np.asarray(node.domain.numbers, dtype=float)
+
+
+def _with_own_arrays(value: Any, memo: dict[int, Any]) -> Any:
+    """A deep copy of arrays and what holds them; objects that answer from arrays never change them."""
+    if isinstance(value, (np.ndarray, SeriesPosterior)):
+        return copy.deepcopy(value, memo)
+    if isinstance(value, dict):
+        return {k: _with_own_arrays(v, memo) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        parts = [_with_own_arrays(part, memo) for part in value]
+        return type(value)(*parts) if hasattr(value, "_fields") else type(value)(parts)
+    return value

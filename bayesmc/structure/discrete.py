@@ -10,12 +10,12 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.distributions.noiseless import plane_log_density
 from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors import FactorLike, LogTable
 from bayesmc.network import Model, Observed
 from bayesmc.network.model import potential_shape
 from bayesmc.network.node import Potential
+from bayesmc.network.rounding import point_log_density
 from bayesmc.shapes import Shape
 from bayesmc.structure.tables import TABLE_ENTRIES, configure, constants_of
 
@@ -339,7 +339,7 @@ def _table(
     invalid, points = result.invalid, None
     if result.noiseless is not None and node.domain is None:
         assert invalid is not None
-        points = _point_densities(source.name, result, values[source.name], shape, len(cards))
+        points = _point_densities(model, source.name, result, values, shape, len(cards))
         invalid = invalid & ~result.noiseless
     invalid = None if invalid is None or not invalid.any() else np.broadcast_to(invalid, shape)
     if node.domain is not None:
@@ -354,7 +354,12 @@ def _table(
 
 
 def _point_densities(
-    name: str, result: Distribution, value: np.ndarray, shape: Shape, axes: int
+    model: Model,
+    name: str,
+    result: Distribution,
+    values: Mapping[str, np.ndarray],
+    shape: Shape,
+    axes: int,
 ) -> np.ndarray | None:
     """Log densities where some elements have no noise, which must be the same at all configurations."""
     assert result.noiseless is not None
@@ -364,7 +369,7 @@ def _point_densities(
             f"node {name!r} is observed with noise at some configurations of the finite nodes and without at "
             "others, and densities do not compare with probabilities; give it a little noise at all of them"
         )
-    return plane_log_density(result, value)
+    return point_log_density(model, name, result, values)
 
 
 def _parents_of(model: Model, source: FactorSource) -> tuple[str, ...]:

@@ -184,3 +184,33 @@ def test_copies_of_posteriors_keep_their_functions():
     dbn.table("y", ["x"], [[0.8, 0.2], [0.1, 0.9]])
     smoothed = bmc.smooth(dbn, {"y": [1, 0, 1]})
     assert np.array_equal(copy.deepcopy(smoothed).pairs("x"), smoothed.pairs("x"))
+
+
+@pytest.mark.parametrize(
+    "engine",
+    [bmc.KalmanFilter(), bmc.GridFilter({"x": (-8, 8, 200)}), bmc.ParticleFilter(50)],
+    ids=lambda e: type(e).__name__,
+)
+def test_deep_copies_of_series_have_arrays_of_their_own(engine):
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    asked = {"up": lambda x: x > 0}
+    keep = {"keep": "particles"} if isinstance(engine, bmc.ParticleFilter) else {}
+    found = bmc.filter(dbn, {"y": [0.3, 1.0]}, engine=engine, queries=asked, rng=0, **keep)
+    before = [found.mean("x"), found.queries["up"].copy(), found.log_marginal_increments.copy()]
+    other = copy.deepcopy(found)
+    assert other.model is found.model and other.engine is found.engine
+    other.queries["up"][:] = 7.0
+    other.queries["more"] = other.log_marginal_increments
+    other.log_marginal_increments[:] = 7.0
+    for cloud in getattr(other, "clouds", None) or ():
+        cloud.values["x"][...] = 7.0
+    after = [found.mean("x"), found.queries["up"], found.log_marginal_increments]
+    for one, two in zip(before, after, strict=True):
+        assert np.array_equal(one, two)
+    assert list(found.queries) == ["up"]
+    if hasattr(found, "expectation") and (keep or not isinstance(engine, bmc.ParticleFilter)):
+        assert (found.expectation(lambda x: x) != 7.0).all()
+        again = copy.deepcopy(found).expectation(lambda x: x)
+        assert np.array_equal(again, found.expectation(lambda x: x))

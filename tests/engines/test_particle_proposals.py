@@ -18,8 +18,9 @@ import bayesmc as bmc
 from bayesmc.dbn import pose_series
 from bayesmc.engines.particles import guarded as guarding
 from bayesmc.engines.particles import lookahead, stages
+from bayesmc.engines.particles.cases import ByCase, Cases
 from bayesmc.engines.particles.guarded import Guarded
-from bayesmc.engines.particles.lookahead import LookAhead
+from bayesmc.engines.particles.lookahead import Belief, LookAhead
 from bayesmc.engines.particles.looking import has_moments
 from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
 from bayesmc.engines.particles.stages import PluggedIn
@@ -737,3 +738,19 @@ def test_a_proposal_for_the_start_stays_there(monkeypatch: pytest.MonkeyPatch) -
 def test_wrong_proposals_for_the_start_are_named(options: Any, error: Any, message: str) -> None:
     with pytest.raises(error, match=message):
         bmc.filter(wide(), {"y": [1.0]}, engine=bmc.ParticleFilter(10, **options), rng=0)
+
+
+def test_a_case_without_a_share_counts_for_nothing() -> None:
+    """It explains nothing of the row, and its covariance may be no number either."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    model = pose_series(dbn, {"y": [0.0]}).slices.first
+    look = LookAhead(model, ["x"], {"y": np.zeros(())}, ["x", "y"], (), True)
+    mean = np.zeros((4, 1))
+    good, bad = (Belief(mean, np.full((4, 1, 1), v), np.zeros(4)) for v in (2.0, np.nan))
+    shares = np.array([[0.0] * 4, [-np.inf] * 4])
+    found = ByCase([look, look]).log_density(
+        {"x": np.arange(4.0)}, Cases((good, bad), shares, np.zeros(4))
+    )
+    assert found == pytest.approx(stats.norm(0.0, np.sqrt(2.0)).logpdf(np.arange(4.0)))

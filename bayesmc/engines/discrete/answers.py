@@ -10,7 +10,6 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term
@@ -20,6 +19,7 @@ from bayesmc.engines.discrete.sums import Variable, groups, log_max, product
 from bayesmc.engines.filtering import Answers, Queries
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
+from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
 from bayesmc.shapes import unravelled
 
@@ -85,9 +85,9 @@ class SliceAnswers:
             parts.append(self._expectation(function, names, kinds[rows.kind], rows, read))
         return np.concatenate(parts)
 
-    def check(self, function: Callable[..., Any]) -> tuple[list[str], dict[int, Term]]:
+    def check(self, function: Callable[..., Any]) -> tuple[tuple[str, ...], dict[int, Term]]:
         """What a query reads, in the three kinds of slices; raises ahead what ``expectation`` does."""
-        names = arguments_of(function)
+        names = nodes_read(function)
         for name in names:
             if name not in self.model.nodes:
                 raise UnknownNodeError(

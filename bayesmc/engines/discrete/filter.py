@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.engines.averages import arguments_of, as_event
+from bayesmc.engines.averages import as_event
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
 from bayesmc.engines.discrete.belief import DiscreteBelief, Held, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
@@ -24,6 +24,7 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries, observed_ans
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
+from bayesmc.network.reading import nodes_read
 from bayesmc.progress import Progress
 from bayesmc.results import SeriesPosterior
 
@@ -257,7 +258,7 @@ class DiscreteFilter(FilterEngine):
 
     def _asks_for_leaves(self, problem: SeriesProblem, queries: Queries | None) -> bool:
         """Whether a query reads finite nodes that would be left to be answered for one by one."""
-        names = {p for f in (queries or {}).values() for p in arguments_of(f)}
+        names = {p for f in (queries or {}).values() for p in nodes_read(f)}
         own = self._plan(problem).reader.variables
         return any(
             n in names and problem.model[n].domain is not None and n not in own

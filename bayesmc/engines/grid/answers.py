@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions import Distribution
-from bayesmc.engines.averages import arguments_of, over_line
+from bayesmc.engines.averages import over_line
 from bayesmc.engines.grid.moves import COUNTS
 from bayesmc.engines.grid.refined import Fine, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
@@ -19,6 +19,7 @@ from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, Term, contract, dense
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
+from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
 
 Moments = tuple[np.ndarray, np.ndarray]
@@ -149,7 +150,7 @@ class Answers:
         ``read`` makes an array of what it returns. Where it reads one number on even cells, finite nodes
         beside, the cells are cut into finer ones.
         """
-        names = arguments_of(function)
+        names = nodes_read(function)
         for name in names:
             if name not in self.model.slices.dynamic and name not in self.model.static:
                 raise UnknownNodeError(f"a query reads {name!r}, which is no node of a slice")

@@ -12,7 +12,6 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.filtering import Asked, FilterEngine
 from bayesmc.engines.grid.automatic import TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
@@ -20,6 +19,7 @@ from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.record import GridPosterior
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
+from bayesmc.network.reading import nodes_read
 
 
 class GridSearch(FilterEngine):
@@ -69,7 +69,7 @@ class GridSearch(FilterEngine):
             return reason
         model = self.model_on_grid(problem.slices, known_static(problem))
         for query, function in asked.queries.items():
-            for name in arguments_of(function):
+            for name in nodes_read(function):
                 if name in model.leaves and name in problem.hidden:
                     return (
                         f"queries={{{query!r}: ...}} reads {name!r}, which is hidden and not on the grid, "

@@ -14,15 +14,15 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.averages import arguments_of
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.kalman.answers import filter_answers, smooth_answers
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.passes import Filtered, State, backward
 from bayesmc.engines.kalman.posterior import GaussianBelief, GaussianSeries
-from bayesmc.engines.kalman.rows import Memory, RowTaker
+from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
+from bayesmc.network.reading import nodes_read
 from bayesmc.progress import Progress
 from bayesmc.results.predictive import warn_of_misfit
 
@@ -44,7 +44,7 @@ class GaussianFilter(FilterEngine):
         reason = super().unable(problem, asked)
         silent = set(self.unanswered(problem)) if asked.queries and reason is None else set()
         for query, function in asked.queries.items():
-            for name in arguments_of(function):
+            for name in nodes_read(function):
                 if name in silent:
                     return (
                         f"queries={{{query!r}: ...}} reads {name!r}, which takes no continuous values, and a "
@@ -169,7 +169,7 @@ class GaussianFilter(FilterEngine):
         state: State,
         pattern: Pattern,
         memory: Memory,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> Expected:
         """See ``rows.Family``."""
         raise NotImplementedError
 

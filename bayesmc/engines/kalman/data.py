@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, SeriesProblem
-from bayesmc.distributions.noiseless import plane_log_density
 from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.slice_steps import plates_apart, summed
 from bayesmc.network import Observed
+from bayesmc.network.rounding import point_log_density
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +247,7 @@ def certain_density(layout: Layout, at: Mapping[str, np.ndarray]) -> Any:
         node = layout.model[name]
         log = None
         if result.noiseless is not None:
-            log = plane_log_density(result, at[name])
+            log = point_log_density(layout.model, name, result, at)
         if log is None:
             log = layout.model.log_density(name, result, at[name])
         total = total + summed(np.asarray(log), node, layout.apart)

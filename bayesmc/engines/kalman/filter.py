@@ -17,7 +17,7 @@ from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.levels import why_not_matched
 from bayesmc.engines.kalman.passes import Filtered, State, forward
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
-from bayesmc.engines.kalman.rows import Memory, contradicts, impossible_row
+from bayesmc.engines.kalman.rows import Expected, Memory, contradicts, impossible_row
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.kernels.kalman import multiplied
@@ -118,7 +118,7 @@ class KalmanFilter(GaussianFilter):
         state: State,
         pattern: Pattern,
         memory: Memory,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> Expected:
         timeless = memory(("timeless", layout), lambda: not reads_time(layout))
 
         def read() -> Linear:
@@ -132,7 +132,12 @@ class KalmanFilter(GaussianFilter):
         whole = timeless and pattern.given is None  # what is seen in part may differ in every row
         found = memory(("chosen", layout), choose) if whole else choose()
         mean = found.offset + multiplied(found.moves, state.mean)
-        return mean, rows_of(found.moves, found.noise, state.factor, pattern.absent)
+        rows = rows_of(found.moves, found.noise, state.factor, pattern.absent)
+
+        def terms() -> np.ndarray:
+            return np.abs(found.offset) + multiplied(np.abs(found.moves), np.abs(state.mean))
+
+        return Expected(mean, rows, terms)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -8,13 +8,13 @@ slices at once, those of one pattern together.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.distributions.noiseless import ALLOWED, FLOOR
+from bayesmc.distributions.noiseless import ALLOWED, FLOOR, ROUNDED
 from bayesmc.engines.kalman.covariances import (
     Chosen,
     Covariances,
@@ -26,7 +26,7 @@ from bayesmc.engines.kalman.covariances import (
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import Conditioned, log_densities, multiplied, standardised
+from bayesmc.kernels.kalman import Conditioned, log_densities, multiplied, standardised, went_in
 
 #: slices of one kind on end from which on they share their matrices
 _RUN = 64
@@ -76,6 +76,7 @@ def absorbed(
     row: np.ndarray,
     given: np.ndarray | None,
     angles: np.ndarray | None = None,
+    terms: Callable[[], np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Take in a row: means of the unknown numbers, standardised innovations, log density of the row.
 
@@ -88,6 +89,8 @@ def absorbed(
         Values of unknown numbers that are observed.
     angles : ndarray of bool, shape (observed,), or None
         Observed numbers whose innovations are angles.
+    terms : callable, optional
+        How large the terms are whose sum is ``mean``; without it they count as no larger than that.
     """
     p = len(pattern.observed)
     off = row - mean[..., :p]
@@ -99,9 +102,9 @@ def absorbed(
     after = _placed(layout, pattern, after, given)
     log = log_densities(found.root, eta, seen, found.certain)
     if found.certain is not None:
-        log = np.where(
-            _contradicts(found.certain, found.root, eta, row, mean[..., :p]), -np.inf, log
-        )
+        size = np.abs(mean) if terms is None else terms()
+        wrong = _contradicts(found.certain, found.root, eta, row, mean[..., :p], size[..., :p])
+        log = np.where(wrong, -np.inf, log)
     return after, eta, log
 
 
@@ -236,7 +239,9 @@ class _Work:
         self.found.means[part.slices] = _placed(layout, part.pattern, after, part.given)
         log = log_densities(part.root, eta, seen, part.certain)
         if part.certain is not None:
-            wrong = _contradicts(part.certain, part.root, eta, part.row, expected[..., :p])
+            terms = np.abs(part.offset) + _times(np.abs(part.moves), np.abs(previous))
+            seen_as = expected[..., :p], terms[..., :p]
+            wrong = _contradicts(part.certain, part.root, eta, part.row, *seen_as)
             log = np.where(wrong, -np.inf, log)
         self.found.increments[part.slices] += log
         self.found.innovations.put(part.slices, layout, part.pattern, part.root, eta)
@@ -257,11 +262,20 @@ class _Work:
 
 
 def _contradicts(
-    certain: np.ndarray, root: np.ndarray, eta: np.ndarray, row: np.ndarray, mean: np.ndarray
+    certain: np.ndarray,
+    root: np.ndarray,
+    eta: np.ndarray,
+    row: np.ndarray,
+    mean: np.ndarray,
+    terms: np.ndarray,
 ) -> np.ndarray:
-    """Whether something observed is not what it must be given the rest, shape (..., *lead)."""
+    """Whether something observed is not what it must be given the rest, shape (..., *lead).
+
+    It may be a small difference of large numbers, which rounding leaves its mark on.
+    """
     off = np.abs(eta) * root.diagonal(0, -2, -1)
-    allowed = ALLOWED * (np.abs(row) + np.abs(mean)) + FLOOR
+    row = np.where(np.isnan(row), 0.0, np.abs(row))  # elements may lack some
+    allowed = ALLOWED * (row + np.abs(mean)) + ROUNDED * went_in(root, row + terms) + FLOOR
     return (certain & (off > allowed)).any(axis=-1)
 
 

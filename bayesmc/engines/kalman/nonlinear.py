@@ -17,7 +17,7 @@ from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.levels import Level, Made, Plan, expected_slice, why_not_matched
 from bayesmc.engines.kalman.passes import Filtered, State, Turns
 from bayesmc.engines.kalman.posterior import GaussianSeries
-from bayesmc.engines.kalman.rows import Memory, RowTaker, Taken
+from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.kalman import multiplied, turned
@@ -64,10 +64,10 @@ class NonlinearFilter(GaussianFilter):
         state: State,
         pattern: Pattern,
         memory: Memory,
-    ) -> tuple[np.ndarray, np.ndarray]:
+    ) -> Expected:
         """See ``rows.Family``."""
         plan = memory(("plan", layout), lambda: Plan(layout, values))
-        return expected_slice(layout, values, state, pattern, self.made_linear, plan)
+        return Expected(*expected_slice(layout, values, state, pattern, self.made_linear, plan))
 
     def _no_mode(self, problem: SeriesProblem) -> str | None:
         """Why smoothed means are not the most likely trajectory, or None."""

@@ -15,9 +15,10 @@ from scipy.special import ndtri
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.averages import arguments_of, as_event, over_normal, over_normals
+from bayesmc.engines.averages import as_event, over_normal, over_normals
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.network.reading import nodes_read
 
 
 class Spread(Protocol):
@@ -67,7 +68,7 @@ def expectation(
     UnknownNodeError, UnsupportedError, QueryError
     """
     layout = view.layout
-    names = arguments_of(function)
+    names = nodes_read(function)
     for name in names:
         if name in layout.silent:
             raise UnsupportedError(
@@ -140,7 +141,7 @@ def quantiles(mean: np.ndarray, std: np.ndarray, q: Any, name: str) -> np.ndarra
 def _called(
     view: View,
     function: Callable[..., Any],
-    names: list[str],
+    names: tuple[str, ...],
     at: np.ndarray,
     numbers: np.ndarray,
     event: bool,
@@ -175,9 +176,14 @@ def _called(
 
 
 def _roots(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Roots of covariances, largest columns last, and where one column is all there is."""
-    values, vectors = np.linalg.eigh(covariances)
+    """Roots of covariances, largest columns last, and where one column is all there is.
+
+    Numbers of unlike units count alike: what is small beside others is judged on the correlations.
+    """
+    spread = np.sqrt(np.clip(np.linalg.diagonal(covariances), 0.0, None))
+    unit = np.where(spread > 0, spread, 1.0)
+    values, vectors = np.linalg.eigh(covariances / unit[..., :, None] / unit[..., None, :])
     values = np.clip(values, 0.0, None)
     rest = values[..., :-1].sum(axis=-1) <= 1e-14 * values[..., -1]
     plain = rest.reshape(len(values), -1).all(axis=1)
-    return vectors * np.sqrt(values)[..., None, :], plain
+    return spread[..., :, None] * vectors * np.sqrt(values)[..., None, :], plain

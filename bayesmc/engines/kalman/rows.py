@@ -41,6 +41,23 @@ def impossible_row(t: int) -> ZeroProbabilityError:
     )
 
 
+class Expected(NamedTuple):
+    """Of the numbers that a pattern chooses.
+
+    Attributes
+    ----------
+    mean : ndarray, shape (*lead, numbers)
+    rows : ndarray, shape ([*lead], numbers, k)
+        Coefficients of the noise.
+    terms : callable or None
+        How large the terms are whose sum is ``mean``; asked for where something is known without noise.
+    """
+
+    mean: np.ndarray
+    rows: np.ndarray
+    terms: Callable[[], np.ndarray] | None = None
+
+
 class Family(Protocol):
     """What a filter says of a slice by itself."""
 
@@ -55,8 +72,8 @@ class Family(Protocol):
         state: State,
         pattern: Pattern,
         memory: Memory,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean of the numbers that a pattern chooses, and their coefficients of the noise."""
+    ) -> Expected:
+        """What a row is compared with."""
         ...
 
 
@@ -133,10 +150,10 @@ class RowTaker:
         if given is not None:
             places = pattern.observed[layout.p :] - layout.p
             target = np.concatenate([target, given[..., places]], axis=-1)
-        mean, rows = self.family.expected(layout, values, state, pattern, self.memory)
+        mean, rows, terms = self.family.expected(layout, values, state, pattern, self.memory)
         made = condition(rows, len(pattern.observed), layout.n_prev if turning else None)
         angles = _angles(layout, pattern)
-        after, eta, log = absorbed(layout, pattern, made, mean, target, given, angles)
+        after, eta, log = absorbed(layout, pattern, made, mean, target, given, angles, terms)
         log = log + certain_density(layout, values)
         if contradicts(layout, log, made):
             raise impossible_row(row.t)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -16,6 +15,7 @@ from bayesmc.engines.particles.families import Families, evidence_error
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance, table_variance
 
 
@@ -238,7 +238,7 @@ def evaluated(
 ) -> np.ndarray:
     """A function's values as ``read`` has them, particles first."""
     arguments = []
-    for name in inspect.signature(function).parameters:
+    for name in nodes_read(function):
         if name not in cloud.values:
             raise UnknownNodeError(
                 f"a query reads {name!r}, of which there are no particles; there are those of "

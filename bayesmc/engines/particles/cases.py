@@ -76,7 +76,11 @@ class ByCase:
     def log_density(self, values: Mapping[str, np.ndarray], cases: Cases) -> np.ndarray:
         """The log density of a block's values, shape ``(*batch, *apart)``."""
         each = zip(self.looks, cases.beliefs, cases.log_shares, strict=True)
-        logs = [share + look.log_density(values, belief) for look, belief, share in each]
+        # a case that explains nothing may have no density: without a share it counts for nothing
+        logs = [
+            np.where(share == -np.inf, -np.inf, share + look.log_density(values, belief))
+            for look, belief, share in each
+        ]
         found: np.ndarray = np.logaddexp.reduce(logs, axis=0)
         return found
 

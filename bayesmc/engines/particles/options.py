@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from types import MappingProxyType
 from typing import Any
 
@@ -12,6 +11,7 @@ from bayesmc.dbn import Slices
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.errors import UnknownNodeError, did_you_mean
+from bayesmc.network.reading import nodes_read
 
 
 def check_count(option: str, given: Any, what: str) -> None:
@@ -76,7 +76,7 @@ def read_by(queries: Queries, slices: Slices) -> list[str]:
     """Nodes that queries read."""
     found = []
     for query, function in queries.items():
-        for name in inspect.signature(function).parameters:
+        for name in nodes_read(function):
             if name not in slices.dynamic:
                 raise UnknownNodeError(
                     f"queries={{{query!r}: ...}} reads {name!r}, which is no node of a slice"
