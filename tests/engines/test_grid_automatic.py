@@ -316,14 +316,14 @@ def test_a_function_that_jumps_from_beyond_the_ends_has_an_error_that_holds() ->
         initial=bmc.Normal(0.0, 1.0),
     )
     dbn.add("y", lambda x: bmc.StudentT(3.0, x, 1.0))
-    for y in ([0.1, 0.3, 1.2, 2.5, 60.2, 60.0, 60.0], [0.1, 0.3, 0.2, 59.0]):
-        with pytest.warns(GridWarning, match="have an error of"):
+    for y in ([0.1, 0.3, 1.2, 2.5, 60.2, 60.0, 60.0], [0.1, 0.3, 3.2, 60.0, 54.0, 48.0]):
+        with pytest.warns(GridWarning, match="have an error of .* lands far from the rest"):
             found = bmc.filter(dbn, {"y": y})
         # cells that end at 3.5
-        truth = on(dbn, {"y": np.array(y)}, (-10.0, 80.0, 4000)).log_marginal_likelihood
+        truth = on(dbn, {"y": np.array(y)}, (-10.0, 80.0, 2000)).log_marginal_likelihood
         error = found.log_marginal_likelihood_mcse
         assert type(found.engine) is bmc.GridFilter and error <= 0.25
-        assert abs(found.log_marginal_likelihood - truth) <= 2 * error
+        assert abs(found.log_marginal_likelihood - truth) <= error
 
 
 def test_what_cannot_be_covered_is_left_to_particles() -> None:

@@ -25,8 +25,9 @@ from bayesmc.errors import UnsupportedError, ZeroProbabilityError
 
 #: error of the log evidence (of each series that is filtered by itself) that a grid is made for
 TARGET = 0.01
-#: error up to which a grid is taken where something lands so far off that particles may miss it without a word
-TAKEN_FAR = 0.25
+#: error up to which a grid is taken where something lands so far off that particles may miss it: what they
+#: aim at themselves
+TAKEN_FAR = 0.5
 #: cells up to which a grid is found, and entries of tables that a pass may take
 MOST_CELLS, MOST_ENTRIES = 4000, 6e9
 #: an entry that is evaluated anew in every slice costs as much as so many that are kept
@@ -300,7 +301,7 @@ class _Search:
         return lattice, np.array(increments)
 
     def passed(self, lattice: Lattice, held: bool = False) -> _Passed:
-        """A pass on one lattice, up to where it turns out to be too narrow; ``held``: that it is not is known."""
+        """A pass on one lattice, up to where it is seen to be too narrow; it is not where all is ``held``."""
         mover, before = self._mover(lattice), None
         landings = self._landings(lattice, mover)
         increments, kept = [], []
@@ -342,6 +343,7 @@ class _Search:
     def answer(self, found: _Passed, others: Sequence[np.ndarray], times: float = 1.0) -> FoundGrid:
         """A grid with its error: what other cells change, and what may lie beyond the ends."""
         total = found.increments.sum(axis=0)
+        times = _SAFE if self.far else times  # functions that jump have errors that halve by chance
         off = times * np.max([np.abs(total - other.sum(axis=0)) for other in others], axis=0)
         rounding = 1e-15 * np.abs(found.increments).sum(axis=0)
         error = off + found.ends.sum(axis=0) + rounding

@@ -67,8 +67,8 @@ def pieces_of(dist: Distribution, batch: int) -> Pieces:
     """
     levels = (0.1587, 0.5, 0.8413)
     if isinstance(dist, Mixture) and all(map(_is_single, dist.parts)):
-        quantiles = [dist.component_ppf(q) for q in levels]
-        return Pieces(dist.weights, *quantiles, True)
+        low, centre, high = map(dist.component_ppf, levels)
+        return Pieces(dist.weights, low, centre, high, True)
     if _is_single(dist):
         low, centre, high = (np.asarray(dist.ppf(q))[..., None] for q in levels)
         return Pieces(np.ones(1), low, centre, high, True)
@@ -129,7 +129,7 @@ class Landings:
         return self._beyond(before, row, found, low, high)
 
     def lost(self, before: Cells | None, row: Row, found: Cells) -> np.ndarray:
-        """A bound for what the lattice leaves out of the evidence, relative to it, where pieces are not known."""
+        """A bound for the share of the evidence that is left out, where pieces are not known."""
         if self.known or not self.can_grow or self._is_seen(row):
             return np.zeros(np.shape(found.increment))
         span = self.high - self.low

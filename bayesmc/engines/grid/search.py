@@ -138,10 +138,15 @@ class GridSearch(FilterEngine):
             error = found.error
             posterior.log_marginal_likelihood_mcse = error if error.ndim else float(error)
             if not np.max(error) <= TARGET and np.isfinite(self.tolerance):
+                other = (
+                    "; some of it lands far from the rest, where particles seldom come"
+                    if found.far
+                    else ", or use ParticleFilter(particles)"
+                )
                 warnings.warn(
                     f"GridFilter: {found.described} for {found.name!r} have an error of "
                     f"{float(np.max(error)):.2g} in the log evidence; give a grid of your own, "
-                    f"grid={{{found.name!r}: (low, high, cells)}}, or use ParticleFilter(particles)",
+                    f"grid={{{found.name!r}: (low, high, cells)}}{other}",
                     GridWarning,
                     stacklevel=4,
                 )
