@@ -141,6 +141,15 @@ class Mixture(Distribution):
             return low
         return invert(self.cdf, self.log_prob, q, low, high)
 
+    @property
+    def parts(self) -> tuple[Distribution, ...]:
+        """The distributions of the components; one where its last batch axis counts them."""
+        return (self._parts.part,) if isinstance(self._parts, _Stacked) else self._parts.parts
+
+    def component_ppf(self, q: float) -> np.ndarray:
+        """A quantile of every component, shape ``(..., K)``."""
+        return self._parts.evaluate("ppf", np.asarray(q, dtype=float))
+
     def _average(self, values: np.ndarray) -> np.ndarray:
         """Weighted sum of ``(..., K, *event)`` over the components, in full batch shape."""
         extra = len(self.event_shape)

@@ -217,6 +217,142 @@ def test_other_questions_take_it_too() -> None:
     assert np.abs(path - best).max() < 0.15  # no closer than its cells are wide
 
 
+# ---- what lands far from the rest ---------------------------------------------------------------
+
+
+def pieces_that_jump() -> Made:
+    """A hundredth of all moves lands at forty, and once one did."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "x",
+        lambda x_prev: bmc.Mixture(
+            [0.99, 0.01], [bmc.Normal(0.9 * x_prev, 0.3), bmc.Normal(40, 0.3)]
+        ),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    return dbn, {"y": np.array([0.1, 0.3, -0.2, 40.2, 36.0, 32.5, 29.0])}, (-10.0, 50.0, 2000)
+
+
+def an_unlikely_start() -> Made:
+    """What the row asks for has a thousandth of the probability."""
+    dbn = bmc.DynamicBayesNet()
+    initial = bmc.Mixture([0.999, 0.001], [bmc.Normal(0, 1), bmc.Normal(40, 1)])
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.3), initial=initial)
+    dbn.add("y", lambda x: bmc.Normal(x, 8.0))
+    return dbn, {"y": np.array([40.0])}, (-15.0, 60.0, 2000)
+
+
+def a_start_that_is_only_known_by_draws() -> Made:
+    """The same, as a density of the user's."""
+
+    def log_density(x: np.ndarray) -> np.ndarray:
+        peaks = np.log(0.999) - x**2 / 2, np.log(0.001) - (x - 40) ** 2 / 2
+        return np.logaddexp(*peaks) - np.log(2 * np.pi) / 2
+
+    def sample(rng: np.random.Generator, shape: Any) -> np.ndarray:
+        return np.where(rng.random(shape) < 0.001, 40.0, 0.0) + rng.normal(size=shape)
+
+    dbn = bmc.DynamicBayesNet()
+    initial = bmc.Density(log_density, sample=sample)
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.3), initial=initial)
+    dbn.add("y", lambda x: bmc.Normal(x, 8.0))
+    return dbn, {"y": np.array([40.0])}, (-15.0, 60.0, 2000)
+
+
+def a_state_that_lands_far_off() -> Made:
+    """A finite node says where the number lands."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.table("z", ["z_prev"], [[0.999, 0.001], [0.5, 0.5]], initial=[1.0, 0.0])
+    dbn.add(
+        "x",
+        lambda x_prev, z: bmc.Normal(np.where(z == 1, -60.0, 0.9 * x_prev), 0.3),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.StudentT(3.0, x, 1.0))
+    return dbn, {"y": np.array([0.5, 0.1, -61.0, -60.0, 0.1])}, (-70.0, 10.0, 2000)
+
+
+def counts_that_jump() -> Made:
+    """Whole numbers, some of them hundreds."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "x",
+        lambda x_prev: bmc.Mixture(
+            [0.98, 0.02], [bmc.Poisson(1 + 0.5 * x_prev), bmc.Poisson(300.0)]
+        ),
+        initial=bmc.Poisson(2.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 2.0))
+    return dbn, {"y": np.array([2.0, 3.0, 297.0, 150.0])}, np.arange(600)
+
+
+FAR: list[Callable[[], Made]] = [
+    pieces_that_jump, an_unlikely_start, a_start_that_is_only_known_by_draws, a_state_that_lands_far_off,
+    counts_that_jump,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("make", FAR)
+def test_what_lands_far_from_the_rest_is_on_the_grid(make: Callable[[], Made]) -> None:
+    dbn, rows, fine = make()
+    found, truth = bmc.filter(dbn, rows), on(dbn, rows, fine)
+    assert type(found.engine) is bmc.GridFilter
+    error = found.log_marginal_likelihood_mcse
+    assert error <= 0.01
+    assert abs(found.log_marginal_likelihood - truth.log_marginal_likelihood) <= error + 1e-6
+    np.testing.assert_allclose(found.mean("x"), truth.mean("x"), rtol=1e-3, atol=1e-3)
+    smoothed = bmc.smooth(dbn, rows)
+    truth = bmc.smooth(dbn, rows, engine=bmc.GridFilter({"x": fine}, tolerance=np.inf))
+    np.testing.assert_allclose(smoothed.mean("x"), truth.mean("x"), rtol=1e-3, atol=1e-3)
+
+
+def test_a_function_that_jumps_from_beyond_the_ends_has_an_error_that_holds() -> None:
+    """No cell ends where it jumps, so the error is large, and is said; particles are off by dozens."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "x",
+        lambda x_prev: bmc.Normal(np.where(x_prev > 3.5, 60.0, 0.9 * x_prev), 0.3),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.StudentT(3.0, x, 1.0))
+    for y in ([0.1, 0.3, 1.2, 2.5, 60.2, 60.0, 60.0], [0.1, 0.3, 3.2, 60.0, 54.0, 48.0]):
+        with pytest.warns(GridWarning, match="have an error of .* lands far from the rest"):
+            found = bmc.filter(dbn, {"y": y})
+        # cells that end at 3.5
+        truth = on(dbn, {"y": np.array(y)}, (-10.0, 80.0, 2000)).log_marginal_likelihood
+        error = found.log_marginal_likelihood_mcse
+        assert type(found.engine) is bmc.GridFilter and error <= 0.25
+        assert abs(found.log_marginal_likelihood - truth) <= error
+
+
+def test_what_cannot_be_covered_is_left_to_particles() -> None:
+    dbn = bmc.DynamicBayesNet()
+    dbn.add(
+        "x",
+        lambda x_prev: bmc.Mixture([0.99, 0.01], [bmc.Normal(x_prev, 0.3), bmc.Normal(1e6, 0.3)]),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("y", lambda x: bmc.Normal(x, 1.0))
+    why = bmc.explain(dbn, {"y": [0.0, 0.1, 0.3]})
+    assert type(why.engine) is bmc.ParticleFilter
+    assert "takes more than" in why.refused["GridFilter"]
+
+
+def test_a_mistake_in_a_function_is_raised() -> None:
+    dbn = bmc.DynamicBayesNet()
+
+    @dbn.node(initial=bmc.Normal(0.0, 1.0))
+    def x(x_prev):
+        if np.size(x_prev) > 100:  # as on the cells of a grid
+            raise KeyError("no such column")
+        return bmc.Normal(0.9 * x_prev, 0.3)
+
+    dbn.add("y", lambda x: bmc.StudentT(3.0, x, 1.0))
+    with pytest.raises(Exception, match="no such column"):
+        bmc.filter(dbn, {"y": [0.0, 0.1]})
+
+
 @pytest.mark.thorough
 def test_the_log_evidence_of_many_series_is_within_its_error() -> None:
     """Three thousand rows, as reported; of data from the model and with a shift."""

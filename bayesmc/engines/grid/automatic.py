@@ -17,6 +17,7 @@ import numpy as np
 from bayesmc.dbn import Row
 from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.grid.axes import Axis, axis_of
+from bayesmc.engines.grid.landings import Landings, narrowest_piece
 from bayesmc.engines.grid.lattice import Lattice, Line
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.tables import GridModel
@@ -24,6 +25,9 @@ from bayesmc.errors import UnsupportedError, ZeroProbabilityError
 
 #: error of the log evidence (of each series that is filtered by itself) that a grid is made for
 TARGET = 0.01
+#: error up to which a grid is taken where something lands so far off that particles may miss it: what they
+#: aim at themselves
+TAKEN_FAR = 0.5
 #: cells up to which a grid is found, and entries of tables that a pass may take
 MOST_CELLS, MOST_ENTRIES = 4000, 6e9
 #: an entry that is evaluated anew in every slice costs as much as so many that are kept
@@ -53,6 +57,8 @@ class FoundGrid:
     mover : GridMover
     kept : list of Cells or None
         Beliefs of all slices, where they are few.
+    far : bool
+        Whether something lands far from the rest, where particles seldom come.
     """
 
     name: str
@@ -60,6 +66,7 @@ class FoundGrid:
     error: np.ndarray
     mover: GridMover
     kept: list[Cells] | None
+    far: bool = False
 
     @property
     def described(self) -> str:
@@ -95,17 +102,24 @@ def find_grid(
     search = _Search(name, make, rows)
     lattice, before = search.held(line, cells)
     if cells is not None:
-        halved = search.passed(lattice.cut(2 * cells)).increments
-        return search.answer(search.passed(lattice.cut(cells)), halved, _SAFE)
+        lattice = search.covering(lattice, cells)
+        others = [
+            search.passed(lattice.cut(n), held=True).increments for n in (2 * cells, _other(cells))
+        ]
+        return search.answer(search.passed(lattice.cut(cells)), others, _SAFE)
     finer = lattice.cut(2 * lattice.cells)
     while True:
         search.check_price(finer)
         found = search.passed(finer)
-        wider = finer.widened(*(found.ends.reshape(2, -1).max(axis=1) > TARGET / 4))
+        wider = found.covering or finer.widened(
+            *(found.ends.reshape(2, -1).max(axis=1) > TARGET / 4)
+        )
         if wider != finer:  # the first pass saw too little of it
             finer = wider
             continue
-        done, half = search.answer(found, before), finer.cut(2 * finer.cells)
+        other = search.passed(finer.cut(_other(finer.cells // 2)), held=True)
+        others = [before, other.increments]
+        done, half = search.answer(found, others), finer.cut(2 * finer.cells)
         small = np.max(done.error) <= TARGET or line.kind == "integers"
         if small or half.cells > MOST_CELLS or search.price(half) > 1:
             return done
@@ -113,6 +127,11 @@ def find_grid(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _other(cells: int) -> int:
+    """Cells that lie otherwise: where functions jump, halves of cells may be off by as much as these."""
+    return round(1.17 * cells) + 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +143,8 @@ class _Passed:
     increments: np.ndarray
     ends: np.ndarray
     kept: list[Cells] | None
+    #: a wider lattice, where this one missed what lands outside: the pass ended there
+    covering: Lattice | None = None
 
 
 class _Search:
@@ -132,6 +153,7 @@ class _Search:
     def __init__(self, name: str, make: Callable[[Axis], GridModel], rows: Sequence[Row]) -> None:
         self.name, self.make, self.rows = name, make, rows
         self.limit = _DUST
+        self.far = False
 
     def held(self, line: Line, cells: int | None) -> tuple[Lattice, np.ndarray]:
         """A lattice that holds all beliefs, and the log evidence of each row on it.
@@ -228,7 +250,8 @@ class _Search:
         before, now = model.place(self.rows[0]), model.place(self.rows[1])
         dist = model.evaluate(False, self.name, model.base(before, now))
         centre: Any = None
-        with suppress(UnsupportedError, NotImplementedError):
+        # families without moments, and distributions of the user's that do not say them
+        with suppress(UnsupportedError, NotImplementedError, AttributeError):
             centre, width = np.asarray(dist.mean), np.sqrt(np.asarray(dist.var))
         if centre is None or not np.isfinite(width).any():
             draws = dist.sample(np.random.default_rng(0), (64,))
@@ -236,18 +259,21 @@ class _Search:
             width = (high - low) / 1.35
         width = width / lattice.line.stretch(lattice.line.coordinate(centre))
         width = width[np.isfinite(width) & (width > 0)]
-        return float(np.quantile(width, 0.1)) if len(width) else np.inf
+        least = narrowest_piece(dist, lattice)
+        return min(least, float(np.quantile(width, 0.1))) if len(width) else least
 
     # ---- passes ---------------------------------------------------------------------------------
 
     def pilot(self, lattice: Lattice, cells: int | None) -> tuple[Lattice, np.ndarray]:
         """A pass in which the lattice becomes as wide and as fine as beliefs want; the last one, and logs."""
         mover, before = self._mover(lattice), None
+        landings = self._landings(lattice, mover)
         increments, k, impossible = [], 0, 0
         grows = any(lattice.line.grows)
         while k < len(self.rows):
             with in_slice(self.rows[k].t):
                 found = self._tried(mover, before, self.rows[k])
+                reach = landings.wanted(before, self.rows[k], found)
             share = None if found is None else self._shares(found)
             changed = lattice
             if found is None:
@@ -260,25 +286,36 @@ class _Search:
                 fixed = cells is not None or lattice.line.kind == "integers"
                 if changed.cells == lattice.cells and share.max() > _TOP and not fixed:
                     changed = self._cut(lattice, 2 * lattice.cells)
+            held = changed.holding(*reach)
+            self.far = self.far or held != changed
+            changed = held
             if changed != lattice:
                 lattice = changed
                 self.check_price(lattice.cut(2 * lattice.cells))
                 mover = self._mover(lattice)
+                landings = self._landings(lattice, mover)
                 continue
             assert found is not None
             increments.append(found.increment)
             before, k = found, k + 1
         return lattice, np.array(increments)
 
-    def passed(self, lattice: Lattice) -> _Passed:
-        """A pass on one lattice."""
+    def passed(self, lattice: Lattice, held: bool = False) -> _Passed:
+        """A pass on one lattice, up to where it is seen to be too narrow; it is not where all is ``held``."""
         mover, before = self._mover(lattice), None
+        landings = self._landings(lattice, mover)
         increments, kept = [], []
         ends: Any = 0.0
         few = True
+        covering = None
         for row in self.rows:
             with in_slice(row.t):
-                before = mover.move(before, row)
+                found = mover.move(before, row)
+                if not held:
+                    wider = lattice.holding(*landings.wanted(before, row, found))
+                    covering = None if wider == lattice else wider
+                    ends = ends + landings.lost(before, row, found) / 2  # once for each end
+            before = found
             increments.append(before.increment)
             share = self._shares(before)
             if share is not None:
@@ -287,16 +324,30 @@ class _Search:
             few = few and 2 * before.probs.nbytes * len(self.rows) <= _KEPT
             if few:
                 kept.append(before)
+            if covering is not None:
+                self.far = True
+                break
         whole = np.array(increments)
         ends = ends * np.ones((2, *whole.shape[1:]))
-        return _Passed(axis_of(lattice), mover, whole, ends, kept if few else None)
+        return _Passed(axis_of(lattice), mover, whole, ends, kept if few else None, covering)
 
-    def answer(self, found: _Passed, other: np.ndarray, times: float = 1.0) -> FoundGrid:
-        """A grid with its error: what a halving of cells changed, and what may lie beyond the ends."""
-        off = times * np.abs(found.increments.sum(axis=0) - other.sum(axis=0))
+    def covering(self, lattice: Lattice, cells: int) -> Lattice:
+        """A lattice that misses nothing in so many cells either."""
+        for _ in range(20):
+            wider = self.passed(lattice.cut(cells)).covering
+            if wider is None:
+                return lattice
+            lattice = wider
+        raise self._refused("what lands outside of it lands ever farther")
+
+    def answer(self, found: _Passed, others: Sequence[np.ndarray], times: float = 1.0) -> FoundGrid:
+        """A grid with its error: what other cells change, and what may lie beyond the ends."""
+        total = found.increments.sum(axis=0)
+        times = _SAFE if self.far else times  # functions that jump have errors that halve by chance
+        off = times * np.max([np.abs(total - other.sum(axis=0)) for other in others], axis=0)
         rounding = 1e-15 * np.abs(found.increments).sum(axis=0)
         error = off + found.ends.sum(axis=0) + rounding
-        return FoundGrid(self.name, found.axis, error, found.mover, found.kept)
+        return FoundGrid(self.name, found.axis, error, found.mover, found.kept, self.far)
 
     def price(self, lattice: Lattice) -> float:
         """What a pass takes, over what it may."""
@@ -325,6 +376,9 @@ class _Search:
 
     def _mover(self, lattice: Lattice) -> GridMover:
         return GridMover(self.make(axis_of(lattice)), np.inf)
+
+    def _landings(self, lattice: Lattice, mover: GridMover) -> Landings:
+        return Landings(self.name, lattice, self.make, mover)
 
     def _tried(self, mover: GridMover, before: Cells | None, row: Row) -> Cells | None:
         try:

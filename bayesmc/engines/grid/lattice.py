@@ -92,6 +92,20 @@ class Lattice:
         more = max(self.cells // 4, 8)
         return self.to(self.low - more * self.step * low, self.high + more * self.step * high)
 
+    def holding(self, low: float, high: float) -> Lattice:
+        """Wide enough for these coordinates, too."""
+        low, high = min(self.low, low), max(self.high, high)
+        if self.line.kind == "integers":
+            low, high = math.floor(low), math.ceil(high) + (high > self.high)
+        # whole cells more, so that cells that it has stay where they are
+        down, up = (
+            math.ceil((self.low - low) / self.step),
+            math.ceil((high - self.high) / self.step),
+        )
+        if not down and not up:
+            return self
+        return self.to(self.low - down * self.step, self.high + up * self.step)
+
     def to(self, low: float, high: float) -> Lattice:
         """Another range, of cells as wide as before; within the bounds of the line."""
         step = self.step

@@ -50,12 +50,15 @@ class Cells:
         What the slice before gives every cell, as ``back`` needs it; None in slice 0.
     increment : ndarray, shape (*apart,)
         Log density of the row given the rows before.
+    mass : ndarray, shape (*apart,)
+        What the densities of what is hidden add up to: one, where nothing is left out.
     """
 
     placed: Placed
     probs: np.ndarray
     predicted: np.ndarray | None
     increment: np.ndarray
+    mass: np.ndarray
 
 
 class GridMover:
@@ -97,7 +100,7 @@ class GridMover:
         mass = prior
         if cells is not None and any(f.scale is not None and not f.hidden for f in factors):
             mass = self._without_likelihood(cells, now, [f for f in factors if f.hidden])
-        self._check_mass(mass, now)
+        whole = self._check_mass(mass, now)
         log = prior + likelihood
         axes = tuple(range(len(now.scalars)))
         level = log.max(axis=axes) if axes else log
@@ -110,7 +113,13 @@ class GridMover:
         probs = probs / total
         self._check_cells(probs, now)
         self._check_edges(probs, now)
-        return Cells(now, probs, predicted, np.asarray(level + np.log(total)))
+        return Cells(now, probs, predicted, np.asarray(level + np.log(total)), whole)
+
+    def likelihood(self, cells: Cells | None, row: Row) -> tuple[Placed, np.ndarray]:
+        """What a row makes of the cells of its slice, in logs; the most that the slice before allows."""
+        now = self.model.place(row)
+        factors = self.model.factors(None if cells is None else cells.placed, now)
+        return now, self._local(factors, now, (*now.shape, *self.model.lead))[1]
 
     def back(self, cells: Cells, after: Cells, smoothed: np.ndarray) -> np.ndarray:
         """Smoothed probabilities of a slice, from those of the one after."""
@@ -206,14 +215,15 @@ class GridMover:
         moved = contract(self._moving(cells, now, hidden), labels)
         return prior + np.log(dense(moved, labels, shape))
 
-    def _check_mass(self, log_mass: np.ndarray, now: Placed) -> None:
+    def _check_mass(self, log_mass: np.ndarray, now: Placed) -> np.ndarray:
+        """The mass on the grid, after a warning where some is missing."""
         axes = tuple(range(len(now.scalars)))
-        if not axes or "mass" in self.warned:
-            return
-        mass = np.exp(log_mass).sum(axis=axes)
+        if not axes:
+            return np.ones(np.shape(log_mass))
+        mass = np.asarray(np.exp(log_mass).sum(axis=axes))
         off = np.abs(mass - 1)
-        if not np.any(off > self.tolerance):
-            return
+        if "mass" in self.warned or not np.any(off > self.tolerance):
+            return mass
         worst = float(np.asarray(mass).flat[int(np.argmax(off))])
         self.warned.add("mass")
         if worst < 1:
@@ -226,6 +236,7 @@ class GridMover:
             GridWarning,
             stacklevel=2,
         )
+        return mass
 
     def _check_cells(self, probs: np.ndarray, now: Placed) -> None:
         """Warn where a belief stands on so few cells that sums over cells are no integrals."""

@@ -13,7 +13,7 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import Asked, FilterEngine
-from bayesmc.engines.grid.automatic import TARGET, FoundGrid, find_grid
+from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
 from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.record import GridPosterior
@@ -49,14 +49,15 @@ class GridSearch(FilterEngine):
             found = self.found(problem)
         except BayesmcError as error:
             return str(error)
-        except Exception as error:  # a function of the user's that fails at points of the grid
+        except FloatingPointError as error:  # of a user who has numpy raise, at points of the grid
             return f"a function fails on the grid: {error!r}"
         assert found is not None
         off = float(np.max(found.error))
-        if not off <= TARGET:
+        most = TAKEN_FAR if found.far else TARGET
+        if not off <= most:
             return (
                 f"a grid of {found.described} for {found.name!r} has an error of {off:.2g} in the log "
-                f"evidence, above {TARGET}"
+                f"evidence, above {most}"
             )
         each = found.axis.size * math.prod(found.mover.model.lead)
         if 16 * problem.steps * each > self.max_bytes:
@@ -137,10 +138,15 @@ class GridSearch(FilterEngine):
             error = found.error
             posterior.log_marginal_likelihood_mcse = error if error.ndim else float(error)
             if not np.max(error) <= TARGET and np.isfinite(self.tolerance):
+                other = (
+                    "; some of it lands far from the rest, where particles seldom come"
+                    if found.far
+                    else ", or use ParticleFilter(particles)"
+                )
                 warnings.warn(
                     f"GridFilter: {found.described} for {found.name!r} have an error of "
                     f"{float(np.max(error)):.2g} in the log evidence; give a grid of your own, "
-                    f"grid={{{found.name!r}: (low, high, cells)}}, or use ParticleFilter(particles)",
+                    f"grid={{{found.name!r}: (low, high, cells)}}{other}",
                     GridWarning,
                     stacklevel=4,
                 )

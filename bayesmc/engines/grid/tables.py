@@ -92,7 +92,7 @@ class GridModel(GridSlices):
         fixed = mask is None and hidden and not sources.timed
         fixed = fixed and not any(n in now.row.seen for n in sources.now)
         fixed = fixed and (before is None or not any(n in before.row.seen for n in sources.before))
-        key = (first, before is not None and before.row.t == 0, name, _ends(before))
+        key = (first, before is not None and before.row.t == 0, name, ends_of(before))
         if fixed and key in self._kept:
             return self._kept[key]
         found = self._tabulated(name, before, now, base, hidden, mask)
@@ -232,6 +232,12 @@ class GridModel(GridSlices):
         return found
 
 
+def ends_of(before: Placed | None) -> tuple[Any, ...]:
+    """Which points the slice before has: a belief may come from another grid."""
+    scalars = () if before is None else before.scalars
+    return tuple((s.size, s.points.flat[0], s.points.flat[-1]) for s in scalars)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -247,12 +253,6 @@ class Block(NamedTuple):
 def _both(before: Placed | None, now: Placed) -> Labels:
     was = () if before is None else tuple(previous(x) for x in before.labels)
     return (*was, *now.labels)
-
-
-def _ends(before: Placed | None) -> tuple[Any, ...]:
-    """Which points the slice before has: a belief may come from another grid."""
-    scalars = () if before is None else before.scalars
-    return tuple((s.size, s.points.flat[0], s.points.flat[-1]) for s in scalars)
 
 
 def _sizes(placed: Placed | None, suffix: str = "") -> dict[Label, int]:
