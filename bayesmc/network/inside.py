@@ -91,7 +91,7 @@ def inside(name: str, value: Any, reads: Reads) -> Inside | None:
     if isinstance(value, _NO_OBJECTS) or _is_ours(value):
         return None
     if not isinstance(value, (dict, list, tuple, set)):
-        kind: Hashable = type(value)
+        kind: Any = type(value)
         reads = _with_methods(kind, reads)
     entries = _freeze(value, reads, _DEPTH)
     return Inside(entries, reads) if isinstance(entries, _Entries) else None
