@@ -12,7 +12,7 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.series import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.particles.filter import ParticleFilter
@@ -93,7 +93,7 @@ def filter(
     (3,)
     """
     problem = pose_series(dbn, observations, inputs)
-    chosen = _engine(problem, engine, Asked("filter", keep, queries or {}))
+    chosen = _engine(problem, engine, Asked("filter", keep, read_queries("filter", queries)))
     options: dict[str, Any] = {"keep": keep, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options)
 
@@ -128,7 +128,7 @@ def smooth(
     ):
         raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
     kind = "smooth" if lag is None else "fixed-lag"
-    chosen = _engine(problem, engine, Asked(kind, None, queries or {}))
+    chosen = _engine(problem, engine, Asked(kind, None, read_queries("smooth", queries)))
     return chosen.smooth(problem, seed_sequence(rng), lag=lag, queries=queries, progress=progress)
 
 
@@ -157,7 +157,7 @@ def forecast(
     """
     check_steps("forecast", steps)
     problem = pose_series(dbn, observations, inputs, ahead=steps)
-    chosen = _engine(problem, engine, Asked("forecast", None, queries or {}))
+    chosen = _engine(problem, engine, Asked("forecast", None, read_queries("forecast", queries)))
     options: dict[str, Any] = {"keep": None, "queries": queries, "progress": progress}
     return chosen.filter(problem, seed_sequence(rng), **options).last(steps, "forecast")
 
@@ -204,7 +204,7 @@ def explained_series(
             f"explain(question={question!r}): there are {', '.join(map(repr, _QUESTIONS))}"
         )
     problem = pose_series(dbn, observations, inputs)
-    asked = Asked(question, keep, queries or {})
+    asked = Asked(question, keep, read_queries("explain", queries))
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
         return Explanation(chosen, reasons, refused, chosen.describe(problem))

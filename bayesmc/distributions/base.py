@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from bayesmc.distributions.reading import read_floats
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import BayesmcError, ParameterError, ShapeError, UnsupportedError
@@ -434,12 +435,7 @@ def as_float(value: Any) -> np.ndarray:
     """A parameter as a float array; what cannot become one raises and says what it is."""
     if type(value) is np.ndarray and value.dtype is _FLOAT:
         return value
-    try:
-        return np.asarray(value, dtype=float)
-    except (TypeError, ValueError) as error:
-        if isinstance(error, BayesmcError):
-            raise
-        raise ParameterError(f"a distribution's parameter is {value!r}, not numbers") from error
+    return read_floats(value)
 
 
 def all_finite(values: np.ndarray) -> bool:

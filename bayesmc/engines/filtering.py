@@ -23,6 +23,7 @@ from bayesmc.errors import (
     EvidenceError,
     InterruptWarning,
     ModelError,
+    QueryError,
     UnsupportedError,
     did_you_mean,
 )
@@ -47,6 +48,26 @@ class Asked(NamedTuple):
     what: str = "filter"
     keep: str | None = None
     queries: Queries = MappingProxyType({})
+
+
+def read_queries(call: str, queries: Any) -> Queries:
+    """The functions asked for by name; anything else is refused with what to give."""
+    if queries is None:
+        return {}
+    fix = "give queries={'name': function}, functions whose arguments name nodes"
+    if not isinstance(queries, Mapping):
+        raise QueryError(
+            f"{call}(queries={queries!r}): a {type(queries).__name__} is no dict; {fix}"
+        )
+    for name, function in queries.items():
+        if not isinstance(name, str) or not callable(function):
+            raise QueryError(
+                f"{call}(queries={{{name!r}: {function!r}}}): {name!r} is no name of a function; {fix}"
+                if not isinstance(name, str)
+                else f"{call}(queries={{{name!r}: {function!r}}}): a {type(function).__name__} is no "
+                f"function; {fix}"
+            )
+    return queries
 
 
 class FilterEngine:

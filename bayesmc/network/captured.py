@@ -2,8 +2,9 @@
 
 A closure or a global is looked up when a function is called, not when it is declared: in a loop every
 function gets the last value. What was read at declaration is noted here and compared when a question is
-asked, so that a net whose meaning has changed says so. Functions, classes and modules may be defined anew,
-and a mutable object may change inside; neither is noticed, but another object in its place is.
+asked, so that a net whose meaning has changed says so; so is what it reads inside a dict or an object, the
+one of a bound method and those of defaults included (``inside``). Functions, classes and modules may be
+defined anew without being noticed.
 """
 
 from __future__ import annotations
@@ -11,17 +12,19 @@ from __future__ import annotations
 import copy
 import dis
 import functools
+import keyword
+import operator
+import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import ModelError
+from bayesmc.network.inside import SMALL, Inside, Reads, inside, is_simple, reads_of
 
-#: numbers of an array up to which a copy tells whether they were written over
-_SMALL = 4096
 #: functions called by functions called by ... that are looked into
 _DEPTH = 3
 #: what may be defined anew without another net being meant
@@ -37,22 +40,28 @@ class Captured:
     name : str
     value : object
         As it stood at declaration; a copy of a small array.
-    function : FunctionType
+    function : callable
         Where it is looked up: the declared function, or one that it calls.
-    cell : int or None
-        Its place in the function's closure; None for a global.
+    cell : int, tuple or None
+        Its place in the function's closure; None for a global; for what is bound to the function, as
+        ``self`` and defaults are, the attribute of the function and the place in it.
+    inside : Inside or None
+        What can be read inside the value, as it stood at declaration.
     """
 
     name: str
     value: Any
-    function: FunctionType
-    cell: int | None
+    function: Any
+    cell: int | tuple[str, Any] | None
+    inside: Inside | None = None
 
     @property
     def now(self) -> Any:
         """What the name stands for now; ``value`` where it is gone."""
         if self.cell is None:
             return self.function.__globals__.get(self.name, self.value)
+        if isinstance(self.cell, tuple):
+            return _bound_now(self.function, *self.cell)
         try:
             return (self.function.__closure__ or ())[self.cell].cell_contents
         except (ValueError, IndexError):
@@ -68,7 +77,13 @@ def captured(function: Any) -> tuple[Captured, ...]:
     """What a function reads from around it, and what Python functions of its module read that it calls."""
     found: dict[tuple[int, str], Captured] = {}
     _collect(function, _DEPTH, found)
-    return tuple(found.values())
+    names = [c for key, c in found.items() if key[1]]
+    if not names:
+        return ()
+    followed = [reads_of(c.function.__code__) for key, c in found.items() if not key[1]]
+    reads = functools.reduce(operator.or_, followed)
+    with_inside = [c if is_simple(c.value) else _with_inside(c, reads) for c in names]
+    return tuple(c for c in with_inside if c is not None)
 
 
 def check_captured(declarations: Iterable[Any], what: str = "node") -> None:
@@ -87,6 +102,9 @@ def check_captured(declarations: Iterable[Any], what: str = "node") -> None:
             now = seen.now
             if now is not seen.value and not _alike(seen.value, now):
                 raise ModelError(_words(what, declaration, seen, now))
+            change = seen.inside.change(now) if seen.inside is not None else None
+            if change is not None:
+                raise ModelError(_words_inside(what, declaration, seen, *change))
 
 
 def redeclared(was: Iterable[Captured], now: Iterable[Captured]) -> str | None:
@@ -126,8 +144,12 @@ def _place(seen: Captured) -> tuple[str, str, str]:
 
 def _collect(function: Any, depth: int, found: dict[tuple[int, str], Captured]) -> None:
     plain = _plain_function(function)
-    if plain is None:
+    if plain is None or (id(plain), "") in found:  # functions may call each other
         return
+    found[id(plain), ""] = Captured("", None, plain, None)
+    for name, value, holder, place in _bound(function, plain):
+        if not is_simple(value):
+            found[id(holder), str(place)] = Captured(name, _kept(value), holder, place)
     for name, value, cell in _around(plain):
         key = (id(plain), name)
         if key in found:
@@ -135,14 +157,9 @@ def _collect(function: Any, depth: int, found: dict[tuple[int, str], Captured]) 
         if isinstance(value, _IGNORED) or isinstance(value, functools.partial):
             inner = _plain_function(value)
             if inner is not None and depth and inner.__globals__ is plain.__globals__:
-                if (id(inner), "") not in found:  # functions may call each other
-                    found[id(inner), ""] = Captured("", None, inner, None)
-                    _collect(inner, depth - 1, found)
+                _collect(value, depth - 1, found)
             continue
         found[key] = Captured(name, _kept(value), plain, cell)
-    if depth == _DEPTH:
-        for key in [k for k in found if not k[1]]:
-            del found[key]
 
 
 def _plain_function(function: Any) -> FunctionType | None:
@@ -157,9 +174,45 @@ def _plain_function(function: Any) -> FunctionType | None:
             function = function.func
         elif isinstance(function, MethodType):
             function = function.__func__
+        elif not isinstance(function, type):
+            function = getattr(type(function), "__call__", None)  # noqa: B004
         else:
             return None
     return None
+
+
+def _bound(function: Any, plain: FunctionType) -> Iterator[tuple[str, Any, Any, tuple[str, Any]]]:
+    """What is bound to a function: ``self``, arguments of partials, defaults: name, value, holder, place."""
+    names = plain.__code__.co_varnames[: plain.__code__.co_argcount]
+    first = names[0] if names else "self"
+    while isinstance(function, functools.partial):
+        for k, value in enumerate(function.args):
+            yield (names[k] if k < len(names) else f"args[{k}]"), value, function, ("args", k)
+        for name, value in function.keywords.items():
+            yield name, value, function, ("keywords", name)
+        function = function.func
+    if isinstance(function, MethodType):
+        yield first, function.__self__, function, ("__self__", None)
+    elif not isinstance(function, (FunctionType, BuiltinFunctionType, type)):
+        yield first, function, function, ("", None)
+    defaults = plain.__defaults__ or ()
+    for k, value in enumerate(defaults):
+        yield names[len(names) - len(defaults) + k], value, plain, ("__defaults__", k)
+    for name, value in (plain.__kwdefaults__ or {}).items():
+        yield name, value, plain, ("__kwdefaults__", name)
+
+
+def _bound_now(holder: Any, attribute: str, place: Any) -> Any:
+    value = getattr(holder, attribute) if attribute else holder
+    return value if place is None else value[place]
+
+
+def _with_inside(seen: Captured, reads: Reads) -> Captured | None:
+    """With what can be read inside it; None for what is bound and cannot change."""
+    entries = inside(seen.name, seen.value, reads)
+    if isinstance(seen.cell, tuple) and entries is None and not isinstance(seen.value, np.ndarray):
+        return None
+    return seen if entries is None else replace(seen, inside=entries)
 
 
 def _around(function: FunctionType) -> Iterator[tuple[str, Any, int | None]]:
@@ -199,7 +252,7 @@ def _names(code: CodeType) -> tuple[frozenset[str], frozenset[str]]:
 
 def _kept(value: Any) -> Any:
     """What is held against later: small arrays may be written over, so a copy of them is."""
-    if isinstance(value, np.ndarray) and value.size <= _SMALL and not value.dtype.hasobject:
+    if isinstance(value, np.ndarray) and value.size <= SMALL and not value.dtype.hasobject:
         return copy.copy(value)
     return value
 
@@ -259,3 +312,35 @@ def _peek(value: Any) -> str:
     except Exception:
         text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
+
+
+def _words_inside(
+    what: str, declaration: Any, seen: Captured, path: str, old: Any, now: Any
+) -> str:
+    entry = f"{seen.name}{path}"
+    place = seen.cell[0] if isinstance(seen.cell, tuple) else None
+    if place in ("__self__", ""):
+        fix = "give every function an object of its own (copy.copy keeps its values)"
+    elif place is not None:
+        fix = f"bind a copy, as {seen.name}=copy.deepcopy({seen.name}) does"
+    else:
+        fix = f"give the function an argument {_argument(seen.name, entry, now)}, which keeps the value"
+        if what == "node":
+            fix += " (arguments with defaults are no parents)"
+    return (
+        f"{what} {declaration.name!r}: its function reads {entry}, which was {_peek(old)} when it was "
+        f"declared and is {_peek(now)} now; {fix}, or declare the {what} anew"
+    )
+
+
+def _argument(name: str, entry: str, now: Any) -> str:
+    """An argument whose default holds an entry, or a copy of the whole where an entry has no name."""
+    last = re.split(r"[.\[\]']+", entry.rstrip("]'"))[-1]
+    if (
+        "(its length)" in entry
+        or not last.isidentifier()
+        or keyword.iskeyword(last)
+        or last == name
+    ):
+        return f"{name}=copy.deepcopy({name})"
+    return f"{last}={entry}" + (".copy()" if isinstance(now, np.ndarray) else "")

@@ -22,7 +22,13 @@ from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
 from bayesmc.results.datatree import datatree
 from bayesmc.results.marginal import Marginal
-from bayesmc.results.posterior import Plates, Posterior, circular_variance, whole_draws
+from bayesmc.results.posterior import (
+    Plates,
+    Posterior,
+    circular_variance,
+    quantile_levels,
+    whole_draws,
+)
 from bayesmc.results.query import Query
 from bayesmc.results.shares import chain_count, is_share, slowest, steps, weighted_count
 
@@ -135,9 +141,7 @@ class DrawsPosterior(Posterior):
     def quantile(self, name: str, q: Any) -> np.ndarray:
         values = self._uncut(name, "quantile")
         flat = values.reshape((math.prod(self._shape), *values.shape[2:]))
-        levels = np.asarray(q, dtype=float)
-        if not ((levels >= 0) & (levels <= 1)).all():
-            raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+        levels = quantile_levels(name, q)
         if self.weights is not None:
             weights = self.weights.ravel()
             return np.quantile(flat, levels, axis=0, weights=weights, method="inverted_cdf")

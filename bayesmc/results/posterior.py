@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
+from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
 from bayesmc.results.marginal import Marginal
@@ -19,6 +19,19 @@ from bayesmc.results.table import Summary
 
 Plates = str | Sequence[str]
 _QUANTILES = (0.05, 0.5, 0.95)
+
+
+def quantile_levels(name: str, q: Any) -> np.ndarray:
+    """The levels of asked quantiles as floats between 0 and 1."""
+    try:
+        levels = np.asarray(q, dtype=float)
+    except (TypeError, ValueError):
+        raise QueryError(
+            f"quantile({name!r}, {q!r}): quantiles are numbers between 0 and 1; give one or an array of them"
+        ) from None
+    if not ((levels >= 0) & (levels <= 1)).all():
+        raise QueryError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+    return levels
 
 
 class Posterior:
@@ -84,6 +97,14 @@ class Posterior:
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Posterior quantiles, shape ``(*q.shape, *plates, *event)``."""
         raise self._cannot("quantile")
+
+    def relabelled(self, by: str) -> Posterior:
+        """The same draws with components named by the order of a node; only chains of draws can."""
+        raise UnsupportedError(
+            f"relabelled({by!r}): {type(self).__name__} keeps no chains whose draws could be put in order; "
+            "ask an engine of chains, as engine=Gibbs(draws), or sort in the query, as "
+            f"expectation(lambda {by}: numpy.sort({by}, axis=-1)) does"
+        )
 
     def probabilities(self, *names: str) -> np.ndarray:
         """Probabilities of the states: ``(*plates, states)``, or the joint table of several nodes."""

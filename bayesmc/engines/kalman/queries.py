@@ -19,6 +19,7 @@ from bayesmc.engines.averages import as_event, over_normal, over_normals
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network.reading import nodes_read
+from bayesmc.results.posterior import quantile_levels
 
 
 class Spread(Protocol):
@@ -124,9 +125,7 @@ def expectation(
 
 def quantiles(mean: np.ndarray, std: np.ndarray, q: Any, name: str) -> np.ndarray:
     """Quantiles of normal numbers, shape ``(steps, *q.shape, *rest)``."""
-    levels = np.asarray(q, dtype=float)
-    if not ((levels >= 0) & (levels <= 1)).all():
-        raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+    levels = quantile_levels(name, q)
     rest = mean.ndim - 1
     lead = (len(mean), *(1,) * levels.ndim, *mean.shape[1:])
     z = ndtri(levels).reshape(1, *levels.shape, *(1,) * rest)

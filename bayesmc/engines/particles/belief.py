@@ -16,7 +16,7 @@ from bayesmc.engines.particles.mover import Mover
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.reading import nodes_read
-from bayesmc.results.posterior import circular_variance, table_variance
+from bayesmc.results.posterior import circular_variance, quantile_levels, table_variance
 
 
 class ParticleBelief(OnlineBelief):
@@ -288,9 +288,7 @@ def quantiles(
     layout: Layout, cloud: Cloud, node: CompiledNode, value: np.ndarray, q: Any
 ) -> np.ndarray:
     """Weighted quantiles of a node that is not made of labels, shape ``(*q.shape, *plates, *event)``."""
-    levels = np.asarray(q, dtype=float)
-    if not ((levels >= 0) & (levels <= 1)).all():
-        raise ValueError(f"quantile({node.name!r}, {q!r}): quantiles lie between 0 and 1")
+    levels = quantile_levels(node.name, q)
     numbers = np.broadcast_to(_values(node, value), (len(cloud.weights), *node.value_shape))
     if node.angles is not None:  # an order needs a cut: opposite the mean
         mean = _mean(layout, cloud, node, value)
