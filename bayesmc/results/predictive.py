@@ -19,7 +19,7 @@ from scipy import special
 from bayesmc.errors import ModelMisfitWarning
 
 #: rows are unlikely where so small a share of the rows that were expected is less likely
-_LOW = 0.05
+UNLIKELY = 0.05
 #: chance at which a model that is right has as many unlikely rows
 _ALPHA = 1e-6
 #: nats per number that must be missing, too, so that a model that is a little off does not alarm: of a
@@ -89,7 +89,7 @@ class Predictive:
         ranks = self.row_ranks.reshape(steps, -1)
         deficits = self.row_deficits.reshape(ranks.shape)
         known = np.isfinite(ranks) & ~np.isnan(deficits)
-        low = known & (ranks < _LOW)
+        low = known & (ranks < UNLIKELY)
         seen = np.flatnonzero(known.any(axis=1))
         if not low.any():
             return None
@@ -105,7 +105,7 @@ class Predictive:
         counts = [_between(pooled if e is None else each[:, e], a, b) for a, b, e in ends]
         few, many = np.floor(np.array(counts) + 1e-9).T
         # of so many binomial ones or more
-        chance = special.betainc(np.maximum(few, 1), np.maximum(many - few, 0) + 1, _LOW)
+        chance = special.betainc(np.maximum(few, 1), np.maximum(many - few, 0) + 1, UNLIKELY)
         blamed = (few > 0) & (chance * len(ends) < _ALPHA)
         for k in np.flatnonzero(blamed):
             first, last, element = ends[k]

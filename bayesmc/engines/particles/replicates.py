@@ -21,12 +21,15 @@ from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import Observed
 from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
-from bayesmc.results.predictive import Predictive
+from bayesmc.results.predictive import UNLIKELY, Predictive
 
 #: rows drawn in a slice, and particles that say how likely they are
 ROWS, JUDGES = 19, 20
-#: slices that are looked at: so many of a series, and every so manieth of a long one
-LOOKS, EVERY = 64, 4
+#: slices that are looked at: so many of a series, and every so manieth of a long one; a look costs as much as
+#: moving a thousand particles
+LOOKS, EVERY = 16, 12
+#: slices that are looked at after a row that is unlikely, and the share of rows filtered separately that must be
+MORE, SHARE = 4, 0.2
 #: the same where rows are wide, such as scans, which are dear to draw; and from how many numbers on they are
 WIDE_LOOKS, WIDE_EVERY, WIDE = 16, 32, 16
 #: and rows below which none is: too few for any conclusion
@@ -50,17 +53,19 @@ class Replicates:
         self.plan = SlicePlan(problem.slices, plan.apart, plan.static)
         self.lead = tuple(problem.slices.first.sizes[p] for p in plan.apart)
         self.names = tuple(problem.series.observed)
-        self._looked = _chosen(problem, rng)
+        self._wide = _numbers_seen(problem) >= WIDE
+        self._looked, self._until = _chosen(problem, self._wide, rng), -1
         self._failed = False
         self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)
         self._rows, self._deficits = np.full(lead, np.nan), np.full(lead, np.nan)
         shapes = {n: problem.slices.first[n].value_shape for n in self.names}
         self._ranks = {n: np.full((problem.steps, *shapes[n]), np.nan) for n in self.names}
+        self._sizes = {n: math.prod(shapes[n]) for n in self.names}
 
     def look(self, k: int, before: Cloud | None, row: Row) -> None:
         """Compare the k-th row, whose slice follows that of a cloud."""
-        if k not in self._looked or self._failed or not row.seen:
+        if (k not in self._looked and k > self._until) or self._failed or not row.seen:
             return
         try:
             values = self._taken(before)
@@ -102,6 +107,9 @@ class Replicates:
 
     def _ancestors(self, cloud: Cloud, count: int) -> np.ndarray:
         """Particles drawn in proportion to their weights, shape (count, *lead)."""
+        if not self.lead:
+            sums = cloud.weights.cumsum()
+            return sums.searchsorted(self.rng.random(count) * sums[-1], side="right").clip(max=len(sums) - 1)
         weights = cloud.weights.reshape(len(cloud.weights), -1)
         found = np.empty((count, weights.shape[1]), dtype=np.intp)
         for k, column in enumerate(weights.T):
@@ -115,7 +123,7 @@ class Replicates:
         state = Pass(self.rng, (ROWS,), {**self.plan.known(unseen), **before})
         values = passed(self.plan.steps(unseen), state).values
         shapes = {n: (ROWS, *self.slices.first[n].value_shape) for n in row.seen}
-        return {n: np.broadcast_to(values[n], shape) for n, shape in shapes.items()}
+        return {n: _shaped(values[n], shape) for n, shape in shapes.items()}
 
     def _judged(
         self, row: Row, drawn: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray]
@@ -123,23 +131,25 @@ class Replicates:
         """Log densities of the row that came, first, and of those drawn, shape (1 + rows, *lead)."""
         seen = {}
         for name, own in row.seen.items():
-            each = np.concatenate(
-                [np.broadcast_to(own.value, drawn[name].shape[1:])[None], drawn[name]]
-            )
-            seen[name] = Observed(np.repeat(each, JUDGES, axis=0), own.mask)
+            one = _shaped(np.asarray(own.value), drawn[name].shape[1:])
+            each = np.concatenate([one[None], drawn[name]])
+            seen[name] = Observed(each.repeat(JUDGES, axis=0), own.mask)
         judged = Row(row.t, seen, row.inputs)
         count = (1 + ROWS) * JUDGES
         state = Pass(self.rng, (count,), {**self.plan.known(judged), **before})
         log = passed(self.plan.steps(judged), state).log_weight
-        log = np.broadcast_to(np.asarray(log, dtype=float), (count, *self.lead))
+        log = _shaped(np.asarray(log, dtype=float), (count, *self.lead))
         log = log.reshape(1 + ROWS, JUDGES, *self.lead)
-        level = np.maximum(log.max(axis=1, keepdims=True), _LEAST)
-        return np.log(np.exp(log - level).mean(axis=1)) + level[:, 0]
+        level = np.maximum(np.maximum.reduce(log, axis=1, keepdims=True), _LEAST)
+        return np.log(np.add.reduce(np.exp(log - level), axis=1) / JUDGES) + level[:, 0]
 
     def _write(self, k: int, row: Row, drawn: Mapping[str, np.ndarray], log: np.ndarray) -> None:
-        self._rows[k] = self._rank(log[0], log[1:])
+        self._rows[k] = ranks = self._rank(log[0], log[1:])
+        if not self._wide and np.count_nonzero(ranks < UNLIKELY) > SHARE * np.size(ranks):
+            self._until = k + MORE
         log = np.maximum(log, _LEAST)
-        self._deficits[k] = (log[1:].mean(axis=0) - log[0]) / np.maximum(self._numbers(row), _TINY)
+        off = np.add.reduce(log[1:]) / ROWS - log[0]
+        self._deficits[k] = off / np.maximum(self._numbers(row), _TINY)
         for name, own in row.seen.items():
             node = self.slices.first[name]
             ranks = self._rank(own.value, drawn[name])
@@ -148,14 +158,19 @@ class Replicates:
                 ranks = np.where(mask, ranks, np.nan)
             self._ranks[name][k] = ranks
 
-    def _rank(self, value: Any, others: np.ndarray) -> np.ndarray:
+    def _rank(self, value: Any, others: np.ndarray) -> Any:
         """Where values lie among others, along the first axis; ties are broken by chance."""
+        if others.ndim == 1:  # without an axis it is several times faster
+            low, same = np.count_nonzero(others < value), np.count_nonzero(others == value)
+            return (low + self.rng.random() * (same + 1)) / (ROWS + 1)
         less = (others < value).sum(axis=0)
         equal = (others == value).sum(axis=0)
         return (less + self.rng.random(less.shape) * (equal + 1)) / (ROWS + 1)
 
-    def _numbers(self, row: Row) -> np.ndarray:
+    def _numbers(self, row: Row) -> Any:
         """How many numbers a row has, shape (*lead); those of tempered densities count for less."""
+        if not self.lead and all(own.mask is None for own in row.seen.values()):
+            return sum(self._worth(row, n) * self._sizes[n] for n in row.seen)
         total = np.zeros(self.lead)
         for name, own in row.seen.items():
             node = self.slices.first[name]
@@ -184,7 +199,18 @@ _LEAST = -1e12
 _TINY = 1e-9
 
 
-def _chosen(problem: SeriesProblem, rng: np.random.Generator) -> frozenset[int]:
+def _shaped(value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A value of a shape; views that are none cost more than they are worth."""
+    return value if value.shape == shape else np.broadcast_to(value, shape)
+
+
+def _numbers_seen(problem: SeriesProblem) -> int:
+    """Of an element of the plates, in a slice."""
+    model = problem.slices.first
+    return sum(math.prod(model[n].event_shape) for n in problem.series.observed)
+
+
+def _chosen(problem: SeriesProblem, wide: bool, rng: np.random.Generator) -> frozenset[int]:
     """The slices that are looked at: one of each stretch, at random, among those with something seen."""
     some = np.zeros(problem.steps, dtype=bool)
     for seen in problem.series.observed.values():
@@ -192,9 +218,7 @@ def _chosen(problem: SeriesProblem, rng: np.random.Generator) -> frozenset[int]:
     rows = np.flatnonzero(some)
     if len(rows) < _FEW:
         return frozenset()
-    model = problem.slices.first
-    numbers = sum(math.prod(model[n].event_shape) for n in problem.series.observed)
-    least, every = (WIDE_LOOKS, WIDE_EVERY) if numbers >= WIDE else (LOOKS, EVERY)
+    least, every = (WIDE_LOOKS, WIDE_EVERY) if wide else (LOOKS, EVERY)
     if len(rows) <= least:
         return frozenset(rows.tolist())
     edges = np.linspace(0, len(rows), max(least, len(rows) // every) + 1)
