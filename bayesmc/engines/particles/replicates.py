@@ -27,7 +27,7 @@ from bayesmc.results.predictive import UNLIKELY, Predictive
 ROWS, JUDGES = 19, 20
 #: slices that are looked at: so many of a series, and every so manieth of a long one; a look costs as much as
 #: moving a thousand particles
-LOOKS, EVERY = 16, 12
+LOOKS, EVERY = 8, 12
 #: slices that are looked at after a row that is unlikely, and the share of rows filtered separately that must be
 MORE, SHARE = 4, 0.2
 #: the same where rows are wide, such as scans, which are dear to draw; and from how many numbers on they are
