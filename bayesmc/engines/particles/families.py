@@ -25,6 +25,8 @@ found families.
 
 from __future__ import annotations
 
+import math
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -114,8 +116,10 @@ def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> 
     steady : bool
         Whether resampling leaves neighbours together the particles that their weight demands, but for one.
     """
+    if cloud.weights.ndim == 1 and steady and cloud.rejuvenated is False:
+        return _followed_alone(families, earlier, cloud)
     poor = cloud.ess < min(RESTS, 0.9 * len(cloud.weights))
-    if poor if isinstance(poor, bool) else poor.any():
+    if np.any(poor):
         families = families._replace(settled=np.where(poor, np.inf, families.settled))
     if cloud.ancestors is not None:
         families = _moved(families, earlier, cloud, steady)
@@ -129,7 +133,7 @@ def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> 
 def evidence_error(families: Families, cloud: Cloud) -> Any:
     """Root mean square error of the log evidence, with its bias of minus half its variance."""
     variance = _variance(families, _weights(families, cloud))
-    explained = families.explained + _explained(cloud)[None]
+    explained = families.explained + _explained(cloud)
     at_edge = _at_edge(variance, explained, len(cloud.weights))
     total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
     found = np.sqrt(total + 0.25 * total**2)
@@ -171,11 +175,42 @@ def _sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     return found
 
 
+@lru_cache(maxsize=64)
 def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
     """Groups of about as many particles: where they begin and end, and their shares."""
     bounds = np.arange(groups + 1) * n // groups
     tail = (1,) * axes
     return bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
+
+
+def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
+    """The same of one filter whose families have the particles that they should, in few calls of NumPy."""
+    bounds, shares, kept, explained, born, settled = families
+    n = len(cloud.weights)
+    if cloud.ess < min(RESTS, 0.9 * n):
+        settled = np.asarray(np.inf)
+    if cloud.ancestors is None:
+        return Families(bounds, shares, kept, explained, born, settled)
+    bounds = cloud.ancestors.searchsorted(bounds)
+    if cloud.resampled:
+        explained = explained + _explained(earlier)
+    found = Families(bounds, shares, kept, explained, born, settled)
+    if cloud.t % STRIDE or not cloud.resampled:
+        return found
+    counts = (bounds[:, 1:] - bounds[:, :-1]) * (1.0 / n)
+    off = counts - shares
+    even = [float(s.dot(s)) for s in shares]
+    variance = [_drifted(float(o.dot(o)), e) for o, e in zip(off, even, strict=True)]
+    every = explained.tolist()
+    if _odd(variance[OLD], *every[OLD], n) or _odd(variance[YOUNG], *every[YOUNG], n):
+        found = found._replace(settled=np.asarray(np.inf))
+    age = cloud.t - int(born[YOUNG])
+    few = even[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
+    if age <= LONGEST and not (age > SHORTEST and few):
+        return found
+    lost = math.inf in variance
+    gained = math.inf if lost else variance[OLD] - variance[YOUNG]
+    return _begun_again(found, cloud, np.asarray(True), found.settled + gained, False)
 
 
 def _moved(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
@@ -184,7 +219,7 @@ def _moved(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Fa
     bounds = _searched(cloud.ancestors, families.bounds)
     explained = families.explained
     if bounds.ndim > 2:
-        explained = explained + np.where(cloud.resampled, _explained(earlier), 0.0)[None]
+        explained = explained + np.where(cloud.resampled, _explained(earlier), 0.0)
     elif cloud.resampled:
         explained = explained + _explained(earlier)
     if steady:
@@ -279,13 +314,11 @@ def _variance(families: Families, weights: np.ndarray) -> np.ndarray:
     return np.where(left > 1e-9, -np.log(np.maximum(left, 1e-9)), np.inf)
 
 
-def _explained(cloud: Cloud) -> np.ndarray:
+def _explained(cloud: Cloud) -> Any:
     """Variance of the log of the mean weight of a slice, and again, as 0 where they have a tail."""
     n = len(cloud.weights)
-    if (
-        isinstance(cloud.ess, float) and cloud.ess >= FEW * n
-    ):  # the rest would cost more than it says
-        return np.full(2, 1.0 / cloud.ess - 1.0 / n)
+    if isinstance(cloud.ess, float) and cloud.ess >= FEW * n:
+        return 1.0 / cloud.ess - 1.0 / n  # an array of two would cost more than it says
     ess = np.asarray(cloud.ess)
     variance = 1.0 / ess - 1.0 / n
     few = ess < FEW * n
@@ -304,10 +337,21 @@ def _explained(cloud: Cloud) -> np.ndarray:
 
 def _at_edge(variance: np.ndarray, explained: np.ndarray, n: int) -> np.ndarray:
     """Whether families differ by far more than the slices' weights explain."""
-    every, bounded = explained[:, 0], explained[:, 1]
+    odd: np.ndarray = np.any(_odd(variance, explained[:, 0], explained[:, 1], n), axis=0)
+    return odd
+
+
+def _odd(variance: Any, every: Any, bounded: Any, n: int) -> Any:
+    """The same, of numbers or arrays."""
     odd = (variance > _level(n)) & (variance > EDGE * every)
     odd |= (variance > LONG) & (variance > EDGE * bounded)
-    return np.any(odd | (variance > MOST), axis=0)
+    return odd | (variance > MOST)
+
+
+def _drifted(spread: float, even: float) -> float:
+    """``_variance`` of one origin, by the squared distance of its shares from where they were."""
+    left = 1.0 - spread / (1.0 - even) if even < 1.0 else 0.0
+    return -math.log(left) if left > 1e-9 else math.inf
 
 
 def _level(n: int) -> float:
