@@ -7,17 +7,17 @@ variance (``families`` says why), with a correction for what the mean owes to th
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.engines.particles.cloud import Cloud, Layout
-from bayesmc.engines.particles.families import OLD, YOUNG, Families, group_sums, row_sums
+from bayesmc.engines.particles.families import OLD, YOUNG, Families, row_sums
 from bayesmc.network import CompiledNode
 from bayesmc.results.shares import is_share, steps
 
-#: particles above which families are taken one by one, without a copy
-MANY = 30_000
+#: slices that are taken together: what costs is calling NumPy
+TOGETHER = 100
 #: even families below which the young origin is asked, too, and those that say nothing; if the young one has
 #: no more than these either, nobody knows
 ENOUGH, LAST = 8.0, 3.5
@@ -26,8 +26,7 @@ ENOUGH, LAST = 8.0, 3.5
 class MeanErrors:
     """Errors of the means of nodes, written as the slices pass; read them by ``found``.
 
-    Of nodes that are one number, the sums over families are kept, and what they come to is worked out in the
-    end, for all slices at a time: what costs here is calling NumPy.
+    Those of nodes that are one number are worked out for several slices at a time.
 
     Parameters
     ----------
@@ -52,14 +51,18 @@ class MeanErrors:
             for n in nodes
             if n.domain is None and n.angles is None and not n.value_shape and not layout.apart
         )
-        #: of each origin: slices, and shares and parts of the means of its families
-        self._parts: tuple[_Parts, _Parts] = (_Parts(self._plain), _Parts(self._plain))
+        self._waiting: list[_Waiting] = []  # slices whose errors are not worked out yet
+        self._room = np.zeros(layout.particles + 1)
 
     def add(self, k: int, cloud: Cloud, families: Families) -> None:
         """Take in the cloud of the k-th slice."""
         means, variances, tables = self.answers
         if self._plain:
-            self._add_plain(k, cloud, families)
+            self._waiting.append(self._summed(k, cloud, families))
+            if len(self._waiting) >= TOGETHER:
+                self._work_out()
+        if len(self._plain) == len(self.nodes):
+            return
         for node in self.nodes:
             name, value = node.name, cloud.values[node.name]
             if value.ndim == len(node.value_shape) or name in self._plain:
@@ -73,46 +76,64 @@ class MeanErrors:
 
     def found(self) -> dict[str, np.ndarray]:
         """Errors by node, time first, shape of the mean; of each state's probability, for labels."""
-        for name in self._plain:
-            mean, variance = self.answers[0][name], np.zeros(len(self._found[name]))
-            for parts in self._parts:
-                at, sums, shares = parts.of(name)
-                if len(at):
-                    found = _by_shares(sums - shares * mean[at, None], shares)
-                    if parts is self._parts[OLD]:
-                        found[np.isinf(found)] = 0.0  # the young origin says
-                    variance[at] = np.maximum(variance[at], found)
-            self._found[name] = np.sqrt(variance)
+        self._work_out()
         return self._found
 
-    def _add_plain(self, k: int, cloud: Cloud, families: Families) -> None:
-        weights, total = cloud.weights, cloud.total
-        for bounds, parts in zip(families.bounds, self._parts, strict=True):
-            shares = group_sums(weights, bounds) / total
-            for name in self._plain:
-                value = cloud.values[name]
-                if value.ndim:
-                    parts.add(name, k, _plain_sums(weights, value, bounds) / total, shares)
-            if shares.dot(shares) * ENOUGH < 1.0:  # else the young origin is asked, too
-                break
+    def _summed(self, k: int, cloud: Cloud, families: Families) -> _Waiting:
+        """Sums over families of weights, and of nodes that are one number: of both origins if need be."""
+        weights, values = cloud.weights, cloud.values
+        n, add = len(weights), np.add.reduceat
+        room = self._room[: n + 1]  # a family without particles may begin at the end
+        room[n] = 0.0
+        starts = families.bounds[:, :-1]
+        room[:n] = weights
+        sums = [add(room, starts[OLD])]
+        few = sums[0].dot(sums[0]) * ENOUGH >= cloud.total**2
+        if few:
+            sums.append(add(room, starts[YOUNG]))
+        parts = {}
+        for name in self._plain:
+            if values[name].ndim:
+                np.multiply(weights, values[name], out=room[:n])
+                parts[name] = [add(room, own) for own in starts[: len(sums)]]
+        return _Waiting(k, cloud.total, families.bounds, sums, parts)
+
+    def _work_out(self) -> None:
+        """Errors of nodes that are one number, of all slices that wait."""
+        waiting, self._waiting = self._waiting, []
+        for name in self._plain if waiting else ():
+            first, last = waiting[0].k, waiting[-1].k + 1
+            variance, few = self._found[name][first:last], np.zeros(last - first, dtype=bool)
+            for origin in (OLD, YOUNG):
+                of = [w for w in waiting if name in w.parts and len(w.sums) > origin]
+                if not of:
+                    continue
+                at = np.array([w.k for w in of]) - first
+                totals = np.array([w.total for w in of])[:, None]
+                edges = np.stack([w.bounds[origin] for w in of])
+                some = edges[:, 1:] > edges[:, :-1]
+                shares = np.where(some, np.stack([w.sums[origin] for w in of]), 0.0) / totals
+                parts = np.where(some, np.stack([w.parts[name][origin] for w in of]), 0.0) / totals
+                found = _by_shares(parts - shares * self.answers[0][name][first + at, None], shares)
+                if origin == OLD:  # the young origin says what the old one does not
+                    few[at] = (shares**2).sum(axis=1) * ENOUGH >= 1.0
+                    variance[at] = np.where(few[at] & np.isinf(found), 0.0, found)
+                else:
+                    variance[at] = np.maximum(variance[at], np.where(few[at], found, 0.0))
+            np.sqrt(variance, out=variance)
 
 
-class _Parts:
-    """What families have of the means of nodes that are one number."""
+class _Waiting(NamedTuple):
+    """What families have of a slice's weights, and of its nodes that are one number.
 
-    def __init__(self, names: frozenset[str]) -> None:
-        self._rows: dict[str, list[tuple[int, np.ndarray, np.ndarray]]] = {n: [] for n in names}
+    The sums of families without particles are not 0.
+    """
 
-    def add(self, name: str, k: int, sums: np.ndarray, shares: np.ndarray) -> None:
-        self._rows[name].append((k, sums, shares))
-
-    def of(self, name: str) -> tuple[list[int], np.ndarray, np.ndarray]:
-        """Slices, parts and shares, slices first."""
-        rows = self._rows[name]
-        if not rows:
-            return [], np.zeros(0), np.zeros(0)
-        at, sums, shares = zip(*rows, strict=True)
-        return list(at), np.stack(sums), np.stack(shares)
+    k: int
+    total: Any
+    bounds: np.ndarray
+    sums: list[np.ndarray]
+    parts: dict[str, list[np.ndarray]]
 
 
 def node_errors(
@@ -180,7 +201,6 @@ def value_errors(
 
 # ---- private ------------------------------------------------------------------------------------
 
-
 def _shape(node: CompiledNode) -> tuple[int, ...]:
     if node.domain is not None and node.domain.labels is not None:
         return (*node.plate_shape, node.domain.size)
@@ -233,15 +253,6 @@ def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
     free = np.maximum(even - 1.0, LAST - 1.0)
     found = (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=1) * (free / (free - 2.0))
     return np.where(even < LAST, np.inf, found)
-
-
-def _plain_sums(weights: np.ndarray, value: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """Weighted sums of one number over families."""
-    if len(weights) <= MANY:
-        return group_sums(weights * value, bounds)
-    edges = bounds.tolist()
-    pairs = zip(edges[:-1], edges[1:], strict=True)
-    return np.array([weights[a:b].dot(value[a:b]) for a, b in pairs])
 
 
 def _of_plates(

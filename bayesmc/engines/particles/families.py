@@ -180,7 +180,10 @@ def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
     """Groups of about as many particles: where they begin and end, and their shares."""
     bounds = np.arange(groups + 1) * n // groups
     tail = (1,) * axes
-    return bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
+    found = bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
+    for array in found:
+        array.flags.writeable = False
+    return found
 
 
 def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
