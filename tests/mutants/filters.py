@@ -217,8 +217,8 @@ MUTANTS = [
     ),
     Mutant(
         "families stay where they were",
-        (Edit("bayesmc.engines.particles.families:_moved",
-              "_searched(cloud.ancestors, families.bounds)", "families.bounds"),),
+        (Edit("bayesmc.engines.particles.families:_followed_alone",
+              "cloud.ancestors.searchsorted(bounds)", "bounds"),),
         stated(line, LONG, bmc.ParticleFilter(300), 150),
         STATED,
     ),

@@ -201,6 +201,7 @@ def value_errors(
 
 # ---- private ------------------------------------------------------------------------------------
 
+
 def _shape(node: CompiledNode) -> tuple[int, ...]:
     if node.domain is not None and node.domain.labels is not None:
         return (*node.plate_shape, node.domain.size)

@@ -204,8 +204,8 @@ def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Familie
     off = counts - shares
     even = [float(s.dot(s)) for s in shares]
     variance = [_drifted(float(o.dot(o)), e) for o, e in zip(off, even, strict=True)]
-    every = explained.tolist()
-    if _odd(variance[OLD], *every[OLD], n) or _odd(variance[YOUNG], *every[YOUNG], n):
+    old, young = explained.tolist()
+    if _odd(variance[OLD], old[0], old[1], n) or _odd(variance[YOUNG], young[0], young[1], n):
         found = found._replace(settled=np.asarray(np.inf))
     age = cloud.t - int(born[YOUNG])
     few = even[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))

@@ -28,7 +28,8 @@ ROWS, JUDGES = 19, 20
 #: slices that are looked at: so many of a series, and every so manieth of a long one; a look costs as much as
 #: moving a thousand particles
 LOOKS, EVERY = 8, 12
-#: slices that are looked at after a row that is unlikely, and the share of rows filtered separately that must be
+#: slices that are looked at after a row that is unlikely, and the share of rows filtered separately that
+#: must be
 MORE, SHARE = 4, 0.2
 #: the same where rows are wide, such as scans, which are dear to draw; and from how many numbers on they are
 WIDE_LOOKS, WIDE_EVERY, WIDE = 16, 32, 16
@@ -109,7 +110,9 @@ class Replicates:
         """Particles drawn in proportion to their weights, shape (count, *lead)."""
         if not self.lead:
             sums = cloud.weights.cumsum()
-            return sums.searchsorted(self.rng.random(count) * sums[-1], side="right").clip(max=len(sums) - 1)
+            return sums.searchsorted(self.rng.random(count) * sums[-1], side="right").clip(
+                max=len(sums) - 1
+            )
         weights = cloud.weights.reshape(len(cloud.weights), -1)
         found = np.empty((count, weights.shape[1]), dtype=np.intp)
         for k, column in enumerate(weights.T):
