@@ -51,8 +51,9 @@ class SeriesPosterior:
     row_ranks : ndarray or None, shape (time,) or (time, *plates)
         Share of the rows that the filter expected which are less likely than the one that came: uniform where
         the model is right, near 0 where rows surprise it. NaN where nothing was seen or compared: Gaussian
-        filters compare all rows, particle filters 64 or a fourth of them (of wide ones, such as scans, 16 or
-        every 32nd), with a few rows drawn from their particles. None from other engines.
+        filters compare all rows, particle filters 8 or every 12th, and more after an unlikely one (of wide
+        ones, such as scans, 16 or every 32nd), with a few rows drawn from their particles. None from other
+        engines.
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
     queries_mcse : dict

@@ -221,7 +221,7 @@ def test_without_evidence_weights_are_uniform() -> None:
 FAULTS = {
     "unknown node": ({"y": 1.0}, "evidence on 'y', which the net does not have"),
     "close name": ({"labels": 1}, "did you mean 'label'"),
-    "deterministic node": ({"twice": 1.0}, "'twice', which is a deterministic node"),
+    "deterministic node": ({"twice": 1}, "'twice', which is a deterministic node"),
     "input": ({"u": 1.0}, "'u', which is an input node"),
     "unknown state": ({"weather": "foggy"}, "'foggy' is not a state; the states are 'dry', 'wet'"),
     "position for a label": ({"weather": 1}, "give the label, not its position"),
@@ -246,7 +246,7 @@ def test_faults_in_evidence_are_named(fault: str) -> None:
     net.add("weather", bmc.Bernoulli(0.5), states=("dry", "wet"))
     net.add("label", lambda p: bmc.Bernoulli(p), plates="i")
     net.add("x", lambda label: bmc.Normal(label, 1.0), plates="i")
-    net.add("twice", lambda p: 2 * p)
+    net.add("twice", lambda n: 2 * n)
     evidence, message = FAULTS[fault]
     with pytest.raises(EvidenceError, match=message):
         bmc.infer(net, evidence, inputs={"u": 1.0}, engine=weighting(10), rng=0)
