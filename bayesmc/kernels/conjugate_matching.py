@@ -109,7 +109,7 @@ def _is_mixed(child: Child, value: Tracer) -> bool:
 
 
 def _may_pick(blanket: Blanket, child: Child, pair: Pair, value: Tracer) -> bool:
-    """Whether each element is affine in one element of the node, so that trying some values tells the rest."""
+    """Whether each element is affine in one of the node, so that trying a few values tells the rest."""
     if not may_be_picked(pair, len(child.term.model[child.term.name].event_shape)):
         return False
     if not value.is_affine or _is_mixed(child, value):

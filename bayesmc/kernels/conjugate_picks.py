@@ -52,7 +52,7 @@ def points_of(kind: str, event_shape: Shape) -> np.ndarray:
 
 
 def may_be_picked(pair: Pair, event_ndim: int) -> bool:
-    """Whether elements of a child may read, or not, a node that enters it so; ``event_ndim`` is the child's."""
+    """Whether some elements of a child alone may read a node; ``event_ndim`` is the child's."""
     return pair.kind in PICKED and (pair.kind != "scale" or event_ndim == 0)
 
 
@@ -82,9 +82,7 @@ def picked_natural(pair: Pair, points: np.ndarray, e: Evaluated, plates: int) ->
         mine, other = (
             ~free & _near(first, points[i]) & _near(last, points[j]) for i, j in ((0, 1), (1, 0))
         )
-        added = [
-            np.where(mine, a, np.where(other, b, 0.0)) for a, b in (found, found[::-1])
-        ]
+        added = [np.where(mine, a, np.where(other, b, 0.0)) for a, b in (found, found[::-1])]
     lost = np.where(free | mine | other | (e.data.count == 0), 0.0, np.nan)
     return e.sum(added[0] + lost), e.sum(added[1] + lost)
 

@@ -159,7 +159,9 @@ class _Side:
             states, _, count, rows = shape
             size = count * rows
             first = self.is_first[:, None]
-            own, other = (np.where(first, a, b) for a, b in ((states * size, size), (size, states * size)))
+            own, other = (
+                np.where(first, a, b) for a, b in ((states * size, size), (size, states * size))
+            )
             begin = self.edge[:, None] * rows + np.arange(rows)
             self._kept.clear()
             self._kept[shape] = begin + own * np.arange(states)[:, None, None], other

@@ -36,7 +36,17 @@ _RESHAPING = frozenset(
 )
 #: functions element by element
 _ELEMENTWISE = frozenset(
-    (np.where, np.select, np.choose, np.copy, np.broadcast_to, np.clip, np.round, np.real, np.nan_to_num)
+    (
+        np.where,
+        np.select,
+        np.choose,
+        np.copy,
+        np.broadcast_to,
+        np.clip,
+        np.round,
+        np.real,
+        np.nan_to_num,
+    )
 )
 _MATRIX = frozenset((np.matrix_transpose, np.linalg.matrix_transpose, np.triu, np.tril))
 
