@@ -222,9 +222,9 @@ class _Round:
         if end > begin:
             log[:, begin:end] += self.leaf.given(tables, drawn)
         if len(members) > end:
-            both = self.both.given(tables, drawn)
-            log[:, end:] += both[:, : len(self.left.variables)]
-            log[:, end:] += both[:, len(self.left.variables) :]
+            given = self.both.given(tables, drawn)
+            log[:, end:] += given[:, : len(self.left.variables)]
+            log[:, end:] += given[:, len(self.left.variables) :]
         drawn[members] = states_at(log, uniform[members], what)
 
 
