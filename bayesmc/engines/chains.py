@@ -390,6 +390,7 @@ class _Kept:
         self.stored: dict[str, np.ndarray] = {}
         self.draws = 0
         self._moving: list[tuple[str, np.ndarray]] = []
+        self._together: list[tuple[list[str], np.ndarray]] = []
         self._earlier: Mapping[str, np.ndarray] = {}
 
     def begin_with(self, stored: Mapping[str, np.ndarray], draws: int) -> None:
@@ -405,31 +406,49 @@ class _Kept:
         at = self.draws
         for name, array in self._moving:
             array[:, at] = values[name]
+        for names, rows in self._together:
+            row = [values[n] for n in names]
+            try:
+                rows[..., at] = np.concatenate(row).reshape(rows.shape[:2])
+            except ValueError:  # some of them come without chains this time
+                for array, value in zip(rows, row, strict=True):
+                    array[:, at] = value
         self.draws = at + 1
 
     def frozen(self) -> dict[str, np.ndarray]:
         """The draws in place, read-only."""
         if not self.stored:
             return dict(self._earlier)
-        for name, array in self._moving:
-            self.stored[name] = array if self.draws == self.room else array[:, : self.draws].copy()
+        moving = {n for n, _ in self._moving} | {n for names, _ in self._together for n in names}
+        for name in moving if self.draws < self.room else ():
+            self.stored[name] = self.stored[name][:, : self.draws].copy()
         for array in self.stored.values():
             array.flags.writeable = False
         return self.stored
 
     def _make_room(self, values: Mapping[str, np.ndarray]) -> None:
-        """Decide from the first draw what is constant."""
+        """Decide from the first draw what is constant; single numbers of a type are kept in one array."""
+        alike: dict[np.dtype[Any], list[str]] = {}
         for name in self.names:
             node, value = self.model[name], values[name]
+            dtype = stored_dtype(node, value)
             if value.ndim == len(node.value_shape):
-                self.stored[name] = np.array(value, dtype=stored_dtype(node, value))[None, None]
+                self.stored[name] = np.array(value, dtype=dtype)[None, None]
                 continue
-            shape = (self.chains, self.room, *node.value_shape)
-            array = np.empty(shape, dtype=stored_dtype(node, value))
-            if self._earlier:
-                array[:, : self.draws] = self._earlier[name]
-            self.stored[name] = array
-            self._moving.append((name, array))
+            self.stored[name] = np.empty(0)  # in its place
+            if value.shape == (self.chains,) and value.dtype == dtype:
+                alike.setdefault(dtype, []).append(name)
+                continue
+            self.stored[name] = np.empty((self.chains, self.room, *node.value_shape), dtype)
+            self._moving.append((name, self.stored[name]))
+        for dtype, names in alike.items():
+            rows = np.empty((len(names), self.chains, self.room), dtype)
+            self.stored.update(zip(names, rows, strict=True))
+            self._together.append((names, rows))
+        if self._earlier:
+            for name, array in self.stored.items():
+                if array.shape[1:2] == (self.room,):
+                    array[:, : self.draws] = self._earlier[name]
 
 
 class _Patience(AbstractContextManager["_Patience"]):
