@@ -139,11 +139,12 @@ def _counts(pair: Pair, points: np.ndarray, e: Evaluated) -> np.ndarray:
     mine = ~free & _near(theta, wanted).all(axis=(0, -1))
     assert isinstance(e.data, Elements)
     if pair.child is Categorical:
-        counts = (e.data.value[..., None] == np.arange(states)) * e.data.count[..., None]
+        codes = e.data.value[..., None].astype(np.intp)
+        counts = np.equal(codes, np.arange(states)) * e.data.count[..., None]
     else:
         counts = e.data.total
     lost = np.where(free | mine | (e.data.count == 0), 0.0, np.nan)
-    return e.sum(np.where(mine[..., None], counts, 0.0) + lost[..., None], 1)
+    return e.sum(np.where(np.asarray(mine)[..., None], counts, 0.0) + lost[..., None], 1)
 
 
 def _mixed(target: Target, states: Values) -> Values:

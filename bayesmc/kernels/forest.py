@@ -133,7 +133,9 @@ class _Side:
     neighbours: np.ndarray
     edge: np.ndarray
     is_first: np.ndarray
-    _kept: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = field(default_factory=dict)
+    _kept: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = field(
+        default_factory=dict, init=False
+    )
 
     @property
     def columns(self) -> tuple[np.ndarray, ...]:
