@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -164,7 +165,7 @@ def test_a_constant_over_a_foreign_plate_is_not_taken_for_a_batch():
     net = bmc.BayesNet(plates={"k": 3})
     net.add("x", bmc.Bernoulli(0.5), plates="k")
     net.add("y", lambda x: bmc.Normal((weight * x).sum("k"), 1.0))
-    with pytest.raises(BayesmcError, match="node 'y'"):
+    with pytest.raises(BroadcastError, match="node 'y'"):
         net.validate()
 
 
@@ -195,7 +196,7 @@ def test_matmul_with_the_batch_is_caught():
     net = bmc.BayesNet(plates={"point": 4})
     net.add("beta", bmc.MvNormal(np.zeros(3), np.eye(3)))
     net.add("y", lambda beta: bmc.Normal(design @ beta, 1.0), plates="point")
-    with pytest.raises(BayesmcError, match="node 'y'"):
+    with pytest.raises(BroadcastError, match="node 'y'"):
         net.validate()
 
 
@@ -769,3 +770,21 @@ def test_supports_too_large_to_list_have_no_states(size):
     # 4.5 standard errors, false alarm 7e-6 each at a fresh seed
     assert abs(p.mean("k") - (size - 1) / 2) < 4.5 * p.mcse("k")
     assert abs(p.mean("n") - 0.3 * (size - 1)) < 4.5 * p.mcse("n")
+
+
+def test_of_many_nodes_those_with_a_function_of_their_own_are_checked() -> None:
+    """One function of many nodes is checked at a few of them; one like it, of the last node, by itself."""
+    net = bmc.BayesNet()
+    net.add("x[0]", bmc.Normal(0.0, 1.0))
+
+    def step(x: Any) -> Any:
+        return bmc.Normal(0.5 * x, 1.0)
+
+    for t in range(1, 40):
+        net.add(f"x[{t}]", step, parents=[f"x[{t - 1}]"])
+    net.sample(2, rng=0)
+    net.add(
+        "y", lambda x: bmc.Normal(np.sort(x, axis=0) if np.ndim(x) else x, 1.0), parents=["x[39]"]
+    )
+    with pytest.raises(BroadcastError, match="node 'y'"):
+        net.validate()
