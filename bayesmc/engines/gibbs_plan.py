@@ -25,6 +25,7 @@ from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import label_kernel
 from bayesmc.kernels.lattice import lattice_kernel
 from bayesmc.kernels.random_walk import AdaptiveWalk
+from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import table_kernel, table_kernels
@@ -187,6 +188,7 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
         kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
+    kernels += redrawn_kernels(target, blankets)
     order = {n: i for i, n in enumerate(target.chain)}
     kernels.sort(key=lambda k: -max(order[n] for n in k.names))
     return Plan(problem, target, blankets, kernels, refusals, constraints)
