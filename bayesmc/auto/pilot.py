@@ -2,7 +2,8 @@
 
 Only small nets are weighed, of a few numbers without plates, each drawn by slices: what a slice costs is not
 worth it where one evaluation of the density is slow. Hierarchies are left to Gibbs, since short chains that
-miss the neck of a funnel look as if they were fast.
+miss the neck of a funnel look as if they were fast. With finite nodes beside the numbers, weighted draws are
+tried, which visit every state, and chains that might miss some are not.
 
 Work is counted, not timed: a call of a node's density is one unit, and so are some thousand numbers that go
 through it. A clock would make the choice, and so the answer, differ from run to run; seeds of the pilot are
@@ -27,6 +28,7 @@ from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.random_walk import AdaptiveWalk
+from bayesmc.kernels.redrawn import Redrawn
 from bayesmc.kernels.slice import Slice
 from bayesmc.network import Model, Problem
 from bayesmc.results import DrawsPosterior
@@ -42,6 +44,7 @@ _WARMUP, _DRAWS, _PER_MEMBER = 100, 100, 8
 _FEW = 8
 #: draws of the pilot of weighting, and the share of them that must count for it to be taken
 _WEIGHTED, _ENOUGH = 2000, 0.1
+_ENOUGH_WEIGHTED = "weighted draws are good enough, so that no chains were tried"
 #: how much better than Gibbs, which needs no tuning, another engine must be
 _BETTER = 1.5
 #: the pilots' own seed
@@ -113,7 +116,8 @@ def weighed(problem: Problem, plan: Plan) -> tuple[Trial, list[Trial]] | None:
     if not _is_small(problem, plan):
         return None
     if "pilot" not in problem.cache:
-        problem.cache["pilot"] = _weighed(problem)
+        switched = any(problem.model[n].domain is not None for k in plan.kernels for n in k.names)
+        problem.cache["pilot"] = _weighed_once(problem) if switched else _weighed(problem)
     return problem.cache["pilot"]
 
 
@@ -121,25 +125,32 @@ def weighed(problem: Problem, plan: Plan) -> tuple[Trial, list[Trial]] | None:
 
 
 def _is_small(problem: Problem, plan: Plan) -> bool:
-    """Whether Gibbs moves a few numbers, all by slices or walks, and none in a plate."""
+    """Whether Gibbs moves a few numbers by slices or walks, and no others, perhaps under finite nodes."""
     model = problem.model
     names = {n for kernel in plan.kernels for n in kernel.names}
-    if not names or any(
-        not isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels
+    slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels)
+    finite = {n for n in names if model[n].domain is not None}
+    known = (Slice, FactorSlice, AdaptiveWalk, Redrawn)
+    if not slow or any(
+        not isinstance(k, known) and not finite >= set(k.names) for k in plan.kernels
     ):
         return False
-    if any(model[n].is_discrete or model[n].plates for n in names):
+    if any(model[n].plates or (model[n].is_discrete and n not in finite) for n in names):
         return False
     return sum(math.prod(model[n].event_shape) for n in names) <= _NUMBERS
+
+
+def _weighed_once(problem: Problem) -> tuple[Trial, list[Trial]] | None:
+    """Weighting where it will do: chains that switch between states may miss one in a pilot, and look fast."""
+    drawn = _weights(problem)
+    return None if drawn is None else (drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED)])
 
 
 def _weighed(problem: Problem) -> tuple[Trial, list[Trial]]:
     """Cheap pilots first: Gibbs has a full one only where it could still be better than what they showed."""
     drawn = _weights(problem)
     if drawn is not None:
-        return drawn, [
-            Trial(Gibbs(), 0.0, "weighted draws are good enough, so that no chains were tried")
-        ]
+        return drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED)]
     walk = _chains(problem, MetropolisHastings())
     gibbs = _at_best(problem)
     if walk.rate < _BETTER * gibbs.rate:

@@ -188,9 +188,9 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
         kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
-    kernels += redrawn_kernels(target, blankets)
     order = {n: i for i, n in enumerate(target.chain)}
     kernels.sort(key=lambda k: -max(order[n] for n in k.names))
+    kernels += redrawn_kernels(target, blankets)
     return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 

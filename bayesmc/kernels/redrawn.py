@@ -70,7 +70,7 @@ class Redrawn(Kernel):
         self.group = group
         self.turn, self.turns = turn, turns
         self.drawn = tuple(n for n in target.chain if n in group.names[1:])
-        self.match = f"with {', '.join(self.drawn)}"
+        self.match = f"with {', '.join(self.drawn)} drawn anew"
         domain = self.blanket.node.domain
         assert domain is not None
         self.states, self.dtype = domain.size, domain.dtype
