@@ -96,7 +96,8 @@ def _but_for_labels(
     point = posterior.checkpoint
     if posterior.problem is None or point is None:
         return found
-    stored, words, orders = posterior._stored, [], {}
+    stored, words = posterior._stored, []
+    orders: dict[str, str] = {}
     for symmetry in symmetries(posterior.problem, point.values):
         pivot = pivot_of(symmetry, posterior.model)
         if pivot is not None and pivot in stored:

@@ -25,10 +25,12 @@ def never_left(posterior: ChainsPosterior | ChainsSums) -> Iterator[str]:
         if not suspect.any():
             continue
         count = int(suspect.sum())
-        which = f"{count} of {suspect.size} elements of {name!r}" if suspect.size > 1 else f"{name!r}"
+        which = (
+            f"{count} of {suspect.size} elements of {name!r}" if suspect.size > 1 else f"{name!r}"
+        )
         yield (
-            f"no chain ever left the state of {which} in which all of them started, and {_below(posterior, name)} "
-            "was hardly ever drawn anew with it: other states may have been missed, so errors of these "
+            f"no chain ever left the state of {which} in which all of them started, and "
+            f"{_below(posterior, name)} was hardly ever drawn anew with it: other states may have been missed, so errors of these "
             f"probabilities are those of {renewed[suspect].min():.0f} independent draws; compare with "
             "LikelihoodWeighting(draws)"
         )
@@ -52,10 +54,12 @@ def _still(posterior: ChainsPosterior | ChainsSums, name: str) -> np.ndarray:
     shape = posterior.model[name].plate_shape
     if isinstance(posterior, ChainsSums):
         moves = posterior.moves(name) if name in posterior._running.names else np.ones(shape, bool)
-        return ~moves.reshape(*shape, -1).any(axis=-1)
+        return np.asarray(~moves.reshape(*shape, -1).any(axis=-1))
     stored = posterior._stored.get(name)
     if stored is None:
         return np.zeros(shape, dtype=bool)
     seen = posterior._seen.get(name)
     still = (stored == stored[:1, :1]).all(axis=(0, 1)).reshape(*shape, -1).all(axis=-1)
-    return still if seen is None else still & ~np.broadcast_to(seen.mask, shape)
+    if seen is None or seen.mask is None:
+        return np.asarray(still)
+    return np.asarray(still & ~seen.mask)

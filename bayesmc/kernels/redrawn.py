@@ -1,8 +1,8 @@
 """A finite node moved together with the numbers that depend on it, which are drawn anew.
 
-Tried state by state, a switch ``s`` waits for a number ``m`` below it that fits another state, and ``m`` waits
-for ``s``: both may stand still for ever, in every chain, and look certain. Here a new state is proposed, or the
-old one again, the numbers are drawn from their densities given it, and the likelihood of what depends on
+Tried state by state, a switch ``s`` waits for a number ``m`` below it that fits another state, and ``m``
+waits for ``s``: both may stand still for ever, in every chain, and look certain. Here a new state is proposed,
+or the old one again, the numbers are drawn from their densities given it, and the likelihood of what depends on
 either decides. How often numbers are drawn anew says what a state that was never seen may weigh.
 """
 
@@ -18,7 +18,7 @@ from bayesmc.errors import BayesmcError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import accepted, instead
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.target import Target, Term, Values
+from bayesmc.structure.target import Target, Values
 
 #: states of a node, and numbers drawn anew for one of its elements, at most
 _STATES, _NUMBERS = 64, 24
@@ -151,7 +151,7 @@ class Redrawn(Kernel):
             plates = draws.shape[: 1 + len(self.target.model[other].plates)]
             bad = ~np.isfinite(draws.reshape(*plates, -1)).all(axis=-1)
             if dist.invalid is not None:
-                bad = bad | dist.invalid
+                bad = np.asarray(bad | dist.invalid)
             dead = dead | (bad if now.ndim > 1 else bad.reshape(len(now), -1).any(axis=1))
             kept = bad | ~asked if now.ndim > 1 else bad
             trial[other] = instead(kept, draws, state[other])

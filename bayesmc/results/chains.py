@@ -44,8 +44,8 @@ class _Chains(Posterior):
     #: sweeps before the first draw, during which the engine adapted
     warmup: int
     checkpoint: Checkpoint | None
-    #: finite node -> how often the hidden numbers below each element were drawn anew with it, at the least as
-    #: often as chains started, shape (*plates,); only nodes that may wait for such numbers, and these for them
+    #: finite node -> how often the hidden numbers below each element were drawn anew with it, at the least
+    #: as often as chains started, shape (*plates,); only nodes that may wait for such numbers
     renewals: Mapping[str, np.ndarray] = MappingProxyType({})
     #: a sentence where chains name components differently that the model does not tell apart
     label_switching: str | None = None

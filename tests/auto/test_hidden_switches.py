@@ -1,4 +1,4 @@
-"""Switches above hidden numbers: chains cross between their states, or their errors say that they may not have.
+"""Switches above hidden numbers: chains cross between their states, or their errors say they may not.
 
 Answers may be off by 4.5 of their errors, which has a chance of 7e-6 in each of the ten figures.
 """

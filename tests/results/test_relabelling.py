@@ -136,9 +136,7 @@ def test_chains_that_differ_in_more_than_names() -> None:
     walk = {n: bmc.RandomWalk(1e-4) for n in ("mean", "precision")}
     engine = bmc.MetropolisHastings(200, 0, 4, proposal=walk)
     posterior, warned = asked(mixture(), {"x": DATA}, engine)
-    assert any(
-        "named by the order of 'mean', the chains have not mixed" in w for w in warned
-    )
+    assert any("named by the order of 'mean', the chains have not mixed" in w for w in warned)
     assert posterior.label_switching is None
 
 
