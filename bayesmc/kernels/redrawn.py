@@ -1,9 +1,10 @@
 """A finite node moved together with the numbers that depend on it, which are drawn anew.
 
 Tried state by state, a switch ``s`` waits for a number ``m`` below it that fits another state, and ``m``
-waits for ``s``: both may stand still for ever, in every chain, and look certain. Here a new state is proposed,
-or the old one again, the numbers are drawn from their densities given it, and the likelihood of what depends on
-either decides. How often numbers are drawn anew says what a state that was never seen may weigh.
+waits for ``s``: both may stand still for ever, in every chain, and look certain. Here a new state is
+proposed, or the old one again, the numbers are drawn from their densities given it, and the likelihood of
+what depends on either decides. How often numbers are drawn anew says what a state that was never seen may
+weigh.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ class Redrawn(Kernel):
             dist, _ = self.target.terms[other].distribution(trial)
             draws = self.target.model.sample_stored(other, dist, rng, (len(now),))
             plates = draws.shape[: 1 + len(self.target.model[other].plates)]
-            bad = ~np.isfinite(draws.reshape(*plates, -1)).all(axis=-1)
+            bad: np.ndarray = ~np.isfinite(draws.reshape(*plates, -1)).all(axis=-1)
             if dist.invalid is not None:
                 bad = np.asarray(bad | dist.invalid)
             dead = dead | (bad if now.ndim > 1 else bad.reshape(len(now), -1).any(axis=1))
