@@ -29,6 +29,7 @@ from bayesmc.errors import BayesmcError
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.redrawn import Redrawn
+from bayesmc.kernels.rescaled import Rescaled
 from bayesmc.kernels.slice import Slice
 from bayesmc.network import Model, Problem
 from bayesmc.results import DrawsPosterior
@@ -133,7 +134,7 @@ def _is_small(problem: Problem, plan: Plan) -> bool:
     names = {n for kernel in plan.kernels for n in kernel.names}
     slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels)
     finite = {n for n in names if model[n].domain is not None}
-    known = (Slice, FactorSlice, AdaptiveWalk, Redrawn)
+    known = (Slice, FactorSlice, AdaptiveWalk, Redrawn, Rescaled)
     if not slow or any(
         not isinstance(k, known) and not finite >= set(k.names) for k in plan.kernels
     ):

@@ -31,8 +31,8 @@ def never_left(posterior: ChainsPosterior | ChainsSums) -> Iterator[str]:
         yield (
             f"no chain ever left the state of {which} in which all of them started, and "
             f"{_below(posterior, name)} was hardly ever drawn anew with it: other states may "
-            f"have been missed, so errors of these probabilities are those of {renewed[suspect].min():.0f} independent draws; compare with "
-            "LikelihoodWeighting(draws)"
+            f"have been missed, so errors of these probabilities are those of "
+            f"{renewed[suspect].min():.0f} independent draws; compare with LikelihoodWeighting(draws)"
         )
 
 
