@@ -123,7 +123,7 @@ class Redrawn(Kernel):
         except BayesmcError:  # a function may mind a state that chains never meet
             return np.zeros((chains, 1))
         if self.group.apart is None:
-            dead = dead.reshape(chains, -1).any(axis=1)
+            dead = np.asarray(dead.reshape(chains, -1).any(axis=1))
         log = np.where(dead, -np.inf, log)
         take = accepted(log, rng)
         for name in self.names:

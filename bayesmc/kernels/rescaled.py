@@ -1,8 +1,9 @@
 """A scale moved together with what it scales, in proportion: hierarchies whose effects have no closed form.
 
-Given many effects, their scale can hardly move, and given the scale neither can they: one at a time they crawl,
-most of all in the neck of a funnel. Here both are multiplied by a number, drawn by a slice, so that effects in
-units of their scale stay what they are. What is a scale, a variance or a precision is found by trying.
+Given many effects, their scale can hardly move, and given the scale neither can they: one at a time they
+crawl, most of all in the neck of a funnel. Here both are multiplied by a number, drawn by a slice, so that
+effects in units of their scale stay what they are. What is a scale, a variance or a precision is found by
+trying.
 
 References
 ----------
