@@ -21,6 +21,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
 from bayesmc.engines.funnels import missed_ends
+from bayesmc.engines.never_left import never_left
 from bayesmc.engines.question import difference
 from bayesmc.engines.start_values import frozen_start, read_start
 from bayesmc.engines.unrolled import series_of
@@ -51,11 +52,12 @@ class Sampler(Protocol):
 
     Notes
     -----
-    Three attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
+    Four attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
     members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
     ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
+    A method is, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
     which is exact if ``step`` writes into no array of the state it is given.
@@ -196,18 +198,23 @@ class ChainEngine(Engine):
         checkpoint: Checkpoint,
     ) -> ChainsPosterior | ChainsSums:
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}
+        found: ChainsPosterior | ChainsSums
         if isinstance(held, RunningChains):
-            return ChainsSums(problem, self, held, acceptance, self.warmup, checkpoint)
-        return ChainsPosterior(
-            problem,
-            self,
-            held.frozen(),
-            (self.chains, held.draws),
-            acceptance,
-            getattr(sampler, "ensemble", 1),
-            self.warmup,
-            checkpoint,
-        )
+            found = ChainsSums(problem, self, held, acceptance, self.warmup, checkpoint)
+        else:
+            found = ChainsPosterior(
+                problem,
+                self,
+                held.frozen(),
+                (self.chains, held.draws),
+                acceptance,
+                getattr(sampler, "ensemble", 1),
+                self.warmup,
+                checkpoint,
+            )
+        if hasattr(sampler, "renewals"):
+            found.renewals = sampler.renewals(checkpoint.state)
+        return found
 
     def _refuse_another(
         self, old: Posterior, problem: Problem, names: tuple[str, ...], summed: bool
@@ -250,6 +257,7 @@ class ChainEngine(Engine):
         timed = problem is not None and series_of(problem) is not None
         if found and timed and "Particle" not in name:
             found[0] += "; ParticleGibbs(draws) draws whole trajectories of a template at once"
+        found += never_left(posterior)
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:

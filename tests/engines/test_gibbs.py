@@ -94,7 +94,7 @@ def test_the_table_of_a_mixture(capsys: pytest.CaptureFixture) -> None:
 
 def test_every_kind_of_kernel_is_found() -> None:
     found = kernels(*everything())
-    assert found["p"] == "conjugate" and found["coin"] == "enumerate"
+    assert found["p"] == "conjugate" and found["coin"] == "enumerate + redrawn"
     assert found["shape"] == found["slope"] == "factor slice"
     assert found["hidden"] == "slice" and "walk" in found["simplex"]
 
