@@ -8,7 +8,8 @@ are metres, angles radians, times seconds.
 from __future__ import annotations
 
 from bayesmc.robotics.aimed import AimedPoses, SensorPoses
-from bayesmc.robotics.beams import BeamFit, BeamModel, Beams, clean_ranges, fit_beams
+from bayesmc.robotics.beam_fit import BeamFit, fit_beams
+from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.robotics.brightness import Ceiling
 from bayesmc.robotics.calibration import FieldFit, fit_field, fit_odometry
 from bayesmc.robotics.field import FieldScan, LikelihoodField
