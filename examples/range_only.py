@@ -12,8 +12,8 @@ Both are parameters; but a particle filter that never moves a parameter is left 
 nodes wander, the bias by 15 cm in a minute; the extended Kalman filter is given the same template.
 
 How far the wheels err is learned from the first 100 s, where somebody followed the robot. That matters: the
-generated robot's headings drift five times as much as those of Plaza 1; with Plaza 1's noise, filters are up to
-twice as far off there, sure of it, and the particle filter warns (``ModelMisfitWarning``).
+generated robot's headings drift five times as much as those of Plaza 1; with Plaza 1's noise, filters are
+up to twice as far off there, sure of it, and the particle filter warns (``ModelMisfitWarning``).
 
 Where the reference data is at hand, the log is Plaza 1 (Djugash, Hamner and Roth 2009, Journal of
 Field Robotics 26), else a generated one in the same files, whose bias is 2.5 m and constant. Filters are told
