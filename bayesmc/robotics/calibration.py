@@ -8,14 +8,15 @@ What is learned is of this robot, this sensor and this map; nothing here localis
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, ShapeError
+from bayesmc.errors import ModelError, ModelMisfitWarning, ShapeError
 from bayesmc.robotics.field import LikelihoodField
-from bayesmc.robotics.grid import FreeSpace, OccupancyGrid, as_grid
+from bayesmc.robotics.grid import FreeSpace, OccupancyGrid, as_grid, as_number
 from bayesmc.robotics.motion import OdometryMotion
 from bayesmc.robotics.poses import as_poses, compose, wrap
 
@@ -23,6 +24,8 @@ from bayesmc.robotics.poses import as_poses, compose, wrap
 _LEAST, _MOST, _FLOOR = 1e-6, 1.0, 0.01
 #: deviations from which on a step is a stray, such as a jump of whatever made the known poses
 _STRAY = 3.0
+#: share of strays from which on the two motions are hardly of the same steps
+_ASTRAY = 0.2
 #: poses beside the true one that a scan is looked at from: metres per cell of the map, and radians
 _CELLS, _TURN = 1.0, 0.03
 #: scans over which the errors of beams are taken to last
@@ -31,6 +34,9 @@ _LAGS = 6
 _OFFSETS, _NEAREST = 100, 0.1
 #: poses on the floor and scans that say how many of the particles of a search a scan leaves, and their share
 _SPREAD, _SCANS, _LEFT = 2000, 20, 0.5
+#: share of readings that are returns at least; places that scans are compared with, and the share of these
+#: that may be likelier
+_RETURNS, _ELSEWHERE, _BEATEN = 0.02, 100, 0.2
 #: share of known poses that surely are on the floor, and by how much others may be less surely so
 _STOOD, _MARGIN = 0.99, 2.0
 
@@ -56,6 +62,12 @@ def fit_odometry(motion: Any, moved: Any) -> tuple[float, float, float, float]:
     ------
     ShapeError
         The two differ in shape, or there are fewer than 10 steps.
+
+    Warns
+    -----
+    ModelMisfitWarning
+        A fifth of the steps or more are strays, or a variance is at its bound: the two are hardly of the same
+        steps.
 
     References
     ----------
@@ -99,6 +111,18 @@ def fit_odometry(motion: Any, moved: Any) -> tuple[float, float, float, float]:
 
     a1, a2 = fitted(aside, turned, 2 * driven).tolist()
     a3, a4 = fitted(ahead, driven, turned).tolist()
+    turns = np.sqrt(a1 * turned + 2 * a2 * driven + _FLOOR**2)
+    ways = np.sqrt(a3 * driven + a4 * turned + _FLOOR**2)
+    astray = ((np.abs(aside) > _STRAY * turns) | (np.abs(ahead) > _STRAY * ways)).mean()
+    if astray > _ASTRAY or max(a1, a2, a3, a4) > 0.99 * _MOST:
+        warnings.warn(
+            f"fit_odometry: {astray:.0%} of the steps are not what the wheels say, by more than three "
+            f"deviations, with variances of {a1:.3g}, {a2:.3g}, {a3:.3g} and {a4:.3g} (at most {_MOST:g}): "
+            "are both motions from one pose to the next (between(poses[:-1], poses[1:])), of the same steps, "
+            "and in radians?",
+            ModelMisfitWarning,
+            stacklevel=2,
+        )
     return a1, a2, a3, a4
 
 
@@ -214,7 +238,7 @@ class FieldFit:
             A number is not positive.
         """
         floor = area if isinstance(area, FreeSpace) else FreeSpace(self.field.grid)
-        area = area.area if isinstance(area, FreeSpace) else area
+        area = area.area if isinstance(area, FreeSpace) else as_number(area)
         if not (particles >= 1 and area > 0):
             raise ValueError(
                 f"searching(particles={particles!r}, area={area!r}): give a number of particles and an area "
@@ -261,6 +285,9 @@ def fit_field(field: LikelihoodField, ranges: Any, poses: Any, angles: Any) -> F
     ------
     ShapeError
         Scans and poses differ in number, or there are fewer than 20.
+    ModelError
+        Hardly a reading is below ``max_range``, or scans are no likelier from their poses than from anywhere:
+        units, frames or columns are other than they should be.
 
     References
     ----------
@@ -286,6 +313,7 @@ def fit_field(field: LikelihoodField, ranges: Any, poses: Any, angles: Any) -> F
             f"fit_field: ranges have shape {ranges.shape}, poses {poses.shape}, angles {angles.shape}; give "
             "(scans, beams), (scans, 3) and (beams,), 20 scans or more"
         )
+    _check_in_place(replace(field, tempering=1.0), ranges, poses, angles)
     plain = _with_hits(replace(field, tempering=1.0), ranges, poses, angles)
     log, slopes, curvature = _shape_of(plain, ranges, poses, angles)
     off = slopes - slopes.mean(axis=0)
@@ -320,6 +348,30 @@ def _exponent(log: np.ndarray, share: float) -> float:
         else:
             high = middle
     return math.exp(high)
+
+
+def _check_in_place(
+    field: LikelihoodField, ranges: np.ndarray, poses: np.ndarray, angles: np.ndarray
+) -> None:
+    """Refuse scans that are not from their poses: what would be learned from them is worth nothing."""
+    seen = ((ranges >= 0) & (ranges < field.max_range)).mean()
+    if seen < _RETURNS:
+        raise ModelError(
+            f"fit_field: {seen:.0%} of the readings are below max_range={field.max_range:g} m; are they in "
+            "metres, and from a place where there is something to see?"
+        )
+    some = np.unique(np.linspace(0, len(ranges) - 1, _SCANS).astype(int))
+    spots = FreeSpace(field.grid).sample(0, sample_shape=_ELSEWHERE)
+    beaten = []
+    for k in some:
+        log = field.given(np.vstack([poses[k], spots]), angles).log_prob(ranges[k])
+        beaten.append((log[1:] > log[0]).mean())
+    if np.median(beaten) > _BEATEN:
+        raise ModelError(
+            f"fit_field: from {np.median(beaten):.0%} of all places on the floor the scans are likelier than "
+            "from the poses given, in the median: are these in the map's frame, x before y, headings in "
+            "radians and counterclockwise, in step with the scans, and is the field's mount the laser's?"
+        )
 
 
 def _with_hits(

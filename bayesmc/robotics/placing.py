@@ -71,6 +71,8 @@ def check_poses(fit: FieldFit, ranges: Any, poses: Any, window: int = 20) -> Pla
 
     Raises
     ------
+    TypeError
+        ``fit`` is no FieldFit.
     ShapeError
         Ranges, poses and the fit's beams do not go together.
     ValueError
@@ -99,6 +101,8 @@ def check_poses(fit: FieldFit, ranges: Any, poses: Any, window: int = 20) -> Pla
     >>> check_poses(fit, scans[40:], poses[40:]).lost[-1]
     np.False_
     """
+    if not isinstance(fit, FieldFit):
+        raise TypeError(f"check_poses: give a FieldFit, which fit_field returns; got {fit!r:.80}")
     if isinstance(window, bool) or not isinstance(window, int | np.integer) or window < 1:
         raise ValueError(f"check_poses: window must be a positive whole number; got {window!r:.80}")
     ranges, poses = np.asarray(ranges, dtype=float), as_poses("check_poses", poses)

@@ -80,6 +80,35 @@ def test_what_does_not_go_together_is_refused(learned) -> None:
         check_poses(fit, log.scans, log.truth[:-1])
     with pytest.raises(ValueError, match="window"):
         check_poses(fit, log.scans, log.truth, window=0)
+    with pytest.raises(TypeError, match="fit_field"):
+        check_poses(fit.field, log.scans, log.truth)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda p: p[:, [1, 0, 2]], lambda p: p * [1.0, 1.0, 180 / np.pi], lambda p: p + [5.0, 3.0, 0.0],
+     lambda p: np.roll(p, 30, axis=0)],
+    ids=["swapped", "degrees", "another frame", "out of step"],
+)  # fmt: skip
+def test_nothing_is_learned_of_poses_that_are_wrong(learned, change: Any) -> None:
+    _, fit = learned
+    with pytest.raises(ModelError, match="x before y"):
+        fit_field(fit.field, fit.ranges, change(fit.poses), fit.angles)
+
+
+def test_units_of_ranges_and_motions_are_noticed(learned) -> None:
+    log, fit = learned
+    with pytest.raises(ModelError, match="in metres"):
+        fit_field(fit.field, 1000 * fit.ranges, fit.poses, fit.angles)
+    moved = between(log.truth[:-1], log.truth[1:])
+    fit_odometry(log.motion[1:], moved)
+    for motion, known in (
+        (log.motion[1:], moved * [1.0, 1.0, 180 / np.pi]),
+        (log.motion[1:], moved[:, [1, 0, 2]]),
+        (log.truth[1:], moved),
+    ):
+        with pytest.warns(ModelMisfitWarning, match="from one pose to the next"):
+            fit_odometry(motion, known)
 
 
 def test_a_scan_leaves_half_of_a_search(learned) -> None:
