@@ -160,7 +160,9 @@ def draw(drive: Drive, found: dict[str, Any]) -> Any:
     wheels = drive.error(drive.reckoned)
     label = f"dead reckoning: {drive.rmse(drive.reckoned):.2f} m"
     ax.plot(drive.times, wheels, ":", color=picture.FAINT, lw=1.6, label=label)
-    ax.set(xlim=(0, drive.times[-1]), ylim=(0, 1.5 * np.nanmax(wheels)), ylabel="m")
+    worst = max(np.nanmax(drive.error(belief.mean("pose"))) for belief in found.values())
+    top = min(1.5 * np.nanmax(wheels), 2.5 * worst)  # wheels alone may end anywhere
+    ax.set(xlim=(0, drive.times[-1]), ylim=(0, top), ylabel="m")
     ax.set_title("distance from the truth")
     ax.legend(frameon=False, loc="upper center", ncols=2, fontsize=9)
     _draw_bias(panels["bias"], drive, found)
