@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 import bayesmc as bmc
-from bayesmc.robotics import PoseNormal, between, compose, range_only, range_to
+from bayesmc.robotics import PoseNormal, between, compose, range_only, range_to, wrap
 from examples import picture, reference
 from examples.robot_landmarks import Drive, ellipse, ranges_heard, write_plaza
 
@@ -83,14 +83,16 @@ def robot(drive: Drive, bias_is: str = "growing") -> bmc.DynamicBayesNet:
 def wheel_noise(drive: Drive) -> tuple[float, float]:
     """Variances that build up along the way, in m^2 and rad^2 per metre, from where true poses are known.
 
-    What the wheels say of each metre against the true poses. Plaza 1's true headings come from the robot's
+    What the wheels say of each metre, its length and its turn, against the true poses: headings that are all
+    turned make no difference, which is for filters to notice. Plaza 1's true headings come from the robot's
     own gyroscope, which is then right without fail; hence a least variance.
     """
     driven = np.cumsum(drive.effort[drive.times <= FOLLOWED, 0])
     at = np.unique(np.searchsorted(driven[:-1], np.arange(0.0, driven[-1], 1.0)))
     said, was = (between(poses[at[:-1]], poses[at[1:]]) for poses in (drive.reckoned, drive.truth))
-    off, metres = between(said, was), np.diff(driven[at]).sum()
-    place, turn = (off[:, :2] ** 2).sum() / (2 * metres), (off[:, 2] ** 2).sum() / metres
+    longer = np.hypot(*said[:, :2].T) - np.hypot(*was[:, :2].T)
+    metres = np.diff(driven[at]).sum()
+    place, turn = (longer**2).sum() / metres, (wrap(said[:, 2] - was[:, 2]) ** 2).sum() / metres
     return max(float(place), LEAST[0]), max(float(turn), LEAST[1])
 
 
