@@ -17,6 +17,7 @@ from bayesmc.engines.filtering import Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief, Kept
+from bayesmc.engines.grid.looked import draws_of
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
 from bayesmc.engines.grid.search import GridSearch, known_static, quiet
@@ -24,9 +25,13 @@ from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label, largest
+from bayesmc.engines.particles.replicates import Replicates
+from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, stream
+from bayesmc.results.predictive import warn_of_misfit
 
 
 @dataclass(frozen=True)
@@ -200,12 +205,15 @@ class GridFilter(GridSearch):
             )
         mover, kept = self._start(problem)
         record = GridRecord(problem, mover.model, queries or {}, keep is None)
+        looks = _looks(problem, mover, seed)
         increments = np.empty((problem.steps, *mover.model.lead))
         before: Cells | None = None
 
         def move(k: int) -> None:
             nonlocal before
-            cells = kept[k] if kept else mover.move(before, problem.series.row(k))
+            row = problem.series.row(k)
+            looks.look(k, draws_of(mover.model, before), row)
+            cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
             record.add(k, _answers(mover, before, cells, cells.probs))
             before = cells
@@ -214,9 +222,10 @@ class GridFilter(GridSearch):
         try:
             with Progress(problem.steps, self.label, progress) as bar, quiet():
                 pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
+            found = so_far()
         except KeyboardInterrupt as stop:
-            return self.with_error(problem, answer_so_far(stop, self))
-        return self.with_error(problem, so_far())
+            found = answer_so_far(stop, self)
+        return self._judged(problem, found, looks)
 
     def smooth(
         self,
@@ -230,6 +239,7 @@ class GridFilter(GridSearch):
         """Every slice given all rows by one pass forwards and one back, or ``lag`` back from every slice."""
         mover, kept = self._start(problem)
         record = GridRecord(problem, mover.model, queries or {}, True)
+        looks = _looks(problem, mover, seed)
         steps = problem.steps
         increments = np.empty((steps, *mover.model.lead))
         reach = steps if lag is None else int(lag)
@@ -237,7 +247,9 @@ class GridFilter(GridSearch):
 
         def move(k: int) -> None:
             before = held[-1] if held else None
-            cells = kept[k] if kept else mover.move(before, problem.series.row(k))
+            row = problem.series.row(k)
+            looks.look(k, draws_of(mover.model, before), row)
+            cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
             held.append(cells)
             if k == 0:
@@ -249,7 +261,7 @@ class GridFilter(GridSearch):
             pass_slices(problem.series.start, steps, move, None, bar.advance)
             self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
         found = record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
-        return self.with_error(problem, found)
+        return self._judged(problem, found, looks)
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
@@ -338,6 +350,15 @@ class GridFilter(GridSearch):
             model = self.model_on_grid(problem.slices, known_static(problem))
             return GridMover(model, self.tolerance), None
 
+    def _judged(
+        self, problem: SeriesProblem, found: GridPosterior, looks: Replicates
+    ) -> GridPosterior:
+        """With the error of the log evidence, and how rows compare with what was expected."""
+        found = self.with_error(problem, found)
+        found.predictive = looks.found(found.steps)
+        warn_of_misfit(found.predictive, "GridFilter", found.start, 5)
+        return found
+
     def _smoothed(
         self,
         mover: GridMover,
@@ -401,6 +422,12 @@ class GridFilter(GridSearch):
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _looks(problem: SeriesProblem, mover: GridMover, seed: np.random.SeedSequence) -> Replicates:
+    """What holds rows against those that the grid expects."""
+    plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
+    return Replicates(problem, plan, stream(seed, Purpose.CHECK))
 
 
 def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.ndarray) -> Answers:

@@ -10,7 +10,7 @@ drawn with.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,9 @@ from bayesmc.network import Observed
 from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
 from bayesmc.results.predictive import UNLIKELY, Predictive
+
+#: draws from a belief that is no cloud: so many values of each node that the next slice reads, first axis
+Draws = Callable[[np.random.Generator, int], Mapping[str, np.ndarray]]
 
 #: rows drawn in a slice, and particles that say how likely they are
 ROWS, JUDGES = 19, 20
@@ -64,8 +67,8 @@ class Replicates:
         self._ranks = {n: np.full((problem.steps, *shapes[n]), np.nan) for n in self.names}
         self._sizes = {n: math.prod(shapes[n]) for n in self.names}
 
-    def look(self, k: int, before: Cloud | None, row: Row) -> None:
-        """Compare the k-th row, whose slice follows that of a cloud."""
+    def look(self, k: int, before: Cloud | Draws | None, row: Row) -> None:
+        """Compare the k-th row, whose slice follows that of a cloud, or of a belief that draws."""
         if (k not in self._looked and k > self._until) or self._failed or not row.seen:
             return
         try:
@@ -86,19 +89,23 @@ class Replicates:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _taken(self, before: Cloud | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _taken(self, before: Cloud | Draws | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Values of the slice before, of the particles that draw rows and of those that judge them."""
         if before is None:
             return {}
-        chosen = self._ancestors(before, ROWS + JUDGES)
+        cloud = before if isinstance(before, Cloud) else None
+        drawn = before.values if isinstance(before, Cloud) else before(self.rng, ROWS + JUDGES)
+        chosen = None if cloud is None else self._ancestors(cloud, ROWS + JUDGES)
         found = {}
         for name in self.slices.interface:
-            value = before.values[name]
+            value = drawn[name]
             node = self.slices.later[name]
             if value.ndim == len(node.value_shape):
                 found[name + PREVIOUS] = value, value
                 continue
-            if self.lead:
+            if chosen is None:
+                taken = value
+            elif self.lead:
                 taken = along_plates(value, chosen, node.plates, self.plan.apart)
             else:
                 taken = value[chosen]
