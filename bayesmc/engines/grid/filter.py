@@ -356,7 +356,7 @@ class GridFilter(GridSearch):
         """With the error of the log evidence, and how rows compare with what was expected."""
         found = self.with_error(problem, found)
         found.predictive = looks.found(found.steps)
-        warn_of_misfit(found.predictive, "GridFilter", found.start, 5)
+        warn_of_misfit(found.predictive, "GridFilter", found.start, 4)
         return found
 
     def _smoothed(

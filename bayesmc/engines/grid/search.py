@@ -148,7 +148,7 @@ class GridSearch(FilterEngine):
                     f"{float(np.max(error)):.2g} in the log evidence; give a grid of your own, "
                     f"grid={{{found.name!r}: (low, high, cells)}}{other}",
                     GridWarning,
-                    stacklevel=4,
+                    stacklevel=5,
                 )
         elif _numbers(problem, self.model_on_grid(problem.slices, known_static(problem))):
             nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)

@@ -329,7 +329,7 @@ class ParticleFilter(FilterEngine):
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
         self._warn(found)
-        warn_of_misfit(found.predictive, type(self).__name__, found.start, 4)
+        warn_of_misfit(found.predictive, type(self).__name__, found.start, 3)
         return found
 
     def smooth(
@@ -353,7 +353,7 @@ class ParticleFilter(FilterEngine):
                 raise UnsupportedError(_not_backwards(sums[0]))
             found, filtered = sized._backwards(problem, seed, queries or {}, progress)
         self._warn(filtered)
-        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 4)
+        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
 
     def _backwards(
