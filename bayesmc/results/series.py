@@ -51,9 +51,9 @@ class SeriesPosterior:
     row_ranks : ndarray or None, shape (time,) or (time, *plates)
         Share of the rows that the filter expected which are less likely than the one that came: uniform where
         the model is right, near 0 where rows surprise it. NaN where nothing was seen or compared: Gaussian
-        filters compare all rows, particle filters 8 or every 12th, and more after an unlikely one (of wide
-        ones, such as scans, 16 or every 32nd), with a few rows drawn from their particles. None from other
-        engines.
+        filters compare all rows, the others 8 or every 12th, and more after an unlikely one (of wide ones,
+        such as scans, 16 or every 32nd; discrete filters 60 at most), with a few rows drawn from their
+        particles, cells or states. None from other engines, and of fewer than five rows.
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
     queries_mcse : dict
@@ -166,7 +166,7 @@ class SeriesPosterior:
 
         The probability, before the row came, of a smaller value (the probability integral transform): uniform
         on (0, 1) where the model is right, heaped at both ends where its spread is too small, at one end
-        where it is off to one side. Particle filters count among 19 draws, and break ties by chance, so that
+        where it is off to one side. Kalman filters know them; the others count among 19 draws, and break ties by chance, so that
         ranks of discrete nodes are uniform, too.
 
         Parameters
@@ -204,8 +204,8 @@ class SeriesPosterior:
         if self.predictive is None:
             raise UnsupportedError(
                 f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare "
-                "rows with what was expected of them; ask the result of filter by a KalmanFilter, an "
-                "ExtendedKalmanFilter, an UnscentedKalmanFilter or a ParticleFilter, with some rows observed"
+                "rows with what was expected of them; ask the result of filter or smooth by a filter (not by "
+                "another engine), with five rows or more, of nodes that random draws can be taken of"
             )
         if name not in self.predictive.ranks:
             raise QueryError(

@@ -50,15 +50,23 @@ class Replicates:
         Its proposals, if any, are not used.
     rng : Generator
         Of its own.
+    most : int, optional
+        Slices that are looked at, but for those after a row that is unlikely.
     """
 
-    def __init__(self, problem: SeriesProblem, plan: SlicePlan, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        problem: SeriesProblem,
+        plan: SlicePlan,
+        rng: np.random.Generator,
+        most: int | None = None,
+    ) -> None:
         self.slices, self.rng, self.steps = problem.slices, rng, problem.steps
         self.plan = SlicePlan(problem.slices, plan.apart, plan.static)
         self.lead = tuple(problem.slices.first.sizes[p] for p in plan.apart)
         self.names = tuple(problem.series.observed)
         self._wide = _numbers_seen(problem) >= WIDE
-        self._looked, self._until = _chosen(problem, self._wide, rng), -1
+        self._looked, self._until = _chosen(problem, self._wide, rng, most), -1
         self._failed = False
         self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)
@@ -67,9 +75,13 @@ class Replicates:
         self._ranks = {n: np.full((problem.steps, *shapes[n]), np.nan) for n in self.names}
         self._sizes = {n: math.prod(shapes[n]) for n in self.names}
 
+    def wanted(self, k: int) -> bool:
+        """Whether the k-th row is looked at."""
+        return (k in self._looked or k <= self._until) and not self._failed
+
     def look(self, k: int, before: Cloud | Draws | None, row: Row) -> None:
         """Compare the k-th row, whose slice follows that of a cloud, or of a belief that draws."""
-        if (k not in self._looked and k > self._until) or self._failed or not row.seen:
+        if not self.wanted(k) or not row.seen:
             return
         try:
             values = self._taken(before)
@@ -220,7 +232,9 @@ def _numbers_seen(problem: SeriesProblem) -> int:
     return sum(math.prod(model[n].event_shape) for n in problem.series.observed)
 
 
-def _chosen(problem: SeriesProblem, wide: bool, rng: np.random.Generator) -> frozenset[int]:
+def _chosen(
+    problem: SeriesProblem, wide: bool, rng: np.random.Generator, most: int | None
+) -> frozenset[int]:
     """The slices that are looked at: one of each stretch, at random, among those with something seen."""
     some = np.zeros(problem.steps, dtype=bool)
     for seen in problem.series.observed.values():
@@ -231,6 +245,6 @@ def _chosen(problem: SeriesProblem, wide: bool, rng: np.random.Generator) -> fro
     least, every = (WIDE_LOOKS, WIDE_EVERY) if wide else (LOOKS, EVERY)
     if len(rows) <= least:
         return frozenset(rows.tolist())
-    edges = np.linspace(0, len(rows), max(least, len(rows) // every) + 1)
+    edges = np.linspace(0, len(rows), min(max(least, len(rows) // every), most or len(rows)) + 1)
     at = edges[:-1] + rng.random(len(edges) - 1) * np.diff(edges)
     return frozenset(rows[np.minimum(at.astype(np.intp), len(rows) - 1)].tolist())
