@@ -232,6 +232,7 @@ def _discover_stochastic(
         unsampled=isinstance(dist, Density) and not dist.can_sample,
         noiseless=_is_noiseless(dist, batch + plates, len(batch)),
         splits=splits(dist),
+        reach=support.at_most,
     )
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)
