@@ -43,8 +43,8 @@ _DETERMINISTIC_TABLE = 4096
 class CompiledNode:
     """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
     ``unsampled`` says that its density has no sampler, ``noiseless`` that some element has no noise
-    whatever its parents are, and so no density, ``splits`` that some components may be seen alone; ``support``
-    is that of all parents alike, and ``reach`` holds those of all parents."""
+    whatever its parents are, and so no density, ``splits`` that some components may be seen alone;
+    ``support`` is the same for all parents, ``reach`` holds those of all parents."""
 
     declaration: Declaration
     links: tuple[tuple[str, Aligner], ...]

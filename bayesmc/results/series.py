@@ -166,8 +166,8 @@ class SeriesPosterior:
 
         The probability, before the row came, of a smaller value (the probability integral transform): uniform
         on (0, 1) where the model is right, heaped at both ends where its spread is too small, at one end
-        where it is off to one side. Kalman filters know them; the others count among 19 draws, and break ties by chance, so that
-        ranks of discrete nodes are uniform, too.
+        where it is off to one side. Kalman filters know them; the others count among 19 draws, and
+        break ties by chance, so that ranks of discrete nodes are uniform, too.
 
         Parameters
         ----------
