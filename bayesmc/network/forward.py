@@ -320,8 +320,8 @@ def refuse_noiseless(model: Model, names: Iterable[str], who: str) -> str | None
             return (
                 f"{who} evaluates the density of {name!r}, which has none: it is computed from its parents, "
                 "and observed. Observe a reading of it with a little noise instead "
-                f"(net.add('{name}_seen', lambda {name}: Normal({name}, scale))), or one of its parents; where the model is "
-                "linear-Gaussian, Exact() and Kalman filters take it as it is"
+                f"(net.add('{name}_seen', lambda {name}: Normal({name}, scale))), or one of its parents; "
+                "where the model is linear-Gaussian, Exact() and Kalman filters take it as it is"
             )
         if model[name].noiseless:
             return (

@@ -66,7 +66,7 @@ def test_evidence_that_some_parents_allow_is_taken() -> None:
     for y in (-40.0, 40.0):
         with pytest.raises(bmc.errors.BayesmcError) as said:
             bmc.infer(ends, {"y": y}, engine=bmc.LikelihoodWeighting(100), rng=0)
-        assert not isinstance(said.value, EvidenceError)
+        assert "support" not in str(said.value)
 
 
 def test_rows_that_no_state_allows_are_named_at_once() -> None:
