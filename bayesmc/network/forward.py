@@ -249,7 +249,8 @@ def _advised(
     assert dist.invalid is not None
     full = np.broadcast_to(dist.invalid, state.batch + node.plate_shape)
     element = (error.index or ())[len(state.batch) :]
-    each = full[(..., *element)]
+    where: tuple[Any, ...] = (..., *element)
+    each = full[where]
     if each.size > 1 and each.all():
         own = {p: np.asarray(state.values[p]) for p in node.parents if p in state.values}
         known = ", ".join(f"{p} = {v.item():g}" for p, v in own.items() if v.ndim == 0)
