@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,18 +12,18 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.exact import readable_bytes
-from bayesmc.engines.filtering import Queries, answer_so_far, pass_slices
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief, Kept
+from bayesmc.engines.grid.limits import too_large, unread, without_density
 from bayesmc.engines.grid.looked import draws_of
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
 from bayesmc.engines.grid.search import GridSearch, known_static, quiet
 from bayesmc.engines.grid.slice import same_points
-from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label, largest
+from bayesmc.engines.grid.terms import Label
 from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
@@ -35,7 +34,7 @@ from bayesmc.results.predictive import warn_of_misfit
 
 
 @dataclass(frozen=True)
-class GridFilter(GridSearch):
+class GridFilter(FilterEngine):
     """Histogram filter (Markov localisation): beliefs as probabilities of the cells of a grid.
 
     Exact but for the grid: sums over points stand for integrals. With points closer than the narrowest
@@ -136,13 +135,13 @@ class GridFilter(GridSearch):
                 model = self.model_on_grid(problem.slices, known_static(problem))
         except BayesmcError as error:
             return str(error)
-        name = self.automatic(problem)
+        name = self._search.automatic(problem)
         if name is not None:
-            return _without_density(problem)
+            return without_density(problem)
         for name in problem.hidden:
             if name in model.own and name not in model.leaves and name not in model.axes.of:
                 return f"GridFilter: {model.axes.missing[name]}"
-        return self._too_large(model, problem) or _without_density(problem)
+        return too_large(model, problem, self.max_bytes) or without_density(problem)
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         """Hidden nodes that are integrated out and have no closed moments."""
@@ -160,9 +159,30 @@ class GridFilter(GridSearch):
                     found.append(name)
         return tuple(found)
 
+    @property
+    def _search(self) -> GridSearch:
+        """The search for a grid of one hidden number, by these options."""
+        return GridSearch(self)
+
+    def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        return self._search.why_not(problem)
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        if reason is not None:
+            return reason
+        model = self.model_on_grid(problem.slices, known_static(problem))
+        return unread(model, asked.queries, problem.hidden)
+
+    def is_displaced(self, problem: SeriesProblem) -> bool:
+        return self._search.automatic(problem) is not None and super().is_displaced(problem)
+
+    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        return self._search.said(problem)
+
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         model = self.model_on_grid(problem.slices, known_static(problem))
-        grid = self.found(problem)
+        grid = self._search.found(problem)
         if grid is not None:
             model = grid.mover.model
         found = {}
@@ -272,7 +292,7 @@ class GridFilter(GridSearch):
         """
         static = known_static(problem)
         with quiet(), Progress(problem.steps, self.label, progress) as bar:
-            found_grid = self.found(problem)
+            found_grid = self._search.found(problem)
             axis = None if found_grid is None else (found_grid.name, found_grid.axis)
             model = self.model_on_grid(problem.slices, static, logs=True, axis=axis)
             mover = GridMover(model, self.tolerance)
@@ -343,7 +363,7 @@ class GridFilter(GridSearch):
 
     def _start(self, problem: SeriesProblem) -> tuple[GridMover, list[Cells] | None]:
         """What moves beliefs, and the beliefs of all slices where a search for the grid left them."""
-        found = self.found(problem)
+        found = self._search.found(problem)
         if found is not None:
             return found.mover, found.kept
         with quiet():
@@ -354,7 +374,7 @@ class GridFilter(GridSearch):
         self, problem: SeriesProblem, found: GridPosterior, looks: Replicates
     ) -> GridPosterior:
         """With the error of the log evidence, and how rows compare with what was expected."""
-        found = self.with_error(problem, found)
+        found = self._search.with_error(problem, found)
         found.predictive = looks.found(found.steps)
         warn_of_misfit(found.predictive, "GridFilter", found.start, 4)
         return found
@@ -389,37 +409,6 @@ class GridFilter(GridSearch):
                 count,
             )
 
-    def _too_large(self, model: GridModel, problem: SeriesProblem) -> str | None:
-        """Why the tables do not fit, found from their sizes alone."""
-        hidden = frozenset(n for n in problem.hidden if n in model.own and n not in model.leaves)
-        sizes: dict[Label, int] = dict(zip(model.apart, model.lead, strict=True))
-        labels: list[Label] = []
-        for name in sorted(hidden):
-            axes = model.axes.of[name]
-            for e in range(model.elements(name)):
-                label = (name, e)
-                labels.append(label)
-                sizes[label] = sizes[previous(label)] = axes[e % len(axes)].size
-        scopes = []
-        for first in (True, False) if problem.steps > 1 else (True,):
-            for name in hidden | set(problem.series.observed):
-                if name not in model.own or (
-                    name in model.leaves and name not in problem.series.observed
-                ):
-                    continue
-                scope = model.scope(first, name, hidden)
-                cells = [sizes[x] for x in scope]
-                if 8 * math.prod(map(float, cells)) > self.max_bytes:
-                    return model.too_large(name, cells, 8 * math.prod(map(float, cells)))
-                if any(map(is_previous, scope)):
-                    scopes.append(scope)
-        belief = {previous(x) for x in labels} | set(model.apart)
-        entries = largest([belief, *scopes], (*labels, *model.apart), sizes)
-        if 8 * entries > self.max_bytes:
-            names = ", ".join(sorted(hidden))
-            return model.too_large(names, [sizes[x] for x in labels], 8 * entries)
-        return None
-
 
 # ---- private ------------------------------------------------------------------------------------
 
@@ -437,20 +426,6 @@ def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.nda
 
     placed = None if before is None else before.placed
     return Answers(mover.model, placed, cells.placed, probs, pair)
-
-
-def _without_density(problem: SeriesProblem) -> str | None:
-    """A node whose density cannot be evaluated, tried where its parents can be."""
-    for model in (problem.slices.first, problem.slices.later):
-        for name in problem.slices.stochastic:
-            try:
-                with quiet():
-                    dist, _ = model.evaluate(name, model.probe)
-                    model.log_density(name, dist, model.probe[name])
-            except (BayesmcError, NotImplementedError) as error:
-                why = str(error) or "it is not implemented"
-                return f"GridFilter evaluates every density, and that of {name!r} cannot be: {why}"
-    return None
 
 
 def _chosen(

@@ -36,9 +36,7 @@ def _positions(
     shape = cells.placed.shape
     if not shape:
         return ()
-    probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(
-        np.prod(shape, dtype=int), -1
-    )
+    probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(np.prod(shape, dtype=int), -1)
     found = np.empty((count, probs.shape[1]), dtype=np.intp)
     for k, column in enumerate(probs.T):
         sums = column.cumsum()
@@ -47,9 +45,7 @@ def _positions(
     return tuple(np.unravel_index(flat, shape))
 
 
-def _taken(
-    model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]
-) -> np.ndarray:
+def _taken(model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]) -> np.ndarray:
     """A node's values at cells; elements of plates that are filtered separately have cells of their own."""
     node, value = model.slices.later[name], placed.values[name]
     batch = value.ndim - len(node.value_shape)
