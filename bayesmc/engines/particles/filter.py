@@ -87,7 +87,7 @@ class ParticleFilter(FilterEngine):
         is seen is affine in them; else what is seen is made linear, or its log density quadratic, at each
         particle, mixtures of Gaussians component by component, and a tenth of the particles is drawn from
         their own densities. Hidden finite nodes are drawn from their own densities; ``explain`` says what
-        guides each node, and why any is not guided.
+        guides each node, and why any is not guided. With any proposal vectors are seen whole or not at all.
     initial_proposal : dict, optional
         As ``proposal``, for slice 0 alone: where the first observations say the start could be.
     auxiliary : bool or callable
