@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, UnknownNodeError, did_you_mean
+from bayesmc.errors import (
+    DensityError,
+    ModelError,
+    ParameterError,
+    UnknownNodeError,
+    did_you_mean,
+)
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
 from bayesmc.network.declared_plates import DeclaredPlates
@@ -293,7 +299,13 @@ class SliceStore:
         self._stores()
         inputs = self._stand_ins(sizes)
         settled = {p: n if n is not None else _OPEN + k for k, (p, n) in enumerate(sizes.items())}
-        return self.slices(settled, inputs)
+        try:
+            return self.slices(settled, inputs)
+        except (ModelError, ParameterError, DensityError):  # inputs may have to be integers
+            if not inputs:
+                raise
+            ones = {n: owned(np.ones(v.shape, dtype=int)) for n, v in inputs.items()}
+            return self.slices(settled, ones)
 
     def validate(self, slices: Slices) -> None:
         """Refuse functions that break the array rules."""

@@ -94,7 +94,13 @@ def declared_table(
         raise ModelError(f"node {name!r}: table() needs probs=")
     if isinstance(parents, str):
         raise ModelError(f"node {name!r}: parents={parents!r} is one string; give a list of names")
-    table = np.array(probs, dtype=float)
+    try:
+        table = np.array(probs, dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"node {name!r}: a {type(probs).__name__} is no density; give a distribution, a function, or a "
+            "table of probabilities, its rows of one length"
+        ) from None
     if table.ndim != len(parents) + 1:
         raise ModelError(
             f"node {name!r}: probs has {table.ndim} axes, but {len(parents)} parents and the node "

@@ -331,6 +331,11 @@ def call(
             return wrapped
         if result is None:
             raise ModelError("the function returns None; return a distribution or an array")
+        if isinstance(result, (tuple, dict, set, str)):
+            raise ModelError(
+                f"the function returns a {type(result).__name__}; return a distribution or an array (of "
+                "several numbers one array, np.stack([...], axis=-1))"
+            )
         if isinstance(result, PlateArray):
             raise result.ungathered()
         array = result if isinstance(result, StateArray) else np.asarray(result)
