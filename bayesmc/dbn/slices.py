@@ -282,6 +282,7 @@ class SliceStore:
             if key in self._found:
                 return self._found[key]
             domains = _computed_domains(self.template, first, later)
+            domains |= _counts_that_vary(self.template, first, later)
             if not domains:
                 break
             self._settle(domains)
@@ -406,6 +407,22 @@ def _previous(template: Template, name: str) -> str:
 
 def _number(t: int) -> np.ndarray:
     return owned(np.asarray(t))
+
+
+def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[str, Domain]:
+    """Drawn nodes whose values are as many as an input or the time says: no finite set serves all slices."""
+    found = {}
+    given = {n + end for n in (*template.inputs, TIME) for end in ("", PREVIOUS)}
+    for model in (first, later):
+        for name in template.later:
+            node = model.nodes.get(name)
+            if node is None or not node.is_stochastic or node.domain is None:
+                continue
+            read = given & set(node.parents) & set(model.probe)
+            moved = model.support_at(name, read, 3) if read and node.domain.labels is None else None
+            if moved is not None and moved != node.support:
+                found[name] = _UNCOUNTED
+    return found
 
 
 def _check_alike(template: Template, first: Model, later: Model) -> None:

@@ -70,8 +70,8 @@ class GridFilter(FilterEngine):
     independently cost the sum of their tables, not the product. Plates whose elements never meet are filtered
     separately on the same grid. Noise narrower than a cell falls between the points: widen it, refine the
     grid, or take another engine; a state without noise has no density at all and is refused. Hidden nodes
-    that nothing reads (missing observations) go without axes unless ``grid`` names them. Vectors are seen whole
-    or not at all: one of which some components are missing is refused. Some rows are held against rows
+    that nothing reads (missing observations) go without axes unless ``grid`` names them. Vectors are seen
+    whole or not at all: one of which some components are missing is refused. Some rows are held against rows
     drawn from the cells (``row_ranks``); a ``ModelMisfitWarning`` says where they do not fit.
 
     References
