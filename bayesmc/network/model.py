@@ -342,14 +342,9 @@ def call(
             return wrapped
         if result is None:
             raise ModelError("the function returns None; return a distribution or an array")
-        if isinstance(result, (tuple, dict, set, str)):
-            raise ModelError(
-                f"the function returns a {type(result).__name__}; return a distribution or an array (of "
-                "several numbers one array, np.stack([...], axis=-1))"
-            )
         if isinstance(result, PlateArray):
             raise result.ungathered()
-        array = result if isinstance(result, StateArray) else np.asarray(result)
+        array = result if isinstance(result, StateArray) else _as_array(result)
         if array.dtype.kind not in "biuf":
             raise ModelError(
                 f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "
@@ -387,6 +382,14 @@ def lookup(node: CompiledNode, values: Mapping[str, np.ndarray]) -> np.ndarray:
         index = (*index, *np.ix_(*(np.arange(n) for n in plates)))
     result = node.table[index] if index else node.table
     return read_only(np.asarray(result))
+
+
+def _as_array(result: Any) -> np.ndarray:
+    """What a function returned as an array; nested things of several lengths are one of objects."""
+    try:
+        return np.asarray(result)
+    except ValueError:
+        return np.empty(0, dtype=object)
 
 
 def invalid_error(

@@ -9,7 +9,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.engines import start_faults
-from bayesmc.errors import EvidenceError, ParameterError, UnsupportedError
+from bayesmc.errors import EvidenceError, ModelError, ParameterError, UnsupportedError
 
 #: runs are short
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
@@ -119,3 +119,11 @@ def test_parameters_that_some_draws_are_to_blame_for_name_priors() -> None:
     net = net_of(s=bmc.Normal(1, 1), y=lambda s: bmc.Normal(0, s))
     with pytest.raises(ParameterError, match="HalfNormal"):
         bmc.infer(net, {"y": 1.0}, engine=bmc.LikelihoodWeighting(1000), rng=0)
+
+
+@pytest.mark.parametrize("cpd", [{"a": 1}, [[0.5, 0.5], [1.0]]])
+def test_what_is_no_table_is_refused(cpd: Any) -> None:
+    with pytest.raises(
+        ModelError, match="'x'.*no density; give a distribution, a function, or a table"
+    ):
+        bmc.BayesNet().add("x", cpd)
