@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     DensityError,
     ModelError,
@@ -419,10 +421,22 @@ def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[st
             if node is None or not node.is_stochastic or node.domain is None:
                 continue
             read = given & set(node.parents) & set(model.probe)
-            moved = model.support_at(name, read, 3) if read and node.domain.labels is None else None
+            plain = read and node.domain.labels is None
+            moved = _support_further(model, name, read) if plain else None
             if moved is not None and moved != node.support:
                 found[name] = _UNCOUNTED
     return found
+
+
+def _support_further(model: Model, name: str, parents: set[str]) -> Support | None:
+    """Where a node's mass lies with some parents' values larger; None where that goes wrong."""
+    moved = {p: np.asarray(model.probe[p]) + 3 for p in parents}
+    try:
+        with marking_invalid(), np.errstate(all="ignore"):
+            dist, _ = model.evaluate(name, {**model.probe, **moved})
+    except Exception:  # a function of the user's, at values that need not be possible
+        return None
+    return dist.support if dist.invalid is None else None
 
 
 def _check_alike(template: Template, first: Model, later: Model) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -18,7 +18,6 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Categorical, Distribution, as_distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     BayesmcError,
@@ -172,16 +171,6 @@ class Model:
             return result, batch
         shape = batch + node.plate_shape + node.event_shape
         return deterministic_fit(node.declaration, result, batch, node.plate_shape, shape), batch
-
-    def support_at(self, name: str, parents: Iterable[str], more: int) -> Support | None:
-        """Where a node's mass lies with some parents' values so much larger; None where that goes wrong."""
-        moved = {p: np.asarray(self.probe[p]) + more for p in parents}
-        try:
-            with marking_invalid(), np.errstate(all="ignore"):
-                dist, _ = self.evaluate(name, {**self.probe, **moved})
-        except Exception:  # a function of the user's, at values that need not be possible
-            return None
-        return dist.support if dist.invalid is None else None
 
     def log_density(self, name: str, distribution: Distribution, stored: np.ndarray) -> np.ndarray:
         """Log density of stored values, shape the broadcast of batch and plates; NaN never passes."""
