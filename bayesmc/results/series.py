@@ -143,7 +143,9 @@ class SeriesPosterior:
 
         def __getattr__(self, name: str) -> Any:
             hint = f"; {_INSTEAD[name]}" if name in _INSTEAD else ""
-            raise AttributeError(f"{type(self).__name__!r} has no {name!r}{hint}", name=name, obj=self)
+            raise AttributeError(
+                f"{type(self).__name__!r} has no {name!r}{hint}", name=name, obj=self
+            )
 
     @property
     def names(self) -> tuple[str, ...]:

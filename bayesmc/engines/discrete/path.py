@@ -25,7 +25,9 @@ def path_values(
         Variable -> its states, shape (steps, sequences).
     """
     plan, reader, found = run.plan, run.plan.reader, {}
-    stored = {n: states_of(run, path, n, run.steps) for n in plan.slices.dynamic if n in reader.variables}
+    stored = {
+        n: states_of(run, path, n, run.steps) for n in plan.slices.dynamic if n in reader.variables
+    }
     for name in names:
         node = plan.slices.first[name]
         if name in reader.variables:
@@ -37,9 +39,7 @@ def path_values(
     return found
 
 
-def states_of(
-    run: Run, path: Mapping[Variable, np.ndarray], name: str, count: int
-) -> np.ndarray:
+def states_of(run: Run, path: Mapping[Variable, np.ndarray], name: str, count: int) -> np.ndarray:
     """Stored values of a node, shape (count, *plates), from states of shape (count, sequences)."""
     reader, node = run.plan.reader, run.plan.slices.first[name]
     shape = (count, *reader.lead)
