@@ -615,6 +615,7 @@ def test_what_is_no_distribution_is_refused():
         (None, "returns None; return a distribution or an array"),
         ({"a": 1}, "the function returns dict; return a distribution"),
         ([bmc.Normal(0, 1)], "the function returns list; return a distribution"),
+        ((np.zeros((3, 2)), 1), "the function returns tuple; return a distribution"),
     ]:
         net = bmc.BayesNet()
         net.add("x", lambda result=result: result)

@@ -87,7 +87,7 @@ class ParticleFilter(FilterEngine):
         is seen is affine in them; else what is seen is made linear, or its log density quadratic, at each
         particle, mixtures of Gaussians component by component, and a tenth of the particles is drawn from
         their own densities. Hidden finite nodes are drawn from their own densities; ``explain`` says what
-        guides each node, and why any is not guided.
+        guides each node, and why any is not guided. With any proposal vectors are seen whole or not at all.
     initial_proposal : dict, optional
         As ``proposal``, for slice 0 alone: where the first observations say the start could be.
     auxiliary : bool or callable
@@ -329,7 +329,7 @@ class ParticleFilter(FilterEngine):
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
         self._warn(found)
-        warn_of_misfit(found.predictive, type(self).__name__, found.start, 4)
+        warn_of_misfit(found.predictive, type(self).__name__, found.start, 3)
         return found
 
     def smooth(
@@ -353,7 +353,7 @@ class ParticleFilter(FilterEngine):
                 raise UnsupportedError(_not_backwards(sums[0]))
             found, filtered = sized._backwards(problem, seed, queries or {}, progress)
         self._warn(filtered)
-        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 4)
+        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
 
     def _backwards(
