@@ -22,6 +22,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, DensityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.slice import slice_move
+from bayesmc.shapes import Shape
 from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.target import Target, Values
 
@@ -109,8 +110,20 @@ class Rescaled(Kernel):
             new = self._scaled(values, centres, np.where(inside, t, 0.0))
         state = {**values, **new}
         self.target.compute(state, self.path)
+        inside = inside & self._keeps_centres(state, centres, t.shape)
         log = self.terms.log_density(state) + (self.power + self.numbers) * t
         return np.where(inside, np.broadcast_to(log, t.shape), -np.inf)
+
+    def _keeps_centres(
+        self, state: Values, centres: Mapping[str, np.ndarray], lead: Shape
+    ) -> np.ndarray:
+        """Whether deviations are counted from where they were: else there is no way back."""
+        kept: np.ndarray = np.ones(lead, dtype=bool)
+        for name, centre in centres.items():
+            now = centre_of(self.target, name, state)
+            same = np.isclose(now, centre, rtol=_CLOSE, atol=0)
+            kept = kept & same.reshape(*lead, -1).all(axis=-1)
+        return kept
 
 
 def centre_of(target: Target, name: str, values: Values) -> np.ndarray:
@@ -147,11 +160,16 @@ def rescaled_kernels(target: Target, slow: Collection[str]) -> list[Kernel]:
     if states is None:
         return []
     above: dict[tuple[str, int], list[str]] = {}
+    terms = [target.terms[n] for n in slow if n in target.terms]
+    # in a random walk, to scale one step would move where the next one begins
+    begins = {n for term in terms for n in target.hidden_above(term)}
     for name in target.chain:
         node, term = target.model[name], target.terms.get(name)
         if name not in slow or term is None or target.seen(name) is not None:
             continue
         if node.is_discrete or node.support is None or node.support.kind != "real":
+            continue
+        if name in begins:
             continue
         for scale in target.hidden_above(term):
             power = _power(target, scale, name, states) if _is_scale(target, scale) else None
