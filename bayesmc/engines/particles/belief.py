@@ -126,10 +126,9 @@ class ParticleBelief(OnlineBelief):
         """
         cloud, layout = self._cloud, self._mover.layout
         assert self.families is not None
-        bounds = self.families.bounds
         if callable(what):
             values = evaluated(layout, cloud, self._mover.slices.first, what)
-            return value_errors(layout, cloud, bounds, values, weighted_mean(cloud, values))
+            return value_errors(layout, cloud, self.families, values, weighted_mean(cloud, values))
         node, value = self._found(what)
         if value.ndim == len(node.value_shape):  # the same for all particles
             labelled = node.domain is not None and node.domain.labels is not None
@@ -139,7 +138,7 @@ class ParticleBelief(OnlineBelief):
         else:
             mean, variance = moments(layout, cloud, node, value)
             centre = (np.asarray(mean)[None], np.asarray(variance)[None])
-        return node_errors(layout, cloud, bounds, node, centre)
+        return node_errors(layout, cloud, self.families, node, centre)
 
     def particles(self, name: str) -> np.ndarray:
         """Values of all particles, ``(particles, *plates, *event)``, not weighted."""

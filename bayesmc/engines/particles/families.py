@@ -31,7 +31,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.forgetting import Lost, Sight
 
 #: families of an origin, and founders of each, at least, where there are particles enough
 GROUPS, LEAST = 32, 4
@@ -78,6 +79,8 @@ class Families(NamedTuple):
         Slices of the origins.
     settled : ndarray, shape (*apart,)
         Variance of the log evidence up to the old origin.
+    lost : Lost or None
+        What the filter has lost sight of.
     """
 
     bounds: np.ndarray
@@ -85,12 +88,13 @@ class Families(NamedTuple):
     kept: np.ndarray
     explained: np.ndarray
     born: np.ndarray
-    settled: np.ndarray
+    settled: Any
+    lost: Lost | None = None
 
 
-def begun(cloud: Cloud, layout: Layout) -> Families:
+def begun(cloud: Cloud, sight: Sight) -> Families:
     """Families of the particles of the first slice, which were drawn independently."""
-    n, lead = layout.particles, layout.lead
+    n, lead = sight.layout.particles, sight.layout.lead
     groups = min(GROUPS, max(n // LEAST, 2), n)
     bounds, shares = _even(len(cloud.weights), groups, len(lead))
     rested = np.asarray(cloud.ess) >= min(RESTS, 0.9 * len(cloud.weights))
@@ -101,10 +105,13 @@ def begun(cloud: Cloud, layout: Layout) -> Families:
         np.zeros((2, 2, *lead)),
         np.full((2, *lead), cloud.t),
         np.where(rested, 0.0, np.inf),
+        sight.after(None, ~rested, cloud),
     )
 
 
-def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
+def followed(
+    families: Families, earlier: Cloud, cloud: Cloud, steady: bool, sight: Sight
+) -> Families:
     """The families one slice later.
 
     Parameters
@@ -115,19 +122,16 @@ def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> 
         The slice before, and this one.
     steady : bool
         Whether resampling leaves neighbours together the particles that their weight demands, but for one.
+    sight : Sight
     """
-    if cloud.weights.ndim == 1 and steady and cloud.rejuvenated is False:
-        return _followed_alone(families, earlier, cloud)
-    poor = cloud.ess < min(RESTS, 0.9 * len(cloud.weights))
-    if np.any(poor):
-        families = families._replace(settled=np.where(poor, np.inf, families.settled))
-    if cloud.ancestors is not None:
-        families = _moved(families, earlier, cloud, steady)
-        if cloud.t % STRIDE == 0:
-            families = _looked_at(families, cloud)
-    if cloud.rejuvenated is not False:
-        families = _renewed(families, earlier, cloud)
-    return families
+    settled, lost = families.settled, families.lost
+    found = _followed(families._replace(settled=_NOTHING), earlier, cloud, steady)
+    gained = found.settled
+    if gained is _NOTHING and lost is None:
+        return found._replace(settled=settled)
+    return found._replace(
+        settled=settled + gained, lost=sight.after(lost, np.isinf(gained), cloud)
+    )
 
 
 def evidence_error(families: Families, cloud: Cloud) -> Any:
@@ -166,6 +170,26 @@ def row_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
+#: the variance of slices in which nothing has happened
+_NOTHING = np.zeros(())
+
+
+def _followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
+    """The same, where nothing was settled so far."""
+    if cloud.weights.ndim == 1 and steady and cloud.rejuvenated is False:
+        return _followed_alone(families, earlier, cloud)
+    poor = cloud.ess < min(RESTS, 0.9 * len(cloud.weights))
+    if np.any(poor):
+        families = families._replace(settled=np.where(poor, np.inf, families.settled))
+    if cloud.ancestors is not None:
+        families = _moved(families, earlier, cloud, steady)
+        if cloud.t % STRIDE == 0:
+            families = _looked_at(families, cloud)
+    if cloud.rejuvenated is not False:
+        families = _renewed(families, earlier, cloud)
+    return families
+
+
 def _sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     some = bounds[1:] > bounds[:-1]
     if some.all():
@@ -188,7 +212,7 @@ def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
     """The same of one filter whose families have the particles that they should, in few calls of NumPy."""
-    bounds, shares, kept, explained, born, settled = families
+    bounds, shares, kept, explained, born, settled, _ = families
     n = len(cloud.weights)
     if cloud.ess < min(RESTS, 0.9 * n):
         settled = np.asarray(np.inf)
@@ -291,12 +315,12 @@ def _begun_again(
         for value, new in zip(families[:5], fresh, strict=True):
             found.append(np.empty_like(value))
             found[-1][OLD], found[-1][YOUNG] = new if both else value[YOUNG], new
-        return Families._make([*found, settled])
+        return Families(*found, settled)
     for value, new in zip(families[:5], fresh, strict=True):
         young = np.broadcast_to(new, value[YOUNG].shape)
         old = young if both else value[YOUNG]
         found.append(np.where(where, np.stack([old, young]), value))
-    return Families._make([*found, settled])
+    return Families(*found, settled)
 
 
 def _weights(families: Families, cloud: Cloud) -> np.ndarray:

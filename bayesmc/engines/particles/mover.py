@@ -16,6 +16,7 @@ from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.cloud import BLOCK, Cloud, Layout, Selection, along_plates
 from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.families import Families, begun, followed
+from bayesmc.engines.particles.forgetting import Sight
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
@@ -100,6 +101,7 @@ class Mover:
         self._ranks = {n + PREVIOUS: len(slices.first[n].value_shape) for n in slices.dynamic}
         self._ranks |= {n: len(slices.first[n].value_shape) for n in slices.dynamic}
         self.layout = Layout(particles, self.apart, self.lead, self.block)
+        self.sight = Sight([slices.later[n] for n in slices.interface], self.layout)
         self._log_particles = math.log(particles)
         self._even = np.ones((particles, *self.lead))
         self._even.flags.writeable = False
@@ -117,9 +119,9 @@ class Mover:
         """The cloud of the next slice, or of the first, and whose descendants its particles are."""
         if cloud is None or families is None:
             found = self.first(row, rng)
-            return found, begun(found, self.layout)
+            return found, begun(found, self.sight)
         found = self.next(cloud, row, rng)
-        return found, followed(families, cloud, found, self.steady)
+        return found, followed(families, cloud, found, self.steady, self.sight)
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""

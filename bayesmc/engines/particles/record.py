@@ -100,7 +100,7 @@ class Record:
             mean = weighted_mean(cloud, values)
             self.queries[name].append(mean)
             if families is not None:
-                errors = value_errors(layout, cloud, families.bounds, values, mean)
+                errors = value_errors(layout, cloud, families, values, mean)
                 self.query_errors[name].append(errors)
         if families is not None:
             self.errors.add(k, cloud, families)
@@ -183,7 +183,7 @@ class FilteredParticles(SeriesPosterior):
         for cloud, families in zip(clouds, self.families, strict=True):
             values = evaluated(layout, cloud, self.model, what)
             mean = weighted_mean(cloud, values)
-            rows.append(value_errors(layout, cloud, families.bounds, values, mean))
+            rows.append(value_errors(layout, cloud, families, values, mean))
         return np.stack(rows)
 
     def particles(self, name: str) -> np.ndarray:
