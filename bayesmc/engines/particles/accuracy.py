@@ -182,6 +182,8 @@ def node_errors(
         own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
         worth = _beside(ess, node, layout, np.ndim(mean))
         found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
+        if families.scouts is not None:
+            found = found + (step * families.scouts.share) ** 2
     if families.lost is not None:
         order = [p for p in node.plates if p in layout.apart]
         if len(order) == len(layout.apart):
@@ -204,6 +206,8 @@ def value_errors(
     if is_share(values):  # an event that no particle has seen may happen
         ess = np.asarray(cloud.ess, dtype=float)
         share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
+        if families.scouts is not None:
+            share = share + families.scouts.share**2
     if families.lost is not None:
         where = families.lost.where
         share = np.where(where.reshape(where.shape + (1,) * len(rest)), np.inf, share)

@@ -33,6 +33,7 @@ import numpy as np
 
 from bayesmc.engines.particles.cloud import Cloud
 from bayesmc.engines.particles.forgetting import Lost, Sight
+from bayesmc.engines.particles.scouts import Scouts
 
 #: families of an origin, and founders of each, at least, where there are particles enough
 GROUPS, LEAST = 32, 4
@@ -56,6 +57,9 @@ FEW, TAIL = 0.05, 0.7
 LONG = 0.2
 #: variance between two origins beyond which the families that are left are too few to tell
 MOST = 1.0
+
+#: share of the belief in states without particles, over that of all particles, up to which it is an error
+LEFT_OUT = 0.1
 
 OLD, YOUNG = 0, 1
 
@@ -81,6 +85,8 @@ class Families(NamedTuple):
         Variance of the log evidence up to the old origin.
     lost : Lost or None
         What the filter has lost sight of.
+    scouts : Scouts or None
+        Where states have no particle: what the rows make of these.
     """
 
     bounds: np.ndarray
@@ -90,6 +96,7 @@ class Families(NamedTuple):
     born: np.ndarray
     settled: Any
     lost: Lost | None = None
+    scouts: Scouts | None = None
 
 
 def begun(cloud: Cloud, sight: Sight) -> Families:
@@ -128,10 +135,23 @@ def followed(
     found = _followed(families._replace(settled=_NOTHING), earlier, cloud, steady)
     gained = found.settled
     if gained is _NOTHING and lost is None:
-        return found._replace(settled=settled)
-    return found._replace(
-        settled=settled + gained, lost=sight.after(lost, np.isinf(gained), cloud)
-    )
+        return found._replace(settled=settled, scouts=families.scouts)
+    lost = sight.after(lost, np.isinf(gained), cloud)
+    return found._replace(settled=settled + gained, lost=lost, scouts=families.scouts)
+
+
+def scouted(families: Families, scouts: Scouts | None, cloud: Cloud, sight: Sight) -> Families:
+    """The families, where scouts have been to states that no particle has.
+
+    What the particles leave out is lost where it is no longer small.
+    """
+    if scouts is None and families.scouts is None:
+        return families
+    families = families._replace(scouts=scouts)
+    if scouts is None or scouts.share <= LEFT_OUT:
+        return families
+    lost = sight.after(families.lost, True, cloud, here=True)
+    return families._replace(settled=np.asarray(np.inf), lost=lost)
 
 
 def evidence_error(families: Families, cloud: Cloud) -> Any:
@@ -140,6 +160,8 @@ def evidence_error(families: Families, cloud: Cloud) -> Any:
     explained = families.explained + _explained(cloud)
     at_edge = _at_edge(variance, explained, len(cloud.weights))
     total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
+    if families.scouts is not None:
+        total = total + families.scouts.share**2
     found = np.sqrt(total + 0.25 * total**2)
     return found if np.ndim(found) else float(found)
 
@@ -212,7 +234,7 @@ def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
     """The same of one filter whose families have the particles that they should, in few calls of NumPy."""
-    bounds, shares, kept, explained, born, settled, _ = families
+    bounds, shares, kept, explained, born, settled = families[:6]
     n = len(cloud.weights)
     if cloud.ess < min(RESTS, 0.9 * n):
         settled = np.asarray(np.inf)

@@ -62,20 +62,25 @@ class Sight:
         self.nodes: tuple[CompiledNode, ...] = tuple(nodes)
         self.layout = layout
 
-    def after(self, lost: Lost | None, now: Any, cloud: Cloud) -> Lost | None:
-        """What is lost after a slice in which some elements ``now`` were, shape (*apart)."""
-        if lost is not None:
+    def after(
+        self, lost: Lost | None, now: Any, cloud: Cloud, here: bool = False
+    ) -> Lost | None:
+        """What is lost after a slice in which some elements ``now`` were, shape (*apart).
+
+        ``here`` says that what was lost before is that of this slice already.
+        """
+        if lost is not None and not here:
             lost = self._followed(lost, cloud)
         if not np.any(now):
             return lost
-        here = np.broadcast_to(np.asarray(now, dtype=bool), self.layout.lead)
+        fresh = np.broadcast_to(np.asarray(now, dtype=bool), self.layout.lead)
         wide = tuple(self._spread(node, cloud) for node in self.nodes)
         if lost is None:
-            return Lost(here, wide, tuple(np.zeros_like(w) for w in wide), cloud.t)
-        fresh = here.reshape(-1, 1)
-        both = tuple(np.where(fresh, w, old) for w, old in zip(wide, lost.wide, strict=True))
-        gone = tuple(np.where(fresh, 0.0, g) for g in lost.gone)
-        return lost._replace(where=lost.where | here, wide=both, gone=gone)
+            return Lost(fresh, wide, tuple(np.zeros_like(w) for w in wide), cloud.t)
+        rows = fresh.reshape(-1, 1)
+        wide = tuple(np.where(rows, w, old) for w, old in zip(wide, lost.wide, strict=True))
+        gone = tuple(np.where(rows, 0.0, g) for g in lost.gone)
+        return lost._replace(where=lost.where | fresh, wide=wide, gone=gone)
 
     def _followed(self, lost: Lost, cloud: Cloud) -> Lost | None:
         """The same one slice later; None where all is found."""

@@ -15,9 +15,10 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.cloud import BLOCK, Cloud, Layout, Selection, along_plates
 from bayesmc.engines.particles.counts import KLD
-from bayesmc.engines.particles.families import Families, begun, followed
+from bayesmc.engines.particles.families import Families, begun, followed, scouted
 from bayesmc.engines.particles.forgetting import Sight
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.scouts import Scouting
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn
@@ -102,6 +103,7 @@ class Mover:
         self._ranks |= {n: len(slices.first[n].value_shape) for n in slices.dynamic}
         self.layout = Layout(particles, self.apart, self.lead, self.block)
         self.sight = Sight([slices.later[n] for n in slices.interface], self.layout)
+        self.scouting = Scouting(slices, plan)
         self._log_particles = math.log(particles)
         self._even = np.ones((particles, *self.lead))
         self._even.flags.writeable = False
@@ -119,9 +121,14 @@ class Mover:
         """The cloud of the next slice, or of the first, and whose descendants its particles are."""
         if cloud is None or families is None:
             found = self.first(row, rng)
-            return found, begun(found, self.sight)
-        found = self.next(cloud, row, rng)
-        return found, followed(families, cloud, found, self.steady, self.sight)
+            now = begun(found, self.sight)
+        else:
+            found = self.next(cloud, row, rng)
+            now = followed(families, cloud, found, self.steady, self.sight)
+        if not self.scouting.nodes:
+            return found, now
+        scouts = self.scouting.after(now.scouts, cloud, found, row)
+        return found, scouted(now, scouts, found, self.sight)
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""
