@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.drift import SEEMS, Compass, Drift
 from bayesmc.engines.particles.forgetting import Lost, Sight
 from bayesmc.engines.particles.scouts import Scouts
 
@@ -50,6 +51,8 @@ RESTS = 4.0
 MATTERS, UNEVEN = (0.05, 0.15), 80.0
 #: times the variance that the slices' weights explain by themselves, above which the rest came from the edge
 EDGE = 4.0
+#: families that make up such differences below which these are an accident of one or two
+SOME = 2.0
 #: share of the particles below which the worth of a slice's has its weights looked at for a tail, and the
 #: mean log of the largest of them over the next from which on they have one (Hill's estimate)
 FEW, TAIL = 0.05, 0.7
@@ -87,6 +90,10 @@ class Families(NamedTuple):
         What the filter has lost sight of.
     scouts : Scouts or None
         Where states have no particle: what the rows make of these.
+    drift : Drift or None
+        Whether rows pull the particles the same way; None where particles are not drawn from the model.
+    doubted : int or ndarray of int, shape (*apart)
+        The last slice in which families differed by more than weights explain, if many did.
     """
 
     bounds: np.ndarray
@@ -97,6 +104,8 @@ class Families(NamedTuple):
     settled: Any
     lost: Lost | None = None
     scouts: Scouts | None = None
+    drift: Drift | None = None
+    doubted: Any = -LONGEST
 
 
 def begun(cloud: Cloud, sight: Sight) -> Families:
@@ -135,9 +144,30 @@ def followed(
     found = _followed(families._replace(settled=_NOTHING), earlier, cloud, steady)
     gained = found.settled
     if gained is _NOTHING and lost is None:
-        return found._replace(settled=settled, scouts=families.scouts)
+        return found._replace(
+            settled=settled, scouts=families.scouts, drift=families.drift, doubted=found.doubted
+        )
     lost = sight.after(lost, np.isinf(gained), cloud)
-    return found._replace(settled=settled + gained, lost=lost, scouts=families.scouts)
+    return found._replace(
+        settled=settled + gained, lost=lost, scouts=families.scouts, drift=families.drift
+    )
+
+
+def drifted(
+    families: Families, compass: Compass, earlier: Cloud | None, cloud: Cloud, sight: Sight
+) -> Families:
+    """The families, where particles are missing if rows go on pulling the same way."""
+    drift = compass.after(families.drift, earlier, cloud)
+    families = families._replace(drift=drift)
+    if drift is None or not np.any(drift.worst > SEEMS):
+        return families
+    worst = np.reshape(drift.worst, sight.layout.lead)
+    doubted = families.doubted > cloud.t - LONGEST
+    missing = (worst > compass.limit) | ((worst > SEEMS) & doubted)
+    if not missing.any():
+        return families
+    lost = sight.after(families.lost, missing, cloud, here=True)
+    return families._replace(settled=np.where(missing, np.inf, families.settled), lost=lost)
 
 
 def scouted(families: Families, scouts: Scouts | None, cloud: Cloud, sight: Sight) -> Families:
@@ -156,9 +186,10 @@ def scouted(families: Families, scouts: Scouts | None, cloud: Cloud, sight: Sigh
 
 def evidence_error(families: Families, cloud: Cloud) -> Any:
     """Root mean square error of the log evidence, with its bias of minus half its variance."""
-    variance = _variance(families, _weights(families, cloud))
+    off = _off(families, _weights(families, cloud))
+    variance = _variance(families, off)
     explained = families.explained + _explained(cloud)
-    at_edge = _at_edge(variance, explained, len(cloud.weights))
+    at_edge = _at_edge(variance, explained, _even_handed(off), _some(families), len(cloud.weights))
     total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
     if families.scouts is not None:
         total = total + families.scouts.share**2
@@ -239,11 +270,11 @@ def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Familie
     if cloud.ess < min(RESTS, 0.9 * n):
         settled = np.asarray(np.inf)
     if cloud.ancestors is None:
-        return Families(bounds, shares, kept, explained, born, settled)
+        return Families(*families[:5], settled, doubted=families.doubted)
     bounds = cloud.ancestors.searchsorted(bounds)
     if cloud.resampled:
         explained = explained + _explained(earlier)
-    found = Families(bounds, shares, kept, explained, born, settled)
+    found = Families(bounds, shares, kept, explained, born, settled, doubted=families.doubted)
     if cloud.t % STRIDE or not cloud.resampled:
         return found
     counts = (bounds[:, 1:] - bounds[:, :-1]) * (1.0 / n)
@@ -251,8 +282,13 @@ def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Familie
     even = [float(s.dot(s)) for s in shares]
     variance = [_drifted(float(o.dot(o)), e) for o, e in zip(off, even, strict=True)]
     old, young = explained.tolist()
-    if _odd(variance[OLD], old[0], old[1], n) or _odd(variance[YOUNG], young[0], young[1], n):
+    some = _some(families)
+    if _odd(variance[OLD], old[0], old[1], off[OLD], some, n) or _odd(
+        variance[YOUNG], young[0], young[1], off[YOUNG], some, n
+    ):
         found = found._replace(settled=np.asarray(np.inf))
+    elif _odd(variance[OLD], old[0], old[1], off[OLD], math.inf, n):
+        found = found._replace(doubted=cloud.t)
     age = cloud.t - int(born[YOUNG])
     few = even[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
     if age <= LONGEST and not (age > SHORTEST and few):
@@ -296,8 +332,12 @@ def _looked_at(families: Families, cloud: Cloud) -> Families:
     counts = (families.bounds[:, 1:] - families.bounds[:, :-1]) / n
     if not families.kept.any() and not _matters(families, cloud, counts):
         return families
-    variance = _variance(families, counts * np.exp(families.kept))
-    edge = resampled & _at_edge(variance, families.explained, n)
+    off = _off(families, counts * np.exp(families.kept))
+    variance = _variance(families, off)
+    by, some = _even_handed(off), _some(families)
+    edge = resampled & _at_edge(variance, families.explained, by, some, n)
+    doubted = resampled & _at_edge(variance, families.explained, by, math.inf, n)
+    families = families._replace(doubted=np.where(doubted, cloud.t, families.doubted))
     age = cloud.t - families.born[YOUNG]
     left = (families.shares[OLD] ** 2).sum(axis=0) / (counts[OLD] ** 2).sum(axis=0)
     due = resampled & ((age > LONGEST) | ((age > SHORTEST) & (left < LEFT)))
@@ -320,7 +360,7 @@ def _matters(families: Families, cloud: Cloud, counts: np.ndarray) -> bool:
 def _renewed(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
     """Where all particles were drawn anew: all that has happened is settled."""
     anew = np.broadcast_to(cloud.rejuvenated, cloud.weights.shape[1:])
-    gained = _variance(families, _weights(families, earlier))[OLD]
+    gained = _variance(families, _off(families, _weights(families, earlier)))[OLD]
     settled = families.settled + np.where(anew, gained, 0.0)
     return _begun_again(families, cloud, anew, settled, True)
 
@@ -337,12 +377,12 @@ def _begun_again(
         for value, new in zip(families[:5], fresh, strict=True):
             found.append(np.empty_like(value))
             found[-1][OLD], found[-1][YOUNG] = new if both else value[YOUNG], new
-        return Families(*found, settled)
+        return Families(*found, settled, doubted=families.doubted)
     for value, new in zip(families[:5], fresh, strict=True):
         young = np.broadcast_to(new, value[YOUNG].shape)
         old = young if both else value[YOUNG]
         found.append(np.where(where, np.stack([old, young]), value))
-    return Families(*found, settled)
+    return Families(*found, settled, doubted=families.doubted)
 
 
 def _weights(families: Families, cloud: Cloud) -> np.ndarray:
@@ -351,16 +391,28 @@ def _weights(families: Families, cloud: Cloud) -> np.ndarray:
     return sums * np.exp(families.kept)
 
 
-def _variance(families: Families, weights: np.ndarray) -> np.ndarray:
+def _off(families: Families, weights: np.ndarray) -> np.ndarray:
+    """By how much the families' shares of the weight have changed."""
+    found: np.ndarray = weights / weights.sum(axis=1)[:, None] - families.shares
+    return found
+
+
+def _variance(families: Families, off: np.ndarray) -> np.ndarray:
     """Variance of the log evidence by what has happened since each origin, shape (2, *apart).
 
     Shares drift apart like those of families in a population: it is minus the log of what is left of their
     evenness, and infinite where a single family is left.
     """
-    spread = ((weights / weights.sum(axis=1)[:, None] - families.shares) ** 2).sum(axis=1)
     even = 1.0 - (families.shares**2).sum(axis=1)
-    left = 1.0 - spread / np.where(even > 0, even, np.nan)
+    left = 1.0 - (off**2).sum(axis=1) / np.where(even > 0, even, np.nan)
     return np.where(left > 1e-9, -np.log(np.maximum(left, 1e-9)), np.inf)
+
+
+def _even_handed(off: np.ndarray) -> np.ndarray:
+    """How many families make up the differences between them, shape (2, *apart)."""
+    squares = off**2
+    found: np.ndarray = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
+    return found
 
 
 def _explained(cloud: Cloud) -> Any:
@@ -384,17 +436,40 @@ def _explained(cloud: Cloud) -> Any:
     return np.stack([variance, bounded.reshape(variance.shape)])
 
 
-def _at_edge(variance: np.ndarray, explained: np.ndarray, n: int) -> np.ndarray:
+def _some(families: Families) -> Any:
+    """How many families must make up the differences: all of them where rows pull the same way."""
+    drift = families.drift
+    if drift is None:
+        return math.inf
+    if isinstance(drift.worst, float):
+        return SOME if drift.worst < SEEMS else math.inf
+    return np.where(drift.worst < SEEMS, SOME, np.inf).reshape(families.shares.shape[2:])
+
+
+def _at_edge(
+    variance: np.ndarray, explained: np.ndarray, by: np.ndarray, some: Any, n: int
+) -> np.ndarray:
     """Whether families differ by far more than the slices' weights explain."""
-    odd: np.ndarray = np.any(_odd(variance, explained[:, 0], explained[:, 1], n), axis=0)
+    odd: np.ndarray = np.any(
+        _beyond(variance, explained[:, 0], explained[:, 1], by, some, n), axis=0
+    )
     return odd
 
 
-def _odd(variance: Any, every: Any, bounded: Any, n: int) -> Any:
-    """The same, of numbers or arrays."""
+def _beyond(variance: Any, every: Any, bounded: Any, by: Any, some: Any, n: int) -> Any:
+    """The same, of numbers or arrays, given how many families make up the differences."""
     odd = (variance > _level(n)) & (variance > EDGE * every)
     odd |= (variance > LONG) & (variance > EDGE * bounded)
-    return odd | (variance > MOST)
+    return (odd & (by < some)) | (variance > MOST)
+
+
+def _odd(
+    variance: float, every: float, bounded: float, off: np.ndarray, some: float, n: int
+) -> bool:
+    """The same of one origin of one filter."""
+    if variance <= MOST and not _beyond(variance, every, bounded, 0.0, some, n):
+        return False
+    return bool(_beyond(variance, every, bounded, _even_handed(off[None])[0], some, n))
 
 
 def _drifted(spread: float, even: float) -> float:
