@@ -6,7 +6,7 @@ variance (``families`` says why), with a correction for what the mean owes to th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,8 +95,12 @@ class MeanErrors:
             if values[name].ndim:
                 np.multiply(weights, values[name], out=room[:n])
                 parts[name] = [add(room, own) for own in starts[: len(sums)]]
-        lost = families.lost is not None
-        return _Waiting(k, cloud.total, families.bounds, sums, parts, lost)
+        lost, left, scouts = families.lost is not None, {}, families.scouts
+        if scouts is not None:
+            for name in parts.keys() & scouts.values.keys():
+                own = _left_out(scouts.share, scouts.values[name], self.answers[0][name][k])
+                left[name] = float(own)
+        return _Waiting(k, cloud.total, families.bounds, sums, parts, lost, left)
 
     def _work_out(self) -> None:
         """Errors of nodes that are one number, of all slices that wait."""
@@ -120,6 +124,8 @@ class MeanErrors:
                     variance[at] = np.where(few[at] & np.isinf(found), 0.0, found)
                 else:
                     variance[at] = np.maximum(variance[at], np.where(few[at], found, 0.0))
+            for own in (w for w in waiting if name in w.left):
+                variance[own.k - first] += own.left[name]
             variance[[w.k - first for w in waiting if w.lost and name in w.parts]] = np.inf
             np.sqrt(variance, out=variance)
 
@@ -136,6 +142,7 @@ class _Waiting(NamedTuple):
     sums: list[np.ndarray]
     parts: dict[str, list[np.ndarray]]
     lost: bool
+    left: dict[str, float]
 
 
 def node_errors(
@@ -184,6 +191,8 @@ def node_errors(
         found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
         if families.scouts is not None:
             found = found + (step * families.scouts.share) ** 2
+    elif families.scouts is not None and node.angles is None and node.name in families.scouts.values:
+        found = found + _left_out(families.scouts.share, families.scouts.values[node.name], mean[0])
     if families.lost is not None:
         order = [p for p in node.plates if p in layout.apart]
         if len(order) == len(layout.apart):
@@ -194,9 +203,17 @@ def node_errors(
 
 
 def value_errors(
-    layout: Layout, cloud: Cloud, families: Families, values: np.ndarray, mean: np.ndarray
+    layout: Layout,
+    cloud: Cloud,
+    families: Families,
+    values: np.ndarray,
+    mean: np.ndarray,
+    there: Callable[[dict[str, np.ndarray]], np.ndarray | None] | None = None,
 ) -> np.ndarray:
-    """Errors of the mean of what a function says of each particle: shape what one value has."""
+    """Errors of the mean of what a function says of each particle: shape what one value has.
+
+    ``there`` is the function at values of scouts, if it can be asked.
+    """
     off = values - mean
     n, many = len(off), int(np.prod(layout.lead))
     rest = off.shape[1 + len(layout.lead) :]
@@ -206,8 +223,8 @@ def value_errors(
     if is_share(values):  # an event that no particle has seen may happen
         ess = np.asarray(cloud.ess, dtype=float)
         share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
-        if families.scouts is not None:
-            share = share + families.scouts.share**2
+    if families.scouts is not None and there is not None:
+        share = share + _left_out(families.scouts.share, there(families.scouts.values), mean)
     if families.lost is not None:
         where = families.lost.where
         share = np.where(where.reshape(where.shape + (1,) * len(rest)), np.inf, share)
@@ -303,6 +320,13 @@ def _along(figures: Any, layout: Layout, node: CompiledNode) -> np.ndarray:
         n if p in layout.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
     ]
     return moved.reshape(shape if layout.apart else ())
+
+
+def _left_out(share: float, values: np.ndarray | None, mean: Any) -> Any:
+    """Square of what a mean owes to states that particles leave out."""
+    if values is None:
+        return 0.0 if share == 0.0 else np.full(np.shape(mean), np.inf)
+    return (share * (values.mean(axis=0) - mean)) ** 2
 
 
 def _unseen(share: np.ndarray, ess: Any) -> np.ndarray:

@@ -128,7 +128,9 @@ class ParticleBelief(OnlineBelief):
         assert self.families is not None
         if callable(what):
             values = evaluated(layout, cloud, self._mover.slices.first, what)
-            return value_errors(layout, cloud, self.families, values, weighted_mean(cloud, values))
+            mean = weighted_mean(cloud, values)
+            there = elsewhere(layout, cloud, self._mover.slices.first, what)
+            return value_errors(layout, cloud, self.families, values, mean, there)
         node, value = self._found(what)
         if value.ndim == len(node.value_shape):  # the same for all particles
             labelled = node.domain is not None and node.domain.labels is not None
@@ -258,6 +260,21 @@ def evaluated(
             "axes follow that of the particles"
         )
     return values
+
+
+def elsewhere(
+    layout: Layout, cloud: Cloud, model: Model, function: Callable[..., Any]
+) -> Callable[[Mapping[str, np.ndarray]], np.ndarray | None]:
+    """The function at values of a few who are not among the particles; None where it reads more of them."""
+
+    def there(values: Mapping[str, np.ndarray]) -> np.ndarray | None:
+        count = len(next(iter(values.values())))
+        if not set(nodes_read(function)) <= values.keys():
+            return None
+        few = cloud._replace(values=dict(values), weights=np.ones(count))
+        return evaluated(layout, few, model, function)
+
+    return there
 
 
 def weighted_mean(cloud: Cloud, values: np.ndarray) -> np.ndarray:

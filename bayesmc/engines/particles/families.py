@@ -286,8 +286,8 @@ def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Familie
     if _odd(variance[OLD], old[0], old[1], off[OLD], some, n) or _odd(
         variance[YOUNG], young[0], young[1], off[YOUNG], some, n
     ):
-        found = found._replace(settled=np.asarray(np.inf))
-    elif _odd(variance[OLD], old[0], old[1], off[OLD], math.inf, n):
+        return _begun_again(found, cloud, np.asarray(True), np.asarray(np.inf), True)
+    if _odd(variance[OLD], old[0], old[1], off[OLD], math.inf, n):
         found = found._replace(doubted=cloud.t)
     age = cloud.t - int(born[YOUNG])
     few = even[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
@@ -342,8 +342,10 @@ def _looked_at(families: Families, cloud: Cloud) -> Families:
     left = (families.shares[OLD] ** 2).sum(axis=0) / (counts[OLD] ** 2).sum(axis=0)
     due = resampled & ((age > LONGEST) | ((age > SHORTEST) & (left < LEFT)))
     settled = np.where(edge, np.inf, families.settled)
+    if edge.any():  # what has happened is told once
+        families, due = _begun_again(families, cloud, edge, settled, True), due & ~edge
     if not due.any():
-        return families._replace(settled=settled) if edge.any() else families
+        return families
     lost = np.isinf(variance).any(axis=0)
     gained = np.where(lost, np.inf, variance[OLD] - np.where(lost, 0.0, variance[YOUNG]))
     return _begun_again(families, cloud, due, settled + np.where(due, gained, 0.0), False)

@@ -77,8 +77,9 @@ class Sight:
         wide = tuple(self._spread(node, cloud) for node in self.nodes)
         if lost is None:
             return Lost(fresh, wide, tuple(np.zeros_like(w) for w in wide), cloud.t)
-        rows = fresh.reshape(-1, 1)
-        wide = tuple(np.where(rows, w, old) for w, old in zip(wide, lost.wide, strict=True))
+        rows, still = fresh.reshape(-1, 1), lost.where.reshape(-1, 1)
+        both = [(w, np.maximum(w, old), old) for w, old in zip(wide, lost.wide, strict=True)]
+        wide = tuple(np.where(rows, np.where(still, more, w), old) for w, more, old in both)
         gone = tuple(np.where(rows, 0.0, g) for g in lost.gone)
         return lost._replace(where=lost.where | fresh, wide=wide, gone=gone)
 

@@ -39,7 +39,7 @@ class Scouts(NamedTuple):
     Attributes
     ----------
     values : dict
-        Nodes that the next slice reads, and those looked at, shape ``(scouts, *plates, *event)``.
+        All nodes of the slice, shape ``(scouts, *plates, *event)``.
     log_weights : ndarray, shape (scouts,)
         Relative to those of all particles together.
     share : float
@@ -85,10 +85,6 @@ class Scouting:
         return _together([_away(p, unmet) for p in parties], there, rng)
 
     # ---- private -------------------------------------------------------------------------------
-
-    @property
-    def _kept(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys((*self.slices.interface, *(n.name for n in self.nodes))))
 
     def _unmet(
         self, earlier: Cloud | None, cloud: Cloud, row: Row
@@ -155,7 +151,7 @@ class Scouting:
     def _weighed(self, state: Pass, carried: float | np.ndarray) -> Scouts:
         log = np.broadcast_to(np.asarray(state.log_weight) + carried, state.batch)
         values = {}
-        for name in self._kept:
+        for name in self.slices.dynamic:
             shape = (*state.batch, *self.slices.later[name].value_shape)
             values[name] = np.broadcast_to(state.values[name], shape)
         return Scouts(values, log, 0.0)
