@@ -198,7 +198,9 @@ def three_thousand(kind: str, engine: bmc.ParticleFilter) -> np.ndarray:
             warnings.simplefilter("ignore", LowEssWarning)
             found = bmc.filter(dbn, {"y": y}, engine=engine, rng=[session.seed(), k])
         error = found.log_marginal_likelihood_mcse
-        off.append((found.log_marginal_likelihood - exact) / error if np.isfinite(error) else np.nan)
+        off.append(
+            (found.log_marginal_likelihood - exact) / error if np.isfinite(error) else np.nan
+        )
     print(
         f"{kind}, {engine.particles} particles: {np.isnan(off).sum()} infinite, "
         f"{(np.abs(off) > 3).sum()} beyond three, root mean square {np.sqrt(np.nanmean(np.square(off))):.2f}"

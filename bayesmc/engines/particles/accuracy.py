@@ -191,7 +191,9 @@ def node_errors(
         found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
         if families.scouts is not None:
             found = found + (step * families.scouts.share) ** 2
-    elif families.scouts is not None and node.angles is None and node.name in families.scouts.values:
+    elif (
+        families.scouts is not None and node.angles is None and node.name in families.scouts.values
+    ):
         found = found + _left_out(families.scouts.share, families.scouts.values[node.name], mean[0])
     if families.lost is not None:
         order = [p for p in node.plates if p in layout.apart]

@@ -52,34 +52,58 @@ class Compass:
             if n.domain is None and n.angles is None and set(layout.apart) <= set(n.plates)
         )
         count = max(sum(math.prod(n.value_shape) for n, _ in self.nodes), 1)
+        one = len(self.nodes) == 1 and not self.nodes[0][1] and not layout.apart
+        self.alone = self.nodes[0][0].name if one else None
         self.limit = math.sqrt(IS**2 + 2.0 * math.log(count))
 
     def after(self, drift: Drift | None, earlier: Cloud | None, cloud: Cloud) -> Drift | None:
         """The same after a slice, whose particles have been drawn from the model itself."""
         if cloud.rejuvenated is not False:
             return None
-        before = None if earlier is None or _all(cloud.resampled) else earlier
+        if self.alone is not None:
+            return self._after_one(drift, earlier, cloud)
+        before = None if earlier is None or np.all(cloud.resampled) else earlier
         if before is not None and len(before.weights) != len(cloud.weights):
             before = None
-        values = [cloud.values[n.name] for n, rank in self.nodes]
-        if len(values) == 1 and values[0].ndim == 1:
-            step: Any = _of_one(values[0], before, cloud)
-        else:
-            step = self._of_many(values, before, cloud)
+        step = self._of_many([cloud.values[n.name] for n, _ in self.nodes], before, cloud)
         if step is None:
             return drift
-        move, variance = step
-        if drift is None:
-            drift = Drift(0.0, 0.0, 0.0)
-        moved = FADING * drift.moved + move
-        spent = FADING**2 * drift.variance + variance
-        if isinstance(moved, float):
-            now: Any = abs(moved) / math.sqrt(spent + _LEAST)
-            return Drift(moved, spent, max(KEPT * drift.worst, now))
+        moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
+        moved, spent = FADING * moved + step[0], FADING**2 * spent + step[1]
         now = (np.abs(moved) / np.sqrt(spent + _LEAST)).max(axis=0)
-        return Drift(moved, spent, np.maximum(KEPT * drift.worst, now))
+        return Drift(moved, spent, np.maximum(KEPT * worst, now))
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _after_one(self, drift: Drift | None, earlier: Cloud | None, cloud: Cloud) -> Drift | None:
+        """The same of one number per particle, in few calls of NumPy."""
+        assert self.alone is not None
+        values = cloud.values[self.alone]
+        if values.ndim == 0:
+            return drift
+        same = earlier is not None and len(earlier.weights) == len(values)
+        prior = earlier if same and not cloud.resampled else None
+        weights, total = cloud.weights, cloud.total
+        if prior is None:
+            n = len(values)
+            mean = float(values.sum()) / n
+        else:
+            mean = float(prior.weights.dot(values)) / prior.total
+        off = values - mean
+        move = float(weights.dot(off)) / total
+        if prior is None:
+            wide = float(off.dot(off)) / n
+            off *= off
+        else:
+            off *= off
+            wide = float(prior.weights.dot(off)) / prior.total
+        if not wide > 0.0:
+            return drift
+        left = float(weights.dot(off)) / total - move * move
+        moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
+        moved = FADING * moved + move / math.sqrt(wide)
+        spent = FADING * FADING * spent + max(1.0 - left / wide, 0.0)
+        return Drift(moved, spent, max(KEPT * worst, abs(moved) / math.sqrt(spent + _LEAST)))
 
     def _of_many(
         self, values: list[np.ndarray], before: Cloud | None, cloud: Cloud
@@ -112,31 +136,6 @@ class Compass:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _all(resampled: Any) -> bool:
-    return bool(resampled) if np.ndim(resampled) == 0 else bool(resampled.all())
-
-
-def _of_one(
-    values: np.ndarray, before: Cloud | None, cloud: Cloud
-) -> tuple[float, float] | None:
-    """Of one number per particle, in few calls of NumPy."""
-    n = len(values)
-    if before is None:
-        mean = float(values.sum()) / n
-    else:
-        mean = float(before.weights.dot(values)) / before.total
-    off = values - mean
-    move = float(cloud.weights.dot(off)) / cloud.total
-    left = float(cloud.weights.dot(off * off)) / cloud.total - move**2
-    if before is None:
-        wide = float(off.dot(off)) / n
-    else:
-        wide = float(before.weights.dot(off * off)) / before.total
-    if not wide > 0.0:
-        return None
-    return move / math.sqrt(wide), max(1.0 - left / wide, 0.0)
 
 
 def _scaled(move: np.ndarray, wide: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

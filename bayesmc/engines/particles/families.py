@@ -26,6 +26,7 @@ found families.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -140,17 +141,18 @@ def followed(
         Whether resampling leaves neighbours together the particles that their weight demands, but for one.
     sight : Sight
     """
-    settled, lost = families.settled, families.lost
-    found = _followed(families._replace(settled=_NOTHING), earlier, cloud, steady)
-    gained = found.settled
-    if gained is _NOTHING and lost is None:
-        return found._replace(
-            settled=settled, scouts=families.scouts, drift=families.drift, doubted=found.doubted
-        )
-    lost = sight.after(lost, np.isinf(gained), cloud)
-    return found._replace(
-        settled=settled + gained, lost=lost, scouts=families.scouts, drift=families.drift
-    )
+    gained: Any
+    if cloud.weights.ndim == 1 and steady and cloud.rejuvenated is False:
+        found, gained = _followed_alone(families, earlier, cloud)
+        if gained == 0.0 and families.lost is None:
+            return found
+        now = gained == math.inf
+    else:
+        found = _followed(families._replace(settled=np.zeros(())), earlier, cloud, steady)
+        gained = found.settled
+        now = np.isinf(gained)
+    lost = sight.after(families.lost, now, cloud)
+    return found._replace(settled=families.settled + gained, lost=lost)
 
 
 def drifted(
@@ -159,7 +161,9 @@ def drifted(
     """The families, where particles are missing if rows go on pulling the same way."""
     drift = compass.after(families.drift, earlier, cloud)
     families = families._replace(drift=drift)
-    if drift is None or not np.any(drift.worst > SEEMS):
+    if drift is None:
+        return families
+    if not (drift.worst if isinstance(drift.worst, float) else drift.worst.max()) > SEEMS:
         return families
     worst = np.reshape(drift.worst, sight.layout.lead)
     doubted = families.doubted > cloud.t - LONGEST
@@ -223,14 +227,8 @@ def row_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
-#: the variance of slices in which nothing has happened
-_NOTHING = np.zeros(())
-
-
 def _followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
-    """The same, where nothing was settled so far."""
-    if cloud.weights.ndim == 1 and steady and cloud.rejuvenated is False:
-        return _followed_alone(families, earlier, cloud)
+    """The families one slice later, where nothing was settled so far."""
     poor = cloud.ess < min(RESTS, 0.9 * len(cloud.weights))
     if np.any(poor):
         families = families._replace(settled=np.where(poor, np.inf, families.settled))
@@ -252,6 +250,10 @@ def _sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     return found
 
 
+#: the only element of a filter by itself
+_HERE = np.asarray(True)
+
+
 @lru_cache(maxsize=64)
 def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
     """Groups of about as many particles: where they begin and end, and their shares."""
@@ -263,20 +265,22 @@ def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
     return found
 
 
-def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
-    """The same of one filter whose families have the particles that they should, in few calls of NumPy."""
-    bounds, shares, kept, explained, born, settled = families[:6]
+def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> tuple[Families, float]:
+    """The same of one filter whose families have the particles that they should, in few calls of NumPy.
+
+    And the variance that is settled in this slice.
+    """
     n = len(cloud.weights)
-    if cloud.ess < min(RESTS, 0.9 * n):
-        settled = np.asarray(np.inf)
+    gained = math.inf if cloud.ess < min(RESTS, 0.9 * n) else 0.0
     if cloud.ancestors is None:
-        return Families(*families[:5], settled, doubted=families.doubted)
+        return families, gained
+    bounds, shares, explained = families.bounds, families.shares, families.explained
     bounds = cloud.ancestors.searchsorted(bounds)
     if cloud.resampled:
         explained = explained + _explained(earlier)
-    found = Families(bounds, shares, kept, explained, born, settled, doubted=families.doubted)
+    found = families._replace(bounds=bounds, explained=explained)
     if cloud.t % STRIDE or not cloud.resampled:
-        return found
+        return found, gained
     counts = (bounds[:, 1:] - bounds[:, :-1]) * (1.0 / n)
     off = counts - shares
     even = [float(s.dot(s)) for s in shares]
@@ -286,16 +290,16 @@ def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Familie
     if _odd(variance[OLD], old[0], old[1], off[OLD], some, n) or _odd(
         variance[YOUNG], young[0], young[1], off[YOUNG], some, n
     ):
-        return _begun_again(found, cloud, np.asarray(True), np.asarray(np.inf), True)
+        return _begun_again(found, cloud, _HERE, found.settled, True), math.inf
     if _odd(variance[OLD], old[0], old[1], off[OLD], math.inf, n):
         found = found._replace(doubted=cloud.t)
-    age = cloud.t - int(born[YOUNG])
+    age = cloud.t - int(families.born[YOUNG])
     few = even[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
     if age <= LONGEST and not (age > SHORTEST and few):
-        return found
+        return found, gained
     lost = math.inf in variance
-    gained = math.inf if lost else variance[OLD] - variance[YOUNG]
-    return _begun_again(found, cloud, np.asarray(True), found.settled + gained, False)
+    gained += math.inf if lost else variance[OLD] - variance[YOUNG]
+    return _begun_again(found, cloud, _HERE, found.settled, False), gained
 
 
 def _moved(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
@@ -379,12 +383,19 @@ def _begun_again(
         for value, new in zip(families[:5], fresh, strict=True):
             found.append(np.empty_like(value))
             found[-1][OLD], found[-1][YOUNG] = new if both else value[YOUNG], new
-        return Families(*found, settled, doubted=families.doubted)
+        return _renamed(families, found, settled)
     for value, new in zip(families[:5], fresh, strict=True):
         young = np.broadcast_to(new, value[YOUNG].shape)
         old = young if both else value[YOUNG]
         found.append(np.where(where, np.stack([old, young]), value))
-    return Families(*found, settled, doubted=families.doubted)
+    return _renamed(families, found, settled)
+
+
+def _renamed(families: Families, found: Sequence[np.ndarray], settled: Any) -> Families:
+    bounds, shares, kept, explained, born = found
+    return families._replace(
+        bounds=bounds, shares=shares, kept=kept, explained=explained, born=born, settled=settled
+    )
 
 
 def _weights(families: Families, cloud: Cloud) -> np.ndarray:

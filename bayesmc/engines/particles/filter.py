@@ -27,6 +27,7 @@ from bayesmc.engines.particles.growth import (
     TOLERANCE,
     collapsed,
     enough,
+    price,
     uncertain,
 )
 from bayesmc.engines.particles.mover import Mover
@@ -117,7 +118,9 @@ class ParticleFilter(FilterEngine):
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
     budget : int
-        Particles times slices (times elements of plates that are filtered separately) that this may take.
+        Particles times slices (times elements of plates that are filtered separately) that this may take:
+        seconds. With ``proposal="optimal"`` or ``auxiliary=True`` each counts as 20, which is about what a
+        look at the row costs.
 
     Raises
     ------
@@ -141,7 +144,10 @@ class ParticleFilter(FilterEngine):
     Whiteley 2018 do with single particles; groups make it right for systematic resampling, too). That of the
     evidence is the root of the mean square error, sqrt(v + v^2/4) for a log of variance v, which is v/2 too
     low on average. Particles know nothing of where none of them has been: the error is infinite where a slice
-    rests on fewer than four, or their descendants show that later rows ask for the edge of the cloud.
+    rests on fewer than four, where their descendants show that later rows ask for the edge of the cloud,
+    where rows go on pulling means the same way, and where a few scouts in states of finite nodes that next to
+    no particle has find more than a tenth of the belief there. Means have infinite errors from such a slice
+    on, until what is random in the transition could have carried particles over all that they stood on.
 
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
     sequences in a plate are 64 filters in one array.
@@ -532,6 +538,7 @@ class ParticleFilter(FilterEngine):
 
         sizes = problem.slices.first.sizes
         slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
+        slices *= price(self)
         return enough(tried, self.tolerance, slices, self.budget, keep)
 
     def _warn(self, filtered: FilteredParticles) -> None:

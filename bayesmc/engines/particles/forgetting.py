@@ -62,16 +62,14 @@ class Sight:
         self.nodes: tuple[CompiledNode, ...] = tuple(nodes)
         self.layout = layout
 
-    def after(
-        self, lost: Lost | None, now: Any, cloud: Cloud, here: bool = False
-    ) -> Lost | None:
+    def after(self, lost: Lost | None, now: Any, cloud: Cloud, here: bool = False) -> Lost | None:
         """What is lost after a slice in which some elements ``now`` were, shape (*apart).
 
         ``here`` says that what was lost before is that of this slice already.
         """
         if lost is not None and not here:
             lost = self._followed(lost, cloud)
-        if not np.any(now):
+        if now is False or not np.any(now):
             return lost
         fresh = np.broadcast_to(np.asarray(now, dtype=bool), self.layout.lead)
         wide = tuple(self._spread(node, cloud) for node in self.nodes)
@@ -85,12 +83,15 @@ class Sight:
 
     def _followed(self, lost: Lost, cloud: Cloud) -> Lost | None:
         """The same one slice later; None where all is found."""
-        if np.any(cloud.rejuvenated):
+        if cloud.rejuvenated is not False:
             lost = lost._replace(where=lost.where & ~np.asarray(cloud.rejuvenated))
         roots = lost.roots
         if cloud.ancestors is not None:
             chosen = cloud.ancestors
-            roots = chosen if roots is None else np.take_along_axis(roots, chosen, axis=0)
+            if roots is None or chosen.ndim == 1:
+                roots = chosen if roots is None else roots.take(chosen)
+            else:
+                roots = np.take_along_axis(roots, chosen, axis=0)
         if cloud.t < lost.since + STRETCH or roots is None:
             return lost._replace(roots=roots)
         moved = (self._spread(node, cloud, roots) for node in self.nodes)

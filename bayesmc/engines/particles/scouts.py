@@ -20,7 +20,7 @@ from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.cloud import Cloud
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.forward import Pass, Step
+from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
 
 #: scouts that are sent to the unmet states of a node, and those that go on
@@ -91,7 +91,11 @@ class Scouting:
     ) -> list[tuple[CompiledNode, np.ndarray]]:
         """Nodes of which a state has next to no particle, and such states."""
         found, kept = [], None
-        if earlier is not None and cloud.resampled is False and len(earlier.weights) == len(cloud.weights):
+        if (
+            earlier is not None
+            and cloud.resampled is False
+            and len(earlier.weights) == len(cloud.weights)
+        ):
             kept = earlier.weights * (len(earlier.weights) / earlier.total)
         for node in self.nodes:
             value = cloud.values.get(node.name)
@@ -211,9 +215,7 @@ def _away(scouts: Scouts, unmet: Sequence[tuple[CompiledNode, np.ndarray]]) -> S
     return scouts._replace(log_weights=np.where(away, scouts.log_weights, -np.inf))
 
 
-def _together(
-    parties: Sequence[Scouts], there: float, rng: np.random.Generator
-) -> Scouts | None:
+def _together(parties: Sequence[Scouts], there: float, rng: np.random.Generator) -> Scouts | None:
     """All that have any weight as one party of bounded size, whose weights sum to the same."""
     log = np.concatenate([p.log_weights for p in parties])
     log = np.where(np.isnan(log), -np.inf, log)
