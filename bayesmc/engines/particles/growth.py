@@ -164,9 +164,13 @@ def _more(filtered: FilteredParticles, engine: ParticleFilter) -> str:
             f"more particles than the {MOST:_} that are tried at most, such as "
             f"ParticleFilter({4 * MOST:_})"
         )
+    assert filtered.log_marginal_increments is not None
     slices = math.prod(filtered.log_marginal_increments.shape) * price(engine)
     if count < affordable(slices, engine.budget, keep):
-        return f"a number of your own, such as ParticleFilter({4 * count:_}) (short runs found {count:_} enough)"
+        return (
+            f"a number of your own, such as ParticleFilter({4 * count:_}) (short runs found {count:_} "
+            "enough)"
+        )
     if keep and engine.budget > KEPT:
         return "more particles, whose number keep= holds down to save memory"
     return f"a larger budget= than {engine.budget:_}"

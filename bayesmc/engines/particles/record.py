@@ -10,7 +10,7 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.particles.accuracy import MeanErrors, value_errors
-from bayesmc.engines.particles.belief import (
+from bayesmc.engines.particles.answers import (
     covariance,
     elsewhere,
     evaluated,

@@ -172,8 +172,8 @@ class _Put:
         name, kind = self.node.name, self.node.domain.dtype
         dist, _ = self.model.evaluate(name, state.values)
         each = [np.full(state.batch, code, dtype=kind) for code in self.codes]
-        logs = [self.model.log_density(name, dist, codes) for codes in each]
-        logs = np.stack([np.broadcast_to(log, state.batch) for log in logs])
+        densities = [self.model.log_density(name, dist, codes) for codes in each]
+        logs = np.stack([np.broadcast_to(log, state.batch) for log in densities])
         level = np.maximum(logs.max(axis=0), -1e300)
         sums = np.exp(logs - level).cumsum(axis=0)
         picked = (state.rng.random(state.batch) * sums[-1] >= sums).sum(axis=0)
