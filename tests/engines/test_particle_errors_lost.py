@@ -185,6 +185,17 @@ def test_speeds_that_rows_reveal_are_no_accident() -> None:
     assert (np.abs(off) < 3).all()
 
 
+def test_nodes_that_all_particles_share_now_and_then_do_not_matter() -> None:
+    """One of them is seen in the first slice."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("a", lambda a_prev: bmc.Normal(0.9 * a_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("x", lambda x_prev, a: bmc.Normal(0.5 * x_prev + a, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    rows = {"y": [0.1, 0.4, 0.2], "a": [0.3, np.nan, np.nan]}
+    found = bmc.filter(dbn, rows, engine=bmc.ParticleFilter(300), rng=0)
+    assert np.isfinite(found.log_marginal_likelihood_mcse)
+
+
 # ---- rows that pull the same way ----------------------------------------------------------------
 
 

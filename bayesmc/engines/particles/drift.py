@@ -66,8 +66,6 @@ class Compass:
         if before is not None and len(before.weights) != len(cloud.weights):
             before = None
         step = self._of_many([cloud.values[n.name] for n, _ in self.nodes], before, cloud)
-        if step is None:
-            return drift
         moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
         moved, spent = FADING * moved + step[0], FADING**2 * spent + step[1]
         now = (np.abs(moved) / np.sqrt(spent + _LEAST)).max(axis=0)
@@ -107,17 +105,15 @@ class Compass:
 
     def _of_many(
         self, values: list[np.ndarray], before: Cloud | None, cloud: Cloud
-    ) -> tuple[np.ndarray, np.ndarray] | None:
+    ) -> tuple[np.ndarray, np.ndarray]:
         many = math.prod(self.layout.lead)
         rows = []
         for (node, rank), value in zip(self.nodes, values, strict=True):
             if value.ndim == rank:  # the same for all particles
-                continue
+                value = np.broadcast_to(value, (len(cloud.weights), *value.shape))
             at = [1 + node.plates.index(p) for p in self.layout.apart]
             first = np.moveaxis(value, at, range(1, 1 + len(at)))
             rows.append(first.reshape(len(value), many, -1).transpose(2, 1, 0))
-        if not rows:
-            return None
         numbers = np.concatenate(rows).astype(float)
         n = numbers.shape[-1]
         posterior = (cloud.weights / cloud.total).reshape(n, many).T
