@@ -27,6 +27,7 @@ from bayesmc.engines.particles.growth import (
     TOLERANCE,
     collapsed,
     enough,
+    price,
     uncertain,
 )
 from bayesmc.engines.particles.mover import Mover
@@ -40,6 +41,7 @@ from bayesmc.engines.particles.options import (
     read_by,
     read_functions,
 )
+from bayesmc.engines.particles.questions import check_together, described, refused
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.replicates import Replicates
@@ -48,7 +50,6 @@ from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
-from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -117,7 +118,9 @@ class ParticleFilter(FilterEngine):
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
     budget : int
-        Particles times slices (times elements of plates that are filtered separately) that this may take.
+        Particles times slices (times elements of plates that are filtered separately) that this may take:
+        seconds. With ``proposal="optimal"`` or ``auxiliary=True`` each counts as 20, which is about what a
+        look at the row costs.
 
     Raises
     ------
@@ -141,7 +144,10 @@ class ParticleFilter(FilterEngine):
     Whiteley 2018 do with single particles; groups make it right for systematic resampling, too). That of the
     evidence is the root of the mean square error, sqrt(v + v^2/4) for a log of variance v, which is v/2 too
     low on average. Particles know nothing of where none of them has been: the error is infinite where a slice
-    rests on fewer than four, or their descendants show that later rows ask for the edge of the cloud.
+    rests on fewer than four, where their descendants show that later rows ask for the edge of the cloud,
+    where rows go on pulling means the same way, and where a few scouts in states of finite nodes that next to
+    no particle has find more than a tenth of the belief there. Means have infinite errors from such a slice
+    on, until what is random in the transition could have carried particles over all that they stood on.
 
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
     sequences in a plate are 64 filters in one array.
@@ -204,24 +210,7 @@ class ParticleFilter(FilterEngine):
             )
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
-        self._check_together()
-
-    def _check_together(self) -> None:
-        """Options that only make sense with others, or without them."""
-        if isinstance(self.proposal, str) and self.initial_proposal is not None:
-            raise ValueError(
-                'ParticleFilter: proposal="optimal" proposes for slice 0 too; leave initial_proposal= out'
-            )
-        if self.recovery is not None and self.rejuvenation is not None:
-            raise ValueError(
-                "ParticleFilter: recovery= and rejuvenation= both begin anew; give one of them"
-            )
-        if self.adapt is not None and self.auxiliary is not False:
-            raise ValueError("ParticleFilter: adapt= and auxiliary= do not go together")
-        if (self.on_degeneracy == "rejuvenate") != (self.rejuvenation is not None):
-            raise ValueError(
-                'ParticleFilter: on_degeneracy="rejuvenate" and rejuvenation={node: density} go together'
-            )
+        check_together(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
@@ -255,34 +244,8 @@ class ParticleFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
-        looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(self, o)]
-        parts = (
-            refuse_parts(problem.series.observed, f"ParticleFilter({looks[0]}=)") if looks else None
-        )
-        if parts is not None:
-            return parts
-        apart = plates_apart(problem.slices)
-        for option in ("adapt", "recovery"):
-            if getattr(self, option) is not None and apart:
-                return (
-                    f"ParticleFilter: {option}= is for one filter, and elements of plate {apart[0]!r} are "
-                    "filtered separately; filter them one by one"
-                )
-        if self.adapt is not None:
-            self.adapt.check(problem.slices.later, problem.slices.interface)
-        known = {*problem.slices.template.static, *problem.series.observed}
-        if not isinstance(self.proposal, str):
-            proposals = self._proposals(problem.slices)
-            seen = problem.series.observed
-            proposals.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
-        for model in (problem.slices.first, problem.slices.later):
-            inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
-            reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
-                model, whole(problem.series.observed), "ParticleFilter"
-            )
-            if reason is not None:
-                return reason
-        return None
+        asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
+        return refused(self, problem, asked)
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
@@ -291,22 +254,7 @@ class ParticleFilter(FilterEngine):
         return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
-        found = {}
-        for name in problem.slices.template.later:
-            node = problem.model[name]
-            seen = problem.series.observed.get(name)
-            if name in problem.slices.template.inputs:
-                found[name] = "input"
-            elif name in problem.slices.template.static:
-                found[name] = "static, known"
-            elif not node.is_stochastic:
-                found[name] = "computed"
-            elif seen is None:
-                found[name] = "sampled given its parents"
-            else:
-                found[name] = "observed, weights the particles"
-                if seen.mask is not None:
-                    found[name] += "; sampled where it is missing"
+        found = described(problem)
         return found | looks_told(self, problem, found)
 
     def filter(
@@ -532,6 +480,7 @@ class ParticleFilter(FilterEngine):
 
         sizes = problem.slices.first.sizes
         slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
+        slices *= price(self)
         return enough(tried, self.tolerance, slices, self.budget, keep)
 
     def _warn(self, filtered: FilteredParticles) -> None:

@@ -10,8 +10,9 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.particles.accuracy import MeanErrors, value_errors
-from bayesmc.engines.particles.belief import (
+from bayesmc.engines.particles.answers import (
     covariance,
+    elsewhere,
     evaluated,
     expectation,
     moments,
@@ -100,7 +101,8 @@ class Record:
             mean = weighted_mean(cloud, values)
             self.queries[name].append(mean)
             if families is not None:
-                errors = value_errors(layout, cloud, families.bounds, values, mean)
+                there = elsewhere(layout, cloud, self.problem.model, function)
+                errors = value_errors(layout, cloud, families, values, mean, there)
                 self.query_errors[name].append(errors)
         if families is not None:
             self.errors.add(k, cloud, families)
@@ -183,7 +185,8 @@ class FilteredParticles(SeriesPosterior):
         for cloud, families in zip(clouds, self.families, strict=True):
             values = evaluated(layout, cloud, self.model, what)
             mean = weighted_mean(cloud, values)
-            rows.append(value_errors(layout, cloud, families.bounds, values, mean))
+            there = elsewhere(layout, cloud, self.model, what)
+            rows.append(value_errors(layout, cloud, families, values, mean, there))
         return np.stack(rows)
 
     def particles(self, name: str) -> np.ndarray:
