@@ -154,9 +154,29 @@ def node_errors(
     centre : tuple
         Its mean and variance, or its table and None, with an axis of length 1 in front.
     """
+    off, count, step = deviations(node, cloud.values[node.name][None], centre)
+    mean = centre[0]
+    if not layout.apart:
+        found = _variances(cloud.weights[None], off, bounds[..., None])
+        ess: Any = np.array([cloud.ess])
+    else:
+        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
+    if count is not None:
+        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
+        worth = _beside(ess, node, layout, np.ndim(mean))
+        found = np.maximum(found, step**2 * unseen(count, worth if own else worth[..., 0]))
+    return np.sqrt(found[0])
+
+
+def deviations(
+    node: CompiledNode, value: np.ndarray, centre: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray | None, float]:
+    """By how much values lie off a mean; the shares that stand behind it, and what a state more or less is.
+
+    Slices and particles come first; ``centre`` as for ``node_errors``. Without states there are no shares.
+    """
     mean, variance = centre
     count, step = None, 1.0
-    value = cloud.values[node.name][None]
     if node.domain is None:
         off = value - mean[:, None]
         if node.angles is not None:
@@ -171,16 +191,7 @@ def node_errors(
     else:
         off = (value[..., None] == np.arange(node.domain.size)) - mean[:, None]
         count = mean
-    if not layout.apart:
-        found = _variances(cloud.weights[None], off, bounds[..., None])
-        ess: Any = np.array([cloud.ess])
-    else:
-        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
-    if count is not None:
-        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
-        worth = _beside(ess, node, layout, np.ndim(mean))
-        found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
-    return np.sqrt(found[0])
+    return off, count, step
 
 
 def value_errors(
@@ -195,8 +206,15 @@ def value_errors(
     share = found.reshape(np.shape(mean))
     if is_share(values):  # an event that no particle has seen may happen
         ess = np.asarray(cloud.ess, dtype=float)
-        share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
+        share = np.maximum(share, unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
     return np.sqrt(share)
+
+
+def unseen(share: np.ndarray, ess: Any) -> np.ndarray:
+    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
+    centre = (share * ess + 2.0) / (ess + 4.0)
+    rare = np.minimum(share, 1.0 - share) * ess < 1.0
+    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -283,10 +301,3 @@ def _beside(ess: Any, node: CompiledNode, layout: Layout, ndim: int) -> Any:
         n if p in layout.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
     ]
     return moved.reshape(1, *shape, 1)
-
-
-def _unseen(share: np.ndarray, ess: Any) -> np.ndarray:
-    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
-    centre = (share * ess + 2.0) / (ess + 4.0)
-    rare = np.minimum(share, 1.0 - share) * ess < 1.0
-    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)

@@ -29,6 +29,7 @@ from bayesmc.engines.particles.growth import (
     enough,
     uncertain,
 )
+from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
@@ -43,7 +44,8 @@ from bayesmc.engines.particles.options import (
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.replicates import Replicates
-from bayesmc.engines.particles.smoothing import Backward, endless, lagged
+from bayesmc.engines.particles.sharing import Sharing
+from bayesmc.engines.particles.smoothing import TRAJECTORIES, Backward, lagged
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
@@ -344,7 +346,7 @@ class ParticleFilter(FilterEngine):
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
-        sized = self._sized(START)
+        sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
             found, filtered = sized._lagged(problem, seed, lag, queries or {}, progress)
         else:
@@ -368,7 +370,7 @@ class ParticleFilter(FilterEngine):
         assert filtered.clouds is not None
         static = {n: o.value for n, o in problem.series.static.items()}
         mover = self._mover(problem.slices, static)
-        count = mover.particles if self.trajectories is None else self.trajectories
+        count = self.trajectories or min(mover.particles, TRAJECTORIES)
         by_bound = self.backward == "rejection"
         backward = Backward(mover.plan, mover.layout, by_bound, _seen(problem))
         with _quiet():
@@ -378,7 +380,9 @@ class ParticleFilter(FilterEngine):
             record = Record(problem, layout, queries, True)
             for k, cloud in enumerate(found):
                 record.add(k, cloud)
-        return self._given_filtered(record.posterior(self, "smooth"), filtered), filtered
+            sharing = Sharing(backward.positions, filtered.clouds, mover.steady)
+            smoothed = record.smoothed(self, sharing, filtered)
+        return self._given_filtered(smoothed, filtered), filtered
 
     def _lagged(
         self,
