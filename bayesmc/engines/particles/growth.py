@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.errors import LowEssWarning
 
 if TYPE_CHECKING:
     from bayesmc.engines.particles.filter import ParticleFilter
@@ -129,4 +133,21 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
         f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
         f"be off as well (weight_ess is {ess[at]:.1f} in slice {filtered.start + at}); use {more}, a "
         "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
+    )
+
+
+def warn_of_a_lonely_step(before: Cloud | None, families: Families | None, cloud: Cloud) -> None:
+    """The first step that leaves little more than one particle says so; later ones know by the error."""
+    if before is not None and families is not None and np.isinf(families.settled).any():
+        return
+    worst = float(np.min(cloud.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(cloud.weights)):
+        return
+    warnings.warn(
+        f"ParticleFilter: step leaves {len(cloud.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {cloud.t}: from here on the belief cannot tell how far it is off "
+        "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
+        "looks at the observations",
+        LowEssWarning,
+        stacklevel=4,
     )

@@ -202,8 +202,7 @@ class FilteredParticles(SeriesPosterior):
         if self.sharing is not None:
             values = np.stack([evaluated(layout, c, self.model, what) for c in clouds])
             return function_errors(self.sharing, values, values.mean(axis=1))
-        if self.families is None:
-            raise self._no_errors()
+        assert self.families is not None
         rows = []
         for cloud, families in zip(clouds, self.families, strict=True):
             values = evaluated(layout, cloud, self.model, what)

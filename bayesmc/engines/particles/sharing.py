@@ -15,7 +15,7 @@ as its weight demands: what the deviations of a particle's parent say of its own
 counted in the slice before, and counts there alone.
 
 A slice where trajectories share three particles or fewer says nothing of how far off these are: the error is
-infinite there, and for slices nearby that hang on it.
+infinite there, for slices nearby that hang on it, and within reach of three such slices in a row.
 
 References
 ----------
@@ -38,6 +38,8 @@ from bayesmc.results.shares import is_share
 #: how far from a slice others are looked at, and for how many slices each of these stands
 _OFFSETS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20, 28, 36, 52, 68, 100, 132])
 _STANDS = np.r_[1.0, np.diff(_OFFSETS[:-1]) / 2 + np.diff(_OFFSETS[1:]) / 2, 16.0]
+#: slices in a row that say nothing, after which none within reach does
+_RUN = 3
 #: slices over which a part is averaged, to see whether those further off have one
 _NEARBY = 21
 
@@ -136,6 +138,7 @@ class Sharing:
                     going &= there & (lost[at] | (uniform_filter1d(part, _NEARBY, axis=0) > 0))
                 total += np.where(going, part * (_STANDS[kind] * factor[at]), 0.0)
                 alone |= going & lost[at]
+        alone |= _near_runs(lost)
         total = np.where(alone, np.inf, np.maximum(total, squares))
         return np.where(squares > 0, total, 0.0)
 
@@ -225,6 +228,16 @@ class _Links(NamedTuple):
     same: np.ndarray
     #: for groups of the slice before, one by the number of children, 0 where there are none
     share: np.ndarray
+
+
+def _near_runs(lost: np.ndarray) -> np.ndarray:
+    """Slices that a run of lost ones is near: what hangs on which cannot be seen through it."""
+    from scipy.ndimage import maximum_filter1d, minimum_filter1d  # slow to import
+
+    runs = minimum_filter1d(lost.astype(np.uint8), _RUN, axis=0, mode="constant")
+    return np.asarray(
+        maximum_filter1d(runs, 2 * int(_OFFSETS[-1]) + 1, axis=0, mode="constant") > 0
+    )
 
 
 def _grouped(own: np.ndarray, particles: int) -> _Groups:
