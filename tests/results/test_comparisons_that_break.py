@@ -1,4 +1,4 @@
-"""Rows that the model draws may be more than functions take: the filter answers, and says what it left out."""
+"""Rows that the model draws may be more than functions take: filters answer, and say what they left out."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_functions_that_break_on_drawn_rows_are_named(reading: Any, said: str) -
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         whole = asked(by_all)
-    assert np.isfinite(whole.row_ranks).sum() >= 8
+    assert np.isfinite(whole.row_ranks).sum() > compared.sum()
     assert found.log_marginal_likelihood == whole.log_marginal_likelihood
 
 
