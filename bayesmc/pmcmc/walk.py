@@ -33,7 +33,7 @@ _LEAST = 0.25
 #: chance of a step to anywhere; in more than so many dimensions, where few are accepted
 _ANEW, _FEW, _SELDOM = 0.5, 8, 0.1
 #: particles of the first look, the error of the log likelihood to aim at, and how many are taken for that
-_PILOT, _BEST, _PARTICLES = 100, 1.2, (50, 5000)
+_PILOT, _BEST, _PARTICLES = 100, 1.0, (50, 5000)
 #: degrees of freedom of such steps, and how much wider than what was learnt they are
 _DF, _WIDER = 5.0, 1.2
 
