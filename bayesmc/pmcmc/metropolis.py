@@ -53,8 +53,8 @@ class ParticleMetropolis(ParticleEngine):
 
     Notes
     -----
-    Where one number of each chain goes from slice to slice, particles are sorted by it and moved by points that
-    lie evenly, which takes a fifth of the particles or less for the same error. The estimate has no bias
+    Where one number of each chain goes from slice to slice, particles are sorted by it and moved by points
+    that lie evenly, which takes a fifth of the particles or less for the same error. The estimate has no bias
     either way.
 
     References
