@@ -71,6 +71,9 @@ class Filter:
         Whether another number may be chosen for the data (``of``).
     """
 
+    #: error of the log likelihood that is best aimed at
+    best = 1.0
+
     def __init__(self, trellis: Trellis, particles: int, chosen: bool = False) -> None:
         self.trellis, self.particles, self.chosen = trellis, particles, chosen
         self.plates = {n: (_CHAIN, *trellis.model[n].plates) for n in trellis.series.slices.dynamic}

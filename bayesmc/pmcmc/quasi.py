@@ -54,6 +54,8 @@ class QuasiFilter(Filter):
         The node whose number it is.
     """
 
+    best = 0.7  # variance falls so fast that more particles cost less than chains that stand still
+
     def __init__(self, trellis: Trellis, particles: int, chosen: bool, key: str) -> None:
         super().__init__(trellis, particles, chosen)
         self.key = key + PREVIOUS

@@ -127,7 +127,9 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     else:
         said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
     more = "more particles"
-    if not given and engine.adapt is None and filtered.clouds is None:  # held ones have another bound
+    if (
+        not given and engine.adapt is None and filtered.clouds is None
+    ):  # held ones have another bound
         more = f"a larger budget= than {engine.budget:_}"
     return (
         f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
