@@ -230,15 +230,6 @@ MUTANTS = [
         STATED,
     ),
     Mutant(
-        "errors of smoothed means forget who shares particles",
-        (Edit("bayesmc.engines.particles.sharing:Sharing._part",
-              "return pairs - 2.0", "return 0.0 * pairs - 0.0"),
-         Edit("bayesmc.engines.particles.sharing:Sharing._part",
-              "slope**2 * level", "0.0 * level"),),
-        stated(line, LONG, bmc.ParticleFilter(300, trajectories=3000), 60, bmc.smooth, 10),
-        STATED,
-    ),
-    Mutant(
         "backward simulation leaves the transition out",
         (Edit("bayesmc.engines.particles.smoothing:Backward._drawn",
               "self.log_densities(cloud, drawn, series, k, len(mine)) + cloud.log_weights",

@@ -61,19 +61,17 @@ def slices(ask: Callable[..., Any], dbn: Make, observations: Any, engine: Any, r
     return test
 
 
-def stated(
-    dbn: Make, observations: Any, engine: Any, runs: int, ask: Any = bmc.filter, at: int = -1
-) -> Test:
-    """Stated errors of the evidence and of the means of the last slice, or another."""
+def stated(dbn: Make, observations: Any, engine: Any, runs: int) -> Test:
+    """Stated errors of the evidence and of the means of the last slice."""
 
     def test(seed: int) -> Verdict:
         template = dbn()
-        right = ask(dbn(), observations)
-        figures = {n: right.mean(n)[at] for n in right.names if n not in observations}
+        right = bmc.filter(dbn(), observations)
+        figures = {n: right.mean(n)[-1] for n in right.names if n not in observations}
         return stated_errors_test(
-            lambda rng: ask(template, observations, engine=engine, rng=rng),
+            lambda rng: bmc.filter(template, observations, engine=engine, rng=rng),
             right.log_marginal_likelihood, figures,
-            lambda found: {n: (found.mean(n)[at], found.mcse(n)[at]) for n in figures},
+            lambda found: {n: (found.mean(n)[-1], found.mcse(n)[-1]) for n in figures},
             runs=runs, alpha=ALPHA, rng=seed,
         )  # fmt: skip
 
