@@ -32,6 +32,8 @@ _FIRST_ERROR = 1.0
 _LEAST = 0.25
 #: chance of a step to anywhere; in more than so many dimensions, where few are accepted
 _ANEW, _FEW, _SELDOM = 0.5, 8, 0.1
+#: times the error to aim at, above which the warmup takes more particles than the first look said
+_MORE = 1.25
 #: particles of the first look, and how many are taken for the error of the log likelihood to aim at
 _PILOT, _PARTICLES = 100, (50, 5000)
 #: degrees of freedom of such steps, and how much wider than what was learnt they are
@@ -207,7 +209,13 @@ class ParameterWalk(BlockWalk):
             apart = np.abs(once - twice)
         looks = np.concatenate([memory["looks"], apart[~np.isnan(apart)]])[-_KEPT:]
         error = float(np.median(looks)) / _MEDIAN if len(looks) else memory["error"]
-        return {**memory, "error": error, "looks": looks}
+        memory = {**memory, "error": error, "looks": looks}
+        least, most = _PARTICLES
+        if self.filter.chosen and error > _MORE * self.filter.best and memory["particles"] < most:
+            wanted = memory["particles"] * (error / self.filter.best) ** 2
+            memory |= {"particles": int(np.clip(wanted, least, most)), "looks": np.zeros(0)}
+            memory["log_likelihood"] = None  # made anew, as at the start
+        return memory
 
 
 def prior_of(target: Target, statics: tuple[str, ...]) -> Target:

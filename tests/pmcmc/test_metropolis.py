@@ -246,6 +246,23 @@ def test_chains_start_where_the_mass_is(steps: int) -> None:
         assert given.start(np.random.default_rng(0), 4)["memory"][0]["particles"] == 70
 
 
+@pytest.mark.parametrize("chosen", [True, False])
+def test_the_warmup_takes_more_particles_where_a_look_was_wrong(chosen: bool) -> None:
+    """A given number stands."""
+    dbn, rows = logits(40)
+    engine = ParticleMetropolis() if chosen else ParticleMetropolis(particles=4)
+    sampler, rng = engine.sampler(pose_any(dbn, rows)), np.random.default_rng(0)
+    with marking_invalid(), np.errstate(all="ignore"):
+        state = sampler.start(rng, 8)
+        (walk,), memory = sampler.kernels, {**state["memory"][0], "particles": 4}
+        values = {**sampler.target.known, **state["values"]}
+        for _ in range(21):
+            new, memory = walk.step(values, memory, rng, True)
+            values = {**values, **new}
+    assert (memory["particles"] > 10) is chosen
+    assert np.isfinite(memory["log_likelihood"]).all()
+
+
 @pytest.mark.thorough
 @pytest.mark.parametrize("engine", [ParticleMetropolis(), bmc.ParticleGibbs()])
 def test_five_hundred_rows_of_counts(engine: Any) -> None:
