@@ -281,22 +281,20 @@ class SeriesPosterior:
 
         Answers that nothing was drawn for have none: 0. What a filter leaves out by its assumptions (an
         extended Kalman filter's tangents, say) is no part of it. Those of particles come from the families
-        of particles of earlier slices (see ``ParticleFilter``).
+        of particles of earlier slices, those of trajectories drawn backwards from which of them share
+        particles (see ``ParticleFilter``); infinite where nobody can tell.
 
         Raises
         ------
         UnknownNodeError
         UnsupportedError
-            Functions, unless particles are kept; trajectories that were drawn backwards by ``smooth``, which
-            state none (with ``lag=`` they do).
+            Functions, unless particles are kept, as ``smooth`` does without ``lag=``.
         """
         if callable(what):
             raise UnsupportedError(
                 "mcse: give a node's name, or the function in queries=, whose errors are in queries_mcse"
             )
         node = self._node(what)
-        if self.mean_errors is None and self.weight_ess is not None:
-            raise self._no_errors()
         if self.mean_errors is not None and what in self.mean_errors:
             return self.mean_errors[what].copy()
         labelled = node.domain is not None and node.domain.labels is not None
@@ -357,12 +355,6 @@ class SeriesPosterior:
                 "queries={name: function}"
             )
         return node
-
-    def _no_errors(self) -> UnsupportedError:
-        return UnsupportedError(
-            "mcse: trajectories that were drawn backwards state no errors of their means; run with a few "
-            "seeds, or smooth with lag="
-        )
 
     def _not_kept(self, what: str) -> UnsupportedError:
         return UnsupportedError(

@@ -163,9 +163,41 @@ def node_errors(
     centre : tuple
         Its mean and variance, or its table and None, with an axis of length 1 in front.
     """
+    off, count, step = deviations(node, cloud.values[node.name][None], centre)
+    mean, bounds = centre[0], families.bounds
+    if not layout.apart:
+        found = _variances(cloud.weights[None], off, bounds[..., None])
+        ess: Any = np.array([cloud.ess])
+    else:
+        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
+    if count is not None:
+        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
+        worth = _beside(ess, node, layout, np.ndim(mean))
+        found = np.maximum(found, step**2 * unseen(count, worth if own else worth[..., 0]))
+        if families.scouts is not None:
+            found = found + (step * families.scouts.share) ** 2
+    elif (
+        families.scouts is not None and node.angles is None and node.name in families.scouts.values
+    ):
+        found = found + _left_out(families.scouts.share, families.scouts.values[node.name], mean[0])
+    if families.lost is not None:
+        order = [p for p in node.plates if p in layout.apart]
+        if len(order) == len(layout.apart):
+            where = _along(families.lost.where, layout, node)
+            tail = found.ndim - 1 - where.ndim
+            found = np.where(where.reshape(where.shape + (1,) * tail), np.inf, found)
+    return np.sqrt(found[0])
+
+
+def deviations(
+    node: CompiledNode, value: np.ndarray, centre: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray | None, float]:
+    """By how much values lie off a mean; the shares that stand behind it, and what a state more or less is.
+
+    Slices and particles come first; ``centre`` as for ``node_errors``. Without states there are no shares.
+    """
     mean, variance = centre
-    count, step, bounds = None, 1.0, families.bounds
-    value = cloud.values[node.name][None]
+    count, step = None, 1.0
     if node.domain is None:
         off = value - mean[:, None]
         if node.angles is not None:
@@ -180,28 +212,7 @@ def node_errors(
     else:
         off = (value[..., None] == np.arange(node.domain.size)) - mean[:, None]
         count = mean
-    if not layout.apart:
-        found = _variances(cloud.weights[None], off, bounds[..., None])
-        ess: Any = np.array([cloud.ess])
-    else:
-        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
-    if count is not None:
-        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
-        worth = _beside(ess, node, layout, np.ndim(mean))
-        found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
-        if families.scouts is not None:
-            found = found + (step * families.scouts.share) ** 2
-    elif (
-        families.scouts is not None and node.angles is None and node.name in families.scouts.values
-    ):
-        found = found + _left_out(families.scouts.share, families.scouts.values[node.name], mean[0])
-    if families.lost is not None:
-        order = [p for p in node.plates if p in layout.apart]
-        if len(order) == len(layout.apart):
-            where = _along(families.lost.where, layout, node)
-            tail = found.ndim - 1 - where.ndim
-            found = np.where(where.reshape(where.shape + (1,) * tail), np.inf, found)
-    return np.sqrt(found[0])
+    return off, count, step
 
 
 def value_errors(
@@ -224,13 +235,20 @@ def value_errors(
     share = found.reshape(np.shape(mean))
     if is_share(values):  # an event that no particle has seen may happen
         ess = np.asarray(cloud.ess, dtype=float)
-        share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
+        share = np.maximum(share, unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
     if families.scouts is not None and there is not None:
         share = share + _left_out(families.scouts.share, there(families.scouts.values), mean)
     if families.lost is not None:
         where = families.lost.where
         share = np.where(where.reshape(where.shape + (1,) * len(rest)), np.inf, share)
     return np.sqrt(share)
+
+
+def unseen(share: np.ndarray, ess: Any) -> np.ndarray:
+    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
+    centre = (share * ess + 2.0) / (ess + 4.0)
+    rare = np.minimum(share, 1.0 - share) * ess < 1.0
+    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -329,10 +347,3 @@ def _left_out(share: float, values: np.ndarray | None, mean: Any) -> Any:
     if values is None:
         return 0.0 if share == 0.0 else np.full(np.shape(mean), np.inf)
     return (share * (values.mean(axis=0) - mean)) ** 2
-
-
-def _unseen(share: np.ndarray, ess: Any) -> np.ndarray:
-    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
-    centre = (share * ess + 2.0) / (ess + 4.0)
-    rare = np.minimum(share, 1.0 - share) * ess < 1.0
-    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.errors import LowEssWarning
 
 if TYPE_CHECKING:
     from bayesmc.engines.particles.filter import ParticleFilter
@@ -150,6 +154,23 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     )
 
 
+def warn_of_a_lonely_step(before: Cloud | None, families: Families | None, cloud: Cloud) -> None:
+    """The first step that leaves little more than one particle says so; later ones know by the error."""
+    if before is not None and families is not None and np.isinf(families.settled).any():
+        return
+    worst = float(np.min(cloud.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(cloud.weights)):
+        return
+    warnings.warn(
+        f"ParticleFilter: step leaves {len(cloud.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {cloud.t}: from here on the belief cannot tell how far it is off "
+        "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
+        "looks at the observations",
+        LowEssWarning,
+        stacklevel=4,
+    )
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -172,5 +193,5 @@ def _more(filtered: FilteredParticles, engine: ParticleFilter) -> str:
             "enough)"
         )
     if keep and engine.budget > KEPT:
-        return "more particles, whose number keep= holds down to save memory"
+        return "more particles, whose number is held down where all slices are kept (smooth, keep=)"
     return f"a larger budget= than {engine.budget:_}"

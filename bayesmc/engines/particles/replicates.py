@@ -18,6 +18,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Row, SeriesProblem
 from bayesmc.engines.particles.cloud import Cloud, along_plates
 from bayesmc.engines.slice_steps import SlicePlan
+from bayesmc.errors import UnsupportedError
 from bayesmc.network import Observed
 from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
@@ -67,7 +68,7 @@ class Replicates:
         self.names = tuple(problem.series.observed)
         self._wide = _numbers_seen(problem) >= WIDE
         self._looked, self._until = _chosen(problem, self._wide, rng, most), -1
-        self._failed = False
+        self._cannot, self._broken = False, ""
         self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)
         self._rows, self._deficits = np.full(lead, np.nan), np.full(lead, np.nan)
@@ -77,7 +78,7 @@ class Replicates:
 
     def wanted(self, k: int) -> bool:
         """Whether the k-th row is looked at."""
-        return (k in self._looked or k <= self._until) and not self._failed
+        return (k in self._looked or k <= self._until) and not (self._cannot or self._broken)
 
     def look(self, k: int, before: Cloud | Draws | None, row: Row) -> None:
         """Compare the k-th row, whose slice follows that of a cloud, or of a belief that draws."""
@@ -87,16 +88,21 @@ class Replicates:
             values = self._taken(before)
             drawn = self._drawn(row, {n: v[0] for n, v in values.items()})
             log = self._judged(row, drawn, {n: v[1] for n, v in values.items()})
-        except Exception:  # functions that break on rows that never came: nothing is said then
-            self._failed = True
+        except UnsupportedError:  # a density that cannot be drawn from
+            self._cannot = True
+            return
+        except (
+            Exception
+        ) as error:  # users' functions may break on rows that never came: that is said
+            self._broken = f"slice {row.t}: {type(error).__name__}: {error}"
             return
         self._write(k, row, drawn, log)
 
     def found(self, steps: int | None = None) -> Predictive | None:
         """What came of it; None where nothing was compared."""
-        if self._failed or not self._looked:
+        if self._cannot or not self._looked:
             return None
-        whole = Predictive(self._rows, self._deficits, self._ranks)
+        whole = Predictive(self._rows, self._deficits, self._ranks, self._broken)
         return whole if steps is None else whole.first(steps)
 
     # ---- private -------------------------------------------------------------------------------
