@@ -13,6 +13,7 @@ import bayesmc as bmc
 from bayesmc.errors import (
     ConvergenceWarning,
     DensityError,
+    EvidenceError,
     ReducibleWarning,
     ZeroProbabilityError,
 )
@@ -217,10 +218,12 @@ def test_vague_priors_do_not_keep_chains_from_starting() -> None:
 
 def test_impossible_evidence_names_the_culprit() -> None:
     net = bmc.BayesNet()
-    net.add("scale", bmc.Gamma(2.0, 1.0))
+    net.add("scale", bmc.Uniform(0.0, 2.0))
     net.add("y", lambda scale: bmc.Uniform(0.0, scale))
     net.add("z", lambda scale: bmc.Normal(scale, 1.0))
     with pytest.raises(ZeroProbabilityError, match="'y'"):
+        bmc.infer(net, {"y": 3.0, "z": 0.0}, engine=bmc.Gibbs(), rng=0)
+    with pytest.raises(EvidenceError, match="'y' is -1.0, outside its support"):
         bmc.infer(net, {"y": -1.0, "z": 0.0}, engine=bmc.Gibbs(), rng=0)
 
 

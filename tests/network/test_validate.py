@@ -165,7 +165,7 @@ def test_a_constant_over_a_foreign_plate_is_not_taken_for_a_batch():
     net = bmc.BayesNet(plates={"k": 3})
     net.add("x", bmc.Bernoulli(0.5), plates="k")
     net.add("y", lambda x: bmc.Normal((weight * x).sum("k"), 1.0))
-    with pytest.raises(BroadcastError, match="node 'y'"):
+    with pytest.raises(BayesmcError, match="node 'y'"):
         net.validate()
 
 
@@ -196,7 +196,7 @@ def test_matmul_with_the_batch_is_caught():
     net = bmc.BayesNet(plates={"point": 4})
     net.add("beta", bmc.MvNormal(np.zeros(3), np.eye(3)))
     net.add("y", lambda beta: bmc.Normal(design @ beta, 1.0), plates="point")
-    with pytest.raises(BroadcastError, match="node 'y'"):
+    with pytest.raises(BayesmcError, match="node 'y'"):
         net.validate()
 
 
