@@ -14,7 +14,7 @@ Meng (2011), To center or not to center, J. Comp. Graph. Statist. 20 (interweavi
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -71,16 +71,18 @@ class Rescaled(Kernel):
     ) -> tuple[Values, Memory]:
         centres = {n: centre_of(self.target, n, values) for n in self.below}
         start = np.zeros(len(values[self.name]))
+        # heavy tails may have no mean: such chains stay, and are the same wherever the move would lead
+        fixed = ~self._all(np.isfinite, centres, start.shape)
+        centres = {n: np.where(np.isfinite(c), c, 0.0) for n, c in centres.items()}
 
         def log_density(t: np.ndarray) -> np.ndarray:
-            return self._log(values, centres, t)
+            return self._log(values, centres, t, fixed)
 
         try:
             t = slice_move(log_density, start, np.full(start.shape, memory["width"]), rng)
         except DensityError as error:
-            if "node" in str(error):
-                raise
             raise DensityError(f"nodes {', '.join(map(repr, self.names))}: {error}") from error
+        t = np.where(fixed, 0.0, t)
         if warmup:
             count = memory["count"] + 1
             rate = max(1.0 / count, 0.02)
@@ -99,7 +101,9 @@ class Rescaled(Kernel):
             found[name] = centre + (now - centre) * factor
         return found
 
-    def _log(self, values: Values, centres: Mapping[str, np.ndarray], t: np.ndarray) -> np.ndarray:
+    def _log(
+        self, values: Values, centres: Mapping[str, np.ndarray], t: np.ndarray, fixed: np.ndarray
+    ) -> np.ndarray:
         """Log density along the orbit, with the change of volume."""
         new = self._scaled(values, centres, t)
         inside = (new[self.name] > 0) & (new[self.name] < self.high)
@@ -110,7 +114,7 @@ class Rescaled(Kernel):
             new = self._scaled(values, centres, np.where(inside, t, 0.0))
         state = {**values, **new}
         self.target.compute(state, self.path)
-        inside = inside & self._keeps_centres(state, centres, t.shape)
+        inside = inside & (fixed | self._keeps_centres(state, centres, t.shape))
         log = self.terms.log_density(state) + (self.power + self.numbers) * t
         return np.where(inside, np.broadcast_to(log, t.shape), -np.inf)
 
@@ -118,12 +122,23 @@ class Rescaled(Kernel):
         self, state: Values, centres: Mapping[str, np.ndarray], lead: Shape
     ) -> np.ndarray:
         """Whether deviations are counted from where they were: else there is no way back."""
-        kept: np.ndarray = np.ones(lead, dtype=bool)
-        for name, centre in centres.items():
-            now = centre_of(self.target, name, state)
-            same = np.isclose(now, centre, rtol=_CLOSE, atol=0)
-            kept = kept & same.reshape(*lead, -1).all(axis=-1)
-        return kept
+        same = {
+            n: np.isclose(centre_of(self.target, n, state), c, rtol=_CLOSE, atol=0)
+            for n, c in centres.items()
+        }
+        return self._all(lambda kept: kept, same, lead)
+
+    def _all(
+        self,
+        test: Callable[[np.ndarray], np.ndarray],
+        figures: Mapping[str, np.ndarray],
+        lead: Shape,
+    ) -> np.ndarray:
+        """Whether a test holds of all figures of a chain."""
+        found: np.ndarray = np.ones(lead, dtype=bool)
+        for name in self.below:
+            found = found & test(figures[name]).reshape(*lead, -1).all(axis=-1)
+        return found
 
 
 def centre_of(target: Target, name: str, values: Values) -> np.ndarray:

@@ -6,7 +6,6 @@ plate and event size, on parents whose batch shapes differ but broadcast and who
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping
 from typing import Any
 
@@ -29,7 +28,7 @@ from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, masks, nearly_equal
 from bayesmc.states import as_numbers
 
-#: nodes of one function that are checked: with their parents' values at that many times as many points
+#: nodes of one function that are checked, besides those whose parents' values are extreme
 _ALIKE = 12
 
 
@@ -37,7 +36,7 @@ def validate_model(model: Model) -> None:
     """Raise on the first node whose function breaks a rule.
 
     Of nodes that have one function and parents of the same kinds, as the slices of a template have, the
-    first few are checked.
+    first few are checked, the last, and those whose parents' values are the largest and the smallest.
 
     Raises
     ------
@@ -45,14 +44,14 @@ def validate_model(model: Model) -> None:
         With the node's name, the entry or plate element, and what to write instead.
     """
     with marking_invalid(), np.errstate(all="ignore"):
-        often: Counter[Hashable] = Counter()
+        alike: dict[Hashable, list[CompiledNode]] = {}
         for node in model.nodes.values():
-            if node.declaration.source != "function":
-                continue
-            kind = _kind(model, node)
-            often[kind] += 1
-            if often[kind] <= _ALIKE:
-                _check_node(model, node)
+            if node.declaration.source == "function":
+                alike.setdefault(_kind(model, node), []).append(node)
+        chosen = {n.name for nodes in alike.values() for n in _unlike(model, nodes)}
+        for name in model.nodes:
+            if name in chosen:
+                _check_node(model, model[name])
         for name, (potential, links) in model.potentials.items():
             model.potential(name, model.probe)  # its shape, said in its own words
             what = Declaration(
@@ -79,6 +78,20 @@ def _kind(model: Model, node: CompiledNode) -> Hashable:
         parents.append((parent.kind, parent.plates, parent.value_shape, parent.is_discrete, states))
     own = node.declaration
     return id(own.function), own.vectorize, node.plates, node.value_shape, tuple(parents)
+
+
+def _unlike(model: Model, nodes: list[CompiledNode]) -> list[CompiledNode]:
+    """Nodes that stand for others with their function: the first, the last, and those at the extremes."""
+    if len(nodes) <= _ALIKE:
+        return nodes
+    found = dict.fromkeys([*range(_ALIKE - 1), len(nodes) - 1])
+    for k in range(len(nodes[0].parents)):
+        values = [np.asarray(model.probe[n.parents[k]]) for n in nodes]
+        if not values[0].size or values[0].dtype.kind not in "fiub":
+            continue
+        found[int(np.argmax([v.max() for v in values]))] = None
+        found[int(np.argmin([v.min() for v in values]))] = None
+    return [nodes[k] for k in sorted(found)]
 
 
 def _check_node(model: Model, node: CompiledNode) -> None:

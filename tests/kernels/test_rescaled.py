@@ -114,6 +114,22 @@ def test_a_random_walk_is_not_rescaled() -> None:
     assert rescaled_kernels(target, ("s", "x0", "x1", "x2")) == []
 
 
+def test_effects_that_may_have_no_mean_are_left_where_they_have_none() -> None:
+    """Student's t with one degree of freedom or less: such chains stay, and none of them breaks off."""
+    rng = np.random.default_rng(3)
+    net = bmc.BayesNet(plates={"i": 20})
+    net.add("df", bmc.Gamma(2.0, 2.0))
+    net.add("s", bmc.HalfNormal(2.0))
+    net.add("b", lambda df, s: bmc.StudentT(df, 0.0, s), plates="i")
+    net.add("y", lambda b: bmc.Poisson(np.exp(np.clip(b, -5, 3))), plates="i")
+    rows = rng.poisson(np.exp(rng.standard_t(1.0, size=20).clip(-3, 3)))
+    engine = bmc.Gibbs(draws=150, warmup=100)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        found = bmc.infer(net, {"y": rows}, engine=engine, rng=session.seed())
+    assert (found["df"] < 1).any() and np.isfinite(found["b"]).all()
+
+
 def logistic() -> tuple[bmc.BayesNet, dict[str, Any]]:
     """A logistic regression with random effects."""
     rng = np.random.default_rng(4)

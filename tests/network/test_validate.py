@@ -773,6 +773,21 @@ def test_supports_too_large_to_list_have_no_states(size):
     assert abs(p.mean("n") - 0.3 * (size - 1)) < 4.5 * p.mcse("n")
 
 
+def test_of_many_nodes_with_one_function_those_at_the_extremes_are_checked() -> None:
+    """A function that mixes elements only where its parent is large, as the parents of some nodes are."""
+
+    def mixing(a: Any) -> Any:
+        large = a > 50
+        return bmc.Normal(np.where(large, np.sort(a, axis=-1), a), 1.0)
+
+    net = bmc.BayesNet(plates={"i": 3})
+    for k in range(40):
+        net.add(f"a{k}", bmc.Normal(100.0 if 20 <= k < 25 else 0.0, 1.0), plates="i")
+        net.add(f"b{k}", mixing, parents=[f"a{k}"], plates="i")
+    with pytest.raises(BroadcastError, match="node 'b2"):
+        net.validate()
+
+
 def test_of_many_nodes_those_with_a_function_of_their_own_are_checked() -> None:
     """One function of many nodes is checked at a few of them; one like it, of the last node, by itself."""
     net = bmc.BayesNet()
