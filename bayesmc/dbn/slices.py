@@ -18,6 +18,7 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
+    BayesmcError,
     DensityError,
     ModelError,
     ParameterError,
@@ -434,7 +435,7 @@ def _support_further(model: Model, name: str, parents: set[str]) -> Support | No
     try:
         with marking_invalid(), np.errstate(all="ignore"):
             dist, _ = model.evaluate(name, {**model.probe, **moved})
-    except Exception:  # a function of the user's, at values that need not be possible
+    except BayesmcError:  # a function of the user's, at values that need not be possible
         return None
     return dist.support if dist.invalid is None else None
 

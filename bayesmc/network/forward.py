@@ -242,6 +242,10 @@ def current_distribution(
     return dist
 
 
+#: draws all of which are out of range before the function is to blame, and not its parents' priors
+_SEVERAL = 20
+
+
 def _advised(
     error: ParameterError, node: CompiledNode, model: Model, dist: Distribution, state: Pass
 ) -> ParameterError:
@@ -251,7 +255,7 @@ def _advised(
     element = (error.index or ())[len(state.batch) :]
     where: tuple[Any, ...] = (..., *element)
     each = full[where]
-    if each.size > 1 and each.all():
+    if each.size >= _SEVERAL and each.all():
         own = {p: np.asarray(state.values[p]) for p in node.parents if p in state.values}
         known = ", ".join(f"{p} = {v.item():g}" for p, v in own.items() if v.ndim == 0)
         error.args = (

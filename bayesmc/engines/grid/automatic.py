@@ -42,6 +42,8 @@ _FINE = 1.25
 _SAFE = 1.5
 #: bytes of beliefs that are kept for the answers, which are worked out again otherwise
 _KEPT = float(2**27)
+#: relative error of what densities and sums of a row are computed with: log factorials alone take some 1e-14
+_ROUNDING = 1e-13
 
 
 @dataclass(frozen=True, eq=False)
@@ -345,7 +347,7 @@ class _Search:
         total = found.increments.sum(axis=0)
         times = _SAFE if self.far else times  # functions that jump have errors that halve by chance
         off = times * np.max([np.abs(total - other.sum(axis=0)) for other in others], axis=0)
-        rounding = 1e-15 * np.abs(found.increments).sum(axis=0)
+        rounding = _ROUNDING * np.abs(found.increments).sum(axis=0)
         error = off + found.ends.sum(axis=0) + rounding
         return FoundGrid(self.name, found.axis, error, found.mover, found.kept, self.far)
 

@@ -19,6 +19,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.cloud import Cloud
 from bayesmc.engines.slice_steps import SlicePlan
+from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
@@ -79,7 +80,7 @@ class Scouting:
         parties = [] if old is None else [old]
         try:
             parties += self._sent(unmet, earlier, cloud, row, rng)
-        except Exception:  # functions that break on what never came: nothing is said then
+        except BayesmcError:  # functions that break on what never came: nothing is said then
             return None
         there = float(cloud.weights[_among(cloud.values, unmet)].sum() / cloud.total)
         return _together([_away(p, unmet) for p in parties], there, rng)
@@ -148,7 +149,7 @@ class Scouting:
         state = Pass(rng, scouts.log_weights.shape, {**self.plan.known(row), **before})
         try:
             passed(self.plan.steps(row), state)
-        except Exception:
+        except BayesmcError:
             return None
         return self._weighed(state, scouts.log_weights - float(cloud.increment))
 
