@@ -3,9 +3,9 @@
 Where one number of each chain goes from slice to slice, particles are sorted by it and resampled on a comb,
 so that offspring lie as evenly as the weights say. The normal numbers that move them are the quantiles of
 ``frac(i a + U)`` for the i-th particle, with ``a`` irrational and U uniform: ancestors and moves together are
-a lattice rule of two dimensions. Ancestors are chosen in proportion to the weights on average over particles,
-and so is what follows of them: the likelihood is estimated without bias, as with independent draws, and with a
-fraction of their variance.
+a lattice rule of two dimensions. Ancestors are chosen in proportion to the weights on average over
+particles, and so is what follows of them: the likelihood is estimated without bias, as with independent
+draws, and with a fraction of their variance.
 
 It is no filter for a kept trajectory, whose companions must be independent. Draws other than normal ones, and
 several for one element at once, are made as they always are.
