@@ -381,13 +381,13 @@ def _as_index(key: Any, plate: str, size: int) -> PlateArray:
         raise IndexError(
             f"plate {plate!r} is gathered by scalars, not by vectors; take a component with v[..., k]"
         )
-    array = np.asarray(foreign.array if foreign is not None else key)
+    array = _array_like(foreign.array if foreign is not None else key)
     if array.dtype.kind not in "iu":
         raise IndexError(
             f"plate {plate!r} is gathered by integers 0..{size - 1} (a discrete parent, an integer or "
             f"an integer array), not by {array.dtype} values"
         )
-    if array.size:
+    if isinstance(array, np.ndarray) and array.size:
         low, high = int(array.min()), int(array.max())
         if low < 0 or high >= size:
             raise IndexError(
