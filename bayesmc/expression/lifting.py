@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from bayesmc.expression.array import TracedArray
-from bayesmc.expression.functions import expression_of
+from bayesmc.expression.functions import expression_of, of_function
 from bayesmc.expression.graph import constant
 from bayesmc.tracing.standin import is_traced
 
@@ -46,7 +46,7 @@ def tells_time_or_chance(function: Any) -> str | None:
             found = _changing(name, held, value)
             if found is not None:
                 return found
-            if isinstance(held, types.FunctionType) and _room(held) not in _KNOWN:
+            if isinstance(held, types.FunctionType) and _is_open(held):
                 todo.append(held)
     return None
 
@@ -84,6 +84,12 @@ def _changing(name: str, value: Any, function: types.FunctionType) -> str | None
     return None
 
 
+def _is_open(function: types.FunctionType) -> bool:
+    """Whether a function is a user's, or one of those that users call in theirs."""
+    module = str(function.__module__ or "")
+    return _room(function) not in _KNOWN or module.startswith("bayesmc.robotics")
+
+
 def _room(value: Any) -> str:
     module = getattr(value, "__module__", None)
     return str(module or "").split(".")[0].lstrip("_")
@@ -114,7 +120,7 @@ def _lifted_function(
 def _lifted(value: Any, seen: dict[int, types.FunctionType]) -> Any:
     if type(value) is np.ndarray and value.ndim and value.dtype in (float, np.int64, bool):
         return TracedArray(constant(value))
-    if isinstance(value, types.FunctionType) and _room(value) not in _KNOWN:
+    if isinstance(value, types.FunctionType) and _is_open(value):
         return _lifted_function(value, seen)
     if isinstance(value, types.ModuleType) and value.__name__.split(".")[0] in ("numpy", "scipy"):
         return _Module(value)
@@ -180,6 +186,7 @@ _INSTEAD: dict[Any, Callable[..., Any]] = {
         (np.array, _array),
         (np.asarray, _array),
         (np.asanyarray, _array),
+        (np.take, lambda *args, **kwargs: TracedArray(of_function(np.take, args, kwargs))),
         (np.float64, lambda x: _array(x, float)),
         (special.logsumexp, _log_sum_exp),
         (special.softmax, _softmax),

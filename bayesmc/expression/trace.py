@@ -34,6 +34,16 @@ class Family:
     parameters: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class Frozen:
+    """A family of ``scipy.stats``."""
+
+    dist: Any
+
+    def __call__(self, args: Sequence[Any], **kwds: Any) -> Any:
+        return self.dist(*args, **kwds)
+
+
 def trace(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
     """What a function returns for stand-ins: an ``Expression``, a ``Family``, or what depends on none.
 
@@ -130,6 +140,9 @@ def _plain(value: Any) -> Any:
     if isinstance(value, TracedCall):
         kept = {k: _plain(v) for k, v in value.arguments.items()}
         return Family(value.function, kept)
+    if all(hasattr(value, name) for name in ("dist", "args", "kwds")):  # of scipy.stats, frozen
+        parts = _plain(list(value.args)), {k: _plain(v) for k, v in value.kwds.items()}
+        return Family(Frozen(value.dist), {"args": parts[0], **parts[1]})
     if isinstance(value, (list, tuple)) and is_traced(value):
         return type(value)(_plain(v) for v in value)
     if isinstance(value, (np.ndarray, np.generic, float, int)) and not isinstance(value, bool):

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Distribution
+from bayesmc.distributions import Categorical, Density, Distribution, as_distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import (
@@ -20,6 +20,7 @@ from bayesmc.expression import (
     broadcast,
     call,
     constant,
+    elementwise,
     expressions_of,
     gather,
     leaf,
@@ -27,6 +28,7 @@ from bayesmc.expression import (
     trace,
 )
 from bayesmc.network.align import Aligner
+from bayesmc.network.domain import Domain
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
@@ -85,7 +87,7 @@ def argument(model: Model, parent: str, link: Aligner) -> Any:
         labels = None if node.domain is None else node.domain.labels
         value = value if labels is None else TracedStates(value, labels)
     else:
-        value = _decoded(TracedArray(stored_leaf(node)), link)
+        value = _decoded(TracedArray(stored_leaf(model, node)), link)
     placed = link.place(value)
     if link.foreign:
         return PlateArray(placed, link.foreign, link.own, link.event_ndim)
@@ -100,16 +102,16 @@ def value_of(model: Model, name: str) -> Expression:
         return broadcast(found.result, node.value_shape)
     parents = tuple(dict.fromkeys(node.parents))
     operands = [
-        _stored_value(model, p) if model[p].kind == "deterministic" else stored_leaf(model[p])
+        _stored_value(model, p) if model[p].kind == "deterministic" else stored_leaf(model, model[p])
         for p in parents
     ]
-    stored = call(_NodeCall(model, name, parents), operands, node.value_shape, _dtype(node))
+    stored = call(_NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
     return stored if node.domain is None else _decoded_values(stored, node)
 
 
-def stored_leaf(node: CompiledNode) -> Expression:
+def stored_leaf(model: Model, node: CompiledNode) -> Expression:
     """A node's stored value as a leaf."""
-    return leaf(node.name, node.value_shape, _dtype(node))
+    return leaf(node.name, node.value_shape, _dtype(model, node))
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -138,7 +140,10 @@ class _NodeCall:
         return self.name
 
 
-def _dtype(node: CompiledNode) -> type:
+def _dtype(model: Model, node: CompiledNode) -> Any:
+    if node.kind in ("input", "fixed") and node.domain is None:
+        kind = model.probe[node.name].dtype.kind
+        return {"b": bool, "i": int, "u": int}.get(kind, float)
     return int if node.is_discrete or node.domain is not None else float
 
 
@@ -149,15 +154,21 @@ def _decoded(stored: TracedArray, link: Aligner) -> Any:
         return stored
     if domain.labels is not None:
         return TracedStates(stored, domain.labels)
-    return domain.decode(stored)  # type: ignore[arg-type]
+    return TracedArray(_numbers(stored.expression, domain))
+
+
+def _numbers(stored: Expression, domain: Domain) -> Expression:
+    """Numeric user values of positions."""
+    if domain.values is not None:
+        return gather(constant(domain.values), stored)
+    return elementwise(np.add, stored, domain.low) if domain.low else stored
 
 
 def _decoded_values(stored: Expression, node: CompiledNode) -> Expression:
     assert node.domain is not None
     if node.domain.labels is not None:
         return stored
-    decoded: Any = node.domain.decode(TracedArray(stored))  # type: ignore[arg-type]
-    return decoded.expression
+    return _numbers(stored, node.domain)
 
 
 def _stored_value(model: Model, name: str) -> Expression:
@@ -169,9 +180,8 @@ def _stored_value(model: Model, name: str) -> Expression:
     numbers = node.domain.numbers
     assert numbers is not None
     order = np.argsort(numbers)
-    found = np.searchsorted(numbers[order], TracedArray(value))
-    at: Any = np.take(order, found)
-    return at.expression
+    found: Any = np.searchsorted(numbers[order], TracedArray(value))  # type: ignore[call-overload]
+    return gather(constant(order), found.expression)
 
 
 def _read(model: Model, name: str) -> Followed | Opaque:
@@ -180,6 +190,8 @@ def _read(model: Model, name: str) -> Followed | Opaque:
         result = _traced(model, node)
         if node.is_stochastic and not isinstance(result, (Family, Distribution)):
             raise TraceError(f"it returns {type(result).__name__}")
+        if isinstance(result, Density) and node.links:
+            raise TraceError("its Density may read parents where that cannot be seen")
         found = Followed(result)
         _check(model, node, found)
         return found
@@ -217,7 +229,7 @@ def _of_table(model: Model, node: CompiledNode) -> Family:
         if parent_node.kind == "deterministic":
             stored = _stored_value(model, parent)
         else:
-            stored = stored_leaf(parent_node)
+            stored = stored_leaf(model, parent_node)
         rows = rows * card + link.place(TracedArray(stored))  # type: ignore[arg-type]
     table = constant(probs.reshape(-1, probs.shape[-1]))
     rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
@@ -226,8 +238,6 @@ def _of_table(model: Model, node: CompiledNode) -> Family:
 
 def _check(model: Model, node: CompiledNode, found: Followed) -> None:
     """Refuse a reading that gives something else than the function at probe points."""
-    if isinstance(found.result, Distribution):
-        return
     program = Program(list(expressions_of(found.result)))
     for values in _probes(model, node, found.leaves):
         with marking_invalid(), np.errstate(all="ignore"):
@@ -240,6 +250,8 @@ def _check(model: Model, node: CompiledNode, found: Followed) -> None:
                 continue  # the function's own fault, or out of range: nothing to compare
             try:
                 made = rebuilt(found.result, iter(program(values)))
+                if node.is_stochastic and not isinstance(made, Distribution):
+                    made = as_distribution(made)
             except (BayesmcError, ValueError, TypeError, IndexError) as error:
                 raise TraceError(f"what was read of it fails: {error}") from error
             if not _agree(node, expected, made, batch + node.plate_shape):

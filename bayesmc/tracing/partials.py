@@ -25,7 +25,7 @@ def partials(ufunc: Any) -> tuple[Partial, ...] | None:
 
 def jumps(ufunc: Any, values: Any, result: Any) -> Any:
     """Where a ufunc that is constant in pieces jumps, as booleans; None for every other ufunc."""
-    rule = _PIECES.get(ufunc)
+    rule = PIECES.get(ufunc)
     return None if rule is None else rule(*values, result)
 
 
@@ -149,7 +149,7 @@ def _never(x: Any, y: Any) -> Any:
 
 
 #: ufuncs that are constant in pieces -> where they jump
-_PIECES: Mapping[Any, Partial] = {
+PIECES: Mapping[Any, Partial] = {
     **dict.fromkeys(
         (np.greater, np.greater_equal, np.less, np.less_equal, np.equal, np.not_equal), _equal
     ),
