@@ -10,13 +10,14 @@ from __future__ import annotations
 from contextlib import contextmanager
 from contextvars import ContextVar
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import graph
-from bayesmc.expression.functions import applied, of_function
+from bayesmc.expression.functions import applied, expression_of, of_function
 from bayesmc.expression.graph import Expression
 from bayesmc.shapes import Shape
 from bayesmc.states import label_code
@@ -34,6 +35,8 @@ class TracedArray(ArrayLike):
     ----------
     expression : Expression
         What it stands for.
+    writable : bool
+        Whether the function made it, and may write to it.
 
     Examples
     --------
@@ -44,11 +47,12 @@ class TracedArray(ArrayLike):
     <Elementwise add ()>
     """
 
-    __slots__ = ("expression",)
+    __slots__ = ("_writable", "expression")
 
-    def __init__(self, expression: Any) -> None:
+    def __init__(self, expression: Any, writable: bool = False) -> None:
         found = expression.expression if isinstance(expression, TracedArray) else expression
         self.expression: Expression = graph.as_expression(found)
+        self._writable = writable
 
     def __repr__(self) -> str:
         return f"TracedArray({self.expression!r})"
@@ -84,10 +88,15 @@ class TracedArray(ArrayLike):
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
         if any(is_foreign(x) for x in inputs):
             return NotImplemented
-        if method == "at" or "out" in kwargs:
+        (target,) = kwargs.pop("out", (None,))
+        if method == "at" or (target is not None and not getattr(target, "_writable", False)):
             raise TypeError("a parent is read-only: write x = x + 1, not x += 1, and use no out=")
         inputs = _with_codes(ufunc, method, inputs)
-        return _noted(applied, ufunc, method, inputs, kwargs)
+        result = _noted(applied, ufunc, method, inputs, kwargs)
+        if target is None:
+            return result
+        target.expression = graph.broadcast(graph.cast(result.expression, target.dtype), target.shape)
+        return target
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
         every = leaves([args, list(kwargs.values())])
@@ -101,18 +110,27 @@ class TracedArray(ArrayLike):
         return _labelled(func, args, every, result)
 
     def __getitem__(self, key: Any) -> Any:
-        return TracedArray(_noted(_indexed, self.expression, key))
+        return TracedArray(_noted_plain(_indexed, self.expression, key))
+
+    def __setitem__(self, key: Any, value: Any) -> None:
+        if not self._writable:
+            raise ValueError("assignment destination is read-only")
+        self.expression = _noted_plain(_assigned, self.expression, key, value)
 
     # ---- copies and other types ----------------------------------------------------------------
 
+    @property
+    def flags(self) -> SimpleNamespace:
+        return SimpleNamespace(writeable=self._writable)
+
     def copy(self) -> Any:
-        return TracedArray(self.expression)
+        return TracedArray(self.expression, True)
 
     def view(self, *kind: Any) -> Any:
         return TracedArray(self.expression)
 
     def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> TracedArray:
-        return TracedArray(_noted(graph.cast, self.expression, dtype))
+        return TracedArray(_noted_plain(graph.cast, self.expression, dtype), True)
 
     def clip(self, *args: Any, **kwargs: Any) -> Any:
         return np.clip(self, *args, **kwargs)
@@ -180,7 +198,7 @@ class TracedStates(TracedArray):
     __slots__ = ("states",)
 
     def __init__(self, expression: Any, states: tuple[Any, ...]) -> None:
-        super().__init__(expression)
+        super().__init__(expression, False)
         self.states = tuple(states)
 
     @property
@@ -232,16 +250,20 @@ _KEEPING = frozenset(
 
 
 def _noted(function: Any, *args: Any) -> Any:
-    """A call whose refusal is remembered."""
+    """What a call makes, as stand-ins; a refusal is remembered."""
+    return _wrapped(_noted_plain(function, *args))
+
+
+def _noted_plain(function: Any, *args: Any) -> Any:
     try:
-        return _wrapped(function(*args))
+        return function(*args)
     except TraceError as error:
         raise refused(str(error)) from error
 
 
 def _wrapped(result: Any) -> Any:
     if isinstance(result, Expression):
-        return TracedArray(result)
+        return TracedArray(result, True)
     if isinstance(result, (list, tuple)):
         return type(result)(_wrapped(r) for r in result)
     return result
@@ -336,6 +358,19 @@ def _indexed(value: Expression, key: Any) -> Expression:
         return found
     at = np.arange(found.size).reshape(found.shape)
     return graph.pick([found], at[(slice(None),) * len(rows.shape) + left])
+
+
+def _assigned(value: Expression, key: Any, new: Any) -> Expression:
+    """The array after ``value[key] = new``."""
+    keys = tuple(_plain_key(k) for k in (key if isinstance(key, tuple) else (key,)))
+    if any(isinstance(k, Expression) for k in keys):
+        raise TraceError("an array is written to at places that vary")
+    at = np.arange(value.size).reshape(value.shape)
+    places = at[keys]
+    given = graph.broadcast(graph.cast(expression_of(new), value.dtype), places.shape)
+    at = at.copy()
+    at[keys] = value.size + np.arange(given.size).reshape(given.shape)
+    return graph.pick([value, given], at)
 
 
 def _plain_key(key: Any) -> Any:

@@ -18,12 +18,14 @@ from scipy import special
 from bayesmc.expression.array import TracedArray
 from bayesmc.expression.functions import expression_of, of_function
 from bayesmc.expression.graph import constant
-from bayesmc.tracing.standin import is_traced
+from bayesmc.tracing.standin import TracedCall, is_traced
 
 #: modules whose functions give another answer the next time
 _CHANGING = frozenset(("time", "random", "datetime", "secrets", "uuid", "os"))
 #: modules whose functions are left as they are
 _KNOWN = frozenset(("numpy", "scipy", "bayesmc", "builtins", "math"))
+#: of these, where functions stand that users call in theirs
+_OPEN = ("bayesmc.robotics", "bayesmc.distributions")
 
 
 def lifted(function: types.FunctionType) -> types.FunctionType:
@@ -87,7 +89,7 @@ def _changing(name: str, value: Any, function: types.FunctionType) -> str | None
 def _is_open(function: types.FunctionType) -> bool:
     """Whether a function is a user's, or one of those that users call in theirs."""
     module = str(function.__module__ or "")
-    return _room(function) not in _KNOWN or module.startswith("bayesmc.robotics")
+    return _room(function) not in _KNOWN or module.startswith(_OPEN)
 
 
 def _room(value: Any) -> str:
@@ -155,9 +157,25 @@ def _if_traced(original: Callable[..., Any], rule: Callable[..., Any]) -> Callab
     return chosen
 
 
-def _array(value: Any, dtype: Any = None, *, copy: Any = None) -> Any:
-    found = TracedArray(expression_of(value))
+def _array(value: Any, dtype: Any = None, **kwargs: Any) -> Any:
+    found = TracedArray(expression_of(value), True)
     return found if dtype is None else found.astype(dtype)
+
+
+def _made(original: Callable[..., Any]) -> Callable[..., Any]:
+    """A function that makes an array, which can then be indexed by, and filled with, stand-ins."""
+
+    def made(*args: Any, **kwargs: Any) -> Any:
+        found = _array(*args, **kwargs) if _is_copy(original, args) else original(*args, **kwargs)
+        standard = type(found) is np.ndarray and found.dtype in (float, np.int64, bool)
+        return TracedArray(constant(found), True) if standard and found.ndim else found
+
+    return made
+
+
+def _is_copy(original: Callable[..., Any], args: tuple[Any, ...]) -> bool:
+    copies = original in (np.array, np.asarray, np.asanyarray)
+    return copies and is_traced(list(args)) and not any(isinstance(a, TracedCall) for a in args)
 
 
 def _log_sum_exp(a: Any, axis: Any = None, b: Any = None, keepdims: bool = False) -> Any:
@@ -183,13 +201,16 @@ def _log_softmax(x: Any, axis: Any = None) -> Any:
 _INSTEAD: dict[Any, Callable[..., Any]] = {
     original: _if_traced(original, rule)
     for original, rule in (
-        (np.array, _array),
-        (np.asarray, _array),
-        (np.asanyarray, _array),
         (np.take, lambda *args, **kwargs: TracedArray(of_function(np.take, args, kwargs))),
         (np.float64, lambda x: _array(x, float)),
         (special.logsumexp, _log_sum_exp),
         (special.softmax, _softmax),
         (special.log_softmax, _log_softmax),
     )
-}
+} | {
+    original: _made(original)
+    for original in (
+        np.array, np.asarray, np.asanyarray, np.zeros, np.ones, np.empty, np.full, np.eye,
+        np.identity, np.arange, np.linspace,
+    )
+}  # fmt: skip
