@@ -7,9 +7,9 @@ Interception by ``__array_ufunc__`` and ``__array_function__``: NumPy enhancemen
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import graph
+from bayesmc.expression.bounds import counted_from_end, within
 from bayesmc.expression.functions import applied, expression_of, of_function
 from bayesmc.expression.graph import Expression
 from bayesmc.shapes import Shape
@@ -95,7 +96,9 @@ class TracedArray(ArrayLike):
         result = _noted(applied, ufunc, method, inputs, kwargs)
         if target is None:
             return result
-        target.expression = graph.broadcast(graph.cast(result.expression, target.dtype), target.shape)
+        target.expression = graph.broadcast(
+            graph.cast(result.expression, target.dtype), target.shape
+        )
         return target
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
@@ -122,6 +125,10 @@ class TracedArray(ArrayLike):
     @property
     def flags(self) -> SimpleNamespace:
         return SimpleNamespace(writeable=self._writable)
+
+    def within(self, size: int) -> TracedArray:
+        """The same as an index along a plate of this size; another is an error once it is looked up."""
+        return TracedArray(within(self.expression, size))
 
     def copy(self) -> Any:
         return TracedArray(self.expression, True)
@@ -166,7 +173,9 @@ class TracedArray(ArrayLike):
 
     def _refuse(self, what: str) -> Exception:
         names = ", ".join(sorted(self.expression.leaves)) or "a constant"
-        return refused(f"it asks for {what} of {names}, where only NumPy operations can be followed")
+        return refused(
+            f"it asks for {what} of {names}, where only NumPy operations can be followed"
+        )
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         return np.array(self._known("a plain array"), dtype)
@@ -299,7 +308,9 @@ def _with_codes(ufunc: Any, method: str, inputs: tuple[Any, ...]) -> tuple[Any, 
 def _is_label(value: Any) -> bool:
     if isinstance(value, (str, tuple)):
         return True
-    return isinstance(value, (list, np.ndarray, np.generic)) and np.asarray(value).dtype.kind in "USO"
+    return (
+        isinstance(value, (list, np.ndarray, np.generic)) and np.asarray(value).dtype.kind in "USO"
+    )
 
 
 def _code(value: Any, states: tuple[Any, ...]) -> Any:
@@ -347,8 +358,7 @@ def _indexed(value: Expression, key: Any) -> Expression:
         at = graph.as_expression(k)
         if at.dtype.kind != "i":
             raise TraceError("an index that is not a whole number")
-        wrapped = graph.elementwise(np.where, graph.elementwise(np.less, at, 0), size, 0)
-        at = graph.elementwise(np.add, at, wrapped)
+        at = within(counted_from_end(at, size), size)
         rows = graph.elementwise(np.add, graph.elementwise(np.multiply, rows, size), at)
     rest = value.shape[len(lead) :]
     table = graph.reshape(value, (-1, *rest)) if value.size else value

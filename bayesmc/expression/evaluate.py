@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
-from bayesmc.errors import TraceError
 from bayesmc.expression.graph import (
     Call,
     Constant,
@@ -183,7 +182,11 @@ def _strides(positions: np.ndarray) -> tuple[int, Shape] | None:
     steps = []
     made = np.asarray(first)
     for axis, size in enumerate(positions.shape):
-        second = positions[(0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)] if size > 1 else first
+        second = (
+            positions[(0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)]
+            if size > 1
+            else first
+        )
         steps.append(int(second) - first)
         along = np.arange(size).reshape((size,) + (1,) * (positions.ndim - axis - 1))
         made = made + steps[-1] * along
@@ -214,7 +217,7 @@ def _gather(node: Gather) -> Step:
 
     def step(values: np.ndarray, at: np.ndarray) -> np.ndarray:
         if at.size and not (at.min() >= 0 and at.max() < size):
-            raise TraceError(f"an index is outside of 0..{size - 1}")
+            raise IndexError(f"an index is outside of 0..{size - 1}")
         if values.ndim == rank:
             return np.take(values, at, axis=0)
         own = at.shape[: at.ndim - row_rank]

@@ -15,6 +15,7 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import graph
+from bayesmc.expression.bounds import counted_from_end, within
 from bayesmc.expression.graph import Expression
 from bayesmc.expression.products import PRODUCTS, einsum, product
 
@@ -257,7 +258,10 @@ def _select(conditions: Any, choices: Any, default: Any = 0) -> Expression:
 
 def _clip(a: Any, a_min: Any = None, a_max: Any = None, *, min: Any = None, max: Any = None) -> Any:
     found = expression_of(a)
-    for bound, ufunc in ((a_min if min is None else min, np.maximum), (a_max if max is None else max, np.minimum)):
+    for bound, ufunc in (
+        (a_min if min is None else min, np.maximum),
+        (a_max if max is None else max, np.minimum),
+    ):
         if bound is not None:
             found = graph.elementwise(ufunc, found, expression_of(bound))
     return found
@@ -300,7 +304,7 @@ def _take(a: Any, indices: Any, axis: Any = None, mode: str = "raise") -> Expres
         node, axis, ndim = graph.reshape(node, (node.size,)), 0, 1
     if axis % ndim:
         raise TraceError("np.take of an inner axis at computed places")
-    return graph.gather(node, _from_end(at, node.shape[0]))
+    return graph.gather(node, counted_from_end(at, node.shape[0]))
 
 
 def _take_along_axis(arr: Any, indices: Any, axis: Any = -1) -> Expression:
@@ -308,14 +312,18 @@ def _take_along_axis(arr: Any, indices: Any, axis: Any = -1) -> Expression:
     axis %= len(node.shape)
     base = np.take(np.arange(node.size).reshape(node.shape), [0], axis=axis)
     stride = int(np.prod(node.shape[axis + 1 :], dtype=int))
-    steps = graph.elementwise(np.multiply, _from_end(at, node.shape[axis]), stride)
+    steps = graph.elementwise(
+        np.multiply, within(counted_from_end(at, node.shape[axis]), node.shape[axis]), stride
+    )
     return graph.gather(graph.reshape(node, (node.size,)), graph.elementwise(np.add, base, steps))
 
 
-def _from_end(at: Expression, size: int) -> Expression:
-    """Positions counted from the end where they are negative."""
-    back = graph.elementwise(np.where, graph.elementwise(np.less, at, 0), size, 0)
-    return graph.elementwise(np.add, at, back)
+def _sort(a: Any, axis: Any = -1, kind: Any = None) -> Expression:
+    node = expression_of(a)
+    if axis is None:
+        raise TraceError("np.sort of all axes")
+    order = repeated(np.argsort, (node,), {"axis": axis, "kind": kind})
+    return _take_along_axis(node, order, axis)
 
 
 def _isin(element: Any, test_elements: Any, *, invert: bool = False) -> Expression:
@@ -388,7 +396,9 @@ def _polyval(p: Any, x: Any) -> Expression:
     return found
 
 
-def _nan_to_num(x: Any, copy: bool = True, nan: float = 0.0, posinf: Any = None, neginf: Any = None) -> Any:
+def _nan_to_num(
+    x: Any, copy: bool = True, nan: float = 0.0, posinf: Any = None, neginf: Any = None
+) -> Any:
     info = np.finfo(float)
     found = expression_of(x)
     for test, number in (
@@ -396,7 +406,9 @@ def _nan_to_num(x: Any, copy: bool = True, nan: float = 0.0, posinf: Any = None,
         (_is_plus_infinity, info.max if posinf is None else posinf),
         (_is_minus_infinity, info.min if neginf is None else neginf),
     ):
-        found = _where(graph.elementwise(test, found) if test is np.isnan else test(found), number, found)
+        found = _where(
+            graph.elementwise(test, found) if test is np.isnan else test(found), number, found
+        )
     return found
 
 
@@ -430,7 +442,7 @@ _RULES: Mapping[Any, Callable[..., Any]] = {
     np.linalg.norm: _norm, np.isin: _isin, np.take: _take, np.take_along_axis: _take_along_axis,
     np.einsum: einsum, np.dot: _dot, np.outer: _outer, np.broadcast_arrays: _broadcast_arrays,
     np.inner: lambda a, b: product(np.vecdot, expression_of(a), expression_of(b)),
-    np.diff: _diff, np.full_like: _full_like, np.triu: _masked(np.triu), np.tril: _masked(np.tril),
+    np.sort: _sort, np.diff: _diff, np.full_like: _full_like, np.triu: _masked(np.triu), np.tril: _masked(np.tril),
     np.diag: _diag, np.polyval: _polyval, np.nan_to_num: _nan_to_num, np.round: _round,
     np.around: _round, np.sinc: _sinc, np.copy: _copied,
     np.average: lambda a, axis=None, weights=None: _average(a, axis, weights),

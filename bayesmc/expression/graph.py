@@ -63,10 +63,18 @@ class Expression:
 
 
 class Leaf(Expression):
-    """A value that is given: a node's, as it is stored."""
+    """A value that is given: a node's, as it is stored.
 
-    __slots__ = ("name",)
+    Attributes
+    ----------
+    name : str
+    states : int or None
+        It is one of the positions 0, 1, ... below this number.
+    """
+
+    __slots__ = ("name", "states")
     name: str
+    states: int | None
 
     @property
     def detail(self) -> str:
@@ -154,8 +162,8 @@ class Call(Expression):
         return call(self.call, operands)
 
 
-def leaf(name: str, shape: Shape, dtype: Any = float) -> Leaf:
-    """A value that is given.
+def leaf(name: str, shape: Shape, dtype: Any = float, states: int | None = None) -> Leaf:
+    """A value that is given; with ``states``, a position below that number.
 
     Examples
     --------
@@ -165,8 +173,8 @@ def leaf(name: str, shape: Shape, dtype: Any = float) -> Leaf:
     >>> elementwise(np.exp, x), elementwise(np.exp, x) is elementwise(np.exp, x)
     (<Elementwise exp (3,)>, True)
     """
-    made = _interned(Leaf, (), (name,), shape, np.dtype(dtype))
-    made.name = name
+    made = _interned(Leaf, (), (name, states), shape, np.dtype(dtype))
+    made.name, made.states = name, states
     made.leaves = frozenset((name,))
     return made
 
@@ -236,7 +244,8 @@ def pick(operands: Sequence[Any], positions: Any) -> Expression:
     at = np.asarray(positions, np.intp)
     args, at = _used(args, at)
     if not args:  # nothing is picked
-        return constant(np.zeros(at.shape))
+        types = {as_expression(a).dtype for a in operands}
+        return constant(np.zeros(at.shape, np.result_type(*types)))
     if len(args) == 1:
         (arg,) = args
         if at.shape == arg.shape and _counts_up(at):
@@ -288,7 +297,9 @@ def reduction(ufunc: np.ufunc, operand: Any, axes: Sequence[int]) -> Expression:
     arg = as_expression(operand)
     along = tuple(sorted({a + len(arg.shape) if a < 0 else a for a in axes}))
     if any(not 0 <= a < len(arg.shape) for a in along):
-        raise TraceError(f"np.{ufunc.__name__}: axes {tuple(axes)} of an array of shape {arg.shape}")
+        raise TraceError(
+            f"np.{ufunc.__name__}: axes {tuple(axes)} of an array of shape {arg.shape}"
+        )
     if not along:
         return arg
     shape = tuple(n for k, n in enumerate(arg.shape) if k not in along)
@@ -446,4 +457,3 @@ def _used(
     moved = np.zeros(len(args), np.intp)
     moved[read] = np.cumsum(sizes) - sizes
     return tuple(args[k] for k in read), at - starts[which] + moved[which] if at.size else at
-

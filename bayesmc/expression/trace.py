@@ -34,11 +34,19 @@ class Family:
     parameters: dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Frozen:
     """A family of ``scipy.stats``."""
 
     dist: Any
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Frozen) or hasattr(self.dist, "xk"):  # a table of its own
+            return False
+        return (type(self.dist), self.dist.name) == (type(other.dist), other.dist.name)
+
+    def __hash__(self) -> int:
+        return hash((type(self.dist), self.dist.name))
 
     def __call__(self, args: Sequence[Any], **kwds: Any) -> Any:
         return self.dist(*args, **kwds)

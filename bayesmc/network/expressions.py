@@ -102,7 +102,9 @@ def value_of(model: Model, name: str) -> Expression:
         return broadcast(found.result, node.value_shape)
     parents = tuple(dict.fromkeys(node.parents))
     operands = [
-        _stored_value(model, p) if model[p].kind == "deterministic" else stored_leaf(model, model[p])
+        _stored_value(model, p)
+        if model[p].kind == "deterministic"
+        else stored_leaf(model, model[p])
         for p in parents
     ]
     stored = call(_NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
@@ -111,7 +113,8 @@ def value_of(model: Model, name: str) -> Expression:
 
 def stored_leaf(model: Model, node: CompiledNode) -> Expression:
     """A node's stored value as a leaf."""
-    return leaf(node.name, node.value_shape, _dtype(model, node))
+    states = None if node.domain is None else node.domain.size
+    return leaf(node.name, node.value_shape, _dtype(model, node), states)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import TraceError
-from bayesmc.expression import Call, Expression, TracedArray, as_expression, call, pick, reduction, reshape
+from bayesmc.expression import (
+    Call,
+    Expression,
+    TracedArray,
+    as_expression,
+    call,
+    pick,
+    reduction,
+    reshape,
+)
 from bayesmc.expression.functions import Repeated
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.shapes import Shape
@@ -29,7 +38,12 @@ def scattered(part: Expression, positions: np.ndarray, shape: Shape) -> Expressi
         return reduction(np.add, pick([part], order), [len(shape)])
     order = np.argsort(flat, kind="stable")
     starts = np.cumsum(counts) - counts
-    return call(_Scattered(_Bytes.of(order), _Bytes.of(starts), _Bytes.of(counts), shape), [reshape(part, (flat.size,))], shape, float)
+    return call(
+        _Scattered(_Bytes.of(order), _Bytes.of(starts), _Bytes.of(counts), shape),
+        [reshape(part, (flat.size,))],
+        shape,
+        float,
+    )
 
 
 def gathered(part: Expression, rows: Expression, shape: Shape) -> Expression:

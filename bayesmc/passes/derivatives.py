@@ -1,7 +1,8 @@
 """Derivatives of expressions, as expressions: along directions, or of a number by everything below it.
 
-At a kink (``np.abs`` at 0) a derivative is NaN; what is constant in pieces has the derivative 0. Branches
-that ``np.where`` leaves out add nothing, even where their own derivative overflows.
+At a kink (``np.abs`` at 0, ``np.maximum`` of equal numbers) a derivative is the mean of those on both sides,
+so that kinks that cancel do (``x - x.max()`` in a softmax); what is constant in pieces has the derivative 0.
+Branches that ``np.where`` leaves out add nothing, even where their own derivative overflows.
 
 References
 ----------
@@ -36,8 +37,14 @@ from bayesmc.expression import (
     reshape,
 )
 from bayesmc.expression.graph import CASTS
-from bayesmc.passes.adjoints import call_adjoints, call_tangent, excluded_products, gathered, scattered
-from bayesmc.passes.arithmetic import ONE, ZERO, add, is_all, multiply, tidy
+from bayesmc.passes.adjoints import (
+    call_adjoints,
+    call_tangent,
+    excluded_products,
+    gathered,
+    scattered,
+)
+from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, tidy
 from bayesmc.tracing.partials import PIECES, partials
 
 
@@ -141,7 +148,7 @@ def slopes(node: Elementwise) -> list[Expression | None]:
         return [None] * len(node.operands)
     if node.function in CASTS:
         return [ONE]
-    rules = partials(node.function)
+    rules = _KINKED.get(node.function) or partials(node.function)
     if rules is None:
         raise TraceError(f"no derivative of {node.detail} is known")
     values = [TracedArray(a) for a in (*node.operands, node)]
@@ -149,6 +156,25 @@ def slopes(node: Elementwise) -> list[Expression | None]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _larger(a: Any, b: Any, y: Any) -> Any:
+    return np.where(np.equal(a, b), 0.5, np.where(np.greater(a, b), 1.0, 0.0))
+
+
+def _smaller(a: Any, b: Any, y: Any) -> Any:
+    return _larger(b, a, y)
+
+
+_KINKED: Mapping[Any, tuple[Any, ...]] = {
+    np.absolute: (lambda x, y: np.sign(x),),
+    np.fabs: (lambda x, y: np.sign(x),),
+    np.maximum: (_larger, _smaller),
+    np.fmax: (_larger, _smaller),
+    np.minimum: (_smaller, _larger),
+    np.fmin: (_smaller, _larger),
+    np.remainder: (lambda a, b, y: 1.0, lambda a, b, y: np.negative(np.floor_divide(a, b))),
+}
 
 
 def _as_expression(value: Any) -> Expression:
@@ -239,7 +265,7 @@ def _reduced_slopes(node: Reduction) -> Expression | None:
     if node.ufunc in (np.maximum, np.minimum, np.fmax, np.fmin):
         top = tidy(np.where, elementwise(np.equal, operand, whole), ONE, ZERO)
         count = reshape(reduction(np.add, top, node.axes), kept)
-        return tidy(np.where, elementwise(np.greater, count, 1.0), np.nan, top)
+        return divide(top, count)
     raise TraceError(f"no derivative of {node.ufunc.__name__}.reduce is known")
 
 
@@ -252,5 +278,3 @@ def _unbroadcast(part: Expression, shape: tuple[int, ...]) -> Expression:
     lead = len(whole) - len(shape)
     inner = [lead + k for k, n in enumerate(shape) if n == 1 and whole[lead + k] != 1]
     return reshape(reduction(np.add, part, [*range(lead), *inner]), shape)
-
-
