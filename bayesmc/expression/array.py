@@ -329,8 +329,8 @@ def _labelled(func: Any, args: Any, every: list[Any], result: Any) -> Any:
     moved = leaves(args[0]) if joins else [args[0]]
     if func in (np.where, np.broadcast_arrays):
         moved = list(args[1:] if func is np.where else args)
-    states = {x.states if isinstance(x, TracedStates) else None for x in moved}
-    if len(states) != 1 or None in states:
+    states = {x.states for x in moved if isinstance(x, TracedStates)}
+    if len(states) != 1 or not all(isinstance(x, TracedStates) for x in moved):
         return result
     (labels,) = states
     if isinstance(result, (list, tuple)):
@@ -346,7 +346,8 @@ def _indexed(value: Expression, key: Any) -> Expression:
         return graph.pick([value], at)
     if not isinstance(value, graph.Constant):
         raise TraceError(
-            "an array that varies is indexed by one that varies: gather along a plate, or use np.take_along_axis"
+            "an array that varies is indexed by one that varies: gather along a plate, or use "
+            "np.take_along_axis"
         )
     computed = [n for n, k in enumerate(keys) if isinstance(k, Expression)]
     lead = keys[: computed[-1] + 1]

@@ -398,26 +398,16 @@ def _polyval(p: Any, x: Any) -> Expression:
 
 def _nan_to_num(
     x: Any, copy: bool = True, nan: float = 0.0, posinf: Any = None, neginf: Any = None
-) -> Any:
+) -> Expression:
     info = np.finfo(float)
     found = expression_of(x)
-    for test, number in (
-        (np.isnan, nan),
-        (_is_plus_infinity, info.max if posinf is None else posinf),
-        (_is_minus_infinity, info.min if neginf is None else neginf),
+    for bad, number in (
+        (graph.elementwise(np.isnan, found), nan),
+        (graph.elementwise(np.equal, found, np.inf), info.max if posinf is None else posinf),
+        (graph.elementwise(np.equal, found, -np.inf), info.min if neginf is None else neginf),
     ):
-        found = _where(
-            graph.elementwise(test, found) if test is np.isnan else test(found), number, found
-        )
+        found = _where(bad, number, found)
     return found
-
-
-def _is_plus_infinity(x: Expression) -> Expression:
-    return graph.elementwise(np.equal, x, np.inf)
-
-
-def _is_minus_infinity(x: Expression) -> Expression:
-    return graph.elementwise(np.equal, x, -np.inf)
 
 
 def _round(a: Any, decimals: int = 0) -> Any:
@@ -442,8 +432,9 @@ _RULES: Mapping[Any, Callable[..., Any]] = {
     np.linalg.norm: _norm, np.isin: _isin, np.take: _take, np.take_along_axis: _take_along_axis,
     np.einsum: einsum, np.dot: _dot, np.outer: _outer, np.broadcast_arrays: _broadcast_arrays,
     np.inner: lambda a, b: product(np.vecdot, expression_of(a), expression_of(b)),
-    np.sort: _sort, np.diff: _diff, np.full_like: _full_like, np.triu: _masked(np.triu), np.tril: _masked(np.tril),
-    np.diag: _diag, np.polyval: _polyval, np.nan_to_num: _nan_to_num, np.round: _round,
+    np.sort: _sort, np.diff: _diff, np.full_like: _full_like, np.triu: _masked(np.triu),
+    np.tril: _masked(np.tril), np.diag: _diag, np.polyval: _polyval, np.nan_to_num: _nan_to_num,
+    np.round: _round,
     np.around: _round, np.sinc: _sinc, np.copy: _copied,
     np.average: lambda a, axis=None, weights=None: _average(a, axis, weights),
     np.ptp: lambda a, axis=None: graph.elementwise(

@@ -35,14 +35,17 @@ class Expression:
         ``float64``, ``int64`` or ``bool``.
     leaves : frozenset of str
         Names of the leaves it depends on.
+    content : tuple
+        What tells it from others with the same operands.
     """
 
-    __slots__ = ("__weakref__", "dtype", "leaves", "operands", "shape")
+    __slots__ = ("__weakref__", "content", "dtype", "leaves", "operands", "shape")
 
     operands: tuple[Expression, ...]
     shape: Shape
     dtype: np.dtype
     leaves: frozenset[str]
+    content: tuple
 
     @property
     def size(self) -> int:
@@ -377,8 +380,10 @@ def substituted(root: Expression, values: dict[str, Expression]) -> Expression:
     """The expression with others in place of some leaves, by name."""
     if not root.leaves & set(values):
         return root
-    of = {n: values[n.name] for n in ordered(root) if isinstance(n, Leaf) and n.name in values}
-    return replaced(root, dict(of))
+    of: dict[Expression, Expression] = {
+        n: values[n.name] for n in ordered(root) if isinstance(n, Leaf) and n.name in values
+    }
+    return replaced(root, of)
 
 
 def sample(arg: Expression) -> np.ndarray:
@@ -395,7 +400,7 @@ _TABLE: WeakValueDictionary[tuple, Expression] = WeakValueDictionary()
 
 
 def _interned(
-    kind: type, operands: tuple[Expression, ...], what: tuple, shape: Shape, dtype: np.dtype
+    kind: Any, operands: tuple[Expression, ...], what: tuple, shape: Shape, dtype: np.dtype
 ) -> Any:
     """The one object for an expression."""
     key = (kind, operands, what, shape, dtype)
@@ -403,7 +408,7 @@ def _interned(
     if found is None:
         found = kind.__new__(kind)
         found.operands, found.shape, found.dtype = operands, shape, dtype
-        found.leaves = _union(operands)
+        found.leaves, found.content = _union(operands), what
         _TABLE[key] = found
     return found
 

@@ -8,6 +8,7 @@ themselves in a copy of the function.
 from __future__ import annotations
 
 import contextlib
+import dis
 import types
 from collections.abc import Callable
 from typing import Any
@@ -58,7 +59,7 @@ def tells_time_or_chance(function: Any) -> str | None:
 
 def _captured(function: types.FunctionType) -> list[tuple[str, Any]]:
     """What a function reads from around it: globals, cells, defaults."""
-    names = set(_names(function.__code__))
+    names = _globals(function.__code__)
     found = [(n, function.__globals__[n]) for n in names if n in function.__globals__]
     for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
         with contextlib.suppress(ValueError):  # an empty cell
@@ -71,6 +72,12 @@ def _names(code: types.CodeType) -> list[str]:
     """Names that code reads, of functions inside of it, too."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
     return [*code.co_names, *(n for c in inner for n in _names(c))]
+
+
+def _globals(code: types.CodeType) -> set[str]:
+    """Names that code looks up around it, of functions inside of it, too."""
+    found = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
+    return found.union(*(_globals(c) for c in code.co_consts if isinstance(c, types.CodeType)))
 
 
 def _changing(name: str, value: Any, function: types.FunctionType) -> str | None:

@@ -183,7 +183,7 @@ def _stored_value(model: Model, name: str) -> Expression:
     numbers = node.domain.numbers
     assert numbers is not None
     order = np.argsort(numbers)
-    found: Any = np.searchsorted(numbers[order], TracedArray(value))  # type: ignore[call-overload]
+    found: Any = np.searchsorted(numbers[order], TracedArray(value))
     return gather(constant(order), found.expression)
 
 
@@ -233,7 +233,8 @@ def _of_table(model: Model, node: CompiledNode) -> Family:
             stored = _stored_value(model, parent)
         else:
             stored = stored_leaf(model, parent_node)
-        rows = rows * card + link.place(TracedArray(stored))  # type: ignore[arg-type]
+        placed: Any = TracedArray(stored)
+        rows = rows * card + link.place(placed)
     table = constant(probs.reshape(-1, probs.shape[-1]))
     rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
     return Family(Categorical, {"probs": gather(table, rows)})

@@ -383,7 +383,7 @@ def _as_index(key: Any, plate: str, size: int) -> PlateArray:
         )
     held = foreign.array if foreign is not None else key
     is_known = not hasattr(held, "within")  # what stands for an index is looked at once it is known
-    array = np.asarray(held) if is_known else held
+    array: Any = np.asarray(held) if is_known else held
     if array.dtype.kind not in "iu":
         raise IndexError(
             f"plate {plate!r} is gathered by integers 0..{size - 1} (a discrete parent, an integer or "

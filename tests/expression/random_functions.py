@@ -42,7 +42,8 @@ _UNARY: dict[str, Callable[[Any], Any]] = {
 _BINARY: dict[str, Callable[[Any, Any], Any]] = {
     "add": lambda x, y: x + y, "subtract": lambda x, y: x - y, "multiply": lambda x, y: np.tanh(x) * y,
     "divide": lambda x, y: x / (1.5 + np.sin(y)), "maximum": np.maximum, "hypot": np.hypot,
-    "arctan2": lambda x, y: np.arctan2(x, 2.5 + np.cos(y)), "power": lambda x, y: (1 + np.abs(x)) ** np.tanh(y),
+    "arctan2": lambda x, y: np.arctan2(x, 2.5 + np.cos(y)),
+    "power": lambda x, y: (1 + np.abs(x)) ** np.tanh(y),
     "logaddexp": np.logaddexp, "where": lambda x, y: np.where(x < y, x, y),
 }  # fmt: skip
 #: of vectors on the last axis
@@ -51,13 +52,16 @@ _VECTOR: dict[str, Callable[[Any], Any]] = {
     "cumsum": lambda x: 0.5 * np.cumsum(x, axis=-1), "roll": lambda x: np.roll(x, 1, axis=-1),
     "matvec": lambda x: np.matvec(SQUARE, x) / 4, "pick": lambda x: x[..., [2, 0, 0]],
     "stack": lambda x: bmc.stack([x[..., 0], x[..., 2], np.sin(x[..., 1])]),
-    "softmax": lambda x: special.softmax(x, axis=-1), "logsumexp": lambda x: x - special.logsumexp(x, axis=-1, keepdims=True),
-    "mean": lambda x: x - np.mean(x, axis=-1, keepdims=True), "einsum": lambda x: np.einsum("...i,ij->...j", x, SQUARE) / 4,
+    "softmax": lambda x: special.softmax(x, axis=-1),
+    "logsumexp": lambda x: x - special.logsumexp(x, axis=-1, keepdims=True),
+    "mean": lambda x: x - np.mean(x, axis=-1, keepdims=True),
+    "einsum": lambda x: np.einsum("...i,ij->...j", x, SQUARE) / 4,
     "concatenate": lambda x: np.concatenate([x[..., 1:], x[..., :1] ** 2 / (1 + x[..., :1] ** 2)], axis=-1),
     "solve": lambda x: np.linalg.solve(SQUARE, x[..., None])[..., 0],
     "norm": lambda x: x / (1 + np.linalg.norm(x, axis=-1, keepdims=True)),
     "max": lambda x: x - 0.5 * np.max(x, axis=-1, keepdims=True), "sort": lambda x: np.sort(x, axis=-1),
-    "filled": lambda x: _filled(x), "diff": lambda x: np.concatenate([x[..., :1], np.diff(x, axis=-1)], axis=-1),
+    "filled": lambda x: _filled(x),
+    "diff": lambda x: np.concatenate([x[..., :1], np.diff(x, axis=-1)], axis=-1),
     "outer": lambda x: np.sum(x[..., :, None] * np.tanh(x)[..., None, :], axis=-1) / 3,
     "prod": lambda x: np.prod(np.tanh(x), axis=-1, keepdims=True) * x,
 }  # fmt: skip

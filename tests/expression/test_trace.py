@@ -136,7 +136,7 @@ LIES = {
     "a counter": (_counting, "differ"),
     "the clock": (_clock, "time"),
     "random numbers": (_drawn, "random numbers from GENERATOR"),
-    "random numbers of its own": (_numpy_drawn, "random numbers"),
+    "random numbers of its own": (_numpy_drawn, "random"),
     "random numbers of Python": (_python_drawn, "random"),
     "float()": (lambda x: float(x[0]) * x, r"float\(\)"),
     "math of Python": (lambda x: x * max(x[0], x[1]), "truth"),
