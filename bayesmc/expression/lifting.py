@@ -54,6 +54,17 @@ def tells_time_or_chance(function: Any) -> str | None:
     return None
 
 
+def log_sum_exp(a: Any, axis: Any = None, b: Any = None, keepdims: bool = False) -> Any:
+    """``log(sum(b * exp(a)))`` in the log domain, of arrays or what stands for them."""
+    top = np.max(a, axis=axis, keepdims=True)
+    top = np.where(np.isfinite(top), top, 0.0)
+    terms = np.exp(a - top) if b is None else b * np.exp(a - top)
+    found = np.log(np.sum(terms, axis=axis, keepdims=True)) + top
+    if keepdims:
+        return found
+    return np.sum(found, axis=axis)  # of one
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -185,16 +196,6 @@ def _is_copy(original: Callable[..., Any], args: tuple[Any, ...]) -> bool:
     return copies and is_traced(list(args)) and not any(isinstance(a, TracedCall) for a in args)
 
 
-def _log_sum_exp(a: Any, axis: Any = None, b: Any = None, keepdims: bool = False) -> Any:
-    top = np.max(a, axis=axis, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    terms = np.exp(a - top) if b is None else b * np.exp(a - top)
-    found = np.log(np.sum(terms, axis=axis, keepdims=True)) + top
-    if keepdims:
-        return found
-    return np.sum(found, axis=axis)  # of one
-
-
 def _softmax(x: Any, axis: Any = None) -> Any:
     shifted = np.exp(x - np.max(x, axis=axis, keepdims=True))
     return shifted / np.sum(shifted, axis=axis, keepdims=True)
@@ -210,7 +211,7 @@ _INSTEAD: dict[Any, Callable[..., Any]] = {
     for original, rule in (
         (np.take, lambda *args, **kwargs: TracedArray(of_function(np.take, args, kwargs))),
         (np.float64, lambda x: _array(x, float)),
-        (special.logsumexp, _log_sum_exp),
+        (special.logsumexp, log_sum_exp),
         (special.softmax, _softmax),
         (special.log_softmax, _log_softmax),
     )

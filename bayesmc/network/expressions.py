@@ -30,6 +30,7 @@ from bayesmc.expression import (
 from bayesmc.network.align import Aligner
 from bayesmc.network.domain import Domain
 from bayesmc.network.model import CompiledNode, Model
+from bayesmc.passes.log_density import family_of, log_density
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
 
@@ -77,6 +78,26 @@ def density(model: Model, name: str) -> Followed | Opaque:
     if name not in known:
         known[name] = _read(model, name)
     return known[name]
+
+
+def log_density_of(model: Model, name: str) -> Expression:
+    """The log density of a stochastic node at its stored value, shape its plates.
+
+    Raises
+    ------
+    TraceError
+        Its function cannot be followed, or its family has no closed form.
+    """
+    node, found = model[name], density(model, name)
+    if isinstance(found, Opaque):
+        raise TraceError(f"node {name!r}: {found.reason}")
+    family = found.result
+    if isinstance(family, Distribution):
+        family = family_of(family)
+    value: Expression = stored_leaf(model, node)
+    if node.domain is not None and node.domain.low:
+        value = elementwise(np.add, value, node.domain.low)
+    return broadcast(log_density(family, value), node.plate_shape)
 
 
 def argument(model: Model, parent: str, link: Aligner) -> Any:
@@ -237,7 +258,7 @@ def _of_table(model: Model, node: CompiledNode) -> Family:
         rows = rows * card + link.place(placed)
     table = constant(probs.reshape(-1, probs.shape[-1]))
     rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
-    return Family(Categorical, {"probs": gather(table, rows)})
+    return Family(Categorical, {"probs": gather(table, rows), "logits": None})
 
 
 def _check(model: Model, node: CompiledNode, found: Followed) -> None:

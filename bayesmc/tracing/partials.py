@@ -127,6 +127,8 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
     special.ndtr: (lambda x, y: np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi),),
     special.log_ndtr: (lambda x, y: np.exp(-0.5 * x * x - y) / np.sqrt(2.0 * np.pi),),
     special.gammaln: (lambda x, y: special.digamma(x),),
+    special.digamma: (lambda x, y: special.zeta(2.0, x),),
+    special.i0e: (lambda x, y: special.i1e(x) - np.sign(x) * y,),
     special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: np.true_divide(a, b)),
     special.xlog1py: (lambda a, b, y: np.log1p(b), lambda a, b, y: np.true_divide(a, 1.0 + b)),
 }

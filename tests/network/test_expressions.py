@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.errors import TraceError
+from bayesmc.expression import Program, as_expression, elementwise, reduction
 from bayesmc.network import expressions
 from bayesmc.network.expressions import Followed, Opaque, density
 from tests.network.zoo import ZOO, build
@@ -25,6 +27,33 @@ def test_the_zoo_is_followed(name):
                 node,
                 found.reason,
             )
+
+
+@pytest.mark.parametrize("name", ZOO)
+def test_log_densities_are_those_of_the_model(name):
+    """Summed over the nodes they are the joint density, and their gradient is that of differences."""
+    net, inputs = build(name)
+    model = net.model({}, inputs or {})
+    total = as_expression(0.0)
+    for node in model.nodes.values():
+        if node.is_stochastic and node.kind == "stochastic":
+            try:
+                own = expressions.log_density_of(model, node.name)
+            except TraceError as error:
+                pytest.skip(str(error))
+            own = reduction(np.add, own, range(len(own.shape)))
+            total = elementwise(np.add, total, own)
+    draws = net.sample(3, rng=1, **({"inputs": inputs} if inputs else {}))
+    stored = {
+        n: model[n].domain.encode(v) if model[n].domain is not None else v
+        for n, v in draws.items()
+        if n in total.leaves
+    }
+    for n in total.leaves - set(stored):
+        stored[n] = np.asarray((inputs or {})[n])
+    (found,) = Program([total])(stored)
+    expected = net.log_prob(draws, **({"inputs": inputs} if inputs else {}))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_deterministic_nodes_are_substituted():
