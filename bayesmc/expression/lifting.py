@@ -11,6 +11,7 @@ import contextlib
 import dis
 import types
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -79,16 +80,20 @@ def _captured(function: types.FunctionType) -> list[tuple[str, Any]]:
     return found
 
 
-def _names(code: types.CodeType) -> list[str]:
+@lru_cache(maxsize=4096)
+def _names(code: types.CodeType) -> tuple[str, ...]:
     """Names that code reads, of functions inside of it, too."""
     inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    return [*code.co_names, *(n for c in inner for n in _names(c))]
+    return (*code.co_names, *(n for c in inner for n in _names(c)))
 
 
-def _globals(code: types.CodeType) -> set[str]:
+@lru_cache(maxsize=4096)
+def _globals(code: types.CodeType) -> frozenset[str]:
     """Names that code looks up around it, of functions inside of it, too."""
-    found = {i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL"}
-    return found.union(*(_globals(c) for c in code.co_consts if isinstance(c, types.CodeType)))
+    found = (i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL")
+    return frozenset(found).union(
+        *(_globals(c) for c in code.co_consts if isinstance(c, types.CodeType))
+    )
 
 
 def _changing(name: str, value: Any, function: types.FunctionType) -> str | None:

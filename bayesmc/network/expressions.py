@@ -31,11 +31,14 @@ from bayesmc.network.align import Aligner
 from bayesmc.network.domain import Domain
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.passes.templates import template
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
 
 #: how far an expression may be off what the function gives, relative to the largest entry
 _RTOL = 1e-11
+#: nodes with one function, such as slices of a template, that are checked
+_CHECKED = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +220,8 @@ def _read(model: Model, name: str) -> Followed | Opaque:
         if isinstance(result, Density) and node.links:
             raise TraceError("its Density may read parents where that cannot be seen")
         found = Followed(result)
-        _check(model, node, found)
+        if not _is_known(model, node, found):
+            _check(model, node, found)
         return found
     except TraceError as error:
         return Opaque(str(error), _leaves_above(model, name))
@@ -259,6 +263,17 @@ def _of_table(model: Model, node: CompiledNode) -> Family:
     table = constant(probs.reshape(-1, probs.shape[-1]))
     rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
     return Family(Categorical, {"probs": gather(table, rows), "logits": None})
+
+
+def _is_known(model: Model, node: CompiledNode, found: Followed) -> bool:
+    """Whether the same function has been read in the same way, but for constants, a few times before."""
+    code = getattr(node.declaration.function, "__code__", None)
+    if code is None:
+        return False
+    keys = tuple(template(e).key for e in expressions_of(found.result))
+    times = model.cache.setdefault("expressions checked", {})
+    times[code, keys] = times.get((code, keys), 0) + 1
+    return times[code, keys] > _CHECKED
 
 
 def _check(model: Model, node: CompiledNode, found: Followed) -> None:

@@ -48,7 +48,7 @@ class Statistics:
     Attributes
     ----------
     coefficients : dict
-        Feature (a power of x, ``LOG`` or ``LOG1M``, without ``CONSTANT``) -> expression of the entries' shape.
+        Feature (a power of x, ``LOG`` or ``LOG1M``) -> expression of the shape of the entries.
     at : Expression of whole numbers
         Flat position of the element of the leaf that each entry reads.
     """
