@@ -253,7 +253,7 @@ class ModelMisfitWarning(BayesmcWarning):
 
 
 class EngineWarning(BayesmcWarning):
-    """An option has another engine answer than would without it."""
+    """An option has another engine answer than would without it, or an engine leaves something out."""
 
 
 class LogWarning(BayesmcWarning):

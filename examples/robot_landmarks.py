@@ -141,8 +141,13 @@ def write_mrclam(folder: Path, seconds: float = 200.0, seed: int = 1) -> Path:
     return folder
 
 
-def write_plaza(folder: Path, seconds: float = 600.0, bias: float = 2.5, seed: int = 2) -> Path:
-    """A folder as `read_plaza` expects it: four beacons, whose ranges are all ``bias`` too long."""
+def write_plaza(
+    folder: Path, seconds: float = 600.0, bias: float = 2.5, seed: int = 2, noise: float = 0.01
+) -> Path:
+    """A folder as `read_plaza` expects it: four beacons, whose ranges are all ``bias`` too long.
+
+    The wheels are off by ``noise`` rad every 0.2 s.
+    """
     from scipy.io import savemat
 
     rng = np.random.default_rng(seed)
@@ -152,7 +157,7 @@ def write_plaza(folder: Path, seconds: float = 600.0, bias: float = 2.5, seed: i
     marks = centre + 0.7 * reach * corners
     steps = np.column_stack([times[1:], 0.2 * v[:-1], 0.2 * omega[:-1]])
     steps[:, 1] *= 1 + 0.1 * rng.standard_normal(len(steps))
-    steps[:, 2] += 0.01 * rng.standard_normal(len(steps)) + 0.0005
+    steps[:, 2] += noise * rng.standard_normal(len(steps)) + 0.0005
     rows = []
     for k in range(5, len(times) - 1):
         beacon = k % 4

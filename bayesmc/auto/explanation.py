@@ -6,12 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from bayesmc.auto.like_lines import together
 from bayesmc.engines.base import Treatment
 
 
 @dataclass(frozen=True)
 class Explanation:
     """Which engine answers a question, and why.
+
+    Printed, like lines of nodes ``x[0]``, ``x[1]``, ... stand as one, ``x[0..99]``.
 
     Attributes
     ----------
@@ -49,11 +52,11 @@ class Explanation:
         lines += [f"not {name}: {why}" for name, why in self.refused.items()]
         if self.table:
             return "\n".join([*lines, *_columns(self.table)])
-        shown = list(self.nodes.items())
+        shown = together(list(self.nodes.items()))
         width = max((len(n) for n, _ in shown), default=0)
         lines += [f"  {name.ljust(width)}  {what}" for name, what in shown[:40]]
         if len(shown) > 40:
-            lines.append(f"  ... and {len(shown) - 40} more nodes")
+            lines.append(f"  ... and {len(shown) - 40} more lines")
         return "\n".join(lines)
 
 
@@ -64,12 +67,14 @@ def _columns(table: Sequence[Treatment]) -> list[str]:
     """A table of nodes in aligned columns; columns that are empty throughout are left out."""
     names = [f.name for f in fields(Treatment) if f.name != "why"] + ["why"]
     shown = [n for n in names if any(getattr(row, n) for row in table)]
-    cells = [shown, *([getattr(row, n) for n in shown] for row in table[:60])]
+    rows = [tuple(getattr(row, n) for n in shown) for row in table]
+    rows = together(rows, [shown.index("colour")] if "colour" in shown else [])
+    cells = [tuple(shown), *rows[:60]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(shown))]
     lines = [
         "  " + "  ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)).rstrip()
         for row in cells
     ]
-    if len(table) > 60:
-        lines.append(f"  ... and {len(table) - 60} more nodes")
+    if len(rows) > 60:
+        lines.append(f"  ... and {len(rows) - 60} more lines")
     return lines

@@ -2,7 +2,8 @@
 
 Only small nets are weighed, of a few numbers without plates, each drawn by slices: what a slice costs is not
 worth it where one evaluation of the density is slow. Hierarchies are left to Gibbs, since short chains that
-miss the neck of a funnel look as if they were fast.
+miss the neck of a funnel look as if they were fast. With finite nodes beside the numbers, weighted draws are
+tried if they visit all joint states, and chains that might miss some are not.
 
 Work is counted, not timed: a call of a node's density is one unit, and so are some thousand numbers that go
 through it. A clock would make the choice, and so the answer, differ from run to run; seeds of the pilot are
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -27,6 +28,8 @@ from bayesmc.engines.weighting import LikelihoodWeighting
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.random_walk import AdaptiveWalk
+from bayesmc.kernels.redrawn import Redrawn
+from bayesmc.kernels.rescaled import Rescaled
 from bayesmc.kernels.slice import Slice
 from bayesmc.network import Model, Problem
 from bayesmc.results import DrawsPosterior
@@ -42,6 +45,9 @@ _WARMUP, _DRAWS, _PER_MEMBER = 100, 100, 8
 _FEW = 8
 #: draws of the pilot of weighting, and the share of them that must count for it to be taken
 _WEIGHTED, _ENOUGH = 2000, 0.1
+#: draws in which every joint state of finite nodes must stand
+_SEEN = 5
+_ENOUGH_WEIGHTED = "weighted draws are good enough, so that no chains were tried"
 #: how much better than Gibbs, which needs no tuning, another engine must be
 _BETTER = 1.5
 #: the pilots' own seed
@@ -113,7 +119,9 @@ def weighed(problem: Problem, plan: Plan) -> tuple[Trial, list[Trial]] | None:
     if not _is_small(problem, plan):
         return None
     if "pilot" not in problem.cache:
-        problem.cache["pilot"] = _weighed(problem)
+        moved = dict.fromkeys(n for k in plan.kernels for n in k.names)
+        finite = [n for n in moved if problem.model[n].domain is not None]
+        problem.cache["pilot"] = _weighed_once(problem, finite) if finite else _weighed(problem)
     return problem.cache["pilot"]
 
 
@@ -121,25 +129,35 @@ def weighed(problem: Problem, plan: Plan) -> tuple[Trial, list[Trial]] | None:
 
 
 def _is_small(problem: Problem, plan: Plan) -> bool:
-    """Whether Gibbs moves a few numbers, all by slices or walks, and none in a plate."""
+    """Whether Gibbs moves a few numbers by slices or walks, and no others, perhaps under finite nodes."""
     model = problem.model
     names = {n for kernel in plan.kernels for n in kernel.names}
-    if not names or any(
-        not isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels
+    slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels)
+    finite = {n for n in names if model[n].domain is not None}
+    known = (Slice, FactorSlice, AdaptiveWalk, Redrawn, Rescaled)
+    if not slow or any(
+        not isinstance(k, known) and not finite >= set(k.names) for k in plan.kernels
     ):
         return False
-    if any(model[n].is_discrete or model[n].plates for n in names):
+    if any(model[n].plates or (model[n].is_discrete and n not in finite) for n in names):
         return False
     return sum(math.prod(model[n].event_shape) for n in names) <= _NUMBERS
+
+
+def _weighed_once(problem: Problem, finite: list[str]) -> tuple[Trial, list[Trial]] | None:
+    """Weighting where it will do: chains that switch between states may miss one in a pilot, and look fast.
+
+    So may weighted draws where a state is rare beforehand: they will do where they see all joint states.
+    """
+    drawn = _weights(problem, finite)
+    return None if drawn is None else (drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED)])
 
 
 def _weighed(problem: Problem) -> tuple[Trial, list[Trial]]:
     """Cheap pilots first: Gibbs has a full one only where it could still be better than what they showed."""
     drawn = _weights(problem)
     if drawn is not None:
-        return drawn, [
-            Trial(Gibbs(), 0.0, "weighted draws are good enough, so that no chains were tried")
-        ]
+        return drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED)]
     walk = _chains(problem, MetropolisHastings())
     gibbs = _at_best(problem)
     if walk.rate < _BETTER * gibbs.rate:
@@ -176,8 +194,8 @@ def _chains(problem: Problem, engine: Any) -> Trial:
     return Trial(engine, 1000.0 * ess / units, words)
 
 
-def _weights(problem: Problem) -> Trial | None:
-    """A pilot of likelihood weighting; None where its weights are too uneven."""
+def _weights(problem: Problem, finite: Sequence[str] = ()) -> Trial | None:
+    """A pilot of likelihood weighting; None where its weights are too uneven, or joint states too rare."""
     engine = LikelihoodWeighting()
     if engine.refusal(problem) is not None:
         return None
@@ -190,8 +208,22 @@ def _weights(problem: Problem) -> Trial | None:
     k = posterior.pareto_k
     if ess < _ENOUGH * _WEIGHTED or (k is not None and k > 0.5):
         return None
+    if finite and _rarest(posterior, finite) < _SEEN:
+        return None
     words = f"{ess:.0f} effective of {_WEIGHTED} draws, {_each(units, ess)}"
     return Trial(engine, 1000.0 * ess / units, words)
+
+
+def _rarest(posterior: DrawsPosterior, names: Sequence[str]) -> int:
+    """How many draws, whatever their weights, show the joint state of some nodes that is shown least."""
+    code, count = np.zeros(posterior._shape, dtype=np.intp), 1
+    for name in names:
+        domain = posterior.model[name].domain
+        assert domain is not None
+        code, count = code * domain.size + posterior._stored[name], count * domain.size
+        if count > _WEIGHTED:
+            return 0
+    return int(np.bincount(code.ravel(), minlength=count).min())
 
 
 def _run(engine: Any, counted: Problem) -> tuple[DrawsPosterior, float]:

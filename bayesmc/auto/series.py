@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
-from bayesmc.dbn.series import check_steps
+from bayesmc.dbn.given import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter

@@ -10,7 +10,7 @@ from typing import Any
 from bayesmc.dbn.series import Series
 from bayesmc.dbn.slices import Slices
 from bayesmc.dbn.template import DynamicBayesNet
-from bayesmc.errors import ModelError
+from bayesmc.errors import BayesmcError, ModelError
 from bayesmc.network import Model
 from bayesmc.network.noiseless import observed_links
 
@@ -75,7 +75,10 @@ def pose_series(
     """
     if not isinstance(dbn, DynamicBayesNet):
         raise ModelError(f"expected a DynamicBayesNet, not {type(dbn).__name__}")
-    links = observed_links(dbn, observations if isinstance(observations, Mapping) else {})
+    try:
+        links = observed_links(dbn, observations if isinstance(observations, Mapping) else {})
+    except BayesmcError:  # with stand-ins for inputs; the data may do better, or say it better
+        links = {}
     dbn = dbn.with_links(links) if links else dbn
     slices, series = dbn.read(observations, inputs, ahead=ahead)
     return SeriesProblem(dbn.copy(), slices, series)

@@ -14,6 +14,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from bayesmc.dbn.given import check_even, check_frame, check_steps, count_of, is_missing
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network import Observed
@@ -22,7 +23,7 @@ from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
 from bayesmc.network.plausible import warn_of_doubts
-from bayesmc.shapes import Shape, first_index, owned
+from bayesmc.shapes import first_index, owned
 
 
 class Compiled(Protocol):
@@ -136,7 +137,7 @@ def read_series(
     )
     if ahead:
         check_steps("forecast", ahead)
-    count = _count(timed, _input_rows(template, inputs), steps, ahead)
+    count = count_of(timed, _input_rows(template, inputs), steps, ahead)
     sizes = sizes_of(template, {**timed, **(inputs or {})}, plates)
     rows = read_input_rows(template, sizes, inputs, count)
     two = {n: v[min(1, count - 1)] for n, v in rows.items()}
@@ -323,15 +324,9 @@ def unrolled(template: Template, observations: Mapping[str, Any]) -> dict[str, A
         if value is None:
             continue
         for t, row in enumerate(_rows(template, name, value)):
-            if not _is_missing(row):
+            if not is_missing(row):
                 evidence[f"{name}[{t}]"] = row
     return evidence
-
-
-def check_steps(who: str, steps: Any) -> None:
-    """Refuse what is no number of slices."""
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
-        raise ValueError(f"{who}(steps={steps!r}): steps is a number of slices, 1 or more")
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -361,7 +356,7 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
     if inputs is not None and not isinstance(inputs, Mapping):
         raise EvidenceError(f"inputs is a {type(inputs).__name__}; give a dict from name to rows")
     for name, given in (inputs or {}).items():
-        _check_frame(f"inputs of {name!r}", given)
+        check_frame(f"inputs of {name!r}", given)
     inputs = {n: _by_label(template, n, v, 1) for n, v in (inputs or {}).items()}
     for name in inputs:
         if name not in template.inputs:
@@ -369,7 +364,7 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
                 f"inputs= gives {name!r}, which is not a declared input"
                 f"{did_you_mean(name, template.inputs)}; the inputs are {list(template.inputs)}"
             )
-        _check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
+        check_even(f"inputs of {name!r}", inputs[name], "an input is known in every slice")
         if np.ndim(inputs[name]) == 0:
             raise EvidenceError(
                 f"inputs of {name!r}: {inputs[name]!r} has no axis for time; give one row per slice"
@@ -380,99 +375,18 @@ def _input_rows(template: Template, inputs: Mapping[str, Any] | None) -> dict[st
 def _rows(template: Template, name: str, value: Any) -> Any:
     """A series with None rows of vectors filled, so that it is an array."""
     refuse_backwards(f"observations of {name!r}", value)
-    _check_frame(f"observations of {name!r}", value)
+    check_frame(f"observations of {name!r}", value)
     value = _by_label(template, name, value, 1)
     if isinstance(value, (list, tuple)) and any(v is None for v in value):
         shapes = {np.shape(v) for v in value if v is not None}
         if len(shapes) == 1 and (shape := shapes.pop()):
             return [np.full(shape, np.nan) if v is None else v for v in value]
-    _check_even(f"observations of {name!r}", value, "a missing row is None")
+    check_even(f"observations of {name!r}", value, "a missing row is None")
     if np.ndim(value) == 0:
         raise EvidenceError(
             f"observations of {name!r}: {value!r} has no axis for time; give one row per slice"
         )
     return value
-
-
-def _check_frame(what: str, value: Any) -> None:
-    """Refuse a table whose labels say that time runs along its columns, square or not."""
-    columns, index = getattr(value, "columns", None), getattr(value, "index", None)
-    if columns is None or index is None:
-        return
-    kinds = [np.asarray(labels).dtype.kind for labels in (index, columns)]
-    names = [str(getattr(labels, "name", None) or "").lower() for labels in (index, columns)]
-    times = [
-        k == "M" or n in ("t", "time", "step", "slice") for k, n in zip(kinds, names, strict=True)
-    ]
-    if times == [False, True]:
-        raise EvidenceError(
-            f"{what}: by its labels the table has time along its columns; time comes first, so give its .T"
-        )
-
-
-def _check_even(what: str, value: Any, hint: str) -> None:
-    """Refuse lists whose rows differ in shape, with the first row that does."""
-    if not isinstance(value, (list, tuple)) or not value:
-        return
-    shapes = [_shape_of(row) for row in value]
-    usual = max(set(shapes) - {None}, key=shapes.count, default=None)
-    for k, shape in enumerate(shapes):
-        if value[k] is None and usual in ((), None) and "missing" in hint:
-            continue  # numbers, some of them missing
-        if shape != usual:
-            got = "None" if value[k] is None else "ragged" if shape is None else f"of shape {shape}"
-            raise EvidenceError(
-                f"{what}: row {k} is {got}, others are of shape {usual}; rows are alike, and {hint}"
-            )
-
-
-def _shape_of(row: Any) -> Shape | None:
-    try:
-        return None if row is None else np.shape(row)
-    except ValueError:
-        return None
-
-
-def _count(
-    observed: Mapping[str, Any], inputs: Mapping[str, Any], steps: int | None, ahead: int
-) -> int:
-    """The number of slices, which all data agree on; ``ahead`` of them have inputs alone."""
-    lengths = {n: len(v) + ahead for n, v in observed.items()} | {
-        n: len(v) for n, v in inputs.items()
-    }
-    wanted = {*lengths.values(), *(() if steps is None else (int(steps),))}
-    if len(wanted) > 1:
-        each = ", ".join(f"{n!r} {len(v)}" for n, v in {**observed, **inputs}.items())
-        more = f"; asked for {steps} slices" if steps is not None else ""
-        more += f"; inputs go on for {ahead} slices after the last row" if ahead else ""
-        more += _transposed({**observed, **inputs})
-        raise EvidenceError(
-            f"the data differ in length ({each}{more}); row k belongs to slice k, and a missing row is NaN "
-            "or None"
-        )
-    if not wanted and not ahead:
-        raise EvidenceError("no observations and no inputs: give at least one series, time first")
-    count = wanted.pop() if wanted else ahead
-    if not count:
-        raise EvidenceError(
-            f"the series of {', '.join(map(repr, {**observed, **inputs}))} have no rows; give one per slice"
-        )
-    return count
-
-
-def _transposed(data: Mapping[str, Any]) -> str:
-    """A hint where one series has along its second axis what the others have along the first."""
-    if len(data) < 2:
-        return ""
-    lengths = [len(v) for v in data.values()]
-    usual = max(set(lengths), key=lengths.count)
-    for name, value in data.items():
-        shape = np.shape(value)
-        if len(shape) > 1 and shape[0] != usual == shape[1]:
-            return (
-                f"; {name!r} has shape {shape}: is it transposed? time comes first, so give its .T"
-            )
-    return ""
 
 
 def _padded(found: Observed | None, node: CompiledNode, ahead: int) -> Observed | None:
@@ -513,15 +427,3 @@ def _over_time(node: CompiledNode, steps: int) -> CompiledNode:
 
 
 _ALONE: WeakKeyDictionary[CompiledNode, CompiledNode] = WeakKeyDictionary()
-
-
-def _is_missing(row: Any) -> bool:
-    """Whether a whole row is missing."""
-    if row is None or row is np.ma.masked:
-        return True
-    if isinstance(row, np.ma.MaskedArray) and np.ma.getmaskarray(row).all():
-        return True
-    if isinstance(row, (list, tuple)):
-        return bool(row) and all(_is_missing(r) for r in row)
-    array = np.asarray(row)
-    return array.dtype.kind == "f" and array.size > 0 and bool(np.isnan(array).all())

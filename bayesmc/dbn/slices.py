@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, UnknownNodeError, did_you_mean
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.distributions.support import Support
+from bayesmc.errors import (
+    DensityError,
+    ModelError,
+    ParameterError,
+    UnknownNodeError,
+    did_you_mean,
+)
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
 from bayesmc.network.declared_plates import DeclaredPlates
@@ -276,6 +284,7 @@ class SliceStore:
             if key in self._found:
                 return self._found[key]
             domains = _computed_domains(self.template, first, later)
+            domains |= _counts_that_vary(self.template, first, later)
             if not domains:
                 break
             self._settle(domains)
@@ -293,7 +302,13 @@ class SliceStore:
         self._stores()
         inputs = self._stand_ins(sizes)
         settled = {p: n if n is not None else _OPEN + k for k, (p, n) in enumerate(sizes.items())}
-        return self.slices(settled, inputs)
+        try:
+            return self.slices(settled, inputs)
+        except (ModelError, ParameterError, DensityError):  # inputs may have to be integers
+            if not inputs:
+                raise
+            ones = {n: owned(np.ones(v.shape, dtype=int)) for n, v in inputs.items()}
+            return self.slices(settled, ones)
 
     def validate(self, slices: Slices) -> None:
         """Refuse functions that break the array rules."""
@@ -394,6 +409,34 @@ def _previous(template: Template, name: str) -> str:
 
 def _number(t: int) -> np.ndarray:
     return owned(np.asarray(t))
+
+
+def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[str, Domain]:
+    """Drawn nodes whose values are as many as an input or the time says: no finite set serves all slices."""
+    found = {}
+    given = {n + end for n in (*template.inputs, TIME) for end in ("", PREVIOUS)}
+    for model in (first, later):
+        for name in template.later:
+            node = model.nodes.get(name)
+            if node is None or not node.is_stochastic or node.domain is None:
+                continue
+            read = given & set(node.parents) & set(model.probe)
+            plain = read and node.domain.labels is None
+            moved = _support_further(model, name, read) if plain else None
+            if moved is not None and moved != node.support:
+                found[name] = _UNCOUNTED
+    return found
+
+
+def _support_further(model: Model, name: str, parents: set[str]) -> Support | None:
+    """Where a node's mass lies with some parents' values larger; None where that goes wrong."""
+    moved = {p: np.asarray(model.probe[p]) + 3 for p in parents}
+    try:
+        with marking_invalid(), np.errstate(all="ignore"):
+            dist, _ = model.evaluate(name, {**model.probe, **moved})
+    except Exception:  # a function of the user's, at values that need not be possible
+        return None
+    return dist.support if dist.invalid is None else None
 
 
 def _check_alike(template: Template, first: Model, later: Model) -> None:

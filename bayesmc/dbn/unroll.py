@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn.series import Compiled, check_steps, read_input_rows, read_series, sizes_of
+from bayesmc.dbn.given import check_steps
+from bayesmc.dbn.series import Compiled, read_input_rows, read_series, sizes_of
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError

@@ -88,6 +88,20 @@ class Support:
         return parts_are and np.size(self.low) == 1 and np.size(self.high) == 1
 
     @property
+    def at_most(self) -> Support:
+        """What it lies in whatever the parents are: bounds that may differ for others are infinite."""
+        if self.kind not in ("interval", "integers") or self.is_single:
+            return self
+        low, high = np.asarray(self.low), np.asarray(self.high)
+        return Support(
+            self.kind,
+            float(_first(low)) if low.size == 1 else -np.inf,
+            float(_first(high)) if high.size == 1 else np.inf,
+            self.open_low,
+            self.open_high,
+        )
+
+    @property
     def size(self) -> int | None:
         """Number of values, where finite and the same for every batch element; else None."""
         if self.kind != "integers" or not self.is_constant:
@@ -174,6 +188,8 @@ class Support:
                     return f"integers {low:g}..{high:g}"
                 left, right = "(" if self.open_low else "[", ")" if self.open_high else "]"
                 return f"numbers in {left}{low:g}, {high:g}{right}"
+            if not (np.isfinite(low) or np.isfinite(high)):
+                return noun
             if np.isfinite(low):
                 return f"{noun} {'>' if self.open_low else '>='} {low:g}"
             return f"{noun} {'<' if self.open_high else '<='} {high:g}"

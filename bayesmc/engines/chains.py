@@ -21,6 +21,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.convergence import poor_acceptance, poor_mixing
 from bayesmc.engines.funnels import missed_ends
+from bayesmc.engines.never_left import never_left
 from bayesmc.engines.question import difference
 from bayesmc.engines.start_values import frozen_start, read_start
 from bayesmc.engines.unrolled import series_of
@@ -51,11 +52,12 @@ class Sampler(Protocol):
 
     Notes
     -----
-    Three attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
+    Four attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
     members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
     ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
+    A method is, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
     which is exact if ``step`` writes into no array of the state it is given.
@@ -196,18 +198,23 @@ class ChainEngine(Engine):
         checkpoint: Checkpoint,
     ) -> ChainsPosterior | ChainsSums:
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}
+        found: ChainsPosterior | ChainsSums
         if isinstance(held, RunningChains):
-            return ChainsSums(problem, self, held, acceptance, self.warmup, checkpoint)
-        return ChainsPosterior(
-            problem,
-            self,
-            held.frozen(),
-            (self.chains, held.draws),
-            acceptance,
-            getattr(sampler, "ensemble", 1),
-            self.warmup,
-            checkpoint,
-        )
+            found = ChainsSums(problem, self, held, acceptance, self.warmup, checkpoint)
+        else:
+            found = ChainsPosterior(
+                problem,
+                self,
+                held.frozen(),
+                (self.chains, held.draws),
+                acceptance,
+                getattr(sampler, "ensemble", 1),
+                self.warmup,
+                checkpoint,
+            )
+        if hasattr(sampler, "renewals"):
+            found.renewals = sampler.renewals(checkpoint.state)
+        return found
 
     def _refuse_another(
         self, old: Posterior, problem: Problem, names: tuple[str, ...], summed: bool
@@ -250,6 +257,7 @@ class ChainEngine(Engine):
         timed = problem is not None and series_of(problem) is not None
         if found and timed and "Particle" not in name:
             found[0] += "; ParticleGibbs(draws) draws whole trajectories of a template at once"
+        found += never_left(posterior)
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
@@ -390,6 +398,7 @@ class _Kept:
         self.stored: dict[str, np.ndarray] = {}
         self.draws = 0
         self._moving: list[tuple[str, np.ndarray]] = []
+        self._together: list[tuple[list[str], np.ndarray]] = []
         self._earlier: Mapping[str, np.ndarray] = {}
 
     def begin_with(self, stored: Mapping[str, np.ndarray], draws: int) -> None:
@@ -405,31 +414,49 @@ class _Kept:
         at = self.draws
         for name, array in self._moving:
             array[:, at] = values[name]
+        for names, rows in self._together:
+            row = [values[n] for n in names]
+            try:
+                rows[..., at] = np.concatenate(row).reshape(rows.shape[:2])
+            except ValueError:  # some of them come without chains this time
+                for array, value in zip(rows, row, strict=True):
+                    array[:, at] = value
         self.draws = at + 1
 
     def frozen(self) -> dict[str, np.ndarray]:
         """The draws in place, read-only."""
         if not self.stored:
             return dict(self._earlier)
-        for name, array in self._moving:
-            self.stored[name] = array if self.draws == self.room else array[:, : self.draws].copy()
+        moving = {n for n, _ in self._moving} | {n for names, _ in self._together for n in names}
+        for name in moving if self.draws < self.room else ():
+            self.stored[name] = self.stored[name][:, : self.draws].copy()
         for array in self.stored.values():
             array.flags.writeable = False
         return self.stored
 
     def _make_room(self, values: Mapping[str, np.ndarray]) -> None:
-        """Decide from the first draw what is constant."""
+        """Decide from the first draw what is constant; single numbers of a type are kept in one array."""
+        alike: dict[np.dtype[Any], list[str]] = {}
         for name in self.names:
             node, value = self.model[name], values[name]
+            dtype = stored_dtype(node, value)
             if value.ndim == len(node.value_shape):
-                self.stored[name] = np.array(value, dtype=stored_dtype(node, value))[None, None]
+                self.stored[name] = np.array(value, dtype=dtype)[None, None]
                 continue
-            shape = (self.chains, self.room, *node.value_shape)
-            array = np.empty(shape, dtype=stored_dtype(node, value))
-            if self._earlier:
-                array[:, : self.draws] = self._earlier[name]
-            self.stored[name] = array
-            self._moving.append((name, array))
+            self.stored[name] = np.empty(0)  # in its place
+            if value.shape == (self.chains,) and value.dtype == dtype:
+                alike.setdefault(dtype, []).append(name)
+                continue
+            self.stored[name] = np.empty((self.chains, self.room, *node.value_shape), dtype)
+            self._moving.append((name, self.stored[name]))
+        for dtype, names in alike.items():
+            rows = np.empty((len(names), self.chains, self.room), dtype)
+            self.stored.update(zip(names, rows, strict=True))
+            self._together.append((names, rows))
+        if self._earlier:
+            for name, array in self.stored.items():
+                if array.shape[1:2] == (self.room,):
+                    array[:, : self.draws] = self._earlier[name]
 
 
 class _Patience(AbstractContextManager["_Patience"]):

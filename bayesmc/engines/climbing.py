@@ -177,7 +177,8 @@ class Climb:
             else:
                 event = len(self.target.model[name].event_shape)
                 some = self._some(tried[name], event) & _wide(at, tried[name])
-                tried[name] = np.where(some, drawn[name], tried[name])
+                other = self._counted(name, tried[name], drawn[name])
+                tried[name] = np.where(some, other, tried[name])
         return self._kept(tried, best, k)
 
     def _stepped(self, u: np.ndarray) -> np.ndarray:
@@ -198,6 +199,16 @@ class Climb:
             _wide(kind < 0.15, u), shrunk, np.where(_wide(kind < 0.25, u), other, moved)
         )
         return np.clip(found, -1e6, 1e6)
+
+    def _counted(self, name: str, value: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+        """Counts move by steps of all sizes, too: what was seen may be where draws never come."""
+        node = self.target.model[name]
+        if node.domain is not None or node.event_shape or not node.is_discrete:
+            return drawn
+        rng, rows = self.rng, len(value)
+        size = np.ceil(10.0 ** rng.uniform(-1.0, 4.0, rows)) * rng.choice([-1.0, 1.0], rows)
+        moved = value + _wide(size, value).astype(value.dtype)
+        return np.where(_wide(rng.random(rows) < 0.5, value), moved, drawn)
 
     def _some(self, values: np.ndarray, event_ndim: int) -> np.ndarray:
         """Some elements of each row, from one to all of them; True broadcasts over what one value is."""

@@ -97,11 +97,16 @@ def _but_for_labels(
     if posterior.problem is None or point is None:
         return found
     stored, words = posterior._stored, []
+    orders: dict[str, str] = {}
     for symmetry in symmetries(posterior.problem, point.values):
         pivot = pivot_of(symmetry, posterior.model)
         if pivot is not None and pivot in stored:
             stored = ordered(posterior.problem, stored, symmetry, pivot)
             of = f"plate {symmetry.plate!r}" if symmetry.plate else f"{pivot!r}"
+            labels = posterior.model.labels.get(symmetry.plate or "")
+            shown = f" ({', '.join(map(str, labels[:6]))})" if labels is not None else ""
+            order = f"with the components of {of}{shown} named by the order of {pivot!r}"
+            orders |= dict.fromkeys(symmetry.names, order)
             words.append(
                 f"the {symmetry.size} components of {of} are named differently from draw to draw, as the "
                 f"model does not tell them apart; by the order of {pivot!r} they have mixed: ask "
@@ -111,9 +116,17 @@ def _but_for_labels(
         return found
     left = _faults(_figures(posterior, stored, forward), posterior)
     if left:
-        return [f"with components named by their order, {fault}" for fault in left]
+        return [_ordered(fault, orders) for fault in left]
     posterior.label_switching = "; ".join(words)
     return []
+
+
+def _ordered(fault: str, orders: Mapping[str, str]) -> str:
+    """A fault, and by which order the component that it names is known, if it names one."""
+    for name, order in orders.items():
+        if f"{name!r}" in fault or f"'{name}[" in fault:
+            return f"{order}, {fault}"
+    return fault
 
 
 def _disagreement(judged: _Judged) -> Iterator[str]:

@@ -25,6 +25,8 @@ from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import label_kernel
 from bayesmc.kernels.lattice import lattice_kernel
 from bayesmc.kernels.random_walk import AdaptiveWalk
+from bayesmc.kernels.redrawn import redrawn_kernels
+from bayesmc.kernels.rescaled import rescaled_kernels
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import table_kernel, table_kernels
@@ -189,7 +191,17 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
         kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
     order = {n: i for i, n in enumerate(target.chain)}
     kernels.sort(key=lambda k: -max(order[n] for n in k.names))
+    slow = [n for k in kernels if _is_slice(k) for n in k.names]
+    moved = set(names)
+    kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
+    kernels += redrawn_kernels(target, blankets)
     return Plan(problem, target, blankets, kernels, refusals, constraints)
+
+
+def _is_slice(kernel: Kernel) -> bool:
+    return isinstance(
+        kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice)
+    )
 
 
 def _finite(

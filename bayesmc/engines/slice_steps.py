@@ -63,6 +63,12 @@ class SlicePlan:
         self._kept: dict[Any, list[Step]] = {}
         self._tables: dict[tuple[bool, str], Table | None] = {}
 
+    @property
+    def guided(self) -> bool:
+        """Whether anything is drawn with a look at the row."""
+        asked = self.proposals
+        return asked is not None and bool(asked.first or asked.later)
+
     def steps(self, row: Row) -> list[Step]:
         """The steps of a row's slice."""
         for seen in row.seen.values():

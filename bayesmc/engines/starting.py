@@ -62,7 +62,8 @@ def start_states(
         if spread == 1.0 and not found.alive:
             refuse_impossible(target, found.tried, found.given)
     free = [n for n in target.chain if n not in found.given]
-    if search and continuous and free and not found.alive:
+    moves = any(target.model[n].domain is None for n in free)  # numbers and counts
+    if search and moves and not found.alive:
         found.climb()
     largest = max((math.prod(target.model[n].value_shape) for n in target.chain), default=1)
     attempts = _ATTEMPTS

@@ -14,6 +14,7 @@ import numpy as np
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.starting import start_states
 from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.redrawn import renewals
 from bayesmc.network.forward import Pass, run
 from bayesmc.structure.target import Target, Values
 
@@ -65,6 +66,15 @@ class SweepSampler:
             for kernel, memory in zip(self.kernels, state["memory"], strict=True)
         }
         return {name: rate for name, rate in rates.items() if rate is not None}
+
+    def renewals(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
+        """How often each finite node that may wait for hidden numbers below it was moved with them.
+
+        Never less than there are rows, which start one by one.
+        """
+        found = renewals(self.target, self.kernels, state["memory"])
+        rows = max((len(state["values"][n]) for n in found), default=0)
+        return {name: np.asarray(np.maximum(count, rows)) for name, count in found.items()}
 
     # ---- for engines whose rows are no chains --------------------------------------------------
 

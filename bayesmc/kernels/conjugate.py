@@ -29,6 +29,7 @@ from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Nat
 from bayesmc.kernels.conjugate_like import partners_of
 from bayesmc.kernels.conjugate_matching import Match, match_of
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
+from bayesmc.kernels.conjugate_picks import is_picked
 from bayesmc.kernels.precisions import keep_precision
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
@@ -66,7 +67,9 @@ class Conjugate(Kernel):
         self.blanket, self.kind, self.partners = blanket, kind, tuple(partners)
         self.power, self.debug = power, debug
         self.names = (blanket.name,)
-        words = dict.fromkeys(p.pair.words for p in partners)
+        words = dict.fromkeys(
+            f"{p.pair.words}{' where it is picked' if p.is_picked else ''}" for p in partners
+        )
         self.match = f"{_prior_words(blanket)} with {', '.join(words)}"
         self._constant = not _prior_is_hidden(blanket)
         self._kept: dict[int, tuple[Naturals, Bounds | None]] = {}
@@ -328,7 +331,10 @@ def conjugate_kernel(
         matches, found = _matched(blanket, kind, base, bounds, pairs)
         if not isinstance(found, str):
             partners = partners_of(blanket, kind, matches)
-            return Conjugate(blanket, kind, partners, found, debug)
+            unlike = (p.unless_picked for p in partners if p.unless_picked and not is_picked(p))
+            found = next(unlike, found)
+            if not isinstance(found, str):
+                return Conjugate(blanket, kind, partners, found, debug)
         told = (len(matches), "makes no conjugate pair" not in found)
         if told > best:  # of a flat prior's kinds, the one that fits most children says most
             best, reason = told, found

@@ -23,6 +23,7 @@ from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, slope_of
 from bayesmc.kernels.conjugate_kinds import Kind, Naturals
 from bayesmc.kernels.conjugate_labels import ByLabel, by_label, read_directly
 from bayesmc.kernels.conjugate_matching import Match
+from bayesmc.kernels.conjugate_picks import picked_natural, points_of
 from bayesmc.kernels.conjugate_sums import Collector
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket
@@ -46,6 +47,7 @@ class Partner:
         self.blanket, self.kind = blanket, kind
         self.child, self.pair = match.child, match.pair
         self.power, self.is_copy = match.power, match.is_copy
+        self.unless_picked, self.is_picked = match.unless_picked, match.unless_picked is not None
         self.term, self.relation = self.child.term, self.child.relation
         self.node = self.term.model[self.term.name]
         neutral = kind.neutral(blanket.event_shape)
@@ -55,6 +57,10 @@ class Partner:
         self._moved = self._neutral
         if len(self._steps):
             self._moved = _stepped(self._neutral, self._steps, blanket.event_shape)
+        self._points = np.zeros(0)
+        if self.is_picked:
+            self._points = points_of(kind.name, blanket.event_shape)
+            self._moved = self._points.reshape((len(self._points), *axes, *neutral.shape))
         self._data = self._known_data()
         self._slope: np.ndarray | None = None
         self._fixed: Naturals | None = None
@@ -83,6 +89,10 @@ class Partner:
             return (count.reshape((len(count), -1)),)
         if self.is_mean_by_label:
             return self._by_label(values)
+        if self.is_picked:
+            e = self._evaluated(values, members, True)
+            assert isinstance(e, Evaluated)
+            return picked_natural(self.pair, self._points, e, len(self.shape))
         steps = self.kind.name == "mean" and self._slope is None
         e = self._evaluated(values, members, steps)
         if self.kind.name == "mean":
@@ -125,8 +135,8 @@ class Partner:
 
         Looked up at the first step, when all kernels have been made.
         """
-        alone = self.pair.child is Categorical and len(self.terms) == 1
-        if not alone or self.blanket.node.plates:
+        alone = self.kind.name == "shares" and self.pair.child is Categorical
+        if not alone or len(self.terms) > 1 or self.is_picked or self.blanket.node.plates:
             return None
         target = self.blanket.target
         return None if target.seen(self.term.name) is not None else counted(target, self.term)
@@ -218,7 +228,7 @@ class Partner:
             value = np.broadcast_to(self._neutral, (1, *self.blanket.node.value_shape))
             self._fixed = self._natural({**target.known, name: value}, members)
             return
-        if members is None and self.pair.by_label:
+        if members is None and self.pair.by_label and not self.is_picked:
             self._way = self._find_way()
         if self._way is not None:
             if self.is_copy or self.pair.form != "multiple":

@@ -62,11 +62,16 @@ class Evaluated(_Whitening):
 
     def get(self, parameter: str, event_ndim: int = 0) -> np.ndarray:
         """A parameter with axes for chains and plates."""
+        array = self.at_points(parameter, event_ndim)
+        return array[0] if self.steps else array
+
+    def at_points(self, parameter: str, event_ndim: int = 0) -> np.ndarray:
+        """A parameter at the neutral value and all steps, if there are any."""
         array = padded(getattr(self.dist, parameter), self.steps + 1 + self.plates + event_ndim)
         if self.lost is not None:
             lost = self.lost.reshape(self.lost.shape + (1,) * event_ndim)
             array = np.where(lost, np.nan, array)
-        return array[0] if self.steps else array
+        return array
 
     def slope(self, steps: np.ndarray) -> np.ndarray:
         """Slopes of the mean in every component, see ``slope_of``."""

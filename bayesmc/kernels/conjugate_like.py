@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -62,7 +63,7 @@ class LikePartner(Partner):
         self._parents = Slots(blanket.target, above, len(self.children))
         self._own = Slots(blanket.target, {own: sources[own]}, len(self.children))
         first = matches[0]
-        super().__init__(blanket, Match(child, first.pair, first.power, first.is_copy), kind)
+        super().__init__(blanket, replace(first, child=child), kind)
 
     # ---- the children as such -----------------------------------------------------------------
 
@@ -119,7 +120,7 @@ def partners_of(blanket: Blanket, kind: Kind, matches: Sequence[Match]) -> list[
 
     def how(child: Child) -> Any:
         match = by_child[id(child)]
-        return id(match.pair), match.power, match.is_copy
+        return id(match.pair), match.power, match.is_copy, match.unless_picked is None
 
     small = [m.child for m in matches if math.prod(m.child.term.shape) < _LARGE]
     groups: dict[int, Partner] = {}

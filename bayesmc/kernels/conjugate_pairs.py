@@ -67,7 +67,8 @@ class Pair:
         As the family calls it.
     form : str
         How the node must enter: ``affine``, ``power`` (``c * x**p``), ``multiple`` (``c * x``, with one
-        number c for a whole matrix) or ``copy``.
+        number c for a whole matrix), ``copy`` or ``pick`` (of the states that were seen, see
+        ``conjugate_picks``, which knows what else need not be read by all elements).
     statistic : callable
         What the child adds, by kind. Mean: a residual divided by the noise. Scale: the power of the
         parameter before the exponential, and the exponential's coefficient. Share: successes and failures.
@@ -152,6 +153,10 @@ def _of_one_trial(e: Evaluation) -> tuple[Any, Any]:
     return e.data.total, e.data.count - e.data.total
 
 
+def _one_success(e: Evaluation) -> tuple[Any, Any]:
+    return e.data.count, np.zeros(())
+
+
 def _of_waiting(e: Evaluation) -> tuple[Any, Any]:
     return e.data.count, e.data.total
 
@@ -191,6 +196,7 @@ PAIRS: tuple[Pair, ...] = (
     Pair("share", Binomial, "probs", "copy", _of_trials),
     Pair("share", Geometric, "probs", "copy", _of_waiting),
     Pair("share", NegativeBinomial, "probs", "copy", _of_failures),
+    Pair("share", Categorical, "probs", "pick", _one_success, by_label=False),
     Pair("shares", Categorical, "probs", "copy", _categories, by_label=False),
     Pair("shares", Multinomial, "probs", "copy", _counts, by_label=False),
     Pair("covariance", MvNormal, "cov", "multiple", _one_each, squares=True),

@@ -8,7 +8,8 @@ steps; the law of the draws is the same. No nets here: variables are numbers, fa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from bayesmc.kernels.enumerate import states_at
 _FEW = 12
 #: sums of tables scaled to one below this are done again in logs
 _SMALL = 1e-250
+#: factors below which two may make such a sum
+_ROUGH = 1e-125
 
 
 class Forest:
@@ -130,6 +133,13 @@ class _Side:
     neighbours: np.ndarray
     edge: np.ndarray
     is_first: np.ndarray
+    _kept: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = field(
+        default_factory=dict, init=False
+    )
+
+    @property
+    def columns(self) -> tuple[np.ndarray, ...]:
+        return self.variables, self.neighbours, self.edge, self.is_first
 
     def taken(self, tables: np.ndarray) -> np.ndarray:
         """Their tables, the variables on the first axis: shape (states, states, variables, rows)."""
@@ -142,13 +152,22 @@ class _Side:
 
     def given(self, tables: np.ndarray, drawn: np.ndarray) -> np.ndarray:
         """Log factors of all states given the neighbour's, shape (states, variables, rows)."""
-        states, _, count, rows = tables.shape
-        size = count * rows
-        first = self.is_first[:, None]
-        own = np.where(first, states * size, size)
-        other = np.where(first, size, states * size)
-        begin = self.edge[:, None] * rows + np.arange(rows) + drawn[self.neighbours] * other
-        return tables.reshape(-1).take(begin + own * np.arange(states)[:, None, None])
+        begin, other = self._places(tables.shape)
+        return tables.reshape(-1).take(begin + drawn[self.neighbours] * other)
+
+    def _places(self, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+        """Where all states of the variables stand beside the first of their neighbours; how far the next."""
+        if shape not in self._kept:
+            states, _, count, rows = shape
+            size = count * rows
+            first = self.is_first[:, None]
+            own, other = (
+                np.where(first, a, b) for a, b in ((states * size, size), (size, states * size))
+            )
+            begin = self.edge[:, None] * rows + np.arange(rows)
+            self._kept.clear()
+            self._kept[shape] = begin + own * np.arange(states)[:, None, None], other
+        return self._kept[shape]
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,6 +184,16 @@ class _Round:
     starts: np.ndarray
     #: number of the first new table
     begin: int
+
+    @cached_property
+    def members(self) -> np.ndarray:
+        return np.concatenate([self.alone, self.leaf.variables, self.left.variables])
+
+    @cached_property
+    def both(self) -> _Side:
+        """The sides of variables with two neighbours, one after the other."""
+        parts = zip(self.left.columns, self.right.columns, strict=True)
+        return _Side(*(np.concatenate(pair) for pair in parts))
 
     def sum_out(self, single: np.ndarray, tables: np.ndarray) -> np.ndarray:
         """Put the sums in place; what the variables without neighbours add to the log normaliser."""
@@ -189,14 +218,15 @@ class _Round:
         what: str,
     ) -> None:
         """Draw the variables given those that were left when they were summed out."""
-        members = np.concatenate([self.alone, self.leaf.variables, self.left.variables])
+        members = self.members
         log = single[:, members]
         begin, end = len(self.alone), len(self.alone) + len(self.leaf.variables)
         if end > begin:
             log[:, begin:end] += self.leaf.given(tables, drawn)
         if len(members) > end:
-            log[:, end:] += self.left.given(tables, drawn)
-            log[:, end:] += self.right.given(tables, drawn)
+            given = self.both.given(tables, drawn)
+            log[:, end:] += given[:, : len(self.left.variables)]
+            log[:, end:] += given[:, len(self.left.variables) :]
         drawn[members] = states_at(log, uniform[members], what)
 
 
@@ -272,11 +302,17 @@ def _log_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
         for j in range(1, len(a)):
             product += a[j][:, None] * b[j]
     log = np.log(product) + top_left[:, None] + top_right
-    small = np.nonzero(product < _SMALL)  # what is impossible, and what was lost
-    if len(small[0]):
+    if _is_rough(a, left) or _is_rough(b, right):
+        small = np.nonzero(product < _SMALL)  # what is impossible, and what was lost
         i, k, variable, row = small
         log[small] = _log_sum(left[:, i, variable, row] + right[:, k, variable, row])
     return log
+
+
+def _is_rough(scaled: np.ndarray, log: np.ndarray) -> bool:
+    """Whether some factor is so small, but not zero, that products with it may be lost."""
+    small = scaled < _ROUGH
+    return bool(small.any() and (log[small] > -np.inf).any())
 
 
 def _top(log: np.ndarray) -> np.ndarray:

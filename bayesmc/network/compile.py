@@ -204,7 +204,8 @@ def _discover_stochastic(
     fit(declaration, dist, batch, plates)
     support = dist.support
     domain = None
-    constant = support.is_single
+    varies = declaration.domain is not None  # known by who declares: not the same in all slices
+    constant = support.is_single and not varies
     small = support.size is not None and support.size <= _DOMAIN_SIZE
     if small and constant and not dist.event_shape:
         assert support.size is not None
@@ -232,6 +233,7 @@ def _discover_stochastic(
         unsampled=isinstance(dist, Density) and not dist.can_sample,
         noiseless=_is_noiseless(dist, batch + plates, len(batch)),
         splits=splits(dist),
+        reach=None if varies else support.at_most,
     )
     value = _reachable(node, dist, shape, count, rng)
     return node, read_only(value)

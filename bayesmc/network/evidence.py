@@ -75,7 +75,7 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     except (TypeError, ValueError) as error:
         if isinstance(error, EvidenceError):
             raise
-        raise EvidenceError(f"evidence on {node.name!r} is ragged or no array: {error}") from error
+        raise EvidenceError(_no_array(node, value, error)) from error
     if array.shape != node.value_shape:
         raise EvidenceError(_shape_message(node, array.shape))
     event = tuple(range(len(node.plate_shape), array.ndim))
@@ -260,20 +260,19 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
             raise EvidenceError(
                 f"evidence on {node.name!r} is {stored[at]:g}{_at(at)}; it must be finite"
             )
-    if node.domain is not None or node.support is None:
+    support = node.support or node.reach
+    if node.domain is not None or support is None:
         return
-    if node.support.event_ndim not in (0, len(node.event_shape)):
+    if support.event_ndim not in (0, len(node.event_shape)):
         return
-    inside = np.asarray(node.support.contains(stored))
-    alone = (
-        bool(event) and node.support.event_ndim == 0
-    )  # an interval, for every component of a vector
+    inside = np.asarray(support.contains(stored))
+    alone = bool(event) and support.event_ndim == 0  # an interval, for every component of a vector
     outside = ~inside & (np.expand_dims(observed, event) if alone else observed)
     if outside.any():
         at = first_index(outside)
         raise EvidenceError(
             f"evidence on {node.name!r} is {_short(stored[at])}{_at(at)}, outside its support "
-            f"({node.support.describe()})"
+            f"({support.describe()})"
         )
 
 
@@ -299,6 +298,20 @@ def _shape_message(node: CompiledNode, shape: Shape) -> str:
     return (
         f"evidence on {node.name!r} has shape {shape}, but the node's plates ({plates or 'none'}) and "
         f"event shape {node.event_shape} make {node.value_shape}"
+    )
+
+
+def _no_array(node: CompiledNode, value: Any, error: Exception) -> str:
+    """What keeps nested lists from being an array."""
+    shapes = [_shape(v) for v in value] if isinstance(value, (list, tuple)) else []
+    odd = next((k for k, s in enumerate(shapes) if s != shapes[0]), None)
+    if odd is None:
+        return f"evidence on {node.name!r} is no array: {error}"
+    plates = ", ".join(f"{p}={n}" for p, n in zip(node.plates, node.plate_shape, strict=True))
+    return (
+        f"evidence on {node.name!r} is ragged: entry 0 has shape {shapes[0]} and entry {odd} has shape "
+        f"{shapes[odd]}; give an array of shape {node.value_shape} (plates {plates or 'none'}, event shape "
+        f"{node.event_shape}), with NaN where nothing was seen"
     )
 
 

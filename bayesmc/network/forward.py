@@ -17,6 +17,7 @@ from bayesmc.distributions.components import completed, log_prob_of
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
+from bayesmc.network.noiseless import is_link
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape
 
@@ -237,13 +238,28 @@ def current_distribution(
     if dist.invalid is not None:
         error = invalid_error(node, dist, state.alive, state.batch, drawn)
         if error is not None:
-            raise _advised(error, node, model)
+            raise _advised(error, node, model, dist, state)
     return dist
 
 
-def _advised(error: ParameterError, node: CompiledNode, model: Model) -> ParameterError:
-    """The error with what to do where a prior allows what a function does not."""
-    if depends_on_numbers(node.links, model.nodes):
+def _advised(
+    error: ParameterError, node: CompiledNode, model: Model, dist: Distribution, state: Pass
+) -> ParameterError:
+    """The error with what to do where a prior allows what a function does not, or a function is wrong."""
+    assert dist.invalid is not None
+    full = np.broadcast_to(dist.invalid, state.batch + node.plate_shape)
+    element = (error.index or ())[len(state.batch) :]
+    where: tuple[Any, ...] = (..., *element)
+    each = full[where]
+    if each.size > 1 and each.all():
+        own = {p: np.asarray(state.values[p]) for p in node.parents if p in state.values}
+        known = ", ".join(f"{p} = {v.item():g}" for p, v in own.items() if v.ndim == 0)
+        error.args = (
+            f"{error}; so it is at each of {each.size} draws of its parents"
+            f"{f' ({known})' if known else ''}, so that none of them is to blame: mend the function, or the "
+            "values that it reads",
+        )
+    elif depends_on_numbers(node.links, model.nodes):
         error.args = (
             f"{error}; draws of its parents may be out of range: give those a prior that cannot be "
             "(HalfNormal, LogNormal, Truncated), or use Gibbs or MetropolisHastings, which reject such "
@@ -301,6 +317,13 @@ def refuse_bare(model: Model, observed: Mapping[str, Observed], who: str) -> Non
 def refuse_noiseless(model: Model, names: Iterable[str], who: str) -> str | None:
     """Why an engine that evaluates the densities of some nodes cannot: one is a point without noise."""
     for name in names:
+        if model[name].noiseless and is_link(model[name].declaration):
+            return (
+                f"{who} evaluates the density of {name!r}, which has none: it is computed from its parents, "
+                "and observed. Observe a reading of it with a little noise instead "
+                f"(net.add('{name}_seen', lambda {name}: Normal({name}, scale))), or one of its parents; "
+                "where the model is linear-Gaussian, Exact() and Kalman filters take it as it is"
+            )
         if model[name].noiseless:
             return (
                 f"{who} evaluates the density of {name!r}, which has none: it is without noise (a scale of "

@@ -43,7 +43,8 @@ _DETERMINISTIC_TABLE = 4096
 class CompiledNode:
     """One node as engines see it. ``table`` holds a finite deterministic node's positions by parent;
     ``unsampled`` says that its density has no sampler, ``noiseless`` that some element has no noise
-    whatever its parents are, and so no density, ``splits`` that some components may be seen alone."""
+    whatever its parents are, and so no density, ``splits`` that some components may be seen alone;
+    ``support`` is the same for all parents, ``reach`` holds those of all parents."""
 
     declaration: Declaration
     links: tuple[tuple[str, Aligner], ...]
@@ -57,6 +58,7 @@ class CompiledNode:
     unsampled: bool = False
     noiseless: bool = False
     splits: bool = False
+    reach: Support | None = None
 
     @property
     def name(self) -> str:
@@ -331,7 +333,7 @@ def call(
             raise ModelError("the function returns None; return a distribution or an array")
         if isinstance(result, PlateArray):
             raise result.ungathered()
-        array = result if isinstance(result, StateArray) else np.asarray(result)
+        array = result if isinstance(result, StateArray) else _as_array(result)
         if array.dtype.kind not in "biuf":
             raise ModelError(
                 f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "
@@ -369,6 +371,14 @@ def lookup(node: CompiledNode, values: Mapping[str, np.ndarray]) -> np.ndarray:
         index = (*index, *np.ix_(*(np.arange(n) for n in plates)))
     result = node.table[index] if index else node.table
     return read_only(np.asarray(result))
+
+
+def _as_array(result: Any) -> np.ndarray:
+    """What a function returned as an array; nested things of several lengths are one of objects."""
+    try:
+        return np.asarray(result)
+    except ValueError:
+        return np.empty(0, dtype=object)
 
 
 def invalid_error(

@@ -5,23 +5,26 @@ It wraps a networkx graph (``net.graph``) and is not one, and it knows no engine
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.errors import (
     DuplicateNodeError,
     EvidenceError,
     ModelError,
-    PlateError,
     UnknownNodeError,
-    did_you_mean,
 )
 from bayesmc.network.captured import captured
 from bayesmc.network.declared_plates import DeclaredPlates
+from bayesmc.network.declaring import (
+    Parents,
+    declared,
+    declared_function,
+    declared_table,
+    settled_sizes,
+)
 from bayesmc.network.evidence import plate_sizes, read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.intervene import fixed
@@ -32,8 +35,6 @@ from bayesmc.network.node import (
     Node,
     Potential,
     bind,
-    checked_rows,
-    plain_states,
 )
 from bayesmc.network.noiseless import without_noise
 from bayesmc.network.store import ModelStore, check_parents, unknown
@@ -42,8 +43,6 @@ from bayesmc.shapes import as_shape
 
 if TYPE_CHECKING:
     import networkx
-
-Parents = Sequence[str] | Mapping[str, str] | None
 
 
 class BayesNet:
@@ -134,7 +133,8 @@ class BayesNet:
                 raise ModelError(
                     "this function has no name to give the node (a lambda or partial); use name= or net.add"
                 )
-            self._declare_function(own, f, parents, plates, states, vectorize, replace)
+            within = self._plates.of(f"node {own!r}", plates)
+            self._declare(declared_function(own, f, parents, within, states, vectorize), replace)
             return f
 
         return declare if function is None else declare(function)
@@ -162,27 +162,8 @@ class BayesNet:
         >>> net["c"].parents
         ('a',)
         """
-        if cpd is None or isinstance(cpd, str):
-            raise ModelError(
-                f"node {name!r}: {cpd!r} is no density; give a distribution, a function or a table"
-            )
-        dist = cpd if isinstance(cpd, Distribution) else as_distribution(cpd)
-        if dist is not None:
-            if parents:
-                raise ModelError(
-                    f"node {name!r}: a distribution has no arguments for parents={parents!r}; pass a "
-                    "function of them that returns it"
-                )
-            own = copy.deepcopy(dist)  # the user's arrays stay the user's
-            self._declare_function(name, _Constant(own), (), plates, states, False, replace)
-        elif callable(cpd):
-            self._declare_function(name, cpd, parents, plates, states, vectorize, replace)
-        else:
-            if isinstance(parents, Mapping):
-                raise ModelError(
-                    f"node {name!r}: a table lists its parents in the order of its axes"
-                )
-            self.table(name, parents or (), cpd, states, plates=plates, replace=replace)
+        own = self._plates.of(f"node {name!r}", plates)
+        self._declare(declared(name, cpd, parents, own, states, vectorize), replace)
 
     def table(
         self,
@@ -210,36 +191,8 @@ class BayesNet:
         ParameterError
             A row that is not a probability vector, with its index.
         """
-        if probs is None:
-            raise ModelError(f"node {name!r}: table() needs probs=")
-        if isinstance(parents, str):
-            raise ModelError(
-                f"node {name!r}: parents={parents!r} is one string; give a list of names"
-            )
-        table = np.array(probs, dtype=float)
-        if table.ndim != len(parents) + 1:
-            raise ModelError(
-                f"node {name!r}: probs has {table.ndim} axes, but {len(parents)} parents and the node "
-                f"itself make {len(parents) + 1}"
-            )
-        states = None if states is None else plain_states(states)
-        if states is not None and len(states) != table.shape[-1]:
-            raise ModelError(
-                f"node {name!r}: states= has {len(states)} entries, but the last axis of probs has "
-                f"{table.shape[-1]}"
-            )
-        table = checked_rows(name, table)
-        self._declare(
-            Declaration(
-                name,
-                "table",
-                tuple(parents),
-                self._plates.of(f"node {name!r}", plates),
-                states,
-                probs=table,
-            ),
-            replace,
-        )
+        own = self._plates.of(f"node {name!r}", plates)
+        self._declare(declared_table(name, parents, probs, states, own), replace)
 
     def input(self, name: str, plates: str | Sequence[str] = (), event_shape: Any = ()) -> None:
         """Declare a known value, passed as ``inputs=`` to ``infer``, ``sample``, ``log_prob``."""
@@ -471,25 +424,7 @@ class BayesNet:
         plates: Mapping[str, int] | None = None,
     ) -> Model:
         """The validated snapshot that engines run on, with plate sizes settled by the data."""
-        for plate, size in (plates or {}).items():
-            if plate not in self._plates.sizes:
-                raise PlateError(
-                    f"plates= gives {plate!r}{did_you_mean(plate, self._plates.sizes)}; the net's plates are "
-                    f"{list(self._plates.sizes)}"
-                )
-            if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
-                raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
-        sizes = plate_sizes(
-            {**self._plates.sizes, **(plates or {})}, self._declarations, evidence, inputs,
-            labels=self._plates.labels,
-        )  # fmt: skip
-        open_plates = [p for p, n in sizes.items() if n is None and self._uses(p)]
-        if open_plates:
-            raise PlateError(
-                f"the size of plate {open_plates[0]!r} is not known; observe a node in it, or declare "
-                f"plates={{{open_plates[0]!r}: size}}"
-            )
-        settled = {p: n if n is not None else 0 for p, n in sizes.items()}
+        settled = settled_sizes(self._plates, self._declarations, evidence, inputs, plates)
         given = read_inputs(self._declarations, settled, inputs, self._fitting(settled))
         model = self._store.model(settled, given)
         self._store.validate(model)
@@ -522,30 +457,6 @@ class BayesNet:
 
     # ---- private ----------------------------------------------------------------------------
 
-    def _declare_function(
-        self,
-        name: str,
-        function: Callable[..., Any],
-        parents: Parents,
-        plates: str | Sequence[str],
-        states: Sequence[Any] | None,
-        vectorize: bool,
-        replace_: bool,
-    ) -> None:
-        names, bound = bind(name, function, parents)
-        if isinstance(function, type) and issubclass(function, Distribution) and not names:
-            raise ModelError(
-                f"node {name!r}: {function.__name__} is a class; call it, {function.__name__}(...), or "
-                "list parents= for its arguments"
-            )
-        labels = None if states is None else plain_states(states)
-        own = self._plates.of(f"node {name!r}", plates)
-        around = captured(function)
-        self._declare(
-            Declaration(name, "function", names, own, labels, bound, vectorize, captured=around),
-            replace_,
-        )
-
     def _declare(self, declaration: Declaration, replace_: bool) -> None:
         name = declaration.name
         if not isinstance(name, str) or not name:
@@ -572,9 +483,6 @@ class BayesNet:
         """Labels of plates that have the size they were declared with."""
         return {p: names for p, names in self._plates.labels.items() if len(names) == sizes[p]}
 
-    def _uses(self, plate: str) -> bool:
-        return any(plate in d.plates for d in self._declarations.values())
-
     def _unbatched(self, name: str, value: Any) -> Any:
         """A stand-in with the value's plate axes in front, for reading plate sizes off it."""
         declaration = self._declarations[name]
@@ -586,13 +494,3 @@ class BayesNet:
         shape = np.shape(value)
         lead = len(shape) - event - len(declaration.plates)
         return np.empty(shape[lead:], dtype=bool) if lead >= 0 else None
-
-
-class _Constant:
-    """A function of no parents that returns one distribution."""
-
-    def __init__(self, distribution: Distribution) -> None:
-        self.distribution = distribution
-
-    def __call__(self) -> Distribution:
-        return self.distribution

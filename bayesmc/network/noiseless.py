@@ -45,4 +45,13 @@ def without_noise(declaration: Declaration, rank: int) -> Declaration:
         size = np.shape(value)[-1]
         return MvNormal(value, np.zeros((size, size)))
 
+    link.__dict__[_MARK] = True
     return replace(declaration, function=link)
+
+
+def is_link(declaration: Declaration) -> bool:
+    """Whether a node was computed before ``without_noise``."""
+    return _MARK in getattr(declaration.function, "__dict__", {})
+
+
+_MARK = "bayesmc_computes"

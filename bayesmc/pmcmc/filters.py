@@ -71,6 +71,9 @@ class Filter:
         Whether another number may be chosen for the data (``of``).
     """
 
+    #: error of the log likelihood that is best aimed at
+    best = 1.0
+
     def __init__(self, trellis: Trellis, particles: int, chosen: bool = False) -> None:
         self.trellis, self.particles, self.chosen = trellis, particles, chosen
         self.plates = {n: (_CHAIN, *trellis.model[n].plates) for n in trellis.series.slices.dynamic}
@@ -104,7 +107,7 @@ class Filter:
             if k:
                 start = self._selected(place, {**known, **before}, values, log, rng)
                 before = {n: self._taken(n, v, start.ancestors) for n, v in before.items()}
-            state = Pass(rng, shape[:2], {**known, **before})
+            state = Pass(self._chance(rng, shape), shape[:2], {**known, **before})
             self._pass(place, state, values)
             log, gained = _normalised(np.broadcast_to(start.carried + state.log_weight, shape))
             history.log_likelihood += gained
@@ -130,6 +133,10 @@ class Filter:
         return found
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _chance(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.random.Generator:
+        """What moves particles of a slice."""
+        return rng
 
     def _start(self, shape: tuple[int, ...]) -> Selection:
         return Selection(None, -np.log(self.particles))

@@ -11,13 +11,13 @@ from bayesmc.engines.weighted import treatment
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.network import Problem
 from bayesmc.pmcmc.base import ParticleEngine
-from bayesmc.pmcmc.filters import Filter
+from bayesmc.pmcmc.quasi import filter_of
 from bayesmc.pmcmc.sampler import ParticleSampler
 from bayesmc.pmcmc.walk import ParameterWalk
 from bayesmc.results import Checkpoint
 
 #: errors of the log likelihood beyond which a chain hardly moves, and the best to have
-_NOISY, _BEST = 2.0, 1.2
+_NOISY, _BEST = 2.0, 1.0
 #: particles where none are given and nothing is known of the data
 _FIRST = 200
 
@@ -40,7 +40,7 @@ class ParticleMetropolis(ParticleEngine):
     chains : int
         They share one array, so that many cost little more than few.
     particles : int, optional
-        Of each filter. Best is an error of the log likelihood near 1.2 (its variance falls with the number of
+        Of each filter. Best is an error of the log likelihood near 1 (its variance falls with the number of
         particles, and rises with that of rows). By default as many as it takes for that, from 50 to 5,000, by
         a look at the posterior before the warmup, where chains start, too; the warmup measures the error, and
         over 2 there is a warning.
@@ -51,8 +51,15 @@ class ParticleMetropolis(ParticleEngine):
         From ``infer``: a plain net, no continuous static node to learn, a discrete one, or a hidden node that
         cannot be sampled.
 
+    Notes
+    -----
+    Where one number of each chain goes from slice to slice, particles are sorted by it and moved by points
+    that lie evenly, which takes a fifth of the particles or less for the same error. The estimate has no bias
+    either way.
+
     References
     ----------
+    Gerber and Chopin (2015), Sequential quasi Monte Carlo, JRSS B 77;
     Andrieu, Doucet and Holenstein (2010), JRSS B 72, sec. 2.4.2; Pitt, Silva, Giordani and Kohn (2012),
     J. Econometrics 171 (how many particles).
 
@@ -112,7 +119,7 @@ class ParticleMetropolis(ParticleEngine):
 
     def _walk(self, problem: Problem) -> ParameterWalk:
         question = self._question(problem)
-        filter = Filter(question.trellis, self.particles or _FIRST, chosen=self.particles is None)
+        filter = filter_of(question.trellis, self.particles or _FIRST, self.particles is None)
         return ParameterWalk(question.target, question.statics, filter)
 
     def _posterior(self, problem: Problem, sampler: Any, held: Any, checkpoint: Checkpoint) -> Any:

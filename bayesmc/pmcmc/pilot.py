@@ -21,8 +21,6 @@ CANDIDATES, _ROUNDS = 64, 8
 _COUNTING = 0.25
 #: width of the noise about the candidates that are drawn again, in standard deviations of all
 _WIDTH = 0.5
-#: median of the absolute deviation of normal numbers from their median, in standard deviations
-_MEDIAN = 0.6745
 
 #: log prior density of points, and an estimate of their log likelihood
 Weigh = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -100,10 +98,12 @@ def particles_for(
     >>> 350 < particles_for(estimates, 100, 1.2, 10, 5000) < 450
     True
     """
+    from scipy.stats import median_abs_deviation  # slow to import
+
     finite = estimates[np.isfinite(estimates)]
     if len(finite) < 2:
         return most
-    spread = np.median(np.abs(finite - np.median(finite))) / _MEDIAN
+    spread = median_abs_deviation(finite, scale="normal")
     # its variance falls with the number of particles
     return int(np.clip(math.ceil(particles * (spread / error) ** 2), least, most))
 

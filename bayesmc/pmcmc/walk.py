@@ -32,8 +32,10 @@ _FIRST_ERROR = 1.0
 _LEAST = 0.25
 #: chance of a step to anywhere; in more than so many dimensions, where few are accepted
 _ANEW, _FEW, _SELDOM = 0.5, 8, 0.1
-#: particles of the first look, the error of the log likelihood to aim at, and how many are taken for that
-_PILOT, _BEST, _PARTICLES = 100, 1.2, (50, 5000)
+#: times the error to aim at, above which the warmup takes more particles than the first look said
+_MORE = 1.25
+#: particles of the first look, and how many are taken for the error of the log likelihood to aim at
+_PILOT, _PARTICLES = 100, (50, 5000)
 #: degrees of freedom of such steps, and how much wider than what was learnt they are
 _DF, _WIDER = 5.0, 1.2
 
@@ -157,7 +159,7 @@ class ParameterWalk(BlockWalk):
             return moved, self.filter.particles
         best = points[np.argmin(np.square(points - weights @ points).sum(axis=1))]
         estimates = weigh(np.tile(best, (count, 1)))[1]
-        return moved, particles_for(estimates, _PILOT, _BEST, *_PARTICLES)
+        return moved, particles_for(estimates, _PILOT, self.filter.best, *_PARTICLES)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -207,7 +209,13 @@ class ParameterWalk(BlockWalk):
             apart = np.abs(once - twice)
         looks = np.concatenate([memory["looks"], apart[~np.isnan(apart)]])[-_KEPT:]
         error = float(np.median(looks)) / _MEDIAN if len(looks) else memory["error"]
-        return {**memory, "error": error, "looks": looks}
+        memory = {**memory, "error": error, "looks": looks}
+        least, most = _PARTICLES
+        if self.filter.chosen and error > _MORE * self.filter.best and memory["particles"] < most:
+            wanted = memory["particles"] * (error / self.filter.best) ** 2
+            memory |= {"particles": int(np.clip(wanted, least, most)), "looks": np.zeros(0)}
+            memory["log_likelihood"] = None  # made anew, as at the start
+        return memory
 
 
 def prior_of(target: Target, statics: tuple[str, ...]) -> Target:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results.checkpoint import Checkpoint
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.posterior import Posterior
+from bayesmc.results.query import Query
 from bayesmc.results.relabelling import ordered, symmetries
 from bayesmc.results.sums import Sums, SumsPosterior
 
@@ -42,6 +44,9 @@ class _Chains(Posterior):
     #: sweeps before the first draw, during which the engine adapted
     warmup: int
     checkpoint: Checkpoint | None
+    #: finite node -> how often the hidden numbers below each element were drawn anew with it, at the least
+    #: as often as chains started, shape (*plates,); only nodes that may wait for such numbers
+    renewals: Mapping[str, np.ndarray] = MappingProxyType({})
     #: a sentence where chains name components differently that the model does not tell apart
     label_switching: str | None = None
 
@@ -58,6 +63,17 @@ class _Chains(Posterior):
         self.ensemble_size = ensemble_size
         self.warmup = warmup
         self.checkpoint = checkpoint
+
+    def _renewed(self, nodes: Iterable[str]) -> dict[str, np.ndarray]:
+        """Renewals of some nodes, or of those that they are computed from."""
+        found, todo = {}, list(nodes)
+        while todo:
+            name = todo.pop()
+            if name in self.renewals:
+                found[name] = self.renewals[name]
+            elif self.model[name].kind == "deterministic":
+                todo += self.model[name].parents
+        return found
 
     def _title(self) -> str:
         chains, draws = self._chains_and_draws
@@ -156,11 +172,30 @@ class ChainsPosterior(_Chains, DrawsPosterior):
                 new.__dict__.pop("_slowest", None)
                 new._stored = ordered(problem, self._stored, found, by)
                 new.checkpoint = new.label_switching = None
+                new.renewals = {
+                    n: np.full_like(count, count.min(initial=np.inf))
+                    for n, count in self.renewals.items()
+                }
                 return new
         raise UnsupportedError(
             f"relabelled({by!r}): its elements are no components that the model could name otherwise; ask of "
             "the posterior as it is"
         )
+
+    def _behind_still(self, what: Any, values: np.ndarray) -> Any:
+        """Those of the slowest scalar that moved, or renewals, where these are fewer."""
+        if isinstance(what, str) and what in self.renewals:
+            count = self.renewals[what]
+            shape = count.shape + (1,) * (values.ndim - 2 - count.ndim)
+            return np.minimum(self._slowest, count.reshape(shape))
+        fewest = self._slowest
+        nodes = [what] if isinstance(what, str) else Query(self.model, what).nodes
+        for name, count in self._renewed(nodes).items():
+            stored = self._of(name)
+            still = (stored == stored[:1, :1]).reshape(*self._shape, *count.shape, -1)
+            still = still.all(axis=(0, 1, -1))
+            fewest = min(fewest, count[still].min(initial=np.inf))
+        return fewest
 
     def _predict(self, *arguments: Any) -> DrawsPosterior:
         drawn = super()._predict(*arguments)
@@ -214,11 +249,21 @@ class ChainsSums(_Chains, SumsPosterior):
     def _share_count(self, what: str, error: np.ndarray) -> Any:
         """Effective draws behind shares; of those that never changed, of the slowest scalar that did."""
         found = self._moved(what)
-        return np.where(np.isnan(found), self._slowest, found)
+        return np.where(np.isnan(found), self._behind_still(what, found), found)
+
+    def _behind_still(self, what: str, figures: np.ndarray) -> Any:
+        """Those of the slowest scalar that moved, or renewals, where these are fewer."""
+        if what in self.renewals:
+            count = self.renewals[what]
+            shape = count.shape + (1,) * (figures.ndim - count.ndim)
+            return np.minimum(self._slowest, count.reshape(shape))
+        fewest = [c.min(initial=np.inf) for c in self._renewed([what]).values()]
+        return min([self._slowest, *fewest])
 
     def ess(self, what: Any) -> np.ndarray:
         found = self._moved(what)
-        still = np.where(np.asarray(self._step(what)) > 0, self._slowest, self._sums.draws)
+        behind = self._behind_still(what, found)
+        still = np.where(np.asarray(self._step(what)) > 0, behind, self._sums.draws)
         missing = np.isnan(self._error(what))
         return np.where(np.isnan(found) & ~missing, still, found)
 

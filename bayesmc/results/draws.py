@@ -199,7 +199,8 @@ class DrawsPosterior(Posterior):
 
     def mcse(self, what: Any) -> np.ndarray:
         values, step = self._scalars_and_step(what)
-        return diagnostics.share_mcse(self._error(values), self._share_count(values, step), step)
+        count = self._share_count(values, step, what)
+        return diagnostics.share_mcse(self._error(values), count, step)
 
     def ess(self, what: Any) -> np.ndarray:
         values, step = self._scalars_and_step(what)
@@ -212,7 +213,7 @@ class DrawsPosterior(Posterior):
         found = diagnostics.chain_statistic("ess", values, self.ensemble_size)
         still = (values == values[:1, :1]).all(axis=(0, 1)) & (np.asarray(step) > 0)
         if still.any():  # chains that never saw another state do not know how soon they would
-            return np.where(still, np.fmin(found, self._slowest), found)
+            return np.where(still, np.fmin(found, self._behind_still(what, values)), found)
         return found
 
     def rhat(self, what: Any) -> np.ndarray:
@@ -368,7 +369,7 @@ class DrawsPosterior(Posterior):
             return spread / np.sqrt(count)
         return diagnostics.chain_statistic("mcse", values, self.ensemble_size)
 
-    def _share_count(self, values: np.ndarray, step: Any) -> Any:
+    def _share_count(self, values: np.ndarray, step: Any, what: Any) -> Any:
         """Effective draws behind shares (`shares`)."""
         if not np.any(step):
             return 1.0
@@ -379,8 +380,13 @@ class DrawsPosterior(Posterior):
             return weighted_count(values, weights)
         if self.independent:
             return float(math.prod(self._shape))
-        moving = self._slowest if (values == values[:1, :1]).all(axis=(0, 1)).any() else np.inf
+        still = (values == values[:1, :1]).all(axis=(0, 1)).any()
+        moving = self._behind_still(what, values) if still else np.inf
         return chain_count(values, moving, self.ensemble_size, step)
+
+    def _behind_still(self, what: Any, values: np.ndarray) -> Any:
+        """Effective draws behind figures that never changed, which broadcasts to ``values.shape[2:]``."""
+        return self._slowest
 
     @cached_property
     def _slowest(self) -> float:

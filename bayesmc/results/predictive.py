@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from bayesmc.errors import ModelMisfitWarning
+from bayesmc.errors import EngineWarning, ModelMisfitWarning
 
 #: rows are unlikely where so small a share of the rows that were expected is less likely
 UNLIKELY = 0.05
@@ -66,16 +66,19 @@ class Predictive:
     ranks : dict
         Observed node -> share of what was expected of each number that is smaller, shape ``(time, *plates,
         *event)``.
+    broken : str
+        Why no more rows were compared from some slice on; empty where nothing was in the way.
     """
 
     row_ranks: np.ndarray
     row_deficits: np.ndarray
     ranks: Mapping[str, np.ndarray] = field(default_factory=dict)
+    broken: str = ""
 
     def first(self, steps: int) -> Predictive:
         """Of the first so many slices."""
         ranks = {n: r[:steps] for n, r in self.ranks.items()}
-        return Predictive(self.row_ranks[:steps], self.row_deficits[:steps], ranks)
+        return Predictive(self.row_ranks[:steps], self.row_deficits[:steps], ranks, self.broken)
 
     def misfit(self) -> Misfit | None:
         """Where a warning is due, the rows that are to blame.
@@ -127,7 +130,17 @@ def warn_of_misfit(found: Predictive | None, who: str, start: int, stacklevel: i
     Warns
     -----
     ModelMisfitWarning
+    EngineWarning
+        Rows were no longer compared, since a function broke on one that was drawn.
     """
+    if found is not None and found.broken:
+        warnings.warn(
+            f"{who}: rows are held against others that the model draws (row_ranks), and one of these broke "
+            f"the comparison in {found.broken}; from there on none is compared, all other answers are as "
+            "they would be. Functions should take whatever values the model can draw",
+            EngineWarning,
+            stacklevel=stacklevel + 1,
+        )
     misfit = None if found is None else found.misfit()
     if misfit is None:
         return

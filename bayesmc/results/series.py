@@ -8,14 +8,38 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Model
-from bayesmc.results.posterior import table_variance
+from bayesmc.results.posterior import quantile_levels, table_variance
 from bayesmc.results.predictive import Predictive
+
+#: what is asked of answers over time that has another name here, or that only some filters have
+_INSTEAD = {
+    "ess": "weight_ess has the effective number of particles of each slice (of a ParticleFilter)",
+    "median": "ask quantile(name, 0.5)",
+    "interval": "ask quantile(name, [0.05, 0.95])",
+    "hdi": "ask quantile(name, [0.05, 0.95])",
+    "mode": "probabilities(name), or density(name) of a GridFilter, say where the belief is highest, and "
+    "most_likely(dbn, observations) the most likely trajectory",
+    "draws": 'a ParticleFilter has particles(name), with keep="particles"',
+    "samples": 'a ParticleFilter has particles(name), with keep="particles"',
+    "particles": "a ParticleFilter has those",
+    "summary": "mean(name), std(name) and quantile(name, q) are arrays, time first",
+    "plot": "mean(name), std(name) and quantile(name, q) are arrays, time first, to plot",
+    "density": "a GridFilter has those",
+    "grid": "a GridFilter has those",
+    "pairs": "a DiscreteFilter has those",
+    "cov": 'Kalman filters have those, and a ParticleFilter with keep="particles"',
+    "expectation": "give queries={name: function} to the call",
+    "probability": "give queries={name: function} to the call, whose mean is the probability of an event",
+    "innovations": "Kalman filters have those; predictive_ranks(name) and row_ranks are every filter's",
+    "nis": "Kalman filters have those; row_deficits are every filter's",
+    "nis_df": "Kalman filters have those",
+}
 
 
 class SeriesPosterior:
@@ -51,9 +75,9 @@ class SeriesPosterior:
     row_ranks : ndarray or None, shape (time,) or (time, *plates)
         Share of the rows that the filter expected which are less likely than the one that came: uniform where
         the model is right, near 0 where rows surprise it. NaN where nothing was seen or compared: Gaussian
-        filters compare all rows, particle filters 8 or every 12th, and more after an unlikely one (of wide
-        ones, such as scans, 16 or every 32nd), with a few rows drawn from their particles. None from other
-        engines.
+        filters compare all rows, the others 8 or every 12th, and more after an unlikely one (of wide ones,
+        such as scans, 16 or every 32nd; discrete filters 60 at most), with a few rows drawn from their
+        particles, cells or states. None from other engines, and of fewer than five rows.
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
     queries_mcse : dict
@@ -115,6 +139,14 @@ class SeriesPosterior:
             steps = 0 if found is None else len(found)
         self.steps = steps
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            hint = f"; {_INSTEAD[name]}" if name in _INSTEAD else ""
+            raise AttributeError(
+                f"{type(self).__name__!r} has no {name!r}{hint}", name=name, obj=self
+            )
+
     @property
     def names(self) -> tuple[str, ...]:
         """Nodes that are answered for, parents first."""
@@ -153,6 +185,37 @@ class SeriesPosterior:
             )
         return self._tables[name].copy()
 
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles, shape ``(time, *q.shape, *plates, *event)``.
+
+        Here of nodes with finitely many numbers, the least at or below which so much lies, and of what was
+        seen; other answers have those of their kind.
+
+        Raises
+        ------
+        UnknownNodeError, QueryError
+        UnsupportedError
+            Means and variances alone do not tell them.
+        """
+        node, levels = self._node(name), quantile_levels(name, q)
+        if name in self._tables:
+            numbers, table = self._numbers(node), self._tables[name]
+            below = table.cumsum(axis=-1)
+            # rounding of the sum must not carry a level to the next number
+            wanted = levels.reshape(1, -1, *(1,) * (table.ndim - 1)) * (1 - 1e-12)
+            at = (below[:, None] < wanted * below[:, None, ..., -1:]).sum(axis=-1)
+            found = numbers[np.minimum(at, len(numbers) - 1)]
+            return found.reshape((len(table), *levels.shape, *table.shape[1:-1]))
+        mean = self._means[name]
+        if np.any(self._variances[name] != 0):
+            raise UnsupportedError(
+                f"quantile({name!r}): this result ({self.kind} by {type(self.engine).__name__}) knows means "
+                "and variances; ask for the mean of an event, queries={name: function}, or take a "
+                'ParticleFilter with keep="particles" or another engine'
+            )
+        every = np.repeat(mean[:, None], levels.size, axis=1)
+        return every.reshape((len(mean), *levels.shape, *mean.shape[1:]))
+
     @property
     def row_ranks(self) -> np.ndarray | None:
         return None if self.predictive is None else self.predictive.row_ranks.copy()
@@ -166,8 +229,8 @@ class SeriesPosterior:
 
         The probability, before the row came, of a smaller value (the probability integral transform): uniform
         on (0, 1) where the model is right, heaped at both ends where its spread is too small, at one end
-        where it is off to one side. Particle filters count among 19 draws, and break ties by chance, so that
-        ranks of discrete nodes are uniform, too.
+        where it is off to one side. Kalman filters know them; the others count among 19 draws, and
+        break ties by chance, so that ranks of discrete nodes are uniform, too.
 
         Parameters
         ----------
@@ -204,8 +267,8 @@ class SeriesPosterior:
         if self.predictive is None:
             raise UnsupportedError(
                 f"predictive_ranks({name!r}): this result (of {type(self.engine).__name__}) does not compare "
-                "rows with what was expected of them; ask the result of filter by a KalmanFilter, an "
-                "ExtendedKalmanFilter, an UnscentedKalmanFilter or a ParticleFilter, with some rows observed"
+                "rows with what was expected of them; ask the result of filter or smooth by a filter (not by "
+                "another engine), with five rows or more, of nodes that random draws can be taken of"
             )
         if name not in self.predictive.ranks:
             raise QueryError(
@@ -218,22 +281,20 @@ class SeriesPosterior:
 
         Answers that nothing was drawn for have none: 0. What a filter leaves out by its assumptions (an
         extended Kalman filter's tangents, say) is no part of it. Those of particles come from the families
-        of particles of earlier slices (see ``ParticleFilter``).
+        of particles of earlier slices, those of trajectories drawn backwards from which of them share
+        particles (see ``ParticleFilter``); infinite where nobody can tell.
 
         Raises
         ------
         UnknownNodeError
         UnsupportedError
-            Functions, unless particles are kept; trajectories that were drawn backwards by ``smooth``, which
-            state none (with ``lag=`` they do).
+            Functions, unless particles are kept, as ``smooth`` does without ``lag=``.
         """
         if callable(what):
             raise UnsupportedError(
                 "mcse: give a node's name, or the function in queries=, whose errors are in queries_mcse"
             )
         node = self._node(what)
-        if self.mean_errors is None and self.weight_ess is not None:
-            raise self._no_errors()
         if self.mean_errors is not None and what in self.mean_errors:
             return self.mean_errors[what].copy()
         labelled = node.domain is not None and node.domain.labels is not None
@@ -294,12 +355,6 @@ class SeriesPosterior:
                 "queries={name: function}"
             )
         return node
-
-    def _no_errors(self) -> UnsupportedError:
-        return UnsupportedError(
-            "mcse: trajectories that were drawn backwards state no errors of their means; run with a few "
-            "seeds, or smooth with lag="
-        )
 
     def _not_kept(self, what: str) -> UnsupportedError:
         return UnsupportedError(

@@ -82,21 +82,23 @@ def weighted_count(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.where(many, 1.0 / squares, two)
 
 
-def chain_count(values: np.ndarray, moving: float, block: int, step: Any) -> np.ndarray:
+def chain_count(values: np.ndarray, moving: Any, block: int, step: Any) -> np.ndarray:
     """Effective draws behind shares of chains, shape ``values.shape[2:]``.
 
     Those of its own mean; of a share that never changed, as many as behind the slowest scalar that did
-    (``moving``), since how fast the chains would have found it is not known.
+    (``moving``), since how fast the chains would have found it is not known, or fewer, where what waits for
+    the node was seldom drawn anew.
     """
     total = float(values.shape[0] * values.shape[1])
+    moving = np.broadcast_to(np.minimum(moving, total), values.shape[2:])
     asked = np.broadcast_to(step, values.shape[2:]) > 0
     count = np.full(values.shape[2:], total)
     still = (values == values[:1, :1]).all(axis=(0, 1))
-    count[asked & still] = min(moving, total)
+    count[asked & still] = moving[asked & still]
     moved = asked & ~still
     if moved.any():
         own = diagnostics.chain_statistic("mean_ess", values[:, :, moved], block)
-        count[moved] = np.where(np.isnan(own), min(moving, total), np.minimum(own, total))
+        count[moved] = np.where(np.isnan(own), moving[moved], np.minimum(own, total))
     return count
 
 

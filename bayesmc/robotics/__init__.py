@@ -8,9 +8,10 @@ are metres, angles radians, times seconds.
 from __future__ import annotations
 
 from bayesmc.robotics.aimed import AimedPoses, SensorPoses
-from bayesmc.robotics.beams import BeamFit, BeamModel, Beams, clean_ranges, fit_beams
+from bayesmc.robotics.beam_fit import BeamFit, fit_beams
+from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.robotics.brightness import Ceiling
-from bayesmc.robotics.calibration import FieldFit, fit_field, fit_odometry
+from bayesmc.robotics.calibration import FieldFit, fit_field, fit_floor, fit_odometry
 from bayesmc.robotics.field import FieldScan, LikelihoodField
 from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
 from bayesmc.robotics.landmarks import (
@@ -24,6 +25,7 @@ from bayesmc.robotics.landmarks import (
 )
 from bayesmc.robotics.mapfile import read_map, write_map
 from bayesmc.robotics.motion import OdometryMotion, VelocityMotion
+from bayesmc.robotics.placing import PlaceCheck, check_poses
 from bayesmc.robotics.pose_distributions import AndAngle, PoseNormal
 from bayesmc.robotics.poses import (
     angle_between,
@@ -52,6 +54,7 @@ __all__ = [
     "LikelihoodField",
     "OccupancyGrid",
     "OdometryMotion",
+    "PlaceCheck",
     "PoseNormal",
     "RayTable",
     "SensorPoses",
@@ -60,6 +63,7 @@ __all__ = [
     "bearing",
     "bearing_to",
     "between",
+    "check_poses",
     "clean_ranges",
     "compass",
     "compose",
@@ -67,6 +71,7 @@ __all__ = [
     "euler_step",
     "fit_beams",
     "fit_field",
+    "fit_floor",
     "fit_odometry",
     "inverse",
     "mean_pose",

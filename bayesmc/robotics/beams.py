@@ -8,10 +8,8 @@ rays cast on a map or anything else, is not decided here.
 from __future__ import annotations
 
 import math
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import special
@@ -19,12 +17,12 @@ from scipy import special
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import as_float
 from bayesmc.distributions.support import Support, nonnegative, product
-from bayesmc.errors import ConvergenceWarning, ParameterError, ShapeError
+from bayesmc.errors import ParameterError, ShapeError
 from bayesmc.robotics.grid import as_number
 from bayesmc.shapes import Shape
 
 _HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
-_PARTS = ("z_hit", "z_short", "z_max", "z_rand")
+PARTS = ("z_hit", "z_short", "z_max", "z_rand")
 
 
 @dataclass(frozen=True)
@@ -71,7 +69,7 @@ class BeamModel:
     tempering: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in _PARTS:
+        for name in PARTS:
             _require(0 <= as_number(getattr(self, name)) <= 1, self, name, "between 0 and 1")
         total = sum(self.shares)
         if abs(total - 1) > 1e-6:
@@ -142,7 +140,7 @@ class Beams(Distribution):
     parameter_ndim = {"expected": 1}
 
     def __init__(self, expected: Any, model: BeamModel) -> None:
-        expected, model = as_float(expected), _as_model("Beams", model)
+        expected, model = as_float(expected), as_model("Beams", model)
         if expected.ndim == 0:
             raise ShapeError("Beams: expected ranges are one number; give (..., beams)")
         self.batch_shape, self.event_shape = expected.shape[:-1], expected.shape[-1:]
@@ -170,7 +168,7 @@ class Beams(Distribution):
         """
         with np.errstate(all="ignore"):
             x = np.asarray(x, dtype=float)
-            return _log_total(self.model, x, _log_parts(self.model, x, self.expected))
+            return log_total(self.model, x, log_parts(self.model, x, self.expected))
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         if x.shape[-1:] != self.event_shape:
@@ -190,121 +188,6 @@ class Beams(Distribution):
         short = np.log1p(u * np.expm1(-model.lambda_short * expected)) / -model.lambda_short
         draws = np.choose(cause, [hit, short, model.max_range, u * model.max_range])
         return np.clip(draws, 0.0, model.max_range)
-
-
-class BeamFit(NamedTuple):
-    """What ``fit_beams`` found.
-
-    Attributes
-    ----------
-    model : BeamModel
-    log_likelihood : ndarray, shape (iterations + 1,)
-        Of the data (not tempered) under the model before each iteration and after the last; it
-        never falls.
-    converged : bool
-        Whether the last iteration gained less than the tolerance, and ``sigma_hit`` did not end at its bound.
-    at_bound : tuple of str
-        Parameters that the data would have smaller than they may be: ``"sigma_hit"``, and ``"lambda_short"``
-        where short readings do not thin out along the beam.
-    """
-
-    model: BeamModel
-    log_likelihood: np.ndarray
-    converged: bool
-    at_bound: tuple[str, ...] = ()
-
-
-def fit_beams(
-    ranges: Any,
-    expected: Any,
-    start: BeamModel | None = None,
-    *,
-    iterations: int = 200,
-    tolerance: float = 1e-7,
-    least_sigma: float = 1e-3,
-) -> BeamFit:
-    """The intrinsic parameters of greatest likelihood, learned from ranges by EM.
-
-    Parameters
-    ----------
-    ranges, expected : array_like, same shape
-        Readings and expected ranges (m); pairs with a NaN or a negative reading are left out.
-    start : BeamModel, optional
-        Where to begin; its ``max_range`` and ``tempering`` are kept. A share that is 0 stays 0.
-    iterations : int
-        At most so many.
-    tolerance : float
-        Gain in mean log likelihood per beam below which it has converged.
-    least_sigma : float
-        The least ``sigma_hit`` in m. Readings that equal what is expected, such as simulated ones without
-        noise, have no greatest likelihood: it grows without end as ``sigma_hit`` shrinks.
-
-    Returns
-    -------
-    BeamFit
-
-    Raises
-    ------
-    ParameterError
-        An expected range is NaN or negative, ``start`` gives some reading probability zero or has a
-        ``sigma_hit`` below ``least_sigma``, or that is not positive and finite.
-    ShapeError
-        The two arrays differ in shape, or there is no usable reading.
-    TypeError
-        ``start`` is no BeamModel.
-
-    Warns
-    -----
-    ConvergenceWarning
-        ``sigma_hit`` ended at ``least_sigma``.
-
-    Notes
-    -----
-    Short readings that are spread evenly, or are more the nearer to what is expected, have no rate above 0
-    that is best; ``lambda_short`` is kept at ``0.001 / max_range`` or more, which is even to a thousandth.
-
-    The scale of hits and the rate of short ones are maximised with the truncation that
-    the density has (the closed forms of the table ignore it and can lower the likelihood), one
-    number at a time.
-
-    References
-    ----------
-    Thrun, Burgard and Fox, Probabilistic Robotics, 2005, table 6.2.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesmc.robotics.beams import BeamModel, Beams, fit_beams
-    >>> truth = BeamModel(0.6, 0.2, 0.1, 0.1, sigma_hit=0.1, lambda_short=0.8, max_range=8.0)
-    >>> expected = np.random.default_rng(0).uniform(1.0, 8.0, 4000)
-    >>> fit = fit_beams(Beams(expected, truth).sample(1), expected, BeamModel(max_range=8.0))
-    >>> [round(share, 2) for share in fit.model.shares], round(fit.model.sigma_hit, 2)
-    ([0.61, 0.19, 0.1, 0.1], 0.1)
-    """
-    model = BeamModel() if start is None else _as_model("fit_beams", start)
-    least = _least(model, least_sigma)
-    z, expected = _pairs(ranges, expected, model)
-    history: list[float] = []
-    converged = False
-    for _ in range(iterations + 1):
-        with np.errstate(all="ignore"):
-            parts = _log_parts(model, z, expected)
-            each = _log_total(model, z, parts)
-            share = np.exp(parts - each)
-        log = float(each.sum())
-        if not math.isfinite(log):
-            at = int(np.argmin(each))
-            raise ParameterError(
-                f"fit_beams: the model gives the reading {z[at]:g} m (expected {expected[at]:g} m) "
-                "probability zero; start with z_rand and z_max above 0"
-            )
-        converged = bool(history) and log - history[-1] < tolerance * len(z)
-        history.append(log)
-        if converged or len(history) > iterations:
-            break
-        model = _maximised(model, z, expected, share, least)
-    stuck = _at_bound(model, least, len(z))
-    return BeamFit(model, np.array(history), converged and "sigma_hit" not in stuck, stuck)
 
 
 def clean_ranges(ranges: Any, max_range: float) -> np.ndarray:
@@ -345,23 +228,23 @@ def clean_ranges(ranges: Any, max_range: float) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _log_parts(model: BeamModel, z: np.ndarray, expected: np.ndarray) -> np.ndarray:
+def log_parts(model: BeamModel, z: np.ndarray, expected: np.ndarray) -> np.ndarray:
     """Logs of share times density of hit, short, max and random, shape (4, ...); none is tempered."""
     sigma, rate, end = model.sigma_hit, model.lambda_short, model.max_range
     log_hit, log_short, log_max, log_rand = (_log(share) for share in model.shares)
     at_end, within = z >= end, (z >= 0) & (z < end)
     blind, empty = expected >= end, expected == 0
     own = np.where(empty, np.logaddexp(log_hit, log_short), log_hit)
-    bell = _log_bell(z, expected, sigma, end)
+    bell = log_bell(z, expected, sigma, end)
     hit = np.where(blind, np.where(at_end, own, -np.inf), np.where(within, own + bell, -np.inf))
     before = within & (z <= expected) & ~empty
-    short = np.where(before, log_short + _log_short(z, expected, rate), -np.inf)
+    short = np.where(before, log_short + log_short_ranges(z, expected, rate), -np.inf)
     largest = np.where(at_end, log_max, -np.inf)
     uniform = np.where(within, log_rand - math.log(end), -np.inf)
     return np.stack(np.broadcast_arrays(hit, short, largest, uniform))
 
 
-def _log_total(model: BeamModel, z: np.ndarray, parts: np.ndarray) -> np.ndarray:
+def log_total(model: BeamModel, z: np.ndarray, parts: np.ndarray) -> np.ndarray:
     """Log density of each range from that of its parts."""
     top = parts.max(axis=0)
     top = np.where(np.isfinite(top), top, 0.0)
@@ -369,13 +252,13 @@ def _log_total(model: BeamModel, z: np.ndarray, parts: np.ndarray) -> np.ndarray
     return np.where(np.isnan(z), 0.0, total)
 
 
-def _log_bell(z: np.ndarray, expected: np.ndarray, sigma: float, end: float) -> np.ndarray:
+def log_bell(z: np.ndarray, expected: np.ndarray, sigma: float, end: float) -> np.ndarray:
     """Log density of a normal truncated to ``[0, end]``."""
     mass = special.ndtr((end - expected) / sigma) - special.ndtr(-expected / sigma)
     return -0.5 * ((z - expected) / sigma) ** 2 - (_HALF_LOG_2PI + math.log(sigma)) - np.log(mass)
 
 
-def _log_short(z: np.ndarray, expected: np.ndarray, rate: float) -> np.ndarray:
+def log_short_ranges(z: np.ndarray, expected: np.ndarray, rate: float) -> np.ndarray:
     """Log density of an exponential truncated to ``[0, expected]``."""
     return math.log(rate) - rate * z - np.log(-np.expm1(-rate * expected))
 
@@ -384,112 +267,8 @@ def _log(share: float) -> float:
     return math.log(share) if share > 0 else -math.inf
 
 
-class _Least(NamedTuple):
-    """What the scale and the rate may not fall below."""
-
-    sigma_hit: float
-    lambda_short: float
-
-
-def _least(start: BeamModel, sigma: float) -> _Least:
-    if not 0 < as_number(sigma) < math.inf:
-        raise ParameterError(
-            f"fit_beams: least_sigma must be positive and finite; got {sigma!r:.80}"
-        )
-    if start.sigma_hit < sigma:
-        raise ParameterError(
-            f"fit_beams: start has sigma_hit={start.sigma_hit:g}, below least_sigma={sigma:g}; give a "
-            "smaller least_sigma"
-        )
-    return _Least(float(sigma), min(1e-3 / start.max_range, start.lambda_short))
-
-
-def _at_bound(model: BeamModel, least: _Least, count: int) -> tuple[str, ...]:
-    """Parameters that ended at their bounds, and a warning about the one that spoils the fit."""
-    found = []
-    if model.sigma_hit <= least.sigma_hit * (1 + 1e-4):
-        found.append("sigma_hit")
-        warnings.warn(
-            f"fit_beams: sigma_hit ended at least_sigma={least.sigma_hit:g} m: hits hardly differ from what "
-            "is expected; are these real readings, and is expected not made of them?",
-            ConvergenceWarning,
-            stacklevel=3,
-        )
-    # a rate of short readings that there are none of says nothing
-    if model.lambda_short <= least.lambda_short * (1 + 1e-4) and model.z_short * count > 1:
-        found.append("lambda_short")
-    return tuple(found)
-
-
-def _maximised(
-    model: BeamModel, z: np.ndarray, expected: np.ndarray, share: np.ndarray, least: _Least
-) -> BeamModel:
-    """The M step: shares in closed form, scale and rate one at a time."""
-    hit, short = share[0], share[1]
-    blind, empty = expected >= model.max_range, expected == 0
-    # what is expected at 0 is hit or short, undivided; the old shares divide it
-    both = model.z_hit + model.z_short
-    moved = (hit * empty).sum() * (model.z_short / both if both else 0.0)
-    totals = share.sum(axis=1) + np.array([-moved, moved, 0.0, 0.0])
-    parts = dict(zip(_PARTS, (totals / totals.sum()).tolist(), strict=True))
-    bells = ~blind & (hit > 0)
-    sigma = _improved(
-        lambda s: float(hit[bells] @ _log_bell(z[bells], expected[bells], s, model.max_range)),
-        model.sigma_hit,
-        least.sigma_hit,
-    )
-    exponentials = short > 0
-    rate = _improved(
-        lambda r: float(
-            short[exponentials] @ _log_short(z[exponentials], expected[exponentials], r)
-        ),
-        model.lambda_short,
-        least.lambda_short,
-    )
-    return replace(model, **parts, sigma_hit=sigma, lambda_short=rate)
-
-
-def _improved(gain: Callable[[float], float], now: float, least: float) -> float:
-    """A number near ``now``, at least ``least``, of the greatest ``gain``; ``now`` where none is greater."""
-    from scipy.optimize import minimize_scalar
-
-    low = max(-1.5, math.log(least / now))
-    with np.errstate(all="ignore"):
-        found = minimize_scalar(
-            lambda log: -gain(now * math.exp(log)),
-            bounds=(low, 1.5),
-            method="bounded",
-            options={"xatol": 1e-6},
-        )
-        others = [now, max(now * math.exp(found.x), least)]
-        if low > -1.5:  # the search comes close to its ends and never there
-            others.append(least)
-        gains = [gain(other) for other in others]
-        return others[int(np.argmax(gains))]
-
-
-def _pairs(ranges: Any, expected: Any, model: BeamModel) -> tuple[np.ndarray, np.ndarray]:
-    """Usable readings and what was expected of them, flat."""
-    z, expected = as_float(ranges), as_float(expected)
-    if z.shape != expected.shape:
-        raise ShapeError(
-            f"fit_beams: ranges have shape {z.shape}, expected ranges {expected.shape}; give one for each"
-        )
-    z, expected = z.ravel(), expected.ravel()
-    usable = z >= 0
-    z, expected = z[usable], expected[usable]
-    if not len(z):
-        raise ShapeError("fit_beams: there is no usable reading (all are NaN or negative)")
-    bad = ~(expected >= 0)
-    if bad.any():
-        at = int(np.argmax(bad))
-        raise ParameterError(
-            f"fit_beams: expected ranges must be nonnegative; got {expected[at]} at usable reading {at}"
-        )
-    return np.minimum(z, model.max_range), np.minimum(expected, model.max_range)
-
-
-def _as_model(call: str, model: Any) -> BeamModel:
+def as_model(call: str, model: Any) -> BeamModel:
+    """``model``, or a TypeError that names the call."""
     if not isinstance(model, BeamModel):
         raise TypeError(
             f"{call}: give a BeamModel, such as BeamModel(max_range=8.0); got {model!r:.80}"

@@ -1,20 +1,22 @@
-"""Settings learned from a stretch of a log with known poses: wheel noise, and the tempering of a scan.
+"""Settings learned from a stretch of a log with known poses: wheel noise, the floor, the tempering of a scan.
 
 Known poses may come from a survey, from mapping, or from a filter that was started where the robot stood.
 What is learned is of this robot, this sensor and this map; nothing here localises. The beam model has
-``fit_beams``.
+``fit_beams``; whether later poses are as good is asked in ``placing``.
 """
 
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ShapeError
+from bayesmc.errors import ModelError, ModelMisfitWarning, ShapeError
 from bayesmc.robotics.field import LikelihoodField
+from bayesmc.robotics.grid import FreeSpace, OccupancyGrid, as_grid, as_number
 from bayesmc.robotics.motion import OdometryMotion
 from bayesmc.robotics.poses import as_poses, compose, wrap
 
@@ -22,12 +24,21 @@ from bayesmc.robotics.poses import as_poses, compose, wrap
 _LEAST, _MOST, _FLOOR = 1e-6, 1.0, 0.01
 #: deviations from which on a step is a stray, such as a jump of whatever made the known poses
 _STRAY = 3.0
+#: share of strays from which on the two motions are hardly of the same steps
+_ASTRAY = 0.2
 #: poses beside the true one that a scan is looked at from: metres per cell of the map, and radians
 _CELLS, _TURN = 1.0, 0.03
 #: scans over which the errors of beams are taken to last
 _LAGS = 6
 #: pairs of poses that say what a search loses, and which of them counts: the best of ten
 _OFFSETS, _NEAREST = 100, 0.1
+#: poses on the floor and scans that say how many of the particles of a search a scan leaves, and their share
+_SPREAD, _SCANS, _LEFT = 2000, 20, 0.5
+#: share of readings that are returns at least; places that scans are compared with, and the share of these
+#: that may be likelier
+_RETURNS, _ELSEWHERE, _BEATEN = 0.02, 100, 0.2
+#: share of known poses that surely are on the floor, and by how much others may be less surely so
+_STOOD, _MARGIN = 0.99, 2.0
 
 
 def fit_odometry(motion: Any, moved: Any) -> tuple[float, float, float, float]:
@@ -51,6 +62,12 @@ def fit_odometry(motion: Any, moved: Any) -> tuple[float, float, float, float]:
     ------
     ShapeError
         The two differ in shape, or there are fewer than 10 steps.
+
+    Warns
+    -----
+    ModelMisfitWarning
+        A fifth of the steps or more are strays, or a variance is at its bound: the two are hardly of the same
+        steps.
 
     References
     ----------
@@ -94,7 +111,74 @@ def fit_odometry(motion: Any, moved: Any) -> tuple[float, float, float, float]:
 
     a1, a2 = fitted(aside, turned, 2 * driven).tolist()
     a3, a4 = fitted(ahead, driven, turned).tolist()
+    turns = np.sqrt(a1 * turned + 2 * a2 * driven + _FLOOR**2)
+    ways = np.sqrt(a3 * driven + a4 * turned + _FLOOR**2)
+    astray = ((np.abs(aside) > _STRAY * turns) | (np.abs(ahead) > _STRAY * ways)).mean()
+    if astray > _ASTRAY or max(a1, a2, a3, a4) > 0.99 * _MOST:
+        warnings.warn(
+            f"fit_odometry: {astray:.0%} of the steps are not what the wheels say, by more than three "
+            f"deviations, with variances of {a1:.3g}, {a2:.3g}, {a3:.3g} and {a4:.3g} (at most {_MOST:g}): "
+            "are both motions from one pose to the next (between(poses[:-1], poses[1:])), of the same steps, "
+            "and in radians?",
+            ModelMisfitWarning,
+            stacklevel=2,
+        )
     return a1, a2, a3, a4
+
+
+def fit_floor(grid: OccupancyGrid, poses: Any, clearance: float = 0.0) -> FreeSpace:
+    """Where a robot can be: cells about as surely free as those where it has been.
+
+    Maps are free wherever beams passed, behind windows, too, and a search that begins there wastes its
+    particles and finds places there that look right. Where a robot drives, beams have passed often.
+
+    Parameters
+    ----------
+    grid : OccupancyGrid
+    poses : array_like, shape (poses, 3)
+        Where it was (m, m, rad), in all kinds of places.
+    clearance : float
+        As of ``FreeSpace``.
+
+    Returns
+    -------
+    FreeSpace
+        Of cells with an occupancy below twice that which 99 in 100 of the poses have at most, and never
+        above the map's threshold.
+
+    Raises
+    ------
+    ModelError
+        More than half of the poses are not on free cells: they are not of this map, or not in its frame.
+    ShapeError
+        The poses are not of shape (poses, 3), 20 or more.
+
+    References
+    ----------
+    Rules of this library's own; measured in "Localising a robot".
+
+    Examples
+    --------
+    >>> from bayesmc.robotics import OccupancyGrid, fit_floor
+    >>> grid = OccupancyGrid([[0.02] * 9, [0.02] * 9, [0.4] * 9], 1.0)  # the last row through a window
+    >>> fit_floor(grid, [[0.5, k % 9 + 0.5, 0.0] for k in range(30)]).area, grid.free().sum()
+    (18.0, np.int64(27))
+    """
+    grid, poses = as_grid("fit_floor", grid), as_poses("fit_floor", poses)
+    if poses.ndim != 2 or len(poses) < 20:
+        raise ShapeError(
+            f"fit_floor: poses have shape {poses.shape}; give (poses, 3), 20 poses or more"
+        )
+    stood = grid.at(poses[:, :2])
+    stood = stood[stood < grid.threshold]  # neither unknown nor an obstacle
+    if 2 * len(stood) < len(poses):
+        raise ModelError(
+            f"fit_floor: {len(poses) - len(stood)} of {len(poses)} poses are not on free cells of {grid!r}: "
+            "are they in the map's frame, in metres, and x before y?"
+        )
+    level = _MARGIN * float(np.quantile(stood, _STOOD))
+    least = float(np.nanmin(grid.occupancy))  # of a map of 0 and 1: whatever is free
+    return FreeSpace(grid, clearance, min(max(level, 2 * least, 1e-6), grid.threshold))
 
 
 #: radians of a particle's box per metre
@@ -115,28 +199,32 @@ class FieldFit:
         Mean log density per beam at the known poses, not tempered: what a filter that is right reaches.
     deviation : float
         Its standard deviation from scan to scan.
+    ranges, poses, angles : ndarray
+        What it was learned from.
     """
 
     field: LikelihoodField
     witnesses: float
     log_density: float
     deviation: float
-    _ranges: np.ndarray
-    _poses: np.ndarray
-    _angles: np.ndarray
+    ranges: np.ndarray
+    poses: np.ndarray
+    angles: np.ndarray
 
-    def searching(self, particles: int, area: float, rng: Any = 0) -> LikelihoodField:
+    def searching(self, particles: int, area: float | FreeSpace, rng: Any = 0) -> LikelihoodField:
         """The field for a robot that may be anywhere, tempered for particles that are sparse.
 
         So many particles spread over a floor are metres and tenths of a radian apart, and none is quite
         right. The best of ten near the truth, in the box that is one particle's, shall lose one nat by that,
-        so that it is not thrown out by the first scan for others that happen to look better.
+        so that it is not thrown out by the first scan for others that happen to look better. And of particles
+        spread over the floor a scan shall leave half (their effective number, in the median over scans), so
+        that one scan after the other decides, and not the first few, whatever the number of particles.
 
         Parameters
         ----------
         particles : int
-        area : float
-            Of the floor, m^2: ``FreeSpace.area``.
+        area : float or FreeSpace
+            The floor, or its area in m^2 where it is all that is free on the map.
         rng : seed, Generator or None
 
         Returns
@@ -149,6 +237,8 @@ class FieldFit:
         ValueError
             A number is not positive.
         """
+        floor = area if isinstance(area, FreeSpace) else FreeSpace(self.field.grid)
+        area = area.area if isinstance(area, FreeSpace) else as_number(area)
         if not (particles >= 1 and area > 0):
             raise ValueError(
                 f"searching(particles={particles!r}, area={area!r}): give a number of particles and an area "
@@ -158,12 +248,15 @@ class FieldFit:
         chance = np.random.default_rng(rng)
         box = np.array([side, side, min(_RADIANS * side, 2 * math.pi)])
         plain, lost = replace(self.field, tempering=1.0), []
-        for pose, scan in zip(self._poses, self._ranges, strict=True):
+        for pose, scan in zip(self.poses, self.ranges, strict=True):
             beside = compose(pose, chance.uniform(-0.5, 0.5, (_OFFSETS, 3)) * box)
-            log = plain.given(np.vstack([pose, beside]), self._angles).log_prob(scan)
+            log = plain.given(np.vstack([pose, beside]), self.angles).log_prob(scan)
             lost.append(np.quantile(log[0] - log[1:], _NEAREST))
         loss = max(float(np.mean(lost)), 1.0)
-        return replace(self.field, tempering=min(self.field.tempering, 1.0 / loss))
+        some = np.unique(np.linspace(0, len(self.ranges) - 1, _SCANS).astype(int))
+        spread = plain.given(floor.sample(chance, sample_shape=_SPREAD), self.angles)
+        half = _exponent(np.array([spread.log_prob(scan) for scan in self.ranges[some]]), _LEFT)
+        return replace(self.field, tempering=min(self.field.tempering, 1.0 / loss, half))
 
 
 def fit_field(field: LikelihoodField, ranges: Any, poses: Any, angles: Any) -> FieldFit:
@@ -192,6 +285,9 @@ def fit_field(field: LikelihoodField, ranges: Any, poses: Any, angles: Any) -> F
     ------
     ShapeError
         Scans and poses differ in number, or there are fewer than 20.
+    ModelError
+        Hardly a reading is below ``max_range``, or scans are no likelier from their poses than from anywhere:
+        units, frames or columns are other than they should be.
 
     References
     ----------
@@ -217,6 +313,7 @@ def fit_field(field: LikelihoodField, ranges: Any, poses: Any, angles: Any) -> F
             f"fit_field: ranges have shape {ranges.shape}, poses {poses.shape}, angles {angles.shape}; give "
             "(scans, beams), (scans, 3) and (beams,), 20 scans or more"
         )
+    _check_in_place(replace(field, tempering=1.0), ranges, poses, angles)
     plain = _with_hits(replace(field, tempering=1.0), ranges, poses, angles)
     log, slopes, curvature = _shape_of(plain, ranges, poses, angles)
     off = slopes - slopes.mean(axis=0)
@@ -236,6 +333,45 @@ def fit_field(field: LikelihoodField, ranges: Any, poses: Any, angles: Any) -> F
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _exponent(log: np.ndarray, share: float) -> float:
+    """The power of densities (scans, poses), at most 1, at which so large a share is effective."""
+    log = log - log.max(axis=-1, keepdims=True)
+    low, high = -10.0, 0.0
+    for _ in range(30):
+        middle = 0.5 * (low + high)
+        weights = np.exp(log * math.exp(middle))
+        left = weights.sum(axis=-1) ** 2 / (weights**2).sum(axis=-1) / log.shape[-1]
+        if np.median(left) > share:
+            low = middle
+        else:
+            high = middle
+    return math.exp(high)
+
+
+def _check_in_place(
+    field: LikelihoodField, ranges: np.ndarray, poses: np.ndarray, angles: np.ndarray
+) -> None:
+    """Refuse scans that are not from their poses: what would be learned from them is worth nothing."""
+    seen = ((ranges >= 0) & (ranges < field.max_range)).mean()
+    if seen < _RETURNS:
+        raise ModelError(
+            f"fit_field: {seen:.0%} of the readings are below max_range={field.max_range:g} m; are they in "
+            "metres, and from a place where there is something to see?"
+        )
+    some = np.unique(np.linspace(0, len(ranges) - 1, _SCANS).astype(int))
+    spots = FreeSpace(field.grid).sample(0, sample_shape=_ELSEWHERE)
+    beaten = []
+    for k in some:
+        log = field.given(np.vstack([poses[k], spots]), angles).log_prob(ranges[k])
+        beaten.append((log[1:] > log[0]).mean())
+    if np.median(beaten) > _BEATEN:
+        raise ModelError(
+            f"fit_field: from {np.median(beaten):.0%} of all places on the floor the scans are likelier than "
+            "from the poses given, in the median: are these in the map's frame, x before y, headings in "
+            "radians and counterclockwise, in step with the scans, and is the field's mount the laser's?"
+        )
 
 
 def _with_hits(

@@ -56,6 +56,8 @@ def function_keeps_affine(func: Any, args: Any, kwargs: Any) -> bool:
         return False  # a type by place
     if func is np.where:
         return len(args) == 3 and not is_traced(args[0])
+    if func is np.choose:
+        return len(args) == 2 and not is_traced(args[0])
     if func is np.select:
         return len(args) > 1 and not is_traced(args[0])
     if func is np.broadcast_arrays:

@@ -36,7 +36,17 @@ _RESHAPING = frozenset(
 )
 #: functions element by element
 _ELEMENTWISE = frozenset(
-    (np.where, np.select, np.copy, np.broadcast_to, np.clip, np.round, np.real, np.nan_to_num)
+    (
+        np.where,
+        np.select,
+        np.choose,
+        np.copy,
+        np.broadcast_to,
+        np.clip,
+        np.round,
+        np.real,
+        np.nan_to_num,
+    )
 )
 _MATRIX = frozenset((np.matrix_transpose, np.linalg.matrix_transpose, np.triu, np.tril))
 
@@ -45,6 +55,8 @@ def operands(func: Any, args: Any) -> list[Any]:
     """The arrays that a function works on, each of which the span is about."""
     if func is np.select:
         return [*args[1], *args[2:]] if isinstance(args[1], (list, tuple)) else []
+    if func is np.choose:
+        return list(args[1]) if isinstance(args[1], (list, tuple)) else []
     if func is np.where:
         return list(args)
     if func is np.einsum:

@@ -173,6 +173,7 @@ def by_logs(log_start: Any, log_step: Any, log_rows: Any) -> tuple[np.ndarray, n
     )
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ModelMisfitWarning")
 @pytest.mark.parametrize(
     ("table", "scale", "steps"),
     [
@@ -202,6 +203,7 @@ def test_densities_of_any_size_are_summed_right(table: Any, scale: float, steps:
     np.testing.assert_allclose(found.probabilities("x"), smoothed, rtol=0, atol=1e-10)
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ModelMisfitWarning")
 def test_without_the_second_pass_lost_states_stay_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control of the test above: scaled sums alone forget a state that later rows call for."""
     dbn = bmc.DynamicBayesNet()

@@ -13,6 +13,7 @@ import bayesmc as bmc
 from bayesmc.errors import (
     ConvergenceWarning,
     DensityError,
+    EvidenceError,
     ReducibleWarning,
     ZeroProbabilityError,
 )
@@ -94,7 +95,7 @@ def test_the_table_of_a_mixture(capsys: pytest.CaptureFixture) -> None:
 
 def test_every_kind_of_kernel_is_found() -> None:
     found = kernels(*everything())
-    assert found["p"] == "conjugate" and found["coin"] == "enumerate"
+    assert found["p"] == "conjugate" and found["coin"] == "enumerate + redrawn"
     assert found["shape"] == found["slope"] == "factor slice"
     assert found["hidden"] == "slice" and "walk" in found["simplex"]
 
@@ -217,10 +218,12 @@ def test_vague_priors_do_not_keep_chains_from_starting() -> None:
 
 def test_impossible_evidence_names_the_culprit() -> None:
     net = bmc.BayesNet()
-    net.add("scale", bmc.Gamma(2.0, 1.0))
+    net.add("scale", bmc.Uniform(0.0, 2.0))
     net.add("y", lambda scale: bmc.Uniform(0.0, scale))
     net.add("z", lambda scale: bmc.Normal(scale, 1.0))
     with pytest.raises(ZeroProbabilityError, match="'y'"):
+        bmc.infer(net, {"y": 3.0, "z": 0.0}, engine=bmc.Gibbs(), rng=0)
+    with pytest.raises(EvidenceError, match="'y' is -1.0, outside its support"):
         bmc.infer(net, {"y": -1.0, "z": 0.0}, engine=bmc.Gibbs(), rng=0)
 
 

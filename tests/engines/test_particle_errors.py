@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import LowEssWarning, UnsupportedError
+from bayesmc.errors import LowEssWarning
 from bayesmc.testing import session
 
 RUNS = 100
@@ -125,6 +125,8 @@ def test_the_binomial_series_is_within_three_errors(kind: str) -> None:
         # of 100 normal figures the spread strays beyond these once in 10,000 times
         assert 0.75 < np.sqrt(np.mean(off[told] ** 2)) < 1.3
         assert (2 * np.abs(off) > 3).sum() > LET_PASS  # half the error would be caught
+    if kind == "small step":
+        assert told.mean() >= 0.5
     if kind in ("step", "far outliers", "bursts"):
         assert told.mean() <= 0.1
 
@@ -155,6 +157,8 @@ def test_stated_errors_are_those_of_many_runs(variant: str) -> None:
     exact = bmc.filter(replicated(declare), {"y": y}, engine=engine)
     found = run(declare, y, bmc.ParticleFilter(1000, **options))
     off = ratios(found, exact)
+    told = np.isfinite(found.log_marginal_likelihood_mcse).mean()
+    assert told >= (0.75 if declare is growth else 0.95)
     assert (np.abs(off) > 3).sum() <= LET_PASS
     assert 0.75 < np.sqrt(np.mean(off**2)) < 1.3
     for name in ("x",) if declare is not machine else ("z",):
@@ -181,23 +185,52 @@ def test_errors_hold_where_numbers_change_and_some_begin_anew(options: dict[str,
     assert 0.67 < logs.std(ddof=1) / stated < 1.4
 
 
-@pytest.mark.thorough
-@pytest.mark.parametrize("particles", [1000, None])
-@pytest.mark.parametrize("kind", BINOMIAL)
-def test_three_thousand_rows_are_within_three_errors(kind: str, particles: int | None) -> None:
-    """The series of the issue, by seeds one after the other, with a number of particles and without."""
+#: runs of three thousand rows whose error may be infinite, of 100: it is no answer
+UNTOLD = 5
+
+
+def three_thousand(kind: str, engine: bmc.ParticleFilter) -> np.ndarray:
+    """Errors over stated ones, of 100 seeds one after the other; NaN where the error is infinite."""
     y, dbn = series(kind, 3000), replicated(binomial)
     exact = bmc.filter(dbn, {"y": y}, engine=GRID).log_marginal_likelihood
     off = []
-    for k in range(RUNS if particles else 20):
+    for k in range(RUNS):
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", LowEssWarning)
-            engine = bmc.ParticleFilter(particles)
             found = bmc.filter(dbn, {"y": y}, engine=engine, rng=[session.seed(), k])
-        off.append((found.log_marginal_likelihood - exact) / found.log_marginal_likelihood_mcse)
-    assert (np.abs(off) > 3).sum() <= (LET_PASS if particles else 2)
-    if kind == "well":
-        assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
+        error = found.log_marginal_likelihood_mcse
+        off.append(
+            (found.log_marginal_likelihood - exact) / error if np.isfinite(error) else np.nan
+        )
+    print(
+        f"{kind}, {engine.particles} particles: {np.isnan(off).sum()} infinite, "
+        f"{(np.abs(off) > 3).sum()} beyond three, root mean square {np.sqrt(np.nanmean(np.square(off))):.2f}"
+    )
+    return np.array(off)
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("particles", [1000, None])
+def test_three_thousand_rows_are_within_three_errors(particles: int | None) -> None:
+    """The series of the issue: 99 of 100 seeds, with a number of particles and without.
+
+    Of 100 normal figures two or more are beyond 3 once in 30 times; of the halved errors fewer than two, once
+    in 60,000 times.
+    """
+    off = three_thousand("well", bmc.ParticleFilter(particles))
+    told = off[~np.isnan(off)]
+    assert len(told) >= RUNS - UNTOLD
+    assert (np.abs(told) > 3).sum() <= 1
+    assert (2 * np.abs(told) > 3).sum() > 1  # half the error would be caught
+    assert 0.75 < np.sqrt(np.mean(told**2)) < 1.3
+
+
+@pytest.mark.thorough
+@pytest.mark.parametrize("kind", [k for k in BINOMIAL if k != "well"])
+def test_three_thousand_rows_that_the_model_explains_badly(kind: str) -> None:
+    """With a number of particles: what is told is right, and most often nothing can be told."""
+    off = three_thousand(kind, bmc.ParticleFilter(1000))
+    assert (np.abs(off) > 3).sum() <= LET_PASS
 
 
 # ---- how many particles -------------------------------------------------------------------------
@@ -325,7 +358,8 @@ def test_fixed_lags_forecasts_and_smoothed_series() -> None:
     assert ahead.mcse("x").shape == ahead.mean("x").shape == (4,)
     whole = bmc.smooth(dbn, {"y": y}, engine=engine, rng=1)
     assert whole.log_marginal_likelihood_mcse > 0
-    with pytest.raises(UnsupportedError, match="backwards"):
-        whole.mcse("x")
+    right = bmc.smooth(dbn, {"y": y})
+    z = (whole.mean("x") - right.mean("x")) / whole.mcse("x")
+    assert 0.4 < np.sqrt(np.mean(z**2)) < 2.0
     assert (exact.mcse("x") == 0).all()
     assert bmc.filter(dbn, {"y": y}).log_marginal_likelihood_mcse == 0.0

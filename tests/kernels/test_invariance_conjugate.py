@@ -77,6 +77,9 @@ SIDES: dict[tuple[str, str, str], tuple[Any, Callable[[Any], Any]]] = {
     ("share", "Binomial", "probs"): (BETA, lambda x: bmc.Binomial(3, x)),
     ("share", "Geometric", "probs"): (BETA, lambda x: bmc.Geometric(x)),
     ("share", "NegativeBinomial", "probs"): (BETA, lambda x: bmc.NegativeBinomial(2.5, x)),
+    ("share", "Categorical", "probs"): (
+        BETA, lambda x: bmc.Categorical(bmc.stack([1 - x, 0 * x, x], axis=-1))
+    ),
     ("shares", "Categorical", "probs"): (WORDS, lambda x: bmc.Categorical(x)),
     ("shares", "Multinomial", "probs"): (WORDS, lambda x: bmc.Multinomial(3, x)),
     ("covariance", "MvNormal", "cov"): (

@@ -136,7 +136,7 @@ def sweep(net: Any, errors: Mapping[str, Callable] | None = None, backwards: boo
             problem = pose(anchored, {"seen": np.zeros(POINTS, dtype=int)})
         plan = plan_of(problem)
         sampler = SweepSampler(plan.target, plan.kernels)
-        kernels = [k for k in sampler.kernels if k.names != ("y",)]
+        kernels = [k for k in sampler.kernels if "y" not in k.names]
         assert sorted(n for k in kernels for n in k.names) == ["label", "mean", "scale", "weights"]
         for name, error in (errors or {}).items():
             kernels = [error(k) if k.names == (name,) else k for k in kernels]

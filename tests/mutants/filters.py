@@ -226,8 +226,8 @@ MUTANTS = [
         "the stated error of a mean is halved",
         (Edit("bayesmc.engines.particles.accuracy:_by_shares",
               "(parts**2 /", "0.25 * (parts**2 /"),),
-        stated(line, LONG, bmc.ParticleFilter(300), 150),
-        STATED,
+        stated(line, {"y": LONG["y"][:16]}, bmc.ParticleFilter(300), 300),
+        "stated_errors_test, 300 runs of 300 particles",
     ),
     Mutant(
         "backward simulation leaves the transition out",

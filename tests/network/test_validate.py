@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -614,6 +615,7 @@ def test_what_is_no_distribution_is_refused():
         (None, "returns None; return a distribution or an array"),
         ({"a": 1}, "the function returns dict; return a distribution"),
         ([bmc.Normal(0, 1)], "the function returns list; return a distribution"),
+        ((np.zeros((3, 2)), 1), "the function returns tuple; return a distribution"),
     ]:
         net = bmc.BayesNet()
         net.add("x", lambda result=result: result)
@@ -769,3 +771,21 @@ def test_supports_too_large_to_list_have_no_states(size):
     # 4.5 standard errors, false alarm 7e-6 each at a fresh seed
     assert abs(p.mean("k") - (size - 1) / 2) < 4.5 * p.mcse("k")
     assert abs(p.mean("n") - 0.3 * (size - 1)) < 4.5 * p.mcse("n")
+
+
+def test_of_many_nodes_those_with_a_function_of_their_own_are_checked() -> None:
+    """One function of many nodes is checked at a few of them; one like it, of the last node, by itself."""
+    net = bmc.BayesNet()
+    net.add("x[0]", bmc.Normal(0.0, 1.0))
+
+    def step(x: Any) -> Any:
+        return bmc.Normal(0.5 * x, 1.0)
+
+    for t in range(1, 40):
+        net.add(f"x[{t}]", step, parents=[f"x[{t - 1}]"])
+    net.sample(2, rng=0)
+    net.add(
+        "y", lambda x: bmc.Normal(np.sort(x, axis=0) if np.ndim(x) else x, 1.0), parents=["x[39]"]
+    )
+    with pytest.raises(BroadcastError, match="node 'y'"):
+        net.validate()

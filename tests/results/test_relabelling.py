@@ -136,10 +136,25 @@ def test_chains_that_differ_in_more_than_names() -> None:
     walk = {n: bmc.RandomWalk(1e-4) for n in ("mean", "precision")}
     engine = bmc.MetropolisHastings(200, 0, 4, proposal=walk)
     posterior, warned = asked(mixture(), {"x": DATA}, engine)
-    assert any(
-        "with components named by their order, the chains have not mixed" in w for w in warned
-    )
+    assert any("named by the order of 'mean', the chains have not mixed" in w for w in warned)
     assert posterior.label_switching is None
+
+
+def test_labels_of_components_are_shown_and_others_are_not_named_by_an_order() -> None:
+    """A scale above components that the data do not tell apart, in a funnel: the fault is the scale's."""
+    net = bmc.BayesNet(plates={"who": ["ann", "bob", "cy"]})
+    net.add("v", bmc.Normal(0.0, 3.0))
+    net.add("x", lambda v: bmc.Normal(0.0, np.exp(v / 2)), plates="who")
+    net.add("y", lambda x: bmc.StudentT(3.0, x, 1.0), plates="who")
+    _, warned = asked(net, {"y": np.zeros(3)}, bmc.Gibbs(60, 20))
+    of_scale = [w for w in warned if "'v'" in w]
+    assert of_scale and not any("order" in w for w in of_scale)
+    net = bmc.BayesNet(plates={"who": ["ann", "bob", "cy"]})
+    net.add("x", bmc.Normal(0.0, 3.0), plates="who")
+    net.potential("sum", lambda x: -0.5 * x.sum("who") ** 2)
+    engine = bmc.MetropolisHastings(60, 0, 4, proposal={"x": bmc.RandomWalk(1e-4)})
+    _, warned = asked(net, {}, engine)
+    assert any("of plate 'who' (ann, bob, cy) named by the order of 'x'" in w for w in warned)
 
 
 def test_groups_with_data_have_names() -> None:

@@ -13,7 +13,8 @@ from scipy import integrate, stats
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import ConvergenceWarning, ParameterError, ShapeError
-from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges, fit_beams
+from bayesmc.robotics.beam_fit import fit_beams
+from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.testing import session
 
 END = 8.0

@@ -17,6 +17,7 @@ from bayesmc.engines.averages import as_event
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
 from bayesmc.engines.discrete.belief import DiscreteBelief, Held, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
+from bayesmc.engines.discrete.looked import rows_compared
 from bayesmc.engines.discrete.path import path_values
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
@@ -27,6 +28,7 @@ from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.network.reading import nodes_read
 from bayesmc.progress import Progress
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.predictive import warn_of_misfit
 
 
 @dataclass(frozen=True)
@@ -161,7 +163,9 @@ class DiscreteFilter(FilterEngine):
             raise ValueError(
                 f"keep={keep!r}: an exact filter has no particles to keep; leave it out"
             )
-        return self._answer(problem, "filter", None, queries, progress)
+        found = self._answer(problem, seed, "filter", None, queries, progress)
+        warn_of_misfit(found.predictive, "DiscreteFilter", found.start, 3)
+        return found
 
     def smooth(
         self,
@@ -173,7 +177,9 @@ class DiscreteFilter(FilterEngine):
         progress: bool | None = None,
     ) -> DiscretePosterior:
         kind = "smooth" if lag is None else "fixed-lag"
-        return self._answer(problem, kind, lag, queries, progress)
+        found = self._answer(problem, seed, kind, lag, queries, progress)
+        warn_of_misfit(found.predictive, "DiscreteFilter", found.start, 3)
+        return found
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
@@ -228,6 +234,7 @@ class DiscreteFilter(FilterEngine):
     def _answer(
         self,
         problem: SeriesProblem,
+        seed: np.random.SeedSequence,
         kind: str,
         lag: int | None,
         queries: Queries | None,
@@ -252,6 +259,7 @@ class DiscreteFilter(FilterEngine):
                 queries=answer_queries(answers, queries),
                 start=problem.series.start,
             )  # fmt: skip
+            found.predictive = rows_compared(problem, run, seed)
             run.forget()
             bar.advance()
         return found.read_from(answers)

@@ -25,7 +25,9 @@ def path_values(
         Variable -> its states, shape (steps, sequences).
     """
     plan, reader, found = run.plan, run.plan.reader, {}
-    stored = {n: _node(run, path, n) for n in plan.slices.dynamic if n in reader.variables}
+    stored = {
+        n: states_of(run, path, n, run.steps) for n in plan.slices.dynamic if n in reader.variables
+    }
     for name in names:
         node = plan.slices.first[name]
         if name in reader.variables:
@@ -37,13 +39,10 @@ def path_values(
     return found
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _node(run: Run, path: Mapping[Variable, np.ndarray], name: str) -> np.ndarray:
-    """Stored values of a node, shape (steps, *plates)."""
+def states_of(run: Run, path: Mapping[Variable, np.ndarray], name: str, count: int) -> np.ndarray:
+    """Stored values of a node, shape (count, *plates), from states of shape (count, sequences)."""
     reader, node = run.plan.reader, run.plan.slices.first[name]
-    shape = (run.steps, *reader.lead)
+    shape = (count, *reader.lead)
     inner = [p for p in node.plates if p not in reader.apart]
     elements = [path[0, name, e].reshape(shape) for e in range(reader.elements(name))]
     sizes = tuple(run.plan.slices.first.sizes[p] for p in inner)
@@ -54,6 +53,9 @@ def _node(run: Run, path: Mapping[Variable, np.ndarray], name: str) -> np.ndarra
     full = full[tuple(0 if k in lacking else slice(None) for k in range(full.ndim))]
     left = [p for p in have if p in node.plates]
     return full.transpose(0, *(1 + left.index(p) for p in node.plates))
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _computed(run: Run, stored: Mapping[str, np.ndarray], name: str) -> np.ndarray:

@@ -12,7 +12,7 @@ from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions import Distribution
 from bayesmc.engines.averages import over_line
 from bayesmc.engines.grid.moves import COUNTS
-from bayesmc.engines.grid.refined import Fine, quantiles, refined
+from bayesmc.engines.grid.refined import Fine, cell_quantiles, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
 from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
@@ -176,24 +176,47 @@ class Answers:
 
         return self._averaged(names, called)
 
-    def quantile(self, name: str, q: Any) -> np.ndarray:
-        """Quantiles of a node of one number on the grid, shape ``(*q.shape, *plates)``."""
-        levels = np.asarray(q, dtype=float)
-        if not ((levels >= 0) & (levels <= 1)).all():
-            raise ValueError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
-        node = self._node(name)
-        label = (name, 0)
-        fine = self._fine(label, {label})
-        if fine is None or node.domain is not None or self.model.elements(name) != 1:
+    def quantile(self, name: str, levels: np.ndarray) -> np.ndarray:
+        """Quantiles of a node on the grid, number by number, shape ``(*levels.shape, *plates, *event)``.
+
+        Within cells the belief is interpolated; on uneven ones it is even in each.
+        """
+        node, model = self._node(name), self.model
+        seen = self.now.row.seen.get(name)
+        if name not in model.axes.of or name in model.leaves or node.domain is not None:
             raise UnsupportedError(
-                f"quantile({name!r}): a grid has quantiles of a node of one number that is hidden, on even "
-                "cells; finite nodes have probabilities"
+                f"quantile({name!r}): the node is not on the grid itself; ask of one that is (here "
+                f"{sorted({str(s.label[0]) for s in self.now.scalars})}), "  # type: ignore[index]
+                "or of the probability of an event, probability(function)"
             )
-        found = quantiles(fine, levels)
-        apart = self.model.apart
-        order = [apart.index(p) for p in node.plates if p in apart]
-        found = found.transpose(*range(levels.ndim), *(levels.ndim + k for k in order))
-        return found.reshape((*levels.shape, *node.value_shape))
+        inner = [
+            1 if p in model.apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)
+        ]
+        order = [model.apart.index(p) for p in node.plates if p in model.apart]
+        held = {s.label: s for s in self.now.scalars}
+        events = list(np.ndindex(*node.event_shape))
+        out = np.empty((*levels.shape, *node.value_shape))
+        for number, plates in enumerate(np.ndindex(*inner)):
+            at = tuple(
+                slice(None) if p in model.apart else k
+                for p, k in zip(node.plates, plates, strict=True)
+            )
+            for k, event in enumerate(events):
+                scalar = held.get((name, number * len(events) + k))
+                if scalar is None:  # seen in all elements that are apart
+                    assert seen is not None
+                    out[(..., *at, *event)] = seen.value[(*at, *event)]
+                    continue
+                fine = self._fine(scalar.label, {scalar.label})
+                if fine is not None:
+                    found = quantiles(fine, levels)
+                else:
+                    share = self._marginal({scalar.label}).reshape(scalar.size, *model.lead)
+                    found = cell_quantiles(scalar.points, share, levels, node.is_discrete)
+                found = found.reshape((*levels.shape, *model.lead))
+                ranks = range(levels.ndim)
+                out[(..., *at, *event)] = found.transpose(*ranks, *(levels.ndim + a for a in order))
+        return out
 
     # ---- private -------------------------------------------------------------------------------
 

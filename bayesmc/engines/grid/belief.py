@@ -16,7 +16,7 @@ from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
-from bayesmc.results.posterior import table_variance
+from bayesmc.results.posterior import quantile_levels, table_variance
 
 
 class Kept(NamedTuple):
@@ -148,7 +148,7 @@ class GridBelief(OnlineBelief):
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles of a node of one number, shape ``(*q.shape, *plates)``."""
         self._node(name)
-        return self._answers.quantile(name, q)
+        return self._answers.quantile(name, quantile_levels(name, q))
 
     def __repr__(self) -> str:
         if self.cells is None:

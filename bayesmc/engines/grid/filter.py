@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -13,24 +12,29 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.exact import readable_bytes
-from bayesmc.engines.filtering import Queries, answer_so_far, pass_slices
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief, Kept
+from bayesmc.engines.grid.limits import too_large, unread, without_density
+from bayesmc.engines.grid.looked import draws_of
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
 from bayesmc.engines.grid.search import GridSearch, known_static, quiet
 from bayesmc.engines.grid.slice import same_points
-from bayesmc.engines.grid.sources import is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label, largest
+from bayesmc.engines.grid.terms import Label
+from bayesmc.engines.particles.replicates import Replicates
+from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, stream
+from bayesmc.results.predictive import warn_of_misfit
 
 
 @dataclass(frozen=True)
-class GridFilter(GridSearch):
+class GridFilter(FilterEngine):
     """Histogram filter (Markov localisation): beliefs as probabilities of the cells of a grid.
 
     Exact but for the grid: sums over points stand for integrals. With points closer than the narrowest
@@ -66,7 +70,9 @@ class GridFilter(GridSearch):
     independently cost the sum of their tables, not the product. Plates whose elements never meet are filtered
     separately on the same grid. Noise narrower than a cell falls between the points: widen it, refine the
     grid, or take another engine; a state without noise has no density at all and is refused. Hidden nodes
-    that nothing reads (missing observations) go without axes unless ``grid`` names them.
+    that nothing reads (missing observations) go without axes unless ``grid`` names them. Vectors are seen
+    whole or not at all: one of which some components are missing is refused. Some rows are held against rows
+    drawn from the cells (``row_ranks``); a ``ModelMisfitWarning`` says where they do not fit.
 
     References
     ----------
@@ -131,13 +137,13 @@ class GridFilter(GridSearch):
                 model = self.model_on_grid(problem.slices, known_static(problem))
         except BayesmcError as error:
             return str(error)
-        name = self.automatic(problem)
+        name = self._search.automatic(problem)
         if name is not None:
-            return _without_density(problem)
+            return without_density(problem)
         for name in problem.hidden:
             if name in model.own and name not in model.leaves and name not in model.axes.of:
                 return f"GridFilter: {model.axes.missing[name]}"
-        return self._too_large(model, problem) or _without_density(problem)
+        return too_large(model, problem, self.max_bytes) or without_density(problem)
 
     def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
         """Hidden nodes that are integrated out and have no closed moments."""
@@ -155,9 +161,30 @@ class GridFilter(GridSearch):
                     found.append(name)
         return tuple(found)
 
+    @property
+    def _search(self) -> GridSearch:
+        """The search for a grid of one hidden number, by these options."""
+        return GridSearch(self)
+
+    def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        return self._search.why_not(problem)
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        if reason is not None:
+            return reason
+        model = self.model_on_grid(problem.slices, known_static(problem))
+        return unread(model, asked.queries, problem.hidden)
+
+    def is_displaced(self, problem: SeriesProblem) -> bool:
+        return self._search.automatic(problem) is not None and super().is_displaced(problem)
+
+    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        return self._search.said(problem)
+
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         model = self.model_on_grid(problem.slices, known_static(problem))
-        grid = self.found(problem)
+        grid = self._search.found(problem)
         if grid is not None:
             model = grid.mover.model
         found = {}
@@ -200,12 +227,15 @@ class GridFilter(GridSearch):
             )
         mover, kept = self._start(problem)
         record = GridRecord(problem, mover.model, queries or {}, keep is None)
+        looks = _looks(problem, mover, seed)
         increments = np.empty((problem.steps, *mover.model.lead))
         before: Cells | None = None
 
         def move(k: int) -> None:
             nonlocal before
-            cells = kept[k] if kept else mover.move(before, problem.series.row(k))
+            row = problem.series.row(k)
+            looks.look(k, draws_of(mover.model, before), row)
+            cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
             record.add(k, _answers(mover, before, cells, cells.probs))
             before = cells
@@ -214,9 +244,10 @@ class GridFilter(GridSearch):
         try:
             with Progress(problem.steps, self.label, progress) as bar, quiet():
                 pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
+            found = so_far()
         except KeyboardInterrupt as stop:
-            return self.with_error(problem, answer_so_far(stop, self))
-        return self.with_error(problem, so_far())
+            found = answer_so_far(stop, self)
+        return self._judged(problem, found, looks)
 
     def smooth(
         self,
@@ -230,6 +261,7 @@ class GridFilter(GridSearch):
         """Every slice given all rows by one pass forwards and one back, or ``lag`` back from every slice."""
         mover, kept = self._start(problem)
         record = GridRecord(problem, mover.model, queries or {}, True)
+        looks = _looks(problem, mover, seed)
         steps = problem.steps
         increments = np.empty((steps, *mover.model.lead))
         reach = steps if lag is None else int(lag)
@@ -237,7 +269,9 @@ class GridFilter(GridSearch):
 
         def move(k: int) -> None:
             before = held[-1] if held else None
-            cells = kept[k] if kept else mover.move(before, problem.series.row(k))
+            row = problem.series.row(k)
+            looks.look(k, draws_of(mover.model, before), row)
+            cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
             held.append(cells)
             if k == 0:
@@ -249,7 +283,7 @@ class GridFilter(GridSearch):
             pass_slices(problem.series.start, steps, move, None, bar.advance)
             self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
         found = record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
-        return self.with_error(problem, found)
+        return self._judged(problem, found, looks)
 
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
@@ -260,7 +294,7 @@ class GridFilter(GridSearch):
         """
         static = known_static(problem)
         with quiet(), Progress(problem.steps, self.label, progress) as bar:
-            found_grid = self.found(problem)
+            found_grid = self._search.found(problem)
             axis = None if found_grid is None else (found_grid.name, found_grid.axis)
             model = self.model_on_grid(problem.slices, static, logs=True, axis=axis)
             mover = GridMover(model, self.tolerance)
@@ -331,12 +365,21 @@ class GridFilter(GridSearch):
 
     def _start(self, problem: SeriesProblem) -> tuple[GridMover, list[Cells] | None]:
         """What moves beliefs, and the beliefs of all slices where a search for the grid left them."""
-        found = self.found(problem)
+        found = self._search.found(problem)
         if found is not None:
             return found.mover, found.kept
         with quiet():
             model = self.model_on_grid(problem.slices, known_static(problem))
             return GridMover(model, self.tolerance), None
+
+    def _judged(
+        self, problem: SeriesProblem, found: GridPosterior, looks: Replicates
+    ) -> GridPosterior:
+        """With the error of the log evidence, and how rows compare with what was expected."""
+        found = self._search.with_error(problem, found)
+        found.predictive = looks.found(found.steps)
+        warn_of_misfit(found.predictive, "GridFilter", found.start, 4)
+        return found
 
     def _smoothed(
         self,
@@ -368,39 +411,14 @@ class GridFilter(GridSearch):
                 count,
             )
 
-    def _too_large(self, model: GridModel, problem: SeriesProblem) -> str | None:
-        """Why the tables do not fit, found from their sizes alone."""
-        hidden = frozenset(n for n in problem.hidden if n in model.own and n not in model.leaves)
-        sizes: dict[Label, int] = dict(zip(model.apart, model.lead, strict=True))
-        labels: list[Label] = []
-        for name in sorted(hidden):
-            axes = model.axes.of[name]
-            for e in range(model.elements(name)):
-                label = (name, e)
-                labels.append(label)
-                sizes[label] = sizes[previous(label)] = axes[e % len(axes)].size
-        scopes = []
-        for first in (True, False) if problem.steps > 1 else (True,):
-            for name in hidden | set(problem.series.observed):
-                if name not in model.own or (
-                    name in model.leaves and name not in problem.series.observed
-                ):
-                    continue
-                scope = model.scope(first, name, hidden)
-                cells = [sizes[x] for x in scope]
-                if 8 * math.prod(map(float, cells)) > self.max_bytes:
-                    return model.too_large(name, cells, 8 * math.prod(map(float, cells)))
-                if any(map(is_previous, scope)):
-                    scopes.append(scope)
-        belief = {previous(x) for x in labels} | set(model.apart)
-        entries = largest([belief, *scopes], (*labels, *model.apart), sizes)
-        if 8 * entries > self.max_bytes:
-            names = ", ".join(sorted(hidden))
-            return model.too_large(names, [sizes[x] for x in labels], 8 * entries)
-        return None
-
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _looks(problem: SeriesProblem, mover: GridMover, seed: np.random.SeedSequence) -> Replicates:
+    """What holds rows against those that the grid expects."""
+    plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
+    return Replicates(problem, plan, stream(seed, Purpose.CHECK))
 
 
 def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.ndarray) -> Answers:
@@ -410,20 +428,6 @@ def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.nda
 
     placed = None if before is None else before.placed
     return Answers(mover.model, placed, cells.placed, probs, pair)
-
-
-def _without_density(problem: SeriesProblem) -> str | None:
-    """A node whose density cannot be evaluated, tried where its parents can be."""
-    for model in (problem.slices.first, problem.slices.later):
-        for name in problem.slices.stochastic:
-            try:
-                with quiet():
-                    dist, _ = model.evaluate(name, model.probe)
-                    model.log_density(name, dist, model.probe[name])
-            except (BayesmcError, NotImplementedError) as error:
-                why = str(error) or "it is not implemented"
-                return f"GridFilter evaluates every density, and that of {name!r} cannot be: {why}"
-    return None
 
 
 def _chosen(

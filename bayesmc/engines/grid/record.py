@@ -17,6 +17,7 @@ from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.posterior import quantile_levels
 
 
 class GridRecord:
@@ -151,9 +152,12 @@ class GridPosterior(SeriesPosterior):
         return self._of_all("probability", lambda one: one.expectation(function, as_event))
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
-        """Quantiles of a node of one number, shape ``(time, *q.shape, *plates)``."""
+        """Quantiles of a node, number by number, shape ``(time, *q.shape, *plates, *event)``."""
         self._node(name)
-        return self._of_all(f"quantile({name!r})", lambda one: one.quantile(name, q))
+        levels = quantile_levels(name, q)
+        if name in self._tables or not np.any(self._variances[name]):  # finite, or seen
+            return super().quantile(name, q)
+        return self._of_all(f"quantile({name!r})", lambda one: one.quantile(name, levels))
 
     def _of_all(self, what: str, ask: Callable[[Answers], np.ndarray]) -> np.ndarray:
         if self.answers is None:

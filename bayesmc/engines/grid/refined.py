@@ -74,6 +74,30 @@ def quantiles(fine: Fine, levels: np.ndarray) -> np.ndarray:
     return np.asarray(fine.number(at))
 
 
+def cell_quantiles(
+    points: np.ndarray, shares: np.ndarray, levels: np.ndarray, isolated: bool
+) -> np.ndarray:
+    """The same on any cells, shape (n, ...): linear within cells that end halfway between points.
+
+    Of ``isolated`` values the least below or at which so much lies.
+    """
+    n = len(shares)
+    share = shares.reshape(n, -1)
+    where = np.broadcast_to(points, shares.shape).reshape(n, -1).astype(float)
+    found = np.empty((levels.size, share.shape[1]))
+    for k, (mass, x) in enumerate(zip(share.T, where.T, strict=True)):
+        below = np.cumsum(mass) / mass.sum()
+        if isolated or np.count_nonzero(mass) == 1:
+            # rounding of the sum must not carry a level to the next value
+            at = np.searchsorted(below, levels.ravel() * (1 - 1e-12))
+            found[:, k] = x[np.clip(at, np.flatnonzero(mass)[0], np.flatnonzero(mass)[-1])]
+            continue
+        halves = (x[1:] + x[:-1]) / 2
+        edges = np.concatenate([[2 * x[0] - halves[0]], halves, [2 * x[-1] - halves[-1]]])
+        found[:, k] = np.interp(levels.ravel(), np.concatenate([[0.0], below]), edges)
+    return found.reshape((*levels.shape, *shares.shape[1:]))
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 

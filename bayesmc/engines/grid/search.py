@@ -6,30 +6,38 @@ import math
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.filtering import Asked, FilterEngine
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
 from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.record import GridPosterior
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
-from bayesmc.network.reading import nodes_read
 
 
-class GridSearch(FilterEngine):
-    """A filter on grids that finds the grid of one hidden number; see ``GridFilter`` for its options."""
+class Options(Protocol):
+    """What a search reads of a filter: its options (see ``GridFilter``), and a template on a grid."""
 
-    grid: Mapping[str, Any]
-    cells: int | None
-    quadrature: str
-    max_bytes: float
-    tolerance: float
+    @property
+    def grid(self) -> Mapping[str, Any]: ...
+
+    @property
+    def cells(self) -> int | None: ...
+
+    @property
+    def quadrature(self) -> str: ...
+
+    @property
+    def max_bytes(self) -> float: ...
+
+    @property
+    def tolerance(self) -> float: ...
 
     def model_on_grid(
         self,
@@ -39,10 +47,22 @@ class GridSearch(FilterEngine):
         axis: tuple[str, Axis] | None = None,
     ) -> GridModel:
         """The template on its grid; ``axis`` is a node's that was found."""
-        raise NotImplementedError
+        ...
 
-    def unasked(self, problem: SeriesProblem, asked: Asked) -> str | None:
-        """A grid is taken unasked where a slice has one hidden number and its error is small."""
+
+@dataclass(frozen=True)
+class GridSearch:
+    """The search for the grid of one hidden number, by the options of a filter.
+
+    Parameters
+    ----------
+    options : Options
+    """
+
+    options: Options
+
+    def why_not(self, problem: SeriesProblem) -> str | None:
+        """Why no grid is taken unasked: it is where a slice has one hidden number and its error is small."""
         if self.automatic(problem) is None:
             return "a grid is taken unasked where one number of a slice is hidden, and here it is not one"
         try:
@@ -60,28 +80,12 @@ class GridSearch(FilterEngine):
                 f"evidence, above {most}"
             )
         each = found.axis.size * math.prod(found.mover.model.lead)
-        if 16 * problem.steps * each > self.max_bytes:
+        if 16 * problem.steps * each > self.options.max_bytes:
             return f"the beliefs of {problem.steps} slices on {found.axis.size} cells do not fit max_bytes"
         return None
 
-    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
-        reason = super().unable(problem, asked)
-        if reason is not None:
-            return reason
-        model = self.model_on_grid(problem.slices, known_static(problem))
-        for query, function in asked.queries.items():
-            for name in nodes_read(function):
-                if name in model.leaves and name in problem.hidden:
-                    return (
-                        f"queries={{{query!r}: ...}} reads {name!r}, which is hidden and not on the grid, "
-                        "since nothing depends on it"
-                    )
-        return None
-
-    def is_displaced(self, problem: SeriesProblem) -> bool:
-        return self.automatic(problem) is not None and super().is_displaced(problem)
-
-    def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+    def said(self, problem: SeriesProblem) -> tuple[str, ...]:
+        """What was found, for users."""
         found = self.found(problem)
         if found is None:
             return ()
@@ -92,21 +96,25 @@ class GridSearch(FilterEngine):
 
     def automatic(self, problem: SeriesProblem) -> str | None:
         """The one hidden number of a slice, whose grid is found; None where there is none."""
-        if self.quadrature != "midpoint":
+        if self.options.quadrature != "midpoint":
             return None
-        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = self.options.model_on_grid(problem.slices, known_static(problem))
         numbers = _numbers(problem, model)
-        if len(numbers) != 1 or numbers[0] in self.grid:
+        if len(numbers) != 1 or numbers[0] in self.options.grid:
             return None
         name = numbers[0]
         if problem.model[name].event_shape or model.elements(name) != 1:
             return None
         bounded = name in model.axes.of
-        return None if line_of(problem.slices, name) is None or (bounded and self.cells) else name
+        return (
+            None
+            if line_of(problem.slices, name) is None or (bounded and self.options.cells)
+            else name
+        )
 
     def found(self, problem: SeriesProblem) -> FoundGrid | None:
         """The grid of the one hidden number, found once for a problem; None where there is none to find."""
-        key = f"grid {self!r}"
+        key = f"grid {self.options!r}"
         if key not in problem.cache:
             with quiet():
                 problem.cache[key] = self._sought(problem)
@@ -121,10 +129,10 @@ class GridSearch(FilterEngine):
         rows = [problem.series.row(k) for k in range(problem.steps)]
 
         def make(axis: Axis) -> GridModel:
-            return self.model_on_grid(problem.slices, static, axis=(name, axis))
+            return self.options.model_on_grid(problem.slices, static, axis=(name, axis))
 
         try:
-            return find_grid(name, line, make, rows, self.cells)
+            return find_grid(name, line, make, rows, self.options.cells)
         except UnsupportedError as error:
             raise UnsupportedError(
                 f"GridFilter: {error}; give it one, grid={{{name!r}: (low, high, cells)}}, or use "
@@ -137,7 +145,7 @@ class GridSearch(FilterEngine):
         if found is not None:
             error = found.error
             posterior.log_marginal_likelihood_mcse = error if error.ndim else float(error)
-            if not np.max(error) <= TARGET and np.isfinite(self.tolerance):
+            if not np.max(error) <= TARGET and np.isfinite(self.options.tolerance):
                 other = (
                     "; some of it lands far from the rest, where particles seldom come"
                     if found.far
@@ -148,9 +156,9 @@ class GridSearch(FilterEngine):
                     f"{float(np.max(error)):.2g} in the log evidence; give a grid of your own, "
                     f"grid={{{found.name!r}: (low, high, cells)}}{other}",
                     GridWarning,
-                    stacklevel=4,
+                    stacklevel=5,
                 )
-        elif _numbers(problem, self.model_on_grid(problem.slices, known_static(problem))):
+        elif _numbers(problem, self.options.model_on_grid(problem.slices, known_static(problem))):
             nothing = np.full(np.shape(posterior.log_marginal_likelihood), np.nan)
             posterior.log_marginal_likelihood_mcse = nothing if nothing.ndim else np.nan
         return posterior

@@ -97,6 +97,8 @@ class GridSlices(GridStructure):
             if not slices.first[name].is_stochastic:
                 self.static[name] = slices.first.evaluate(name, self.static)[0]
         self._whole: set[tuple[bool, str]] = set()
+        self._open: dict[tuple[bool, str], list[tuple[int, tuple[Any, ...], Any]]] = {}
+        self._spread: dict[tuple[bool, str, Labels], np.ndarray] = {}
 
     def place(self, row: Row) -> Placed:
         """The scalars of a slice, and values that run over them.
@@ -115,12 +117,22 @@ class GridSlices(GridStructure):
             elif name not in self.leaves:
                 if name not in self.axes.of:
                     raise UnsupportedError(f"GridFilter: {self.axes.missing[name]}")
-                mine = list(self._scalars(model[name], row))
+                known = (row.t == 0, name)
+                if seen is None and known not in self._open:
+                    self._open[known] = list(self._scalars(model[name], row))
+                mine = self._open[known] if seen is None else list(self._scalars(model[name], row))
                 open_.append((model[name], mine))
                 scalars += [s for _, _, s in mine if isinstance(s, Scalar)]
         order = {s.label: k for k, s in enumerate(scalars)}
+        labels = tuple(order)
         for node, mine in open_:
-            values[node.name] = self._filled(node, mine, order)
+            key = (row.t == 0, node.name, labels)
+            if node.name in row.seen:
+                values[node.name] = self._filled(node, mine, order)
+                continue
+            if key not in self._spread:
+                self._spread[key] = self._filled(node, mine, order)
+            values[node.name] = self._spread[key]
         placed = Placed(row, tuple(scalars), values)
         base = self.base(None, placed)
         for name in self.slices.interface:

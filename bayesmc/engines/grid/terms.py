@@ -45,6 +45,9 @@ def dense(term: Term, labels: Labels, shape: Shape, full: bool = True) -> np.nda
 
 def contract(terms: Sequence[Term], keep: Sequence[Label]) -> Term:
     """The product of all terms, summed over every axis that is not kept."""
+    moved = _moved(terms, keep)
+    if moved is not None:
+        return moved
     left = list(terms)
     sizes = _sizes(left)
     for touched, _, labels in _steps([set(t.labels) for t in left], set(keep), sizes):
@@ -112,6 +115,20 @@ def maximise(terms: Sequence[Term], keep: Sequence[Label]) -> tuple[Term, list[C
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _moved(terms: Sequence[Term], keep: Sequence[Label]) -> Term | None:
+    """The commonest product by itself, in a fraction of the time: a row of numbers times a table."""
+    if len(terms) != 2 or len(keep) != 1 or len(terms[0].labels) != 1:
+        return None
+    row, table = terms
+    if len(table.labels) != 2 or row.labels[0] in keep:
+        return None
+    if table.labels == (row.labels[0], keep[0]):
+        return Term((keep[0],), row.table @ table.table)
+    if table.labels == (keep[0], row.labels[0]):
+        return Term((keep[0],), table.table @ row.table)
+    return None
 
 
 def _steps(

@@ -100,7 +100,7 @@ class GaussianFilter(FilterEngine):
         except KeyboardInterrupt as stop:
             return answer_so_far(stop, self)
         answers = filter_answers(self, problem, data, found, queries)
-        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 4)
+        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 3)
         return answers
 
     def smooth(
@@ -117,7 +117,7 @@ class GaussianFilter(FilterEngine):
         smoothed = backward(data.layouts[0], found, lag)
         kind = "smooth" if lag is None else "fixed-lag"
         answers = smooth_answers(self, problem, data, found, smoothed, kind, queries)
-        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 4)
+        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 3)
         return answers
 
     def most_likely(

@@ -6,7 +6,7 @@ variance (``families`` says why), with a correction for what the mean owes to th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -71,8 +71,7 @@ class MeanErrors:
                 centre: Any = (tables[name][k : k + 1], None)
             else:
                 centre = (means[name][k : k + 1], variances[name][k : k + 1])
-            found = node_errors(self.layout, cloud, families.bounds, node, centre)
-            self._found[name][k] = found
+            self._found[name][k] = node_errors(self.layout, cloud, families, node, centre)
 
     def found(self) -> dict[str, np.ndarray]:
         """Errors by node, time first, shape of the mean; of each state's probability, for labels."""
@@ -96,7 +95,12 @@ class MeanErrors:
             if values[name].ndim:
                 np.multiply(weights, values[name], out=room[:n])
                 parts[name] = [add(room, own) for own in starts[: len(sums)]]
-        return _Waiting(k, cloud.total, families.bounds, sums, parts)
+        lost, left, scouts = families.lost is not None, {}, families.scouts
+        if scouts is not None:
+            for name in parts.keys() & scouts.values.keys():
+                own = _left_out(scouts.share, scouts.values[name], self.answers[0][name][k])
+                left[name] = float(own)
+        return _Waiting(k, cloud.total, families.bounds, sums, parts, lost, left)
 
     def _work_out(self) -> None:
         """Errors of nodes that are one number, of all slices that wait."""
@@ -120,6 +124,9 @@ class MeanErrors:
                     variance[at] = np.where(few[at] & np.isinf(found), 0.0, found)
                 else:
                     variance[at] = np.maximum(variance[at], np.where(few[at], found, 0.0))
+            for own in (w for w in waiting if name in w.left):
+                variance[own.k - first] += own.left[name]
+            variance[[w.k - first for w in waiting if w.lost and name in w.parts]] = np.inf
             np.sqrt(variance, out=variance)
 
 
@@ -134,12 +141,14 @@ class _Waiting(NamedTuple):
     bounds: np.ndarray
     sums: list[np.ndarray]
     parts: dict[str, list[np.ndarray]]
+    lost: bool
+    left: dict[str, float]
 
 
 def node_errors(
     layout: Layout,
     cloud: Cloud,
-    bounds: np.ndarray,
+    families: Families,
     node: CompiledNode,
     centre: tuple[np.ndarray, np.ndarray | None],
 ) -> np.ndarray:
@@ -149,14 +158,46 @@ def node_errors(
     ----------
     layout : Layout
     cloud : Cloud
-    bounds : ndarray of int, shape (2, groups + 1, *apart)
+    families : Families
     node : CompiledNode
     centre : tuple
         Its mean and variance, or its table and None, with an axis of length 1 in front.
     """
+    off, count, step = deviations(node, cloud.values[node.name][None], centre)
+    mean, bounds = centre[0], families.bounds
+    if not layout.apart:
+        found = _variances(cloud.weights[None], off, bounds[..., None])
+        ess: Any = np.array([cloud.ess])
+    else:
+        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
+    if count is not None:
+        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
+        worth = _beside(ess, node, layout, np.ndim(mean))
+        found = np.maximum(found, step**2 * unseen(count, worth if own else worth[..., 0]))
+        if families.scouts is not None:
+            found = found + (step * families.scouts.share) ** 2
+    elif (
+        families.scouts is not None and node.angles is None and node.name in families.scouts.values
+    ):
+        found = found + _left_out(families.scouts.share, families.scouts.values[node.name], mean[0])
+    if families.lost is not None:
+        order = [p for p in node.plates if p in layout.apart]
+        if len(order) == len(layout.apart):
+            where = _along(families.lost.where, layout, node)
+            tail = found.ndim - 1 - where.ndim
+            found = np.where(where.reshape(where.shape + (1,) * tail), np.inf, found)
+    return np.sqrt(found[0])
+
+
+def deviations(
+    node: CompiledNode, value: np.ndarray, centre: tuple[np.ndarray, np.ndarray | None]
+) -> tuple[np.ndarray, np.ndarray | None, float]:
+    """By how much values lie off a mean; the shares that stand behind it, and what a state more or less is.
+
+    Slices and particles come first; ``centre`` as for ``node_errors``. Without states there are no shares.
+    """
     mean, variance = centre
     count, step = None, 1.0
-    value = cloud.values[node.name][None]
     if node.domain is None:
         off = value - mean[:, None]
         if node.angles is not None:
@@ -171,32 +212,43 @@ def node_errors(
     else:
         off = (value[..., None] == np.arange(node.domain.size)) - mean[:, None]
         count = mean
-    if not layout.apart:
-        found = _variances(cloud.weights[None], off, bounds[..., None])
-        ess: Any = np.array([cloud.ess])
-    else:
-        found, ess = _of_plates(layout, cloud, bounds, node, off[0])
-    if count is not None:
-        own = np.ndim(found) == np.ndim(mean)  # of each state; else of the node's number
-        worth = _beside(ess, node, layout, np.ndim(mean))
-        found = np.maximum(found, step**2 * _unseen(count, worth if own else worth[..., 0]))
-    return np.sqrt(found[0])
+    return off, count, step
 
 
 def value_errors(
-    layout: Layout, cloud: Cloud, bounds: np.ndarray, values: np.ndarray, mean: np.ndarray
+    layout: Layout,
+    cloud: Cloud,
+    families: Families,
+    values: np.ndarray,
+    mean: np.ndarray,
+    there: Callable[[dict[str, np.ndarray]], np.ndarray | None] | None = None,
 ) -> np.ndarray:
-    """Errors of the mean of what a function says of each particle: shape what one value has."""
+    """Errors of the mean of what a function says of each particle: shape what one value has.
+
+    ``there`` is the function at values of scouts, if it can be asked.
+    """
     off = values - mean
     n, many = len(off), int(np.prod(layout.lead))
     rest = off.shape[1 + len(layout.lead) :]
     rows = np.moveaxis(off.reshape(n, many, *rest), 1, 0)
-    found = _variances(cloud.weights.reshape(n, many).T, rows, _flat(bounds, many))
+    found = _variances(cloud.weights.reshape(n, many).T, rows, _flat(families.bounds, many))
     share = found.reshape(np.shape(mean))
     if is_share(values):  # an event that no particle has seen may happen
         ess = np.asarray(cloud.ess, dtype=float)
-        share = np.maximum(share, _unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
+        share = np.maximum(share, unseen(mean, ess.reshape(ess.shape + (1,) * len(rest))))
+    if families.scouts is not None and there is not None:
+        share = share + _left_out(families.scouts.share, there(families.scouts.values), mean)
+    if families.lost is not None:
+        where = families.lost.where
+        share = np.where(where.reshape(where.shape + (1,) * len(rest)), np.inf, share)
     return np.sqrt(share)
+
+
+def unseen(share: np.ndarray, ess: Any) -> np.ndarray:
+    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
+    centre = (share * ess + 2.0) / (ess + 4.0)
+    rare = np.minimum(share, 1.0 - share) * ess < 1.0
+    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -277,16 +329,21 @@ def _beside(ess: Any, node: CompiledNode, layout: Layout, ndim: int) -> Any:
     """What particles are worth, with the axes of a node's table."""
     if not layout.apart:
         return ess.reshape(-1, *(1,) * (ndim - 1))
+    return _along(ess, layout, node)[None, ..., None]
+
+
+def _along(figures: Any, layout: Layout, node: CompiledNode) -> np.ndarray:
+    """Figures of elements that are filtered separately, along the plates of a node."""
     order = [p for p in node.plates if p in layout.apart]
-    moved = ess.transpose([layout.apart.index(p) for p in order])
+    moved = np.transpose(figures, [layout.apart.index(p) for p in order])
     shape = [
         n if p in layout.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
     ]
-    return moved.reshape(1, *shape, 1)
+    return moved.reshape(shape if layout.apart else ())
 
 
-def _unseen(share: np.ndarray, ess: Any) -> np.ndarray:
-    """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
-    centre = (share * ess + 2.0) / (ess + 4.0)
-    rare = np.minimum(share, 1.0 - share) * ess < 1.0
-    return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)
+def _left_out(share: float, values: np.ndarray | None, mean: Any) -> Any:
+    """Square of what a mean owes to states that particles leave out."""
+    if values is None:
+        return 0.0 if share == 0.0 else np.full(np.shape(mean), np.inf)
+    return (share * (values.mean(axis=0) - mean)) ** 2

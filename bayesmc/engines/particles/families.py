@@ -26,12 +26,16 @@ found families.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.drift import SEEMS, Compass, Drift
+from bayesmc.engines.particles.forgetting import Lost, Sight
+from bayesmc.engines.particles.scouts import Scouts
 
 #: families of an origin, and founders of each, at least, where there are particles enough
 GROUPS, LEAST = 32, 4
@@ -48,6 +52,8 @@ RESTS = 4.0
 MATTERS, UNEVEN = (0.05, 0.15), 80.0
 #: times the variance that the slices' weights explain by themselves, above which the rest came from the edge
 EDGE = 4.0
+#: families that make up such differences below which these are an accident of one or two
+SOME = 2.0
 #: share of the particles below which the worth of a slice's has its weights looked at for a tail, and the
 #: mean log of the largest of them over the next from which on they have one (Hill's estimate)
 FEW, TAIL = 0.05, 0.7
@@ -55,6 +61,9 @@ FEW, TAIL = 0.05, 0.7
 LONG = 0.2
 #: variance between two origins beyond which the families that are left are too few to tell
 MOST = 1.0
+
+#: share of the belief in states without particles, over that of all particles, up to which it is an error
+LEFT_OUT = 0.1
 
 OLD, YOUNG = 0, 1
 
@@ -78,6 +87,14 @@ class Families(NamedTuple):
         Slices of the origins.
     settled : ndarray, shape (*apart,)
         Variance of the log evidence up to the old origin.
+    lost : Lost or None
+        What the filter has lost sight of.
+    scouts : Scouts or None
+        Where states have no particle: what the rows make of these.
+    drift : Drift or None
+        Whether rows pull the particles the same way; None where particles are not drawn from the model.
+    doubted : int or ndarray of int, shape (*apart)
+        The last slice in which families differed by more than weights explain, if many did.
     """
 
     bounds: np.ndarray
@@ -85,12 +102,16 @@ class Families(NamedTuple):
     kept: np.ndarray
     explained: np.ndarray
     born: np.ndarray
-    settled: np.ndarray
+    settled: Any
+    lost: Lost | None = None
+    scouts: Scouts | None = None
+    drift: Drift | None = None
+    doubted: Any = -LONGEST
 
 
-def begun(cloud: Cloud, layout: Layout) -> Families:
+def begun(cloud: Cloud, sight: Sight) -> Families:
     """Families of the particles of the first slice, which were drawn independently."""
-    n, lead = layout.particles, layout.lead
+    n, lead = sight.layout.particles, sight.layout.lead
     groups = min(GROUPS, max(n // LEAST, 2), n)
     bounds, shares = _even(len(cloud.weights), groups, len(lead))
     rested = np.asarray(cloud.ess) >= min(RESTS, 0.9 * len(cloud.weights))
@@ -101,10 +122,13 @@ def begun(cloud: Cloud, layout: Layout) -> Families:
         np.zeros((2, 2, *lead)),
         np.full((2, *lead), cloud.t),
         np.where(rested, 0.0, np.inf),
+        sight.after(None, ~rested, cloud),
     )
 
 
-def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
+def followed(
+    families: Families, earlier: Cloud, cloud: Cloud, steady: bool, sight: Sight
+) -> Families:
     """The families one slice later.
 
     Parameters
@@ -115,27 +139,64 @@ def followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> 
         The slice before, and this one.
     steady : bool
         Whether resampling leaves neighbours together the particles that their weight demands, but for one.
+    sight : Sight
     """
+    gained: Any
     if cloud.weights.ndim == 1 and steady and cloud.rejuvenated is False:
-        return _followed_alone(families, earlier, cloud)
-    poor = cloud.ess < min(RESTS, 0.9 * len(cloud.weights))
-    if np.any(poor):
-        families = families._replace(settled=np.where(poor, np.inf, families.settled))
-    if cloud.ancestors is not None:
-        families = _moved(families, earlier, cloud, steady)
-        if cloud.t % STRIDE == 0:
-            families = _looked_at(families, cloud)
-    if cloud.rejuvenated is not False:
-        families = _renewed(families, earlier, cloud)
-    return families
+        found, gained = _followed_alone(families, earlier, cloud)
+        if gained == 0.0 and families.lost is None:
+            return found
+        now = gained == math.inf
+    else:
+        found = _followed(families._replace(settled=np.zeros(())), earlier, cloud, steady)
+        gained = found.settled
+        now = np.isinf(gained)
+    lost = sight.after(families.lost, now, cloud)
+    return found._replace(settled=families.settled + gained, lost=lost)
+
+
+def drifted(
+    families: Families, compass: Compass, earlier: Cloud | None, cloud: Cloud, sight: Sight
+) -> Families:
+    """The families, where particles are missing if rows go on pulling the same way."""
+    drift = compass.after(families.drift, earlier, cloud)
+    families = families._replace(drift=drift)
+    if drift is None:
+        return families
+    if not (drift.worst if isinstance(drift.worst, float) else drift.worst.max()) > SEEMS:
+        return families
+    worst = np.reshape(drift.worst, sight.layout.lead)
+    doubted = families.doubted > cloud.t - LONGEST
+    missing = (worst > compass.limit) | ((worst > SEEMS) & doubted)
+    if not missing.any():
+        return families
+    lost = sight.after(families.lost, missing, cloud, here=True)
+    return families._replace(settled=np.where(missing, np.inf, families.settled), lost=lost)
+
+
+def scouted(families: Families, scouts: Scouts | None, cloud: Cloud, sight: Sight) -> Families:
+    """The families, where scouts have been to states that no particle has.
+
+    What the particles leave out is lost where it is no longer small.
+    """
+    if scouts is None and families.scouts is None:
+        return families
+    families = families._replace(scouts=scouts)
+    if scouts is None or scouts.share <= LEFT_OUT:
+        return families
+    lost = sight.after(families.lost, True, cloud, here=True)
+    return families._replace(settled=np.asarray(np.inf), lost=lost)
 
 
 def evidence_error(families: Families, cloud: Cloud) -> Any:
     """Root mean square error of the log evidence, with its bias of minus half its variance."""
-    variance = _variance(families, _weights(families, cloud))
+    off = _off(families, _weights(families, cloud))
+    variance = _variance(families, off)
     explained = families.explained + _explained(cloud)
-    at_edge = _at_edge(variance, explained, len(cloud.weights))
+    at_edge = _at_edge(variance, explained, _even_handed(off), _some(families), len(cloud.weights))
     total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
+    if families.scouts is not None:
+        total = total + families.scouts.share**2
     found = np.sqrt(total + 0.25 * total**2)
     return found if np.ndim(found) else float(found)
 
@@ -166,6 +227,20 @@ def row_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _followed(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
+    """The families one slice later, where nothing was settled so far."""
+    poor = cloud.ess < min(RESTS, 0.9 * len(cloud.weights))
+    if np.any(poor):
+        families = families._replace(settled=np.where(poor, np.inf, families.settled))
+    if cloud.ancestors is not None:
+        families = _moved(families, earlier, cloud, steady)
+        if cloud.t % STRIDE == 0:
+            families = _looked_at(families, cloud)
+    if cloud.rejuvenated is not False:
+        families = _renewed(families, earlier, cloud)
+    return families
+
+
 def _sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     some = bounds[1:] > bounds[:-1]
     if some.all():
@@ -173,6 +248,10 @@ def _sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     found = np.zeros((len(bounds) - 1, *values.shape[1:]))
     found[some] = np.add.reduceat(values, bounds[:-1][some], axis=0)
     return found
+
+
+#: the only element of a filter by itself
+_HERE = np.asarray(True)
 
 
 @lru_cache(maxsize=64)
@@ -186,34 +265,41 @@ def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
     return found
 
 
-def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
-    """The same of one filter whose families have the particles that they should, in few calls of NumPy."""
-    bounds, shares, kept, explained, born, settled = families
+def _followed_alone(families: Families, earlier: Cloud, cloud: Cloud) -> tuple[Families, float]:
+    """The same of one filter whose families have the particles that they should, in few calls of NumPy.
+
+    And the variance that is settled in this slice.
+    """
     n = len(cloud.weights)
-    if cloud.ess < min(RESTS, 0.9 * n):
-        settled = np.asarray(np.inf)
+    gained = math.inf if cloud.ess < min(RESTS, 0.9 * n) else 0.0
     if cloud.ancestors is None:
-        return Families(bounds, shares, kept, explained, born, settled)
+        return families, gained
+    bounds, shares, explained = families.bounds, families.shares, families.explained
     bounds = cloud.ancestors.searchsorted(bounds)
     if cloud.resampled:
         explained = explained + _explained(earlier)
-    found = Families(bounds, shares, kept, explained, born, settled)
+    found = families._replace(bounds=bounds, explained=explained)
     if cloud.t % STRIDE or not cloud.resampled:
-        return found
+        return found, gained
     counts = (bounds[:, 1:] - bounds[:, :-1]) * (1.0 / n)
     off = counts - shares
     even = [float(s.dot(s)) for s in shares]
     variance = [_drifted(float(o.dot(o)), e) for o, e in zip(off, even, strict=True)]
     old, young = explained.tolist()
-    if _odd(variance[OLD], old[0], old[1], n) or _odd(variance[YOUNG], young[0], young[1], n):
-        found = found._replace(settled=np.asarray(np.inf))
-    age = cloud.t - int(born[YOUNG])
+    some = _some(families)
+    if _odd(variance[OLD], old[0], old[1], off[OLD], some, n) or _odd(
+        variance[YOUNG], young[0], young[1], off[YOUNG], some, n
+    ):
+        return _begun_again(found, cloud, _HERE, found.settled, True), math.inf
+    if _odd(variance[OLD], old[0], old[1], off[OLD], math.inf, n):
+        found = found._replace(doubted=cloud.t)
+    age = cloud.t - int(families.born[YOUNG])
     few = even[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
     if age <= LONGEST and not (age > SHORTEST and few):
-        return found
+        return found, gained
     lost = math.inf in variance
-    gained = math.inf if lost else variance[OLD] - variance[YOUNG]
-    return _begun_again(found, cloud, np.asarray(True), found.settled + gained, False)
+    gained += math.inf if lost else variance[OLD] - variance[YOUNG]
+    return _begun_again(found, cloud, _HERE, found.settled, False), gained
 
 
 def _moved(families: Families, earlier: Cloud, cloud: Cloud, steady: bool) -> Families:
@@ -250,14 +336,20 @@ def _looked_at(families: Families, cloud: Cloud) -> Families:
     counts = (families.bounds[:, 1:] - families.bounds[:, :-1]) / n
     if not families.kept.any() and not _matters(families, cloud, counts):
         return families
-    variance = _variance(families, counts * np.exp(families.kept))
-    edge = resampled & _at_edge(variance, families.explained, n)
+    off = _off(families, counts * np.exp(families.kept))
+    variance = _variance(families, off)
+    by, some = _even_handed(off), _some(families)
+    edge = resampled & _at_edge(variance, families.explained, by, some, n)
+    doubted = resampled & _at_edge(variance, families.explained, by, math.inf, n)
+    families = families._replace(doubted=np.where(doubted, cloud.t, families.doubted))
     age = cloud.t - families.born[YOUNG]
     left = (families.shares[OLD] ** 2).sum(axis=0) / (counts[OLD] ** 2).sum(axis=0)
     due = resampled & ((age > LONGEST) | ((age > SHORTEST) & (left < LEFT)))
     settled = np.where(edge, np.inf, families.settled)
+    if edge.any():  # what has happened is told once
+        families, due = _begun_again(families, cloud, edge, settled, True), due & ~edge
     if not due.any():
-        return families._replace(settled=settled) if edge.any() else families
+        return families
     lost = np.isinf(variance).any(axis=0)
     gained = np.where(lost, np.inf, variance[OLD] - np.where(lost, 0.0, variance[YOUNG]))
     return _begun_again(families, cloud, due, settled + np.where(due, gained, 0.0), False)
@@ -274,7 +366,7 @@ def _matters(families: Families, cloud: Cloud, counts: np.ndarray) -> bool:
 def _renewed(families: Families, earlier: Cloud, cloud: Cloud) -> Families:
     """Where all particles were drawn anew: all that has happened is settled."""
     anew = np.broadcast_to(cloud.rejuvenated, cloud.weights.shape[1:])
-    gained = _variance(families, _weights(families, earlier))[OLD]
+    gained = _variance(families, _off(families, _weights(families, earlier)))[OLD]
     settled = families.settled + np.where(anew, gained, 0.0)
     return _begun_again(families, cloud, anew, settled, True)
 
@@ -291,12 +383,19 @@ def _begun_again(
         for value, new in zip(families[:5], fresh, strict=True):
             found.append(np.empty_like(value))
             found[-1][OLD], found[-1][YOUNG] = new if both else value[YOUNG], new
-        return Families._make([*found, settled])
+        return _renamed(families, found, settled)
     for value, new in zip(families[:5], fresh, strict=True):
         young = np.broadcast_to(new, value[YOUNG].shape)
         old = young if both else value[YOUNG]
         found.append(np.where(where, np.stack([old, young]), value))
-    return Families._make([*found, settled])
+    return _renamed(families, found, settled)
+
+
+def _renamed(families: Families, found: Sequence[np.ndarray], settled: Any) -> Families:
+    bounds, shares, kept, explained, born = found
+    return families._replace(
+        bounds=bounds, shares=shares, kept=kept, explained=explained, born=born, settled=settled
+    )
 
 
 def _weights(families: Families, cloud: Cloud) -> np.ndarray:
@@ -305,16 +404,28 @@ def _weights(families: Families, cloud: Cloud) -> np.ndarray:
     return sums * np.exp(families.kept)
 
 
-def _variance(families: Families, weights: np.ndarray) -> np.ndarray:
+def _off(families: Families, weights: np.ndarray) -> np.ndarray:
+    """By how much the families' shares of the weight have changed."""
+    found: np.ndarray = weights / weights.sum(axis=1)[:, None] - families.shares
+    return found
+
+
+def _variance(families: Families, off: np.ndarray) -> np.ndarray:
     """Variance of the log evidence by what has happened since each origin, shape (2, *apart).
 
     Shares drift apart like those of families in a population: it is minus the log of what is left of their
     evenness, and infinite where a single family is left.
     """
-    spread = ((weights / weights.sum(axis=1)[:, None] - families.shares) ** 2).sum(axis=1)
     even = 1.0 - (families.shares**2).sum(axis=1)
-    left = 1.0 - spread / np.where(even > 0, even, np.nan)
+    left = 1.0 - (off**2).sum(axis=1) / np.where(even > 0, even, np.nan)
     return np.where(left > 1e-9, -np.log(np.maximum(left, 1e-9)), np.inf)
+
+
+def _even_handed(off: np.ndarray) -> np.ndarray:
+    """How many families make up the differences between them, shape (2, *apart)."""
+    squares = off**2
+    found: np.ndarray = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
+    return found
 
 
 def _explained(cloud: Cloud) -> Any:
@@ -338,17 +449,40 @@ def _explained(cloud: Cloud) -> Any:
     return np.stack([variance, bounded.reshape(variance.shape)])
 
 
-def _at_edge(variance: np.ndarray, explained: np.ndarray, n: int) -> np.ndarray:
+def _some(families: Families) -> Any:
+    """How many families must make up the differences: all of them where rows pull the same way."""
+    drift = families.drift
+    if drift is None:
+        return math.inf
+    if isinstance(drift.worst, float):
+        return SOME if drift.worst < SEEMS else math.inf
+    return np.where(drift.worst < SEEMS, SOME, np.inf).reshape(families.shares.shape[2:])
+
+
+def _at_edge(
+    variance: np.ndarray, explained: np.ndarray, by: np.ndarray, some: Any, n: int
+) -> np.ndarray:
     """Whether families differ by far more than the slices' weights explain."""
-    odd: np.ndarray = np.any(_odd(variance, explained[:, 0], explained[:, 1], n), axis=0)
+    odd: np.ndarray = np.any(
+        _beyond(variance, explained[:, 0], explained[:, 1], by, some, n), axis=0
+    )
     return odd
 
 
-def _odd(variance: Any, every: Any, bounded: Any, n: int) -> Any:
-    """The same, of numbers or arrays."""
+def _beyond(variance: Any, every: Any, bounded: Any, by: Any, some: Any, n: int) -> Any:
+    """The same, of numbers or arrays, given how many families make up the differences."""
     odd = (variance > _level(n)) & (variance > EDGE * every)
     odd |= (variance > LONG) & (variance > EDGE * bounded)
-    return odd | (variance > MOST)
+    return (odd & (by < some)) | (variance > MOST)
+
+
+def _odd(
+    variance: float, every: float, bounded: float, off: np.ndarray, some: float, n: int
+) -> bool:
+    """The same of one origin of one filter."""
+    if variance <= MOST and not _beyond(variance, every, bounded, 0.0, some, n):
+        return False
+    return bool(_beyond(variance, every, bounded, _even_handed(off[None])[0], some, n))
 
 
 def _drifted(spread: float, even: float) -> float:

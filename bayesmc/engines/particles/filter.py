@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, ClassVar
@@ -14,11 +12,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.particles.anew import Lost, Rejuvenation
 from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.cloud import Cloud
 from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.growth import (
@@ -27,8 +24,11 @@ from bayesmc.engines.particles.growth import (
     TOLERANCE,
     collapsed,
     enough,
+    price,
     uncertain,
+    warn_of_a_lonely_step,
 )
+from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.particles.mover import Mover
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
@@ -40,15 +40,15 @@ from bayesmc.engines.particles.options import (
     read_by,
     read_functions,
 )
+from bayesmc.engines.particles.questions import check_together, described, refused
 from bayesmc.engines.particles.record import FilteredParticles, Record
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.replicates import Replicates
-from bayesmc.engines.particles.smoothing import Backward, endless, lagged
+from bayesmc.engines.particles.smoothed import backwards, by_lag, quiet, seen_in_full
 from bayesmc.engines.particles.stages import GivenStage, PluggedIn
 from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
-from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
@@ -65,10 +65,11 @@ class ParticleFilter(FilterEngine):
     Parameters
     ----------
     particles : int, optional
-        By default as many as ``tolerance`` needs, 1,000 or more, for ``filter`` and ``forecast``: short runs
-        of few particles say how many (a quarter of the time, or a third, goes there), and the run that
-        answers has a random stream of its own. 1,000 for ``smooth``, ``start`` and ``step``, and with
-        ``adapt``.
+        By default as many as ``tolerance`` needs, 1,000 or more, for ``filter``, ``smooth`` and ``forecast``:
+        short runs of few particles say how many (a quarter of the time, or a third, goes there), and the run
+        that answers has a random stream of its own. 1,000 for ``start`` and ``step``, and with ``adapt``.
+        Where the particles of all slices are held (``smooth`` without ``lag=``, ``keep="particles"``),
+        particles times slices are at most 5 million.
     resampling : str, callable or Adaptive
         ``"multinomial"``, ``"stratified"``, ``"systematic"``, ``"residual"``, ``"ssp"``, or a function
         ``(weights, draws, rng) -> sorted indices``; an ``Adaptive`` brings its own threshold, which is taken
@@ -87,7 +88,7 @@ class ParticleFilter(FilterEngine):
         is seen is affine in them; else what is seen is made linear, or its log density quadratic, at each
         particle, mixtures of Gaussians component by component, and a tenth of the particles is drawn from
         their own densities. Hidden finite nodes are drawn from their own densities; ``explain`` says what
-        guides each node, and why any is not guided.
+        guides each node, and why any is not guided. With any proposal vectors are seen whole or not at all.
     initial_proposal : dict, optional
         As ``proposal``, for slice 0 alone: where the first observations say the start could be.
     auxiliary : bool or callable
@@ -109,15 +110,19 @@ class ParticleFilter(FilterEngine):
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
 
     trajectories : int, optional
-        Trajectories that ``smooth`` draws; by default as many as there are particles.
+        Trajectories that ``smooth`` draws; by default as many as there are particles, 1,000 at most.
     backward : "rejection" or "exact"
-        How ``smooth`` draws them: by rejection where the transition's height is known (time linear in the
-        particles, and the same law), else with all particles tried for each.
+        How ``smooth`` draws them: by rejection where the transition's height is known (the same law); what is
+        still open, and elsewhere all, among 500 particles of the slice drawn by weight and the filter's own
+        ancestor. So time is that of the filter, and at most some 500 densities per trajectory and slice (as
+        many times as lags reach back). ``"exact"`` tries all particles for each.
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
     budget : int
-        Particles times slices (times elements of plates that are filtered separately) that this may take.
+        Particles times slices (times elements of plates that are filtered separately) that this may take:
+        seconds. With ``proposal="optimal"`` or ``auxiliary=True`` each counts as 20, which is about what a
+        look at the row costs.
 
     Raises
     ------
@@ -131,7 +136,8 @@ class ParticleFilter(FilterEngine):
     LowEssWarning
         From the filter, where more than a tenth of the slices rest on little more than one particle, or the
         stated error of the log evidence is above 1, or cannot be told (with a given number of particles:
-        above 3, or cannot be told since the first row that is seen, or several, leave fewer than two).
+        above 3, or cannot be told since the first row that is seen, or several, leave fewer than two). From
+        ``step``, where no number is given, at the first slice that rests on fewer than two.
 
     Notes
     -----
@@ -141,7 +147,11 @@ class ParticleFilter(FilterEngine):
     Whiteley 2018 do with single particles; groups make it right for systematic resampling, too). That of the
     evidence is the root of the mean square error, sqrt(v + v^2/4) for a log of variance v, which is v/2 too
     low on average. Particles know nothing of where none of them has been: the error is infinite where a slice
-    rests on fewer than four, or their descendants show that later rows ask for the edge of the cloud.
+    rests on fewer than four, where their descendants show that later rows ask for the edge of the cloud,
+    where rows go on pulling means the same way, and where a few scouts in states of finite nodes that next to
+    no particle has find more than a tenth of the belief there. Means have infinite errors from such a slice
+    on, until what is random in the transition could have carried particles over all that they stood on. Those
+    of trajectories drawn backwards count how few these are, and which of them share particles in a slice.
 
     Plates whose elements never meet are filtered separately, each with weights and ancestors of its own: 64
     sequences in a plate are 64 filters in one array.
@@ -189,7 +199,9 @@ class ParticleFilter(FilterEngine):
         check_budget(self.tolerance, self.budget)
         if self.trajectories is not None:
             check_count(
-                "trajectories", self.trajectories, "or None for as many as there are particles"
+                "trajectories",
+                self.trajectories,
+                "or None for as many as there are particles, 1,000 at most",
             )
         check_threshold(self.ess_threshold)
         scheme_of(self.resampling)
@@ -204,24 +216,7 @@ class ParticleFilter(FilterEngine):
             )
         for option in _FUNCTIONS:
             object.__setattr__(self, option, read_functions(option, getattr(self, option)))
-        self._check_together()
-
-    def _check_together(self) -> None:
-        """Options that only make sense with others, or without them."""
-        if isinstance(self.proposal, str) and self.initial_proposal is not None:
-            raise ValueError(
-                'ParticleFilter: proposal="optimal" proposes for slice 0 too; leave initial_proposal= out'
-            )
-        if self.recovery is not None and self.rejuvenation is not None:
-            raise ValueError(
-                "ParticleFilter: recovery= and rejuvenation= both begin anew; give one of them"
-            )
-        if self.adapt is not None and self.auxiliary is not False:
-            raise ValueError("ParticleFilter: adapt= and auxiliary= do not go together")
-        if (self.on_degeneracy == "rejuvenate") != (self.rejuvenation is not None):
-            raise ValueError(
-                'ParticleFilter: on_degeneracy="rejuvenate" and rejuvenation={node: density} go together'
-            )
+        check_together(self)
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions."""
@@ -255,58 +250,17 @@ class ParticleFilter(FilterEngine):
         common = super().refusal(problem)
         if common is not None:
             return common
-        looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(self, o)]
-        parts = (
-            refuse_parts(problem.series.observed, f"ParticleFilter({looks[0]}=)") if looks else None
-        )
-        if parts is not None:
-            return parts
-        apart = plates_apart(problem.slices)
-        for option in ("adapt", "recovery"):
-            if getattr(self, option) is not None and apart:
-                return (
-                    f"ParticleFilter: {option}= is for one filter, and elements of plate {apart[0]!r} are "
-                    "filtered separately; filter them one by one"
-                )
-        if self.adapt is not None:
-            self.adapt.check(problem.slices.later, problem.slices.interface)
-        known = {*problem.slices.template.static, *problem.series.observed}
-        if not isinstance(self.proposal, str):
-            proposals = self._proposals(problem.slices)
-            seen = problem.series.observed
-            proposals.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
-        for model in (problem.slices.first, problem.slices.later):
-            inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
-            reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
-                model, whole(problem.series.observed), "ParticleFilter"
-            )
-            if reason is not None:
-                return reason
-        return None
+        asked = None if isinstance(self.proposal, str) else self._proposals(problem.slices)
+        return refused(self, problem, asked)
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return _NOT_SMOOTHED
-        sums = endless(problem.slices, _seen(problem)) if asked.what == "smooth" else ()
+        sums = endless(problem.slices, seen_in_full(problem)) if asked.what == "smooth" else ()
         return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
-        found = {}
-        for name in problem.slices.template.later:
-            node = problem.model[name]
-            seen = problem.series.observed.get(name)
-            if name in problem.slices.template.inputs:
-                found[name] = "input"
-            elif name in problem.slices.template.static:
-                found[name] = "static, known"
-            elif not node.is_stochastic:
-                found[name] = "computed"
-            elif seen is None:
-                found[name] = "sampled given its parents"
-            else:
-                found[name] = "observed, weights the particles"
-                if seen.mask is not None:
-                    found[name] += "; sampled where it is missing"
+        found = described(problem)
         return found | looks_told(self, problem, found)
 
     def filter(
@@ -329,7 +283,7 @@ class ParticleFilter(FilterEngine):
         except KeyboardInterrupt as stop:
             found = answer_so_far(stop, self)
         self._warn(found)
-        warn_of_misfit(found.predictive, type(self).__name__, found.start, 4)
+        warn_of_misfit(found.predictive, type(self).__name__, found.start, 3)
         return found
 
     def smooth(
@@ -344,90 +298,16 @@ class ParticleFilter(FilterEngine):
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
-        sized = self._sized(START)
+        sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
-            found, filtered = sized._lagged(problem, seed, lag, queries or {}, progress)
+            found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
         else:
-            sums = endless(problem.slices, _seen(problem))
+            sums = endless(problem.slices, seen_in_full(problem))
             if sums:
                 raise UnsupportedError(_not_backwards(sums[0]))
-            found, filtered = sized._backwards(problem, seed, queries or {}, progress)
+            found, filtered = backwards(sized, problem, seed, queries or {}, progress)
         self._warn(filtered)
-        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 4)
-        return found
-
-    def _backwards(
-        self,
-        problem: SeriesProblem,
-        seed: np.random.SeedSequence,
-        queries: Queries,
-        progress: bool | None,
-    ) -> tuple[FilteredParticles, FilteredParticles]:
-        """Trajectories drawn backwards, and the filter's answer."""
-        filtered = self._passed(problem, seed, True, {}, progress)
-        assert filtered.clouds is not None
-        static = {n: o.value for n, o in problem.series.static.items()}
-        mover = self._mover(problem.slices, static)
-        count = mover.particles if self.trajectories is None else self.trajectories
-        by_bound = self.backward == "rejection"
-        backward = Backward(mover.plan, mover.layout, by_bound, _seen(problem))
-        with _quiet():
-            rng = stream(seed, Purpose.SMOOTH)
-            found = backward.trajectories(filtered.clouds, problem.series, count, rng)
-            layout = Layout(count, mover.apart, mover.lead)
-            record = Record(problem, layout, queries, True)
-            for k, cloud in enumerate(found):
-                record.add(k, cloud)
-        return self._given_filtered(record.posterior(self, "smooth"), filtered), filtered
-
-    def _lagged(
-        self,
-        problem: SeriesProblem,
-        seed: np.random.SeedSequence,
-        lag: int,
-        queries: Queries,
-        progress: bool | None,
-    ) -> tuple[FilteredParticles, FilteredParticles]:
-        """Slices by the particles ``lag`` slices later, through ancestors; and the filter's answer."""
-        static = {n: o.value for n, o in problem.series.static.items()}
-        mover = self._mover(problem.slices, static)
-        record = Record(problem, mover.layout, queries, False)
-        filtered = Record(problem, mover.layout, {}, False)
-        window: deque[Cloud] = deque(maxlen=lag + 1)
-        rng, rows, last = stream(seed, Purpose.FILTER), problem.series, problem.steps - 1
-        looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK))
-        cloud: Cloud | None = None
-        families: Families | None = None
-
-        def move(k: int) -> None:
-            nonlocal cloud, families
-            row = rows.row(k)
-            looks.look(k, cloud, row)
-            cloud, families = mover.moved(cloud, families, row, rng)
-            filtered.add(k, cloud, families)
-            window.append(cloud)
-            while window and (len(window) > lag or k == last):
-                at = k - len(window) + 1
-                record.add(at, lagged(list(window), mover.layout, mover.slices), families)
-                window.popleft()
-
-        with Progress(problem.steps, self.label, progress) as bar, _quiet():
-            so_far = partial(filtered.posterior, self, "filter")
-            pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
-        whole = filtered.posterior(self)
-        whole.predictive = looks.found()
-        return self._given_filtered(record.posterior(self, "fixed-lag"), whole), whole
-
-    def _given_filtered(
-        self, found: FilteredParticles, filtered: FilteredParticles
-    ) -> FilteredParticles:
-        """Smoothed answers with the filter's figures."""
-        found.log_marginal_increments = filtered.log_marginal_increments
-        found.log_marginal_likelihood = filtered.log_marginal_likelihood
-        found.log_marginal_likelihood_mcse = filtered.log_marginal_likelihood_mcse
-        found.weight_ess, found.resampled = filtered.weight_ess, filtered.resampled
-        found.unique_ancestors = filtered.unique_ancestors
-        found.rejuvenated, found.predictive = filtered.rejuvenated, filtered.predictive
+        warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
@@ -457,8 +337,10 @@ class ParticleFilter(FilterEngine):
             warn_of_what_is_not_guided(self, slices, row.seen)
         chance = belief.chance
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
-        with _quiet():
+        with quiet():
             cloud, families = mover.moved(belief.cloud, belief.families, row, rng)
+        if self.particles is None:
+            warn_of_a_lonely_step(belief.cloud, belief.families, cloud)
         total = belief.log_marginal_likelihood + cloud.increment
         return ParticleBelief(
             belief.dbn, belief.seed, belief.static, mover, cloud,
@@ -497,7 +379,7 @@ class ParticleFilter(FilterEngine):
             if old is not None and not keep:
                 mover.recycle(old)
 
-        with Progress(problem.steps, self.label, progress) as bar, _quiet():
+        with Progress(problem.steps, self.label, progress) as bar, quiet():
             so_far = partial(record.posterior, self, "filter")
             pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         found = record.posterior(self)
@@ -532,6 +414,7 @@ class ParticleFilter(FilterEngine):
 
         sizes = problem.slices.first.sizes
         slices = problem.steps * math.prod(sizes[p] for p in plates_apart(problem.slices))
+        slices *= price(self)
         return enough(tried, self.tolerance, slices, self.budget, keep)
 
     def _warn(self, filtered: FilteredParticles) -> None:
@@ -585,20 +468,9 @@ _NOT_SMOOTHED = (
 )
 
 
-def _seen(problem: SeriesProblem) -> set[str]:
-    """Nodes that are seen in full in all slices."""
-    return {n for n, o in problem.series.observed.items() if o.mask is None}
-
-
 def _not_backwards(name: str) -> str:
     return (
         f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
         "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
         "engine=ParticleGibbs())"
     )
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    with marking_invalid(), np.errstate(all="ignore"):
-        yield

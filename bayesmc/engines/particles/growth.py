@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.errors import LowEssWarning
 
 if TYPE_CHECKING:
     from bayesmc.engines.particles.filter import ParticleFilter
@@ -21,6 +25,9 @@ FIRST, TIMES = 250, 4
 TOLERANCE = 0.5
 #: particles times slices that a run may take, and those whose particles are kept
 BUDGET, KEPT = 30_000_000, 5_000_000
+#: what a particle that looks at the row costs, in particles that do not: 4 where what is seen is affine in
+#: what is hidden, 19 for Poisson counts; measured once, so that the same call gives the same answer anywhere
+GUIDED = 20
 #: error of a short run up to which it says how many particles are enough; beyond it is no longer normal
 TRUSTED = 1.5
 #: variance that is aimed at, as a share of the tolerance's
@@ -33,6 +40,8 @@ LARGE_GIVEN = 3.0
 SEVERAL, OFTEN = 3, 0.005
 #: equally weighted particles below which a slice rests on a single one
 COLLAPSED = 2.0
+#: and those below which a slice is named as one that is hard to explain
+FEW = 30.0
 #: share of such slices from which on a warning says so
 MANY = 0.1
 
@@ -48,7 +57,7 @@ def enough(
         ``(particles, unit) -> error`` of a run with a random stream of its own.
     tolerance : float
     slices : int
-        Times the elements of plates that are filtered separately.
+        Times the elements of plates that are filtered separately, and the price of a particle.
     budget : int
         Particles times slices.
     keep : bool
@@ -60,8 +69,7 @@ def enough(
         A power of two times ``START``, or the most that the budget allows; ``START`` at least. The answer is
         that of a run of its own, so what chose the number has no part in it, and the evidence is unbiased.
     """
-    share = min(budget, KEPT) if keep else budget
-    most = max(START, min(MOST, share // max(slices, 1)))
+    most = affordable(slices, budget, keep)
     particles, unit = FIRST, 1
     while particles < most:
         error = tried(particles, unit)
@@ -71,6 +79,18 @@ def enough(
             return min(START * 2**doublings, most)
         particles, unit = particles * TIMES, unit + 1
     return most
+
+
+def price(engine: ParticleFilter) -> int:
+    """What a particle of a slice costs, in draws from its own density."""
+    guided = isinstance(engine.proposal, str) or engine.auxiliary is True
+    return GUIDED if guided else 1
+
+
+def affordable(slices: int, budget: int, keep: bool) -> int:
+    """The most particles that are tried where nobody says how many."""
+    share = min(budget, KEPT) if keep else budget
+    return max(START, min(MOST, share // max(slices, 1)))
 
 
 def collapsed(filtered: FilteredParticles) -> str | None:
@@ -122,11 +142,56 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
         said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
     else:
         said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
-    more = "more particles"
-    if not given and engine.adapt is None:
-        more = f"a larger budget= than {engine.budget:_}"
+    why = (
+        f"weight_ess is {ess[at]:.1f} in slice {filtered.start + at}"
+        if ess[at] < FEW
+        else "particles that later rows ask for were rare among those of earlier slices"
+    )
     return (
         f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
-        f"be off as well (weight_ess is {ess[at]:.1f} in slice {filtered.start + at}); use {more}, a "
+        f"be off as well ({why}); use {_more(filtered, engine)}, a "
         "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
     )
+
+
+def warn_of_a_lonely_step(before: Cloud | None, families: Families | None, cloud: Cloud) -> None:
+    """The first step that leaves little more than one particle says so; later ones know by the error."""
+    if before is not None and families is not None and np.isinf(families.settled).any():
+        return
+    worst = float(np.min(cloud.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(cloud.weights)):
+        return
+    warnings.warn(
+        f"ParticleFilter: step leaves {len(cloud.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {cloud.t}: from here on the belief cannot tell how far it is off "
+        "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
+        "looks at the observations",
+        LowEssWarning,
+        stacklevel=4,
+    )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _more(filtered: FilteredParticles, engine: ParticleFilter) -> str:
+    """How to have more particles, by what set their number."""
+    assert filtered.counts is not None
+    if engine.particles is not None or engine.adapt is not None:
+        return "more particles"
+    count, keep = int(filtered.counts.max()), filtered.clouds is not None
+    if count >= MOST:
+        return (
+            f"more particles than the {MOST:_} that are tried at most, such as "
+            f"ParticleFilter({4 * MOST:_})"
+        )
+    assert filtered.log_marginal_increments is not None
+    slices = math.prod(filtered.log_marginal_increments.shape) * price(engine)
+    if count < affordable(slices, engine.budget, keep):
+        return (
+            f"a number of your own, such as ParticleFilter({4 * count:_}) (short runs found {count:_} "
+            "enough)"
+        )
+    if keep and engine.budget > KEPT:
+        return "more particles, whose number is held down where all slices are kept (smooth, keep=)"
+    return f"a larger budget= than {engine.budget:_}"

@@ -15,8 +15,11 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.cloud import BLOCK, Cloud, Layout, Selection, along_plates
 from bayesmc.engines.particles.counts import KLD
-from bayesmc.engines.particles.families import Families, begun, followed
+from bayesmc.engines.particles.drift import Compass
+from bayesmc.engines.particles.families import Families, begun, drifted, followed, scouted
+from bayesmc.engines.particles.forgetting import Sight
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.scouts import Scouting
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn
@@ -100,6 +103,11 @@ class Mover:
         self._ranks = {n + PREVIOUS: len(slices.first[n].value_shape) for n in slices.dynamic}
         self._ranks |= {n: len(slices.first[n].value_shape) for n in slices.dynamic}
         self.layout = Layout(particles, self.apart, self.lead, self.block)
+        self.sight = Sight([slices.later[n] for n in slices.interface], self.layout)
+        self.scouting = Scouting(slices, plan)
+        blind = plan.guided or first_stage is not None or recovery is not None
+        compass = Compass(self.sight.nodes, self.layout)
+        self.compass = compass if compass.nodes and not blind else None
         self._log_particles = math.log(particles)
         self._even = np.ones((particles, *self.lead))
         self._even.flags.writeable = False
@@ -117,9 +125,16 @@ class Mover:
         """The cloud of the next slice, or of the first, and whose descendants its particles are."""
         if cloud is None or families is None:
             found = self.first(row, rng)
-            return found, begun(found, self.layout)
-        found = self.next(cloud, row, rng)
-        return found, followed(families, cloud, found, self.steady)
+            now = begun(found, self.sight)
+        else:
+            found = self.next(cloud, row, rng)
+            now = followed(families, cloud, found, self.steady, self.sight)
+        if self.compass is not None:
+            now = drifted(now, self.compass, cloud, found, self.sight)
+        if self.scouting.nodes:
+            scouts = self.scouting.after(now.scouts, cloud, found, row)
+            now = scouted(now, scouts, found, self.sight)
+        return found, now
 
     def first(self, row: Row, rng: np.random.Generator) -> Cloud:
         """The cloud of slice 0."""

@@ -38,6 +38,8 @@ from bayesmc.structure.affine import why_not_linear
 class OptimalPlan(SlicePlan):
     """Steps of slices whose hidden numbers are drawn with a look at the row."""
 
+    guided = True
+
     def _build(self, row: Row) -> list[Step]:
         model = self.slices.model(row.t)
         order = order_of(model, self.slices)

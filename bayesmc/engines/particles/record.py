@@ -10,8 +10,9 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.particles.accuracy import MeanErrors, value_errors
-from bayesmc.engines.particles.belief import (
+from bayesmc.engines.particles.answers import (
     covariance,
+    elsewhere,
     evaluated,
     expectation,
     moments,
@@ -22,6 +23,8 @@ from bayesmc.engines.particles.belief import (
 )
 from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.engines.particles.families import Families, evidence_error
+from bayesmc.engines.particles.sharing import Sharing, function_errors
+from bayesmc.engines.particles.sharing import node_errors as smoothed_errors
 from bayesmc.errors import QueryError
 from bayesmc.results import SeriesPosterior
 
@@ -100,7 +103,8 @@ class Record:
             mean = weighted_mean(cloud, values)
             self.queries[name].append(mean)
             if families is not None:
-                errors = value_errors(layout, cloud, families.bounds, values, mean)
+                there = elsewhere(layout, cloud, self.problem.model, function)
+                errors = value_errors(layout, cloud, families, values, mean, there)
                 self.query_errors[name].append(errors)
         if families is not None:
             self.errors.add(k, cloud, families)
@@ -140,6 +144,24 @@ class Record:
             found.families = self.families and self.families[:k]
         return found
 
+    def smoothed(
+        self, engine: Any, sharing: Sharing, filtered: FilteredParticles
+    ) -> FilteredParticles:
+        """The answers of trajectories, with their errors: infinite where the filter's are."""
+        found = self.posterior(engine, "smooth")
+        assert found.clouds is not None and filtered.mean_errors is not None
+        found.sharing, found.mean_errors = sharing, {}
+        for name, node, _ in self._nodes:
+            labels = node.domain is not None
+            centre: Any = (
+                (self.tables[name], None) if labels else (self.means[name], self.variances[name])
+            )
+            errors = smoothed_errors(sharing, self.layout, found.clouds, node, centre)
+            lost = np.isinf(filtered.mean_errors[name])
+            found.mean_errors[name] = np.where(lost, np.inf, errors)
+        found.queries_mcse = {n: found.mcse(function) for n, function in self.asked.items()}
+        return found
+
 
 class FilteredParticles(SeriesPosterior):
     """What a particle filter says of every slice.
@@ -171,19 +193,24 @@ class FilteredParticles(SeriesPosterior):
     clouds: list[Cloud] | None = None
     layout: Layout | None = None
     families: list[Families] | None = None
+    #: of trajectories that were drawn backwards
+    sharing: Sharing | None = None
 
     def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
         """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
         if not callable(what):
             return super().mcse(what)
         clouds, layout = self._kept("mcse of a function")
-        if self.families is None:
-            raise self._no_errors()
+        if self.sharing is not None:
+            values = np.stack([evaluated(layout, c, self.model, what) for c in clouds])
+            return function_errors(self.sharing, values, values.mean(axis=1))
+        assert self.families is not None
         rows = []
         for cloud, families in zip(clouds, self.families, strict=True):
             values = evaluated(layout, cloud, self.model, what)
             mean = weighted_mean(cloud, values)
-            rows.append(value_errors(layout, cloud, families.bounds, values, mean))
+            there = elsewhere(layout, cloud, self.model, what)
+            rows.append(value_errors(layout, cloud, families, values, mean, there))
         return np.stack(rows)
 
     def particles(self, name: str) -> np.ndarray:

@@ -10,7 +10,7 @@ drawn with.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -18,10 +18,14 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Row, SeriesProblem
 from bayesmc.engines.particles.cloud import Cloud, along_plates
 from bayesmc.engines.slice_steps import SlicePlan
+from bayesmc.errors import UnsupportedError
 from bayesmc.network import Observed
 from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
 from bayesmc.results.predictive import UNLIKELY, Predictive
+
+#: draws from a belief that is no cloud: so many values of each node that the next slice reads, first axis
+Draws = Callable[[np.random.Generator, int], Mapping[str, np.ndarray]]
 
 #: rows drawn in a slice, and particles that say how likely they are
 ROWS, JUDGES = 19, 20
@@ -47,16 +51,24 @@ class Replicates:
         Its proposals, if any, are not used.
     rng : Generator
         Of its own.
+    most : int, optional
+        Slices that are looked at, but for those after a row that is unlikely.
     """
 
-    def __init__(self, problem: SeriesProblem, plan: SlicePlan, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        problem: SeriesProblem,
+        plan: SlicePlan,
+        rng: np.random.Generator,
+        most: int | None = None,
+    ) -> None:
         self.slices, self.rng, self.steps = problem.slices, rng, problem.steps
         self.plan = SlicePlan(problem.slices, plan.apart, plan.static)
         self.lead = tuple(problem.slices.first.sizes[p] for p in plan.apart)
         self.names = tuple(problem.series.observed)
         self._wide = _numbers_seen(problem) >= WIDE
-        self._looked, self._until = _chosen(problem, self._wide, rng), -1
-        self._failed = False
+        self._looked, self._until = _chosen(problem, self._wide, rng, most), -1
+        self._cannot, self._broken = False, ""
         self._exponents: dict[str, float] = {}
         lead = (problem.steps, *self.lead)
         self._rows, self._deficits = np.full(lead, np.nan), np.full(lead, np.nan)
@@ -64,41 +76,54 @@ class Replicates:
         self._ranks = {n: np.full((problem.steps, *shapes[n]), np.nan) for n in self.names}
         self._sizes = {n: math.prod(shapes[n]) for n in self.names}
 
-    def look(self, k: int, before: Cloud | None, row: Row) -> None:
-        """Compare the k-th row, whose slice follows that of a cloud."""
-        if (k not in self._looked and k > self._until) or self._failed or not row.seen:
+    def wanted(self, k: int) -> bool:
+        """Whether the k-th row is looked at."""
+        return (k in self._looked or k <= self._until) and not (self._cannot or self._broken)
+
+    def look(self, k: int, before: Cloud | Draws | None, row: Row) -> None:
+        """Compare the k-th row, whose slice follows that of a cloud, or of a belief that draws."""
+        if not self.wanted(k) or not row.seen:
             return
         try:
             values = self._taken(before)
             drawn = self._drawn(row, {n: v[0] for n, v in values.items()})
             log = self._judged(row, drawn, {n: v[1] for n, v in values.items()})
-        except Exception:  # functions that break on rows that never came: nothing is said then
-            self._failed = True
+        except UnsupportedError:  # a density that cannot be drawn from
+            self._cannot = True
+            return
+        except (
+            Exception
+        ) as error:  # users' functions may break on rows that never came: that is said
+            self._broken = f"slice {row.t}: {type(error).__name__}: {error}"
             return
         self._write(k, row, drawn, log)
 
     def found(self, steps: int | None = None) -> Predictive | None:
         """What came of it; None where nothing was compared."""
-        if self._failed or not self._looked:
+        if self._cannot or not self._looked:
             return None
-        whole = Predictive(self._rows, self._deficits, self._ranks)
+        whole = Predictive(self._rows, self._deficits, self._ranks, self._broken)
         return whole if steps is None else whole.first(steps)
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _taken(self, before: Cloud | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _taken(self, before: Cloud | Draws | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Values of the slice before, of the particles that draw rows and of those that judge them."""
         if before is None:
             return {}
-        chosen = self._ancestors(before, ROWS + JUDGES)
+        cloud = before if isinstance(before, Cloud) else None
+        drawn = before.values if isinstance(before, Cloud) else before(self.rng, ROWS + JUDGES)
+        chosen = None if cloud is None else self._ancestors(cloud, ROWS + JUDGES)
         found = {}
         for name in self.slices.interface:
-            value = before.values[name]
+            value = drawn[name]
             node = self.slices.later[name]
             if value.ndim == len(node.value_shape):
                 found[name + PREVIOUS] = value, value
                 continue
-            if self.lead:
+            if chosen is None:
+                taken = value
+            elif self.lead:
                 taken = along_plates(value, chosen, node.plates, self.plan.apart)
             else:
                 taken = value[chosen]
@@ -213,7 +238,9 @@ def _numbers_seen(problem: SeriesProblem) -> int:
     return sum(math.prod(model[n].event_shape) for n in problem.series.observed)
 
 
-def _chosen(problem: SeriesProblem, wide: bool, rng: np.random.Generator) -> frozenset[int]:
+def _chosen(
+    problem: SeriesProblem, wide: bool, rng: np.random.Generator, most: int | None
+) -> frozenset[int]:
     """The slices that are looked at: one of each stretch, at random, among those with something seen."""
     some = np.zeros(problem.steps, dtype=bool)
     for seen in problem.series.observed.values():
@@ -224,6 +251,6 @@ def _chosen(problem: SeriesProblem, wide: bool, rng: np.random.Generator) -> fro
     least, every = (WIDE_LOOKS, WIDE_EVERY) if wide else (LOOKS, EVERY)
     if len(rows) <= least:
         return frozenset(rows.tolist())
-    edges = np.linspace(0, len(rows), max(least, len(rows) // every) + 1)
+    edges = np.linspace(0, len(rows), min(max(least, len(rows) // every), most or len(rows)) + 1)
     at = edges[:-1] + rng.random(len(edges) - 1) * np.diff(edges)
     return frozenset(rows[np.minimum(at.astype(np.intp), len(rows) - 1)].tolist())

@@ -3,7 +3,10 @@
 Backward simulation draws a particle of the last slice, then one of each slice before with its weight times
 the density of what was drawn after it. Exactly that costs trajectories x particles per slice; where the
 density is known to be bounded, particles are drawn by weight and accepted with its share of the bound
-instead, and only what is still open after some rounds is drawn exactly.
+instead, and only what is still open after some rounds is drawn otherwise: exactly, or, where particles are
+many, among a few hundred of them drawn by weight and the ancestor that the filter knows. A move among such
+candidates leaves the law of what is drawn backwards as it is (it is a Gibbs step over which of them is the
+draw); the ancestor helps where transitions are so narrow that next to no other particle would do.
 
 Elements of plates that are filtered separately have a past each: positions have shape ``(rows, *apart)``, and
 what is still open is packed to the front in every element for itself.
@@ -25,8 +28,9 @@ References
 ----------
 Godsill, Doucet and West (2004), Monte Carlo smoothing for nonlinear time series, JASA 99; Douc, Garivier,
 Moulines and Olsson (2011), Ann. Appl. Probab. 21 (rejection); Taghavi et al. (2013), Adaptive stopping for
-fast particle smoothing; Lindsten and Schön (2013), Backward simulation methods for Monte Carlo statistical
-inference, sec. 4 (models with memory).
+fast particle smoothing; Andrieu, Lee and Vihola (2018), Bernoulli 24, and Dau and Chopin (2023), On backward
+smoothing algorithms, Ann. Statist. 51 (moves among candidates, from the ancestor); Lindsten and Schön (2013),
+Backward simulation methods for Monte Carlo statistical inference, sec. 4 (models with memory).
 """
 
 from __future__ import annotations
@@ -34,23 +38,25 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Series, Slices
-from bayesmc.distributions import Cauchy, Laplace, MvNormal, Normal, StudentT
 from bayesmc.engines.particles.cloud import Cloud, Layout, along_plates, even_cloud
+from bayesmc.engines.particles.layers import LOCATION, Layer, is_bounded, layers_of
 from bayesmc.engines.slice_steps import SlicePlan, size_of
-from bayesmc.network.forward import Compute, Pass, Step, WeighDrawn, summed
+from bayesmc.network.forward import Pass, Step, summed
 from bayesmc.resampling import multinomial, systematic
 
+#: trajectories that are drawn where nobody says how many, at most
+TRAJECTORIES = 1000
 #: numbers of all pairs of trajectories and particles in one call
 _PAIRS = 1 << 18
 #: rounds of rejection before what is open is drawn exactly
 _ROUNDS = 40
-#: families that are highest at ``loc``; a family derived from one of them need not be
-_LOCATION = (Normal, MvNormal, StudentT, Laplace, Cauchy)
+#: particles drawn by weight among which a draw is made, where more are too many to be tried
+_CANDIDATES = 500
 
 
 class Backward:
@@ -62,9 +68,14 @@ class Backward:
     layout : Layout
         Of the clouds.
     rejection : bool
-        Accept draws by a bound where one is known.
+        Accept draws by a bound where one is known, and try a few candidates alone where particles are many.
     seen : collection of str
         Nodes that are seen in full in all slices.
+
+    Attributes
+    ----------
+    positions : list of ndarray
+        Of the trajectories drawn last, in each slice's cloud, shape ``(trajectories, *apart)``.
     """
 
     def __init__(
@@ -76,11 +87,13 @@ class Backward:
     ) -> None:
         self.plan, self.layout = plan, layout
         self.slices: Slices = plan.slices
-        self.layers = _layers(plan, seen)
+        self.layers = layers_of(plan, seen)
         self.crossing = self.layers[0].crossing
         one = len(self.layers) == 1
-        self.rejection = rejection and one and _is_bounded(plan, self.crossing)
-        #: draws accepted by the bound, and drawn exactly
+        self.rejection = rejection and one and is_bounded(plan, self.crossing)
+        self.few = rejection
+        self.positions: list[np.ndarray] = []
+        #: draws accepted by the bound, and drawn exactly, or among candidates
         self.accepted = self.exact = 0
 
     def trajectories(
@@ -89,11 +102,13 @@ class Backward:
         """So many trajectories, as one cloud of equal weights per slice."""
         layout = Layout(count, self.layout.apart, self.layout.lead)
         last = clouds[-1]
-        values = self._taken(last.values, _at_random(last, count, rng))
-        found = [even_cloud(last.t, values, layout)]
+        index = _at_random(last, count, rng)
+        self.positions = [index]
+        found = [even_cloud(last.t, self._taken(last.values, index), layout)]
         for k in range(len(clouds) - 2, -1, -1):
             after = _After(found[: -1 - len(self.layers) : -1], clouds[k + 1 :])
-            index = self._drawn(clouds[k], after, series, k, rng)
+            index = self._drawn(clouds[k], after, series, k, _parents(clouds[k + 1], index), rng)
+            self.positions.append(index)
             values = self._taken(clouds[k].values, index)
             before: Mapping[str, np.ndarray] = values
             for m, layer in enumerate(self.layers[: len(found)]):
@@ -101,6 +116,7 @@ class Backward:
                 before = self._computed(layer, before, now.values, series, k + m)
                 found[-1 - m] = now._replace(values=dict(before))
             found.append(even_cloud(clouds[k].t, values, layout))
+        self.positions.reverse()
         return found[::-1]
 
     def log_densities(
@@ -114,7 +130,7 @@ class Backward:
             n: v[None] if v.ndim > self._trailing(n) else v for n, v in self._before(cloud).items()
         }
         now = after.each(lambda n, v: v[:, None] if v.ndim > self._trailing(n) else v)
-        return self._log(before, now, series, k, (draws, self.layout.particles))
+        return self._log(before, now, series, k, (draws, len(cloud.log_weights)))
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -124,11 +140,13 @@ class Backward:
         after: _After,
         series: Series,
         k: int,
+        parents: np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
         """For every trajectory a particle of the k-th cloud, shape (draws, *apart).
 
-        Where the slice after began anew, its density given the one before means nothing.
+        ``parents`` are the filter's ancestors of what was drawn after it. Where the slice after began anew,
+        its density given the one before means nothing.
         """
         anew = after.anew[0]
         shape = (after.draws, *self.layout.lead)
@@ -141,17 +159,45 @@ class Backward:
         )
         if self.rejection and len(rows):
             rows, wanted = self._by_rejection(cloud, after, series, k, rows, wanted, found, rng)
-        block = max(1, _PAIRS // (self.layout.particles * max(size_of(self.slices), 1)))
+        block = max(1, _PAIRS // (self._tries * max(size_of(self.slices), 1)))
         for low in range(0, len(rows), block):
             mine, asked = rows[low : low + block], wanted[low : low + block]
             drawn = after.taken(self._taken, mine)
-            log = self.log_densities(cloud, drawn, series, k, len(mine)) + cloud.log_weights
-            # where no particle explains what came after, there is only the filter's word
-            explained = np.any(log > -np.inf, axis=1, keepdims=True)
-            log = log if explained.all() else np.where(explained, log, cloud.log_weights)
-            _put(found, mine, _picked(log, rng), asked)
+            if self._tries < self.layout.particles:
+                own = np.take_along_axis(parents, mine, axis=0)
+                index = self._among_few(cloud, drawn, series, k, own, rng)
+            else:
+                log = self.log_densities(cloud, drawn, series, k, len(mine)) + cloud.log_weights
+                index = _picked(_explained(log, cloud.log_weights), rng)
+            _put(found, mine, index, asked)
         self.exact += int(np.count_nonzero(wanted))
         return found
+
+    @property
+    def _tries(self) -> int:
+        """Particles that are tried for a draw that no bound has accepted."""
+        return min(self.layout.particles, _CANDIDATES) if self.few else self.layout.particles
+
+    def _among_few(
+        self,
+        cloud: Cloud,
+        after: _After,
+        series: Series,
+        k: int,
+        own: np.ndarray,
+        rng: np.random.Generator,
+    ) -> np.ndarray:
+        """Particles drawn from candidates by weight and the ancestor that each trajectory has."""
+        tried = systematic(cloud.weights, self._tries, rng)
+        values, even = self._taken(cloud.values, tried), np.zeros(tried.shape)
+        few = cloud._replace(values=values, log_weights=even)
+        log = self.log_densities(few, after, series, k, len(own))
+        before = self._taken(self._before(cloud), own)
+        last = self._log(before, after, series, k, (len(own),))[:, None]
+        log = np.concatenate([log, last], axis=1)
+        at = _picked(_explained(log, np.zeros(log.shape[1:])), rng)
+        drawn = np.take_along_axis(tried, np.minimum(at, len(tried) - 1), axis=0)
+        return np.where(at == len(tried), own, drawn)
 
     def _by_rejection(
         self,
@@ -178,7 +224,7 @@ class Backward:
             accepted = int(np.count_nonzero(good))
             self.accepted += accepted
             rows, wanted = _packed(rows, wanted & ~good)
-            if not len(rows) or accepted * self.layout.particles < good.size:
+            if not len(rows) or accepted * self._tries < good.size:
                 break  # what a round costs is no longer saved
         return rows, wanted
 
@@ -196,7 +242,7 @@ class Backward:
             if name not in self.crossing or node.domain is not None:
                 continue  # a probability is at most one
             dist, _ = model.evaluate(name, known)
-            if type(dist) not in _LOCATION:  # its function may return one family now, another then
+            if type(dist) not in LOCATION:  # its function may return one family now, another then
                 return np.full(self.layout.lead, np.inf)
             top = summed(np.asarray(dist.log_prob(dist.loc)), node, apart)
             total = total + (top.max(axis=0) if top.ndim > len(apart) else top)
@@ -225,7 +271,7 @@ class Backward:
 
     def _computed(
         self,
-        layer: _Layer,
+        layer: Layer,
         before: Mapping[str, np.ndarray],
         now: Mapping[str, np.ndarray],
         series: Series,
@@ -261,20 +307,6 @@ class Backward:
 
     def _trailing(self, name: str) -> int:
         return len(self.slices.later[name].value_shape)
-
-
-def endless(slices: Slices, seen: Collection[str] = ()) -> tuple[str, ...]:
-    """Computed nodes through which a value enters all later slices, such as running sums.
-
-    Trajectories are not put together backwards through them: each particle would be held against all that
-    follows. Lags and chains of them forget; what is computed of nodes ``seen`` in full is the same for all.
-    """
-    found = set(_entering(slices, seen))
-    while True:
-        further = _carried(slices, {n + PREVIOUS for n in found})
-        if further == found or not further:
-            return tuple(n for n in slices.dynamic if n in further)
-        found = further
 
 
 def lagged(clouds: Sequence[Cloud], layout: Layout, slices: Slices) -> Cloud:
@@ -323,6 +355,17 @@ def _at_random(cloud: Cloud, count: int, rng: np.random.Generator) -> np.ndarray
     return rng.permuted(systematic(cloud.weights, count, rng), axis=0)
 
 
+def _parents(cloud: Cloud, index: np.ndarray) -> np.ndarray:
+    """Ancestors of particles in the cloud before; where these began anew they mean nothing."""
+    return index if cloud.ancestors is None else np.take_along_axis(cloud.ancestors, index, axis=0)
+
+
+def _explained(log: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Log weights; where no particle explains what came after, there is only the filter's word."""
+    explained = np.any(log > -np.inf, axis=1, keepdims=True)
+    return log if explained.all() else np.where(explained, log, otherwise)
+
+
 def _taken(
     values: Mapping[str, np.ndarray], index: np.ndarray, slices: Slices, apart: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
@@ -365,17 +408,6 @@ def _either(anew: np.ndarray, before: Cloud, after: Cloud) -> Cloud:
     )
 
 
-class _Layer(NamedTuple):
-    """What a slice does to one some slices later: factors that it enters, and what is computed on the way."""
-
-    steps: Sequence[Step]
-    computed: Sequence[Step]
-    #: nodes whose factors the slice enters
-    crossing: frozenset[str]
-    #: computed nodes that take something of it on to the next
-    carried: frozenset[str]
-
-
 class _After:
     """Slices drawn after some slice, the next first: values, and where the filter began anew in them."""
 
@@ -396,72 +428,6 @@ class _After:
         other = copy(self)
         other.values = list(values)
         return other
-
-
-def _entering(slices: Slices, seen: Collection[str]) -> set[str]:
-    """Nodes that the next slice reads and that particles may differ in."""
-    varying = {n for n in slices.stochastic if n not in seen}
-    before = -1
-    while len(varying) > before:
-        before = len(varying)
-        for name in slices.dynamic:
-            read = {p.removesuffix(PREVIOUS) for p in slices.later[name].parents}
-            if not slices.later[name].is_stochastic and varying & read:
-                varying.add(name)
-            elif not slices.first[name].is_stochastic and varying & set(slices.first[name].parents):
-                varying.add(name)
-    return varying & set(slices.interface)
-
-
-def _layers(plan: SlicePlan, seen: Collection[str]) -> list[_Layer]:
-    """What slices do to those after them, as far as values are carried on."""
-    model, slices = plan.slices.later, plan.slices
-    found: list[_Layer] = []
-    entering = _entering(slices, seen)
-    while entering and (not found or len(found) <= len(slices.interface)):
-        reached = {n + PREVIOUS for n in entering}
-        steps: list[Step] = []
-        crossing = set()
-        for name in slices.dynamic:
-            node = model[name]
-            if not reached & set(node.parents):
-                continue
-            if node.is_stochastic:
-                steps.append(WeighDrawn(model, node, plan.apart))
-                crossing.add(name)
-            else:
-                steps.append(Compute(model, node))
-                reached.add(name)
-        entering = {n for n in reached if n in slices.interface}
-        computed = [step for step in steps if isinstance(step, Compute)]
-        found.append(_Layer(steps, computed, frozenset(crossing), frozenset(entering)))
-    return found or [_Layer([], [], frozenset(), frozenset())]
-
-
-def _carried(slices: Slices, entering: set[str]) -> set[str]:
-    """Computed nodes that take what enters a slice on to the next."""
-    reached = set(entering)
-    for name in slices.dynamic:
-        node = slices.later[name]
-        if not node.is_stochastic and reached & set(node.parents):
-            reached.add(name)
-    return {n for n in reached if n in slices.interface}
-
-
-def _is_bounded(plan: SlicePlan, crossing: frozenset[str]) -> bool:
-    """Whether every factor is a probability, or as high as its particle alone says."""
-    model, slices = plan.slices.later, plan.slices
-    own = set(slices.dynamic)
-    for name in crossing:
-        node = model[name]
-        if node.domain is not None:
-            continue
-        if own & set(node.parents):
-            return False
-        dist, _ = model.evaluate(name, {**model.probe, **plan.static})
-        if type(dist) not in _LOCATION:
-            return False
-    return True
 
 
 def _picked(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -1,0 +1,150 @@
+"""What a user gives for a node, read: a distribution, a function or a table becomes a declaration."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution, as_distribution
+from bayesmc.errors import ModelError, PlateError, did_you_mean
+from bayesmc.network.captured import captured
+from bayesmc.network.declared_plates import DeclaredPlates
+from bayesmc.network.evidence import plate_sizes
+from bayesmc.network.node import Declaration, bind, checked_rows, plain_states
+
+Parents = Sequence[str] | Mapping[str, str] | None
+
+
+class Constant:
+    """A function of no parents that returns one distribution."""
+
+    def __init__(self, distribution: Distribution) -> None:
+        self.distribution = distribution
+
+    def __call__(self) -> Distribution:
+        return self.distribution
+
+
+def declared(
+    name: str,
+    cpd: Any,
+    parents: Parents,
+    plates: tuple[str, ...],
+    states: Sequence[Any] | None,
+    vectorize: bool,
+) -> Declaration:
+    """A node by whatever says its density.
+
+    Raises
+    ------
+    ModelError, ParameterError
+    """
+    if cpd is None or isinstance(cpd, str):
+        raise ModelError(
+            f"node {name!r}: {cpd!r} is no density; give a distribution, a function or a table"
+        )
+    dist = cpd if isinstance(cpd, Distribution) else as_distribution(cpd)
+    if dist is not None:
+        if parents:
+            raise ModelError(
+                f"node {name!r}: a distribution has no arguments for parents={parents!r}; pass a "
+                "function of them that returns it"
+            )
+        own = copy.deepcopy(dist)  # the user's arrays stay the user's
+        return declared_function(name, Constant(own), (), plates, states, False)
+    if callable(cpd):
+        return declared_function(name, cpd, parents, plates, states, vectorize)
+    if isinstance(parents, Mapping):
+        raise ModelError(f"node {name!r}: a table lists its parents in the order of its axes")
+    return declared_table(name, parents or (), cpd, states, plates)
+
+
+def declared_function(
+    name: str,
+    function: Callable[..., Any],
+    parents: Parents,
+    plates: tuple[str, ...],
+    states: Sequence[Any] | None,
+    vectorize: bool,
+) -> Declaration:
+    """A node by a function of its parents."""
+    names, bound = bind(name, function, parents)
+    if isinstance(function, type) and issubclass(function, Distribution) and not names:
+        raise ModelError(
+            f"node {name!r}: {function.__name__} is a class; call it, {function.__name__}(...), or "
+            "list parents= for its arguments"
+        )
+    labels = None if states is None else plain_states(states)
+    around = captured(function)
+    return Declaration(name, "function", names, plates, labels, bound, vectorize, captured=around)
+
+
+def declared_table(
+    name: str,
+    parents: Sequence[str],
+    probs: Any,
+    states: Sequence[Any] | None,
+    plates: tuple[str, ...],
+) -> Declaration:
+    """A node by its conditional probability table."""
+    if probs is None:
+        raise ModelError(f"node {name!r}: table() needs probs=")
+    if isinstance(parents, str):
+        raise ModelError(f"node {name!r}: parents={parents!r} is one string; give a list of names")
+    try:
+        table = np.array(probs, dtype=float)
+    except (TypeError, ValueError):
+        raise ModelError(
+            f"node {name!r}: a {type(probs).__name__} is no density; give a distribution, a function, or a "
+            "table of probabilities, its rows of one length"
+        ) from None
+    if table.ndim != len(parents) + 1:
+        raise ModelError(
+            f"node {name!r}: probs has {table.ndim} axes, but {len(parents)} parents and the node "
+            f"itself make {len(parents) + 1}"
+        )
+    states = None if states is None else plain_states(states)
+    if states is not None and len(states) != table.shape[-1]:
+        raise ModelError(
+            f"node {name!r}: states= has {len(states)} entries, but the last axis of probs has "
+            f"{table.shape[-1]}"
+        )
+    table = checked_rows(name, table)
+    return Declaration(name, "table", tuple(parents), plates, states, probs=table)
+
+
+def settled_sizes(
+    declared: DeclaredPlates,
+    declarations: Mapping[str, Declaration],
+    evidence: Mapping[str, Any] | None,
+    inputs: Mapping[str, Any] | None,
+    given: Mapping[str, int] | None,
+) -> dict[str, int]:
+    """The size of every plate, declared, ``given`` or read off the data; 0 where no node is in it.
+
+    Raises
+    ------
+    PlateError
+    """
+    for plate, size in (given or {}).items():
+        if plate not in declared.sizes:
+            raise PlateError(
+                f"plates= gives {plate!r}{did_you_mean(plate, declared.sizes)}; the net's plates are "
+                f"{list(declared.sizes)}"
+            )
+        if isinstance(size, bool) or not isinstance(size, (int, np.integer)) or size < 0:
+            raise PlateError(f"plates={{{plate!r}: {size!r}}}: the size is a whole number")
+    sizes = plate_sizes(
+        {**declared.sizes, **(given or {})}, declarations, evidence, inputs, labels=declared.labels
+    )
+    used = {p for d in declarations.values() for p in d.plates}
+    open_plates = [p for p, n in sizes.items() if n is None and p in used]
+    if open_plates:
+        raise PlateError(
+            f"the size of plate {open_plates[0]!r} is not known; observe a node in it, or declare "
+            f"plates={{{open_plates[0]!r}: size}}"
+        )
+    return {p: n if n is not None else 0 for p, n in sizes.items()}
