@@ -186,6 +186,10 @@ class UnsupportedError(BayesmcError, NotImplementedError):
     """The engine, distribution or posterior cannot answer this; the message names what can."""
 
 
+class TraceError(UnsupportedError):
+    """A function does what cannot be followed; engines that need none of it go on without."""
+
+
 class BudgetError(UnsupportedError):
     """An exact answer would cost more memory than allowed; ``bytes`` is the estimate."""
 

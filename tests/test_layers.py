@@ -28,7 +28,9 @@ kernels
 dbn | structure | results
 network
 factors | montecarlo
+passes
 distributions
+expression
 resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
 errors | shapes
 """

@@ -381,20 +381,22 @@ def _as_index(key: Any, plate: str, size: int) -> PlateArray:
         raise IndexError(
             f"plate {plate!r} is gathered by scalars, not by vectors; take a component with v[..., k]"
         )
-    array = np.asarray(foreign.array if foreign is not None else key)
+    held = foreign.array if foreign is not None else key
+    is_known = not hasattr(held, "within")  # what stands for an index is looked at once it is known
+    array: Any = np.asarray(held) if is_known else held
     if array.dtype.kind not in "iu":
         raise IndexError(
             f"plate {plate!r} is gathered by integers 0..{size - 1} (a discrete parent, an integer or "
             f"an integer array), not by {array.dtype} values"
         )
-    if array.size:
+    if is_known and array.size:
         low, high = int(array.min()), int(array.max())
         if low < 0 or high >= size:
             raise IndexError(
                 f"index {low if low < 0 else high} is outside plate {plate!r}, whose positions are "
                 f"0..{size - 1}"
             )
-    array = array.astype(np.intp, copy=False)
+    array = array.astype(np.intp, copy=False) if is_known else array.within(size)
     if foreign is None:
         return PlateArray(array, ())
     return PlateArray(array, foreign.plates, foreign.own, foreign.event_ndim)

@@ -25,7 +25,7 @@ def partials(ufunc: Any) -> tuple[Partial, ...] | None:
 
 def jumps(ufunc: Any, values: Any, result: Any) -> Any:
     """Where a ufunc that is constant in pieces jumps, as booleans; None for every other ufunc."""
-    rule = _PIECES.get(ufunc)
+    rule = PIECES.get(ufunc)
     return None if rule is None else rule(*values, result)
 
 
@@ -127,6 +127,8 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
     special.ndtr: (lambda x, y: np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi),),
     special.log_ndtr: (lambda x, y: np.exp(-0.5 * x * x - y) / np.sqrt(2.0 * np.pi),),
     special.gammaln: (lambda x, y: special.digamma(x),),
+    special.digamma: (lambda x, y: special.zeta(2.0, x),),
+    special.i0e: (lambda x, y: special.i1e(x) - np.sign(x) * y,),
     special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: np.true_divide(a, b)),
     special.xlog1py: (lambda a, b, y: np.log1p(b), lambda a, b, y: np.true_divide(a, 1.0 + b)),
 }
@@ -149,7 +151,7 @@ def _never(x: Any, y: Any) -> Any:
 
 
 #: ufuncs that are constant in pieces -> where they jump
-_PIECES: Mapping[Any, Partial] = {
+PIECES: Mapping[Any, Partial] = {
     **dict.fromkeys(
         (np.greater, np.greater_equal, np.less, np.less_equal, np.equal, np.not_equal), _equal
     ),

@@ -1,0 +1,230 @@
+"""Values of expressions: the graph as NumPy calls on arrays with batch axes in front."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+
+from bayesmc.expression.graph import (
+    Call,
+    Constant,
+    Elementwise,
+    Expression,
+    Gather,
+    Leaf,
+    Pick,
+    Reduction,
+    ordered,
+)
+from bayesmc.shapes import Shape
+
+Step = Callable[..., np.ndarray]
+
+
+def evaluate(roots: Sequence[Expression], values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Values of expressions.
+
+    Parameters
+    ----------
+    roots : sequence of Expression
+    values : mapping
+        Leaf -> its value, shape ``(*batch, *shape)``; batch shapes may differ but broadcast.
+
+    Returns
+    -------
+    list of ndarray
+        Of shapes ``(*batch, *shape)``, each with the batch of the leaves that it depends on.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import elementwise, evaluate, leaf
+    >>> x = leaf("x", (2,))
+    >>> evaluate([elementwise(np.multiply, x, [1.0, 10.0])], {"x": np.array([[1.0, 2.0], [3.0, 4.0]])})
+    [array([[ 1., 20.],
+           [ 3., 40.]])]
+    """
+    return Program(roots)(values)
+
+
+class Program:
+    """Expressions made ready to be evaluated often.
+
+    Parameters
+    ----------
+    roots : sequence of Expression
+    """
+
+    def __init__(self, roots: Sequence[Expression]) -> None:
+        nodes = ordered(*roots)
+        at = {node: k for k, node in enumerate(nodes)}
+        self._leaves = [(at[n], n.name) for n in nodes if isinstance(n, Leaf)]
+        self._constants = [(at[n], n.value) for n in nodes if isinstance(n, Constant)]
+        self._steps = [
+            (at[n], _step(n), tuple(at[a] for a in n.operands)) for n in nodes if n.operands
+        ]
+        self._roots = [at[r] for r in roots]
+        self._count = len(nodes)
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        slots: list[Any] = [None] * self._count
+        for k, value in self._constants:
+            slots[k] = value
+        for k, name in self._leaves:
+            slots[k] = values[name]
+        with np.errstate(all="ignore"):
+            for k, step, operands in self._steps:
+                slots[k] = step(*[slots[a] for a in operands])
+        return [slots[k] for k in self._roots]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _step(node: Expression) -> Step:
+    if isinstance(node, Elementwise):
+        return _elementwise(node)
+    if isinstance(node, Pick):
+        return _pick(node)
+    if isinstance(node, Gather):
+        return _gather(node)
+    if isinstance(node, Reduction):
+        axes = tuple(a - len(node.operands[0].shape) for a in node.axes)
+        reduce = node.ufunc.reduce
+        return lambda value: reduce(value, axis=axes)
+    assert isinstance(node, Call)
+    return node.call
+
+
+def _elementwise(node: Elementwise) -> Step:
+    ndim = len(node.shape)
+    pads = [ndim - len(a.shape) if a.leaves else 0 for a in node.operands]
+    function = node.function
+    if not any(pads):
+        return function
+    shapes = [(1,) * pad + a.shape for pad, a in zip(pads, node.operands, strict=True)]
+    ranks = [len(a.shape) for a in node.operands]
+
+    def step(*values: np.ndarray) -> np.ndarray:
+        return function(
+            *(
+                v.reshape(v.shape[: v.ndim - rank] + shape) if pad and v.ndim > rank else v
+                for v, pad, rank, shape in zip(values, pads, ranks, shapes, strict=True)
+            )
+        )
+
+    return step
+
+
+def _pick(node: Pick) -> Step:
+    take = _taken(node.positions)
+    if len(node.operands) == 1:
+        (operand,) = node.operands
+        rank, size = len(operand.shape), operand.size
+
+        def one(value: np.ndarray) -> np.ndarray:
+            return take(value.reshape((*value.shape[: value.ndim - rank], size)))
+
+        return one
+    ranks = [len(a.shape) for a in node.operands]
+    sizes = [a.size for a in node.operands]
+    dtype = node.dtype
+
+    def several(*values: np.ndarray) -> np.ndarray:
+        batches = [v.shape[: v.ndim - rank] for v, rank in zip(values, ranks, strict=True)]
+        batch = np.broadcast_shapes(*batches)
+        parts = [
+            np.broadcast_to(v.reshape((*own, size)), (*batch, size))
+            for v, own, size in zip(values, batches, sizes, strict=True)
+        ]
+        return take(np.concatenate(parts, axis=-1, dtype=dtype))
+
+    return several
+
+
+def _taken(positions: np.ndarray) -> Step:
+    """Elements of the last axis at positions, as a view where they are evenly spaced."""
+    shape = positions.shape
+    even = _strides(positions)
+    if even is None:
+        return lambda flat: np.take(flat, positions, axis=-1)
+    offset, strides = even
+    count = positions.size
+    run = _run(shape, strides)
+    if run is not None:
+        whole = slice(offset, offset + count * run, run)
+        if run < 0:
+            stop = offset + count * run
+            whole = slice(offset, stop if stop >= 0 else None, run)
+        return lambda flat: flat[..., whole].reshape(flat.shape[:-1] + shape)
+
+    def view(flat: np.ndarray) -> np.ndarray:
+        step = flat.strides[-1]
+        return as_strided(
+            flat[..., offset:],
+            flat.shape[:-1] + shape,
+            flat.strides[:-1] + tuple(s * step for s in strides),
+            writeable=False,
+        )
+
+    return view
+
+
+def _strides(positions: np.ndarray) -> tuple[int, Shape] | None:
+    """``(first, steps along each axis)`` where positions are evenly spaced, else None."""
+    if not positions.size:
+        return None
+    first = int(positions.flat[0])
+    steps = []
+    made = np.asarray(first)
+    for axis, size in enumerate(positions.shape):
+        second = (
+            positions[(0,) * axis + (1,) + (0,) * (positions.ndim - axis - 1)]
+            if size > 1
+            else first
+        )
+        steps.append(int(second) - first)
+        along = np.arange(size).reshape((size,) + (1,) * (positions.ndim - axis - 1))
+        made = made + steps[-1] * along
+    return (first, tuple(steps)) if np.array_equal(made, positions) else None
+
+
+def _run(shape: Shape, strides: Shape) -> int | None:
+    """The step of positions that count on through all axes, in C order; None where they do not."""
+    run, count = None, 1
+    for size, stride in zip(reversed(shape), reversed(strides), strict=True):
+        if size == 1:
+            continue
+        if run is None:
+            run = stride
+        elif stride != run * count:
+            return None
+        count *= size
+    if run is None:
+        return 1
+    return run if run else None
+
+
+def _gather(node: Gather) -> Step:
+    table, rows = node.operands
+    size, block = table.shape[0], table.shape[1:]
+    rank, row_rank = len(table.shape), len(rows.shape)
+    axis = -1 - len(block)
+
+    def step(values: np.ndarray, at: np.ndarray) -> np.ndarray:
+        if at.size and not (at.min() >= 0 and at.max() < size):
+            raise IndexError(f"an index is outside of 0..{size - 1}")
+        if values.ndim == rank:
+            return np.take(values, at, axis=0)
+        own = at.shape[: at.ndim - row_rank]
+        batch = np.broadcast_shapes(values.shape[: values.ndim - rank], own)
+        wide = np.broadcast_to(values, (*batch, size, *block)).reshape((-1, *block))
+        lead = np.arange(math.prod(batch)).reshape(batch + (1,) * row_rank) * size
+        whole = at.reshape(own + at.shape[at.ndim - row_rank :])
+        return np.take(wide, lead + whole, axis=axis)
+
+    return step

@@ -1,0 +1,453 @@
+"""What ufuncs and NumPy functions make of expressions: one rule for each, calls for what has none.
+
+Functions that move elements about are read off positions: they are applied to the numbers 0, 1, 2, ... in
+the place of the elements, and what comes out says which element stands where.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import TraceError
+from bayesmc.expression import graph
+from bayesmc.expression.bounds import counted_from_end, within
+from bayesmc.expression.graph import Expression
+from bayesmc.expression.products import PRODUCTS, einsum, product
+
+#: functions that move the elements of their first argument about (an array, or a sequence of arrays)
+_MOVERS = frozenset(
+    (
+        np.stack, np.concatenate, np.vstack, np.hstack, np.dstack, np.column_stack, np.broadcast_to,
+        np.copy, np.reshape, np.ravel, np.transpose, np.matrix_transpose, np.squeeze, np.expand_dims,
+        np.moveaxis, np.swapaxes, np.rollaxis, np.repeat, np.tile, np.flip, np.flipud, np.fliplr,
+        np.rot90, np.roll, np.atleast_1d, np.atleast_2d, np.atleast_3d, np.diagonal, np.split,
+        np.array_split, np.linalg.diagonal, np.linalg.matrix_transpose, np.block, np.append, np.delete,
+    )
+)  # fmt: skip
+#: of these, what takes more arrays than the first argument
+_OF_TWO = frozenset((np.append,))
+_REDUCERS: Mapping[Any, np.ufunc] = {
+    np.sum: np.add, np.prod: np.multiply, np.max: np.maximum, np.min: np.minimum,
+    np.any: np.logical_or, np.all: np.logical_and,
+}  # fmt: skip
+#: functions that hand numbers to callbacks or files, or draw them
+_SHOWING = frozenset(
+    (np.apply_along_axis, np.apply_over_axes, np.piecewise, np.save, np.savez, np.savetxt)
+)
+
+
+def applied(ufunc: Any, method: str, inputs: Any, kwargs: dict[str, Any]) -> Any:
+    """What a ufunc makes of its inputs."""
+    dtype = kwargs.pop("dtype", None)
+    if method == "reduce":
+        operand, *rest = inputs
+        found: Any = _reduced(ufunc, operand, *(rest or (kwargs.pop("axis", 0),)), **kwargs)
+    elif method == "outer":
+        first, second = map(expression_of, inputs)
+        wide = graph.reshape(first, first.shape + (1,) * len(second.shape))
+        found = graph.elementwise(ufunc, wide, second)
+    elif method != "__call__" or (ufunc.signature and ufunc not in PRODUCTS):
+        return repeated(getattr(ufunc, method), inputs, kwargs)
+    elif kwargs:
+        raise TraceError(f"np.{ufunc.__name__} with {', '.join(kwargs)}=")
+    elif ufunc in PRODUCTS:
+        found = product(ufunc, *map(expression_of, inputs))
+    elif ufunc is np.divmod:
+        return applied(np.floor_divide, method, inputs, {}), applied(np.mod, method, inputs, {})
+    elif ufunc.nout > 1:
+        return repeated(ufunc, inputs, {})
+    else:
+        found = graph.elementwise(ufunc, *map(expression_of, inputs))
+    return found if dtype is None else graph.cast(found, dtype)
+
+
+def of_function(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """What a NumPy function makes of its arguments."""
+    rule = _RULES.get(func)
+    if rule is not None:
+        try:
+            return rule(*args, **kwargs)
+        except TypeError as error:
+            raise TraceError(f"np.{func.__name__}: {error}") from error
+    if func in _REDUCERS:
+        return _reduced(_REDUCERS[func], *args, **kwargs)
+    if func in _MOVERS:
+        return _moved(func, args, kwargs)
+    if func in _SHOWING:
+        raise TraceError(f"np.{func.__name__} hands the numbers on")
+    return repeated(func, args, kwargs)
+
+
+def expression_of(value: Any) -> Expression:
+    """The expression behind an argument."""
+    found = getattr(value, "expression", value)
+    if isinstance(found, (list, tuple)) and _any_traced(found):
+        return _moved(np.stack, ([_plainly(v) for v in found],), {})
+    if isinstance(found, np.ma.MaskedArray):
+        raise TraceError("a masked array")
+    return graph.as_expression(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Repeated:
+    """A call to be made again, with other arrays in the place of those that varied.
+
+    Two are equal where they call the same function in the same way.
+    """
+
+    function: Callable[..., Any]
+    args: Any
+    kwargs: dict[str, Any]
+    output: int | None = None
+    key: Hashable = field(default=None)
+
+    def __call__(self, *arrays: np.ndarray) -> np.ndarray:
+        with np.errstate(all="ignore"):
+            args, kwargs = _filled(self.args, arrays), _filled(self.kwargs, arrays)
+            found = self.function(*args, **kwargs)
+        return np.asarray(found if self.output is None else found[self.output])
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Repeated) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __str__(self) -> str:
+        return getattr(self.function, "__name__", str(self.function))
+
+
+def repeated(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """A call of whole arrays that is made again as it stands."""
+    operands: list[Expression] = []
+    held = _held(list(args), operands), _held(kwargs, operands)
+    key = (function, _key(held[0]), _key(held[1]))
+    probe = Repeated(function, held[0], held[1], None, key)
+    arrays = [o.value if isinstance(o, graph.Constant) else graph.sample(o) for o in operands]
+    try:
+        with np.errstate(all="ignore"):
+            found = function(*_filled(held[0], arrays), **_filled(held[1], arrays))
+    except (TypeError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+        name = getattr(function, "__name__", str(function))
+        raise TraceError(f"{name}: {error}") from error
+    if not isinstance(found, (list, tuple)):
+        return graph.call(probe, operands)
+    return tuple(
+        graph.call(Repeated(function, held[0], held[1], k, (*key, k)), operands)
+        for k in range(len(found))
+    )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """The place of the operand with this number."""
+
+    number: int
+
+
+def _held(value: Any, operands: list[Expression]) -> Any:
+    """Arguments with slots in the place of what varies."""
+    found = getattr(value, "expression", value)
+    if isinstance(found, Expression):
+        operands.append(found)
+        return _Slot(len(operands) - 1)
+    if isinstance(found, (list, tuple)):
+        return type(found)(_held(v, operands) for v in found)
+    if isinstance(found, dict):
+        return {k: _held(v, operands) for k, v in found.items()}
+    return np.array(found) if isinstance(found, np.ndarray) else found
+
+
+def _filled(value: Any, arrays: Any) -> Any:
+    if isinstance(value, _Slot):
+        return arrays[value.number]
+    if isinstance(value, (list, tuple)):
+        return type(value)(_filled(v, arrays) for v in value)
+    if isinstance(value, dict):
+        return {k: _filled(v, arrays) for k, v in value.items()}
+    return value
+
+
+def _key(value: Any) -> Hashable:
+    if isinstance(value, (list, tuple)):
+        return (type(value), *map(_key, value))
+    if isinstance(value, dict):
+        return tuple((k, _key(v)) for k, v in value.items())
+    if isinstance(value, np.ndarray):
+        return value.shape, value.dtype.str, value.tobytes()
+    try:
+        hash(value)
+    except TypeError:
+        return object()
+    return type(value), value
+
+
+def _any_traced(value: Any) -> bool:
+    if isinstance(value, (list, tuple)):
+        return any(map(_any_traced, value))
+    return isinstance(getattr(value, "expression", None), Expression)
+
+
+def _plainly(value: Any) -> Any:
+    """What stands for an array as its expression, a sequence of such as one."""
+    if isinstance(value, (list, tuple)) and _any_traced(value):
+        return expression_of(value)
+    return getattr(value, "expression", value)
+
+
+def _reduced(
+    ufunc: np.ufunc, operand: Any, axis: Any = None, *rest: Any, **kwargs: Any
+) -> Expression:
+    if rest or any(kwargs.get(k) is not None for k in ("dtype", "out", "initial", "where")):
+        raise TraceError(f"np.{ufunc.__name__}.reduce with more than axis= and keepdims=")
+    node = expression_of(operand)
+    ndim = len(node.shape)
+    axes = range(ndim) if axis is None else [int(a) for a in np.atleast_1d(axis)]
+    found = graph.reduction(ufunc, node, axes)
+    if not ndim and ufunc in (np.logical_or, np.logical_and):
+        found = graph.cast(found, bool)
+    if not kwargs.get("keepdims", False):
+        return found
+    gone = {a % ndim for a in axes} if ndim else set()
+    return graph.reshape(found, tuple(1 if k in gone else n for k, n in enumerate(node.shape)))
+
+
+def _moved(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """Elements moved about, told by where the numbers 0, 1, 2, ... go."""
+    operands: list[Expression] = []
+    offset = 0
+
+    def placed(value: Any) -> Any:
+        nonlocal offset
+        if isinstance(value, (list, tuple)):
+            return type(value)(placed(v) for v in value)
+        node = expression_of(value)
+        operands.append(node)
+        offset += node.size
+        return np.arange(offset - node.size, offset).reshape(node.shape)
+
+    if not args or {"dtype", "casting", "out"} & set(kwargs):
+        raise TraceError(f"np.{func.__name__} with a type of its own")
+    count = 2 if func in _OF_TWO else 1
+    if any(map(_any_traced, args[count:])) or any(map(_any_traced, kwargs.values())):
+        raise TraceError(f"np.{func.__name__} is steered by what varies")
+    at = func(*(placed(a) for a in args[:count]), *args[count:], **kwargs)
+    if isinstance(at, (list, tuple)):
+        return [graph.pick(operands, a) for a in at]
+    return graph.pick(operands, at)
+
+
+def _where(condition: Any, a: Any, b: Any) -> Expression:
+    return graph.elementwise(np.where, *map(expression_of, (condition, a, b)))
+
+
+def _select(conditions: Any, choices: Any, default: Any = 0) -> Expression:
+    found = expression_of(default)
+    for condition, choice in reversed(list(zip(conditions, choices, strict=True))):
+        found = _where(condition, choice, found)
+    return found
+
+
+def _clip(a: Any, a_min: Any = None, a_max: Any = None, *, min: Any = None, max: Any = None) -> Any:
+    found = expression_of(a)
+    for bound, ufunc in (
+        (a_min if min is None else min, np.maximum),
+        (a_max if max is None else max, np.minimum),
+    ):
+        if bound is not None:
+            found = graph.elementwise(ufunc, found, expression_of(bound))
+    return found
+
+
+def _mean(a: Any, axis: Any = None, *, keepdims: bool = False) -> Expression:
+    node = expression_of(a)
+    total = _reduced(np.add, node, axis, keepdims=keepdims)
+    return graph.elementwise(np.divide, total, node.size // max(total.size, 1))
+
+
+def _var(a: Any, axis: Any = None, *, ddof: int = 0, keepdims: bool = False) -> Expression:
+    node = expression_of(a)
+    off = graph.elementwise(np.subtract, node, _mean(node, axis, keepdims=True))
+    total = _reduced(np.add, graph.elementwise(np.multiply, off, off), axis, keepdims=keepdims)
+    return graph.elementwise(np.divide, total, node.size // max(total.size, 1) - ddof)
+
+
+def _std(a: Any, axis: Any = None, *, ddof: int = 0, keepdims: bool = False) -> Expression:
+    return graph.elementwise(np.sqrt, _var(a, axis, ddof=ddof, keepdims=keepdims))
+
+
+def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
+    node = expression_of(x)
+    vector = isinstance(axis, int) or (axis is None and len(node.shape) == 1)
+    if ord not in (None, 2) or not vector:
+        return repeated(np.linalg.norm, (x,), {"ord": ord, "axis": axis, "keepdims": keepdims})
+    square = graph.elementwise(np.multiply, node, node)
+    return graph.elementwise(np.sqrt, _reduced(np.add, square, axis, keepdims=keepdims))
+
+
+def _take(a: Any, indices: Any, axis: Any = None, mode: str = "raise") -> Expression:
+    node, at = expression_of(a), expression_of(indices)
+    if mode != "raise":
+        raise TraceError(f"np.take with mode={mode!r}")
+    if isinstance(at, graph.Constant):
+        return _moved(np.take, (node, at.value), {"axis": axis})
+    ndim = len(node.shape)
+    if axis is None:
+        node, axis, ndim = graph.reshape(node, (node.size,)), 0, 1
+    if axis % ndim:
+        raise TraceError("np.take of an inner axis at computed places")
+    return graph.gather(node, counted_from_end(at, node.shape[0]))
+
+
+def _take_along_axis(arr: Any, indices: Any, axis: Any = -1) -> Expression:
+    node, at = expression_of(arr), expression_of(indices)
+    axis %= len(node.shape)
+    base = np.take(np.arange(node.size).reshape(node.shape), [0], axis=axis)
+    stride = int(np.prod(node.shape[axis + 1 :], dtype=int))
+    steps = graph.elementwise(
+        np.multiply, within(counted_from_end(at, node.shape[axis]), node.shape[axis]), stride
+    )
+    return graph.gather(graph.reshape(node, (node.size,)), graph.elementwise(np.add, base, steps))
+
+
+def _sort(a: Any, axis: Any = -1, kind: Any = None) -> Expression:
+    node = expression_of(a)
+    if axis is None:
+        raise TraceError("np.sort of all axes")
+    order = repeated(np.argsort, (node,), {"axis": axis, "kind": kind})
+    return _take_along_axis(node, order, axis)
+
+
+def _isin(element: Any, test_elements: Any, *, invert: bool = False) -> Expression:
+    node = expression_of(element)
+    same = [graph.elementwise(np.equal, node, v) for v in np.ravel(test_elements)]
+    found = functools.reduce(
+        functools.partial(graph.elementwise, np.logical_or),
+        same,
+        graph.broadcast(graph.constant(False), node.shape),
+    )
+    return graph.elementwise(np.logical_not, found) if invert else found
+
+
+def _dot(a: Any, b: Any) -> Expression:
+    first, second = expression_of(a), expression_of(b)
+    if not (first.shape and second.shape):
+        return graph.elementwise(np.multiply, first, second)
+    if len(second.shape) > 2:
+        raise TraceError("np.dot of more than two axes")
+    return product(np.matmul, first, second)
+
+
+def _outer(a: Any, b: Any) -> Expression:
+    first, second = expression_of(a), expression_of(b)
+    column = graph.reshape(first, (first.size, 1))
+    return graph.elementwise(np.multiply, column, graph.reshape(second, (1, second.size)))
+
+
+def _broadcast_arrays(*args: Any) -> tuple[Expression, ...]:
+    nodes = [expression_of(a) for a in args]
+    shape = np.broadcast_shapes(*(n.shape for n in nodes))
+    return tuple(graph.broadcast(n, shape) for n in nodes)
+
+
+def _diff(a: Any, n: int = 1, axis: int = -1) -> Expression:
+    node = expression_of(a)
+    for _ in range(n):
+        size = node.shape[axis]
+        later, sooner = (_take(node, range(k, size - 1 + k), axis) for k in (1, 0))
+        node = graph.elementwise(np.subtract, later, sooner)
+    return node
+
+
+def _full_like(a: Any, fill_value: Any) -> Expression:
+    return graph.broadcast(expression_of(fill_value), expression_of(a).shape)
+
+
+def _masked(keep: Callable[..., np.ndarray]) -> Callable[..., Expression]:
+    def rule(m: Any, k: int = 0) -> Expression:
+        node = expression_of(m)
+        return _where(keep(np.ones(node.shape[-2:]), k).astype(bool), node, 0)
+
+    return rule
+
+
+def _diag(v: Any, k: int = 0) -> Expression:
+    node = expression_of(v)
+    if len(node.shape) == 2:
+        return _moved(np.diagonal, (node, k), {})
+    if k:
+        raise TraceError("np.diag off the diagonal")
+    return graph.elementwise(np.multiply, graph.reshape(node, (*node.shape, 1)), np.eye(node.size))
+
+
+def _polyval(p: Any, x: Any) -> Expression:
+    found, at = expression_of(0.0), expression_of(x)
+    for coefficient in p:
+        scaled = graph.elementwise(np.multiply, found, at)
+        found = graph.elementwise(np.add, scaled, expression_of(coefficient))
+    return found
+
+
+def _nan_to_num(
+    x: Any, copy: bool = True, nan: float = 0.0, posinf: Any = None, neginf: Any = None
+) -> Expression:
+    info = np.finfo(float)
+    found = expression_of(x)
+    for bad, number in (
+        (graph.elementwise(np.isnan, found), nan),
+        (graph.elementwise(np.equal, found, np.inf), info.max if posinf is None else posinf),
+        (graph.elementwise(np.equal, found, -np.inf), info.min if neginf is None else neginf),
+    ):
+        found = _where(bad, number, found)
+    return found
+
+
+def _round(a: Any, decimals: int = 0) -> Any:
+    if decimals:
+        return repeated(np.round, (a, decimals), {})
+    node = expression_of(a)
+    return node if node.dtype.kind == "i" else graph.elementwise(np.rint, node)
+
+
+def _sinc(x: Any) -> Expression:
+    node = graph.elementwise(np.multiply, expression_of(x), np.pi)
+    ratio = graph.elementwise(np.divide, graph.elementwise(np.sin, node), node)
+    return _where(graph.elementwise(np.equal, node, 0.0), 1.0, ratio)
+
+
+def _copied(a: Any, *args: Any, **kwargs: Any) -> Expression:
+    return expression_of(a)
+
+
+_RULES: Mapping[Any, Callable[..., Any]] = {
+    np.where: _where, np.select: _select, np.clip: _clip, np.mean: _mean, np.var: _var, np.std: _std,
+    np.linalg.norm: _norm, np.isin: _isin, np.take: _take, np.take_along_axis: _take_along_axis,
+    np.einsum: einsum, np.dot: _dot, np.outer: _outer, np.broadcast_arrays: _broadcast_arrays,
+    np.inner: lambda a, b: product(np.vecdot, expression_of(a), expression_of(b)),
+    np.sort: _sort, np.diff: _diff, np.full_like: _full_like, np.triu: _masked(np.triu),
+    np.tril: _masked(np.tril), np.diag: _diag, np.polyval: _polyval, np.nan_to_num: _nan_to_num,
+    np.round: _round,
+    np.around: _round, np.sinc: _sinc, np.copy: _copied,
+    np.average: lambda a, axis=None, weights=None: _average(a, axis, weights),
+    np.ptp: lambda a, axis=None: graph.elementwise(
+        np.subtract, _reduced(np.maximum, a, axis), _reduced(np.minimum, a, axis)
+    ),
+}  # fmt: skip
+
+
+def _average(a: Any, axis: Any, weights: Any) -> Any:
+    if weights is None:
+        return _mean(a, axis)
+    node, by = expression_of(a), expression_of(weights)
+    if by.shape != node.shape:
+        raise TraceError("np.average with weights of another shape")
+    total = _reduced(np.add, graph.elementwise(np.multiply, node, by), axis)
+    return graph.elementwise(np.divide, total, _reduced(np.add, by, axis))

@@ -1,0 +1,1 @@
+"""Passes over the expression graph: what engines want to know of a density, one short module each."""

@@ -1,0 +1,233 @@
+"""Derivatives of what has no element-by-element rule: elements put back, products, calls of whole arrays."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Call,
+    Expression,
+    TracedArray,
+    as_expression,
+    call,
+    pick,
+    reduction,
+    reshape,
+)
+from bayesmc.expression.functions import Repeated
+from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.shapes import Shape
+
+
+def scattered(part: Expression, positions: np.ndarray, shape: Shape) -> Expression:
+    """Elements added up at flat positions of an array of zeros: what undoes a pick."""
+    size, flat = math.prod(shape), positions.reshape(-1)
+    counts = np.bincount(flat, minlength=size)
+    if counts.max(initial=0) <= 1:  # nothing meets
+        back = np.full(size, flat.size)
+        back[flat] = np.arange(flat.size)
+        return pick([part, reshape(ZERO, (1,))], back.reshape(shape))
+    if (counts == counts[0]).all():  # a broadcast
+        order = np.argsort(flat, kind="stable").reshape(*shape, counts[0])
+        return reduction(np.add, pick([part], order), [len(shape)])
+    order = np.argsort(flat, kind="stable")
+    starts = np.cumsum(counts) - counts
+    return call(
+        _Scattered(_Bytes.of(order), _Bytes.of(starts), _Bytes.of(counts), shape),
+        [reshape(part, (flat.size,))],
+        shape,
+        float,
+    )
+
+
+def gathered(part: Expression, rows: Expression, shape: Shape) -> Expression:
+    """Entries added up at computed rows of a table of zeros: what undoes a gather."""
+    return call(_Gathered(shape, len(rows.shape)), [part, rows], shape, float)
+
+
+def excluded_products(operand: Expression, axes: Sequence[int]) -> Expression:
+    """For each element the product of the others along some axes."""
+    return call(
+        _Excluded(tuple(a - len(operand.shape) for a in axes)), [operand], operand.shape, float
+    )
+
+
+def call_tangent(node: Call, moved: Sequence[Expression]) -> Expression:
+    """How the result of a call moves when its operands move so."""
+    rule = _rules(node)
+    values = [TracedArray(a) for a in (*node.operands, node)]
+    total: Expression = ZERO
+    for k, direction in enumerate(moved):
+        part = rule.forward(k, TracedArray(direction), *values)
+        total = add(total, as_expression(part.expression))
+    return total
+
+
+def call_adjoints(node: Call, own: Expression) -> list[Expression | None]:
+    """What the adjoint of a call's result adds to those of its operands."""
+    rule = _rules(node)
+    values = [TracedArray(a) for a in (*node.operands, node)]
+    parts = [rule.reverse(k, TracedArray(own), *values) for k in range(len(node.operands))]
+    return [p.expression for p in parts]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Bytes:
+    """Whole numbers that compare and hash by what they are."""
+
+    data: bytes
+
+    @classmethod
+    def of(cls, array: np.ndarray) -> _Bytes:
+        return cls(np.ascontiguousarray(array, np.intp).tobytes())
+
+    @property
+    def array(self) -> np.ndarray:
+        return np.frombuffer(self.data, np.intp)
+
+
+@dataclass(frozen=True)
+class _Scattered:
+    order: _Bytes
+    starts: _Bytes
+    counts: _Bytes
+    shape: Shape
+
+    def __call__(self, part: np.ndarray) -> np.ndarray:
+        some = self.counts.array > 0
+        sums = np.add.reduceat(part[..., self.order.array], self.starts.array[some], axis=-1)
+        found = np.zeros((*part.shape[:-1], some.size))
+        found[..., some] = sums
+        return found.reshape(*part.shape[:-1], *self.shape)
+
+
+@dataclass(frozen=True)
+class _Gathered:
+    shape: Shape
+    row_ndim: int
+
+    def __call__(self, part: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        block = self.shape[1:]
+        own = part.shape[: part.ndim - self.row_ndim - len(block)]
+        batch = np.broadcast_shapes(own, rows.shape[: rows.ndim - self.row_ndim])
+        places = rows.shape[rows.ndim - self.row_ndim :]
+        part = np.broadcast_to(part, (*batch, *places, *block))
+        at = np.broadcast_to(rows, (*batch, *places))
+        many, size = math.prod(batch), self.shape[0]
+        flat = (at.reshape(many, -1) + size * np.arange(many)[:, None]).reshape(-1)
+        found = np.zeros((many * size, *block))
+        np.add.at(found, flat, part.reshape(-1, *block))
+        return found.reshape(*batch, *self.shape)
+
+
+@dataclass(frozen=True)
+class _Excluded:
+    axes: tuple[int, ...]
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        last = tuple(range(-len(self.axes), 0))
+        moved = np.moveaxis(x, self.axes, last)
+        shape = moved.shape
+        flat = moved.reshape(*shape[: len(shape) - len(last)], -1)
+        ones = np.ones_like(flat[..., :1])
+        before = np.cumprod(np.concatenate([ones, flat[..., :-1]], axis=-1), axis=-1)
+        behind = np.concatenate([ones, flat[..., :0:-1]], axis=-1)
+        after = np.cumprod(behind, axis=-1)[..., ::-1]
+        return np.moveaxis((before * after).reshape(shape), last, self.axes)
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """``forward(k, direction, *operands, result)``, ``reverse(k, adjoint, *operands, result)``."""
+
+    forward: Callable[..., Any]
+    reverse: Callable[..., Any]
+
+
+def _rules(node: Call) -> _Rule:
+    made = node.call
+    plain = isinstance(made, Repeated) and len(made.args) == len(node.operands)
+    if plain and not made.kwargs and made.output is None and made.function in _RULES:
+        return _RULES[made.function]
+    if isinstance(made, Repeated) and made.function in (np.cumsum,):
+        return _cumulative(made, node)
+    raise TraceError(f"no derivative of {node.detail} is known")
+
+
+def _cumulative(made: Repeated, node: Call) -> _Rule:
+    axis = made.kwargs.get("axis", made.args[1] if len(made.args) > 1 else None)
+    if axis is None and len(node.shape) != 1:
+        raise TraceError("no derivative of np.cumsum over all axes is known")
+    along = -1 if axis is None else axis
+
+    def back(k: int, adjoint: Any, *values: Any) -> Any:
+        return np.flip(np.cumsum(np.flip(adjoint, along), axis=along), along)
+
+    return _Rule(lambda k, direction, *values: np.cumsum(direction, axis=along), back)
+
+
+def _transposed(matrix: Any) -> Any:
+    return np.swapaxes(matrix, -1, -2)
+
+
+def _inverse_forward(k: int, direction: Any, a: Any, inverse: Any) -> Any:
+    return -np.matmul(np.matmul(inverse, direction), inverse)
+
+
+def _inverse_reverse(k: int, adjoint: Any, a: Any, inverse: Any) -> Any:
+    turned = _transposed(inverse)
+    return -np.matmul(np.matmul(turned, adjoint), turned)
+
+
+def _solve_forward(k: int, direction: Any, a: Any, b: Any, x: Any) -> Any:
+    return np.linalg.solve(a, direction if k else -np.matmul(direction, x))
+
+
+def _solve_reverse(k: int, adjoint: Any, a: Any, b: Any, x: Any) -> Any:
+    back = np.linalg.solve(_transposed(a), adjoint)
+    return back if k else -np.matmul(back, _transposed(x))
+
+
+def _det_forward(k: int, direction: Any, a: Any, det: Any) -> Any:
+    return det * np.sum(_transposed(np.linalg.inv(a)) * direction, axis=(-2, -1))
+
+
+def _det_reverse(k: int, adjoint: Any, a: Any, det: Any) -> Any:
+    return (adjoint * det)[..., None, None] * _transposed(np.linalg.inv(a))
+
+
+def _lower_half(matrix: Any) -> Any:
+    """The lower triangle with half its diagonal."""
+    n = matrix.shape[-1]
+    return matrix * (np.tril(np.ones((n, n)), -1) + 0.5 * np.eye(n))
+
+
+def _cholesky_forward(k: int, direction: Any, a: Any, factor: Any) -> Any:
+    inverse = np.linalg.inv(factor)
+    symmetric = 0.5 * (direction + _transposed(direction))
+    inner = np.matmul(np.matmul(inverse, symmetric), _transposed(inverse))
+    return np.matmul(factor, _lower_half(inner))
+
+
+def _cholesky_reverse(k: int, adjoint: Any, a: Any, factor: Any) -> Any:
+    inverse = np.linalg.inv(factor)
+    inner = _lower_half(np.matmul(_transposed(factor), adjoint))
+    half = np.matmul(np.matmul(_transposed(inverse), inner), inverse)
+    return 0.5 * (half + _transposed(half))
+
+
+_RULES: dict[Any, _Rule] = {
+    np.linalg.inv: _Rule(_inverse_forward, _inverse_reverse),
+    np.linalg.solve: _Rule(_solve_forward, _solve_reverse),
+    np.linalg.det: _Rule(_det_forward, _det_reverse),
+    np.linalg.cholesky: _Rule(_cholesky_forward, _cholesky_reverse),
+}
