@@ -3,7 +3,7 @@
 Only small nets are weighed, of a few numbers without plates, each drawn by slices: what a slice costs is not
 worth it where one evaluation of the density is slow. Hierarchies are left to Gibbs, since short chains that
 miss the neck of a funnel look as if they were fast. With finite nodes beside the numbers, weighted draws are
-tried if they visit all joint states, and chains that might miss some are not.
+tried if they tell what every joint state weighs, and chains that might miss some are not.
 
 Work is counted, not timed: a call of a node's density is one unit, and so are some thousand numbers that go
 through it. A clock would make the choice, and so the answer, differ from run to run; seeds of the pilot are
@@ -45,9 +45,10 @@ _WARMUP, _DRAWS, _PER_MEMBER = 100, 100, 8
 _FEW = 8
 #: draws of the pilot of weighting, and the share of them that must count for it to be taken
 _WEIGHTED, _ENOUGH = 2000, 0.1
-#: draws in which every joint state of finite nodes must stand
-_SEEN = 5
-_ENOUGH_WEIGHTED = "weighted draws are good enough, so that no chains were tried"
+#: effective draws that there must be within every joint state of finite nodes
+_WITHIN = 10
+_ENOUGH_WEIGHTED = "weighted draws are good enough{}, so that no chains were tried"
+_EACH_STATE = " within each joint state of the finite nodes"
 #: how much better than Gibbs, which needs no tuning, another engine must be
 _BETTER = 1.5
 #: the pilots' own seed
@@ -147,17 +148,19 @@ def _is_small(problem: Problem, plan: Plan) -> bool:
 def _weighed_once(problem: Problem, finite: list[str]) -> tuple[Trial, list[Trial]] | None:
     """Weighting where it will do: chains that switch between states may miss one in a pilot, and look fast.
 
-    So may weighted draws where a state is rare beforehand: they will do where they see all joint states.
+    So may weighted draws where a state is rare beforehand, or where hardly a draw in it fits the data: they
+    will do where the draws within each joint state tell what it weighs.
     """
     drawn = _weights(problem, finite)
-    return None if drawn is None else (drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED)])
+    words = _ENOUGH_WEIGHTED.format(_EACH_STATE)
+    return None if drawn is None else (drawn, [Trial(Gibbs(), 0.0, words)])
 
 
 def _weighed(problem: Problem) -> tuple[Trial, list[Trial]]:
     """Cheap pilots first: Gibbs has a full one only where it could still be better than what they showed."""
     drawn = _weights(problem)
     if drawn is not None:
-        return drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED)]
+        return drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED.format(""))]
     walk = _chains(problem, MetropolisHastings())
     gibbs = _at_best(problem)
     if walk.rate < _BETTER * gibbs.rate:
@@ -195,7 +198,7 @@ def _chains(problem: Problem, engine: Any) -> Trial:
 
 
 def _weights(problem: Problem, finite: Sequence[str] = ()) -> Trial | None:
-    """A pilot of likelihood weighting; None where its weights are too uneven, or joint states too rare."""
+    """A pilot of likelihood weighting; None where its weights are too uneven, or so within a joint state."""
     engine = LikelihoodWeighting()
     if engine.refusal(problem) is not None:
         return None
@@ -208,22 +211,37 @@ def _weights(problem: Problem, finite: Sequence[str] = ()) -> Trial | None:
     k = posterior.pareto_k
     if ess < _ENOUGH * _WEIGHTED or (k is not None and k > 0.5):
         return None
-    if finite and _rarest(posterior, finite) < _SEEN:
+    if finite and _least_within(posterior, finite) < _WITHIN:
         return None
     words = f"{ess:.0f} effective of {_WEIGHTED} draws, {_each(units, ess)}"
     return Trial(engine, 1000.0 * ess / units, words)
 
 
-def _rarest(posterior: DrawsPosterior, names: Sequence[str]) -> int:
-    """How many draws, whatever their weights, show the joint state of some nodes that is shown least."""
+def _least_within(posterior: DrawsPosterior, names: Sequence[str]) -> float:
+    """Effective draws within the joint state of some nodes that has the fewest, by their weights there.
+
+    Draws of a state whose weights are uneven, or all zero, do not tell what the state weighs, however many
+    they are: one that fits, and weighs more than all others together, may not be among them.
+    """
     code, count = np.zeros(posterior._shape, dtype=np.intp), 1
     for name in names:
         domain = posterior.model[name].domain
         assert domain is not None
-        code, count = code * domain.size + posterior._stored[name], count * domain.size
-        if count > _WEIGHTED:
-            return 0
-    return int(np.bincount(code.ravel(), minlength=count).min())
+        stored = posterior._stored[name].reshape((*posterior._shape, -1))
+        for element in np.moveaxis(stored, -1, 0):
+            code, count = code * domain.size + element, count * domain.size
+            if count > _WEIGHTED:
+                return 0.0
+    code = code.ravel()
+    logs = np.zeros(posterior._shape) if posterior.log_weights is None else posterior.log_weights
+    logs = np.ravel(logs)
+    largest = np.full(count, -np.inf)
+    np.maximum.at(largest, code, logs)
+    if not np.isfinite(largest).all():  # a state without draws, or none of them possible
+        return 0.0
+    weights = np.exp(logs - largest[code])
+    total, squares = (np.bincount(code, w, count) for w in (weights, weights**2))
+    return float((total**2 / squares).min())
 
 
 def _run(engine: Any, counted: Problem) -> tuple[DrawsPosterior, float]:

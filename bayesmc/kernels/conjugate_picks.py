@@ -7,6 +7,8 @@ it. An element of which none is true has no closed form, and what it adds is NaN
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +20,9 @@ from bayesmc.kernels.conjugate_data import Elements
 from bayesmc.kernels.conjugate_evaluation import Evaluated
 from bayesmc.kernels.conjugate_kinds import Naturals
 from bayesmc.kernels.conjugate_pairs import Pair
+from bayesmc.kernels.conjugate_states import joint_states
 from bayesmc.shapes import Shape
-from bayesmc.structure.target import Target, Values
+from bayesmc.structure.target import Values
 
 if TYPE_CHECKING:
     from bayesmc.kernels.conjugate_children import Partner
@@ -28,8 +31,6 @@ if TYPE_CHECKING:
 PICKED = ("scale", "share", "shares")
 #: how far a parameter may be from what it is, by rounding of the arithmetic that picks
 _ROUNDING = 1e-12
-#: random states of finite nodes at which whole rows must be picked
-_STATES = 200
 
 
 def points_of(kind: str, event_shape: Shape) -> np.ndarray:
@@ -91,22 +92,26 @@ def is_picked(partner: Partner) -> bool:
     """Whether a child is seen to pick at the states that are tried.
 
     Numbers take a slice step where a state turns up at which it is not so. Rows cannot: their parameter is
-    affine in all numbers that are hidden together, so that what is picked hangs on finite nodes alone, and
-    many states of these are tried.
+    affine in all numbers that are hidden together, so that what is picked hangs on finite nodes alone: all
+    joint states of these are tried, and where they are too many nothing is claimed.
     """
     target, blanket = partner.blanket.target, partner.blanket
     states = target.states
     if states is None:
         return False
-    tried = [states]
-    if partner.kind.name == "shares":
-        tried.append(_mixed(target, states))
+    tried: Iterable[Values] = [states]
     try:
         with marking_invalid(), np.errstate(all="ignore"):
-            for values in tried:
-                found = partner.natural(values, blanket.classes[0])
-                if not all(np.isfinite(f).all() for f in found):
+            if partner.kind.name == "shares":
+                rest = joint_states(target, states, partner.terms)
+                if rest is None:
                     return False
+                tried = chain(tried, rest)
+            for values in tried:
+                for members in blanket.classes:
+                    found = partner.natural(values, members)
+                    if not all(np.isfinite(f).all() for f in found):
+                        return False
     except (BayesmcError, ValueError, IndexError):
         return False
     return True
@@ -145,21 +150,3 @@ def _counts(pair: Pair, points: np.ndarray, e: Evaluated) -> np.ndarray:
         counts = e.data.total
     lost = np.where(free | mine | (e.data.count == 0), 0.0, np.nan)
     return e.sum(np.where(np.asarray(mine)[..., None], counts, 0.0) + lost[..., None], 1)
-
-
-def _mixed(target: Target, states: Values) -> Values:
-    """Values of all nodes with the hidden finite ones anywhere."""
-    rng = np.random.default_rng(0)
-    values = dict(target.known)
-    for name in target.chain:
-        node, now = target.model[name], states[name]
-        values[name] = np.resize(now, (_STATES, *now.shape[1:]))
-        seen = target.seen(name)
-        if node.domain is not None:
-            anywhere = rng.integers(node.domain.size, size=values[name].shape)
-            if seen is not None and seen.mask is not None:
-                anywhere = np.where(seen.mask, seen.value, anywhere)
-            values[name] = anywhere.astype(node.domain.dtype)
-    for link in target.links:
-        values[link], _ = target.model.evaluate(link, values)
-    return values

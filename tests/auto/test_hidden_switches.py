@@ -175,3 +175,27 @@ def test_weighting_is_taken_where_it_sees_all_states(rare: float, chosen: type) 
         for p, a in ((1 - rare, 2), (rare, 10))
     ]
     assert abs(found.mean("s") - joint[1] / sum(joint)) < 4.5 * found.mcse("s") < 0.1
+
+
+def sensor(steep: bool) -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """A reading that is precise or not; if steep, hardly a draw of the level fits a precise one."""
+    precise = 1e-4 if steep else 30.0
+    net = bmc.BayesNet(plates={"i": 5})
+    net.add("on", bmc.Bernoulli(0.5))
+    net.add(
+        "level", lambda on: bmc.Normal(0.0, np.where(on, 2.0, 1.0) if not steep else 1 + 9 * on)
+    )
+    net.add(
+        "y", lambda on, level: bmc.Normal(np.sinh(level), np.where(on, precise, 1e3)), plates="i"
+    )
+    return net, {"y": np.sinh(3.0) + 1e-4 * np.array([0.3, -0.8, 1.1, -0.2, 0.5])}
+
+
+@pytest.mark.parametrize(("steep", "chosen"), [(True, bmc.Gibbs), (False, bmc.LikelihoodWeighting)])
+def test_weighting_is_taken_where_it_knows_what_each_state_weighs(
+    steep: bool, chosen: type
+) -> None:
+    """Half of all draws are of the state that is certain, if steep: hardly one of them fits."""
+    text = str(bmc.explain(*sensor(steep))).splitlines()
+    assert text[0].split()[1].startswith(chosen.__name__)
+    assert any("each joint state" in row for row in text) is not steep
