@@ -2,19 +2,22 @@
 
 Sums over even points are as good as exact for smooth functions under smooth densities (the trapezoidal rule);
 where a function jumps, as an event does, the place is found and what the sum gets wrong there is
-put right. Several numbers are averaged over point sets that have the mean and the covariance of the normal
-law, so that quadratic functions are exact; shifted sets give the error. Beliefs and nodes are not known here.
+put right. An event that no point saw, or every point, is looked for on finer points, and known no better than
+what lies between two of those. Several numbers are averaged over point sets that have the mean and the
+covariance of the normal law, so that quadratic functions are exact; shifted sets give the error. Beliefs and
+nodes are not known here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
-from bayesmc.errors import QueryError
+from bayesmc.errors import BayesmcError, QueryError
 
 #: what a function returns at points ``(count, [dimension])`` of beliefs ``(count,)``
 Evaluated = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -25,11 +28,43 @@ _HELD = 1 << 20
 _JUMP = 8.0
 #: jumps that are looked for at most; parts that their surroundings are cut into, so many times over
 _JUMPS, _PARTS, _ROUNDS = 1 << 18, 64, 3
+#: parts that gaps between points are cut into where an event was seen at no point, or at all
+_FINER = 4
 #: even points for a normal number, and how far they reach in standard deviations
 _POINTS, _REACH = 1024, 8.5
 #: shifted sets for several numbers, points in each at least and at most, and in those of all beliefs;
 #: dimensions up to which they are Kronecker's
 _SETS, _FEW, _MANY, _ALL, _KRONECKER = 8, 512, 1 << 14, 1 << 22, 16
+
+
+@contextmanager
+def naming(query: str) -> Iterator[None]:
+    """Errors about what a function of ``queries=`` returns say which one it is."""
+    try:
+        yield
+    except QueryError as error:
+        error.args = (f"queries={{{query!r}: ...}}: {error}", *error.args[1:])
+        raise
+
+
+def called(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+    """What a user's function returns for arrays of values.
+
+    Raises
+    ------
+    QueryError
+        It fails, as one written for single numbers does.
+    """
+    try:
+        return function(*arguments)
+    except BayesmcError:
+        raise
+    except Exception as error:
+        shapes = ", ".join(str(np.shape(a)) for a in arguments)
+        raise QueryError(
+            f"the function fails on arrays of shape {shapes} ({type(error).__name__}: {error}); it gets many "
+            "values at once, so write it with NumPy (& for and, np.where for if, np.maximum for max)"
+        ) from error
 
 
 def as_event(values: Any) -> np.ndarray:
@@ -50,7 +85,7 @@ def as_event(values: Any) -> np.ndarray:
 
 def over_line(
     evaluate: Evaluated, beliefs: int, points: np.ndarray, masses: np.ndarray
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Averages over one number, whose density is given at even points.
 
     Parameters
@@ -64,7 +99,9 @@ def over_line(
 
     Returns
     -------
-    ndarray, shape (beliefs, *shape)
+    mean, error : ndarray, shape (beliefs, *shape)
+        The error is zero, but for events (values 0 and 1) that were seen at no point or at every point: there
+        it is the largest probability between neighbouring points.
 
     Notes
     -----
@@ -73,14 +110,15 @@ def over_line(
     step = max(_HELD // len(points), 1)
     parts = []
     for low in range(0, beliefs, step):
-        count = min(step, beliefs - low)
-        own = masses if masses.ndim == 1 else masses[low : low + count]
-        parts.append(_summed(evaluate, low, count, points, own))
-    return np.concatenate(parts)
+        rows = np.arange(low, min(low + step, beliefs))
+        own = masses[None] if masses.ndim == 1 else masses[rows]
+        parts.append(_looked(evaluate, rows, points, own))
+    means, errors = zip(*parts, strict=True)
+    return np.concatenate(means), np.concatenate(errors)
 
 
-def over_normal(evaluate: Evaluated, beliefs: int) -> np.ndarray:
-    """Averages over one standard normal number, shape ``(beliefs, *shape)``; see ``over_line``."""
+def over_normal(evaluate: Evaluated, beliefs: int) -> tuple[np.ndarray, np.ndarray]:
+    """Averages over one standard normal number and their errors; see ``over_line``."""
     points = np.linspace(-_REACH, _REACH, _POINTS)
     masses = np.exp(-0.5 * points**2)
     return over_line(evaluate, beliefs, points, masses / masses.sum())
@@ -99,7 +137,8 @@ def over_normals(
     Returns
     -------
     mean, error : ndarray, shape (beliefs, *shape)
-        The error is that of the mean over shifted point sets.
+        The error is that of the mean over shifted point sets; of an event that was seen at no point, or at
+        every point, the share that one point stands for.
 
     Notes
     -----
@@ -113,31 +152,66 @@ def over_normals(
     for low in range(0, beliefs, step):
         at = np.repeat(np.arange(low, min(low + step, beliefs)), size)
         count = len(at) // size
-        each = []
+        each, plain = [], []
         for points in sets:
             values = np.asarray(evaluate(at, np.tile(points, (count, 1))), dtype=float)
-            each.append(values.reshape(count, size, *values.shape[1:]).mean(axis=1))
-        means.append(np.mean(each, axis=0))
-        errors.append(np.std(each, axis=0, ddof=1) / np.sqrt(_SETS))
+            values = values.reshape(count, size, *values.shape[1:])
+            each.append(values.mean(axis=1))
+            plain.append(_unseen(values))
+        mean = np.mean(each, axis=0)
+        # a mean of 0 or 1 in every set is that of an event, and no function that varies has it
+        same = ((mean == 0) | (mean == 1)) & (np.ptp(each, axis=0) == 0)
+        least = np.where(same & np.logical_and.reduce(plain), 1 / (size * _SETS), 0.0)
+        means.append(mean)
+        errors.append(np.maximum(np.std(each, axis=0, ddof=1) / np.sqrt(_SETS), least))
     return np.concatenate(means), np.concatenate(errors)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _looked(
+    evaluate: Evaluated, rows: np.ndarray, points: np.ndarray, masses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A few beliefs: sums, on finer points where an event was not seen, and their errors."""
+    found, unseen = _summed(evaluate, rows, points, masses)
+    error = np.zeros(found.shape)
+    again = np.flatnonzero(unseen.reshape(len(rows), -1).any(axis=1))
+    if not len(again) or len(points) < 2:
+        return found, error
+    part = np.arange(_FINER) / _FINER
+    finer = np.append((points[:-1, None] + part * np.diff(points)[:, None]).ravel(), points[-1])
+    own = np.moveaxis(masses if len(masses) == 1 else masses[again], 1, -1)
+    between = own[..., :-1, None] + part * np.diff(own)[..., None]
+    between = np.concatenate([between.reshape(*own.shape[:-1], -1), own[..., -1:]], axis=-1)
+    total = between.sum(axis=-1, keepdims=True)
+    share = np.divide(own.sum(axis=-1, keepdims=True), total, out=0 * total, where=total > 0)
+    between = np.moveaxis(between * share, -1, 1)
+    better, still = _summed(evaluate, rows[again], finer, between)
+    largest = between.max(axis=1)
+    largest = largest.reshape(largest.shape + (1,) * (found.ndim - largest.ndim))
+    was = unseen[again]
+    found[again] = np.where(was & ~still, better, found[again])
+    error[again] = np.where(was & still, largest, 0.0)
+    return found, error
+
+
+def _unseen(values: np.ndarray) -> np.ndarray:
+    """Where values ``(count, points, ...)`` are 0 at all points, or 1 at all."""
+    return (values == 0).all(axis=1) | (values == 1).all(axis=1)
+
+
 def _summed(
-    evaluate: Evaluated, low: int, count: int, points: np.ndarray, masses: np.ndarray
-) -> np.ndarray:
-    """A few beliefs: the sum, and what jumps make of it."""
-    size = len(points)
-    at = np.repeat(np.arange(low, low + count), size)
-    raw = np.asarray(evaluate(at, np.tile(points, count)))
+    evaluate: Evaluated, rows: np.ndarray, points: np.ndarray, masses: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """A few beliefs: the sum, and what jumps make of it; and where values are those of an event unseen."""
+    size, count = len(points), len(rows)
+    raw = np.asarray(evaluate(np.repeat(rows, size), np.tile(points, count)))
     values = raw.astype(float).reshape(count, size, *raw.shape[1:])
-    full = masses.reshape((1, size) if masses.ndim == 1 else masses.shape)
-    full = full.reshape(full.shape + (1,) * (values.ndim - full.ndim))
+    full = masses.reshape(masses.shape + (1,) * (values.ndim - masses.ndim))
     found = np.where(full > 0, full * values, 0.0).sum(axis=1)
     if size < 2 or not np.isfinite(values).all():
-        return found
+        return found, _unseen(values)
     gaps = np.abs(np.diff(values, axis=1))
     jumps = gaps > 0
     if raw.dtype.kind != "b":
@@ -148,13 +222,13 @@ def _summed(
     jumps &= wide[:, :-1] + wide[:, 1:] > 1e-14
     where = np.nonzero(jumps)
     if 0 < len(where[0]) <= _JUMPS:
-        _mend(evaluate, low, points, wide, values, where, found)
-    return found
+        _mend(evaluate, rows, points, wide, values, where, found)
+    return found, _unseen(values)
 
 
 def _mend(
     evaluate: Evaluated,
-    low: int,
+    rows: np.ndarray,
     points: np.ndarray,
     masses: np.ndarray,
     values: np.ndarray,
@@ -168,7 +242,7 @@ def _mend(
     count, inner = np.arange(len(row)), np.arange(1, _PARTS) / _PARTS
     for _ in range(_ROUNDS):
         tried = left[:, None] + inner * width[:, None]
-        here = np.asarray(evaluate(np.repeat(row + low, len(inner)), tried.ravel())).astype(float)
+        here = np.asarray(evaluate(np.repeat(rows[row], len(inner)), tried.ravel())).astype(float)
         here = here.reshape(*tried.shape, *here.shape[1:])
         here = here[(count[:, None], np.arange(len(inner)), *(r[:, None] for r in rest))]
         far = np.abs(here - one[:, None]) > np.abs(here - other[:, None])

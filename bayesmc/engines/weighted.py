@@ -25,9 +25,11 @@ from bayesmc.randomness import Purpose, stream
 from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
 from bayesmc.results.checkpoint import noted_densities
 
-#: share of the draws above which weights are even enough to leave their tail unfitted
+#: share of the draws above which weights are even: they have a heavy tail only if the largest one counts
 _EVEN = 0.5
-
+#: share of the sum of squared weights from which one weight counts; of weights that are bounded every share
+#: falls as 1 / draws, while k is large wherever a rare state has a larger weight than the others
+_COUNTS = 0.004
 
 #: draws at which the densities of a net that was declared anew are compared
 _COMPARED = 16
@@ -102,7 +104,7 @@ class WeightedEngine(Engine):
         weighted = self.is_weighted(problem)
         posterior = SumsPosterior(problem, self, sums, weighted)
         log_total = sums.top + float(np.log(sums.weight[0]))
-        self._set_evidence(posterior, log_total, self.draws, weighted)
+        self._set_evidence(posterior, log_total, self.draws, weighted, sums.tail.values())
         return posterior
 
     def _draws(
@@ -139,7 +141,7 @@ class WeightedEngine(Engine):
         few = _first(stored, problem)
         posterior.densities = None if few is None else noted_densities(problem, few)
         log_total = float(diagnostics.log_sum_exp(log_weights))
-        self._set_evidence(posterior, log_total, total, weighted)
+        self._set_evidence(posterior, log_total, total, weighted, log_weights)
         return posterior
 
     def _joined(
@@ -189,8 +191,13 @@ class WeightedEngine(Engine):
                 f"probability is zero or far too small for this engine; {self.zero_remedy}"
             )
 
-    def _set_evidence(self, posterior: Any, log_total: float, draws: int, weighted: bool) -> None:
-        """Log evidence, its error by the delta method, and a warning where it rests on too little."""
+    def _set_evidence(
+        self, posterior: Any, log_total: float, draws: int, weighted: bool, largest: np.ndarray
+    ) -> None:
+        """Log evidence, its error by the delta method, and a warning where it rests on too little.
+
+        ``largest`` are at least the largest log weights.
+        """
         posterior.log_marginal_likelihood = log_total - float(np.log(draws)) if weighted else 0.0
         posterior.log_marginal_likelihood_mcse = 0.0
         if not weighted:
@@ -204,13 +211,26 @@ class WeightedEngine(Engine):
                 LowEssWarning,
                 stacklevel=5,
             )
-        elif ess < _EVEN * draws and posterior.pareto_k > diagnostics.MAX_PARETO_K:
+        elif posterior.pareto_k > diagnostics.MAX_PARETO_K and (
+            ess < _EVEN * draws or _rests_on_one(largest, log_total, ess)
+        ):
             warnings.warn(
                 f"{self.label}: the weights have a heavy tail (Pareto k = {posterior.pareto_k:.2f}, "
                 f"above {diagnostics.MAX_PARETO_K}); answers converge slowly: {self.remedy}",
                 LowEssWarning,
                 stacklevel=5,
             )
+
+
+def _rests_on_one(largest: np.ndarray, log_total: float, ess: float) -> bool:
+    """Whether the largest weight counts among the squares, and no other is equal to it.
+
+    Where it has equals, weights are those of states and bounded.
+    """
+    top = float(largest.max())
+    if np.count_nonzero(largest > top - 1e-9) > 1:
+        return False
+    return ess * float(np.exp(2 * (top - log_total))) > _COUNTS
 
 
 class Kept:

@@ -81,7 +81,8 @@ class SeriesPosterior:
     row_deficits : ndarray or None, shape (time,) or (time, *plates)
         By how many nats per observed number each row is less likely than expected; 0 on average.
     queries_mcse : dict
-        Name -> standard errors of ``queries``, where the engine states some.
+        Name -> standard errors of ``queries``, where the engine states some. Of an event that no point of a
+        quadrature or grid saw, or every one, the largest probability between neighbouring points.
 
     Examples
     --------

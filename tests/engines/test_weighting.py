@@ -361,6 +361,25 @@ def test_tied_weights_are_no_heavy_tail() -> None:
                 assert not posterior.pareto_k > 0.7
 
 
+@pytest.mark.parametrize("seen", ["finite", "number"])
+def test_a_rare_state_of_larger_weight_is_no_heavy_tail(seen: str) -> None:
+    """Its weight is bounded: k is above 1, and the answers are as good as their error bars say."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Categorical([0.995, 0.005]))
+    net.add("x", bmc.Normal(0.0, 1.0))
+    if seen == "finite":
+        net.table("y", ["a"], [[0.9, 0.1], [0.1, 0.9]])
+    else:
+        net.add("y", lambda a, x: bmc.Normal(0.1 * x + 3.0 * a, 2.0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for seed in range(4):
+            for keep in ("draws", "summaries"):
+                evidence = {"y": 1 if seen == "finite" else 3.0}
+                posterior = bmc.infer(net, evidence, engine=weighting(20_000), rng=seed, keep=keep)
+    assert posterior.pareto_k > 0.7
+
+
 def test_error_bars_cover() -> None:
     """Of 300 answers, those within 2 standard errors: 95.4 % expected; below 91.5 % or above 98.5 % has
     probability 2e-3 (binomial)."""

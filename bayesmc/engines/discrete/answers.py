@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.averages import called, naming
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term
@@ -300,7 +301,7 @@ class SliceAnswers:
                 node = reader.model(term.kind, 0)[name]
                 value = np.broadcast_to(placed.value(name, 0), (*lead, *node.value_shape))
                 arguments.append(node.decode(value.reshape(count, *node.value_shape)))
-            values = read(function(*arguments))
+            values = read(called(function, arguments))
         if (
             not values.ndim
             or len(values) != count
@@ -322,7 +323,11 @@ class SliceAnswers:
 
 def answer_queries(answers: SliceAnswers, queries: Queries | None) -> dict[str, np.ndarray]:
     """Expectations of functions in every slice, by name."""
-    return {n: answers.expectation(f) for n, f in (queries or {}).items()}
+    found = {}
+    for name, function in (queries or {}).items():
+        with naming(name):
+            found[name] = answers.expectation(function)
+    return found
 
 
 def best_path(run: Run) -> dict[Variable, np.ndarray] | None:

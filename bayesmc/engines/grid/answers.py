@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions import Distribution
-from bayesmc.engines.averages import over_line
+from bayesmc.engines.averages import called, over_line
 from bayesmc.engines.grid.moves import COUNTS
 from bayesmc.engines.grid.refined import Fine, cell_quantiles, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
@@ -144,11 +144,12 @@ class Answers:
         self,
         function: Callable[..., Any],
         read: Callable[[Any], np.ndarray] = np.asarray,
-    ) -> np.ndarray:
-        """Mean of a function of nodes of the slice, whose arguments have a leading axis of cells.
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean of a function of nodes of the slice, whose arguments have a leading axis of cells; its error.
 
         ``read`` makes an array of what it returns. Where it reads one number on even cells, finite nodes
-        beside, the cells are cut into finer ones.
+        beside, the cells are cut into finer ones. The error is zero, but for an event that no cell saw, or
+        every cell: there it is the largest probability of a cell of one number.
         """
         names = nodes_read(function)
         for name in names:
@@ -161,9 +162,9 @@ class Answers:
                 )
         nodes = [self._node(n) for n in names]
 
-        def called(values: Sequence[np.ndarray], cells: int) -> np.ndarray:
+        def on_cells(values: Sequence[np.ndarray], cells: int) -> np.ndarray:
             result = read(
-                function(*(node.decode(v) for node, v in zip(nodes, values, strict=True)))
+                called(function, [node.decode(v) for node, v in zip(nodes, values, strict=True)])
             )
             apart = self.model.lead
             if result.shape[: 1 + len(apart)] != (cells, *apart):
@@ -174,7 +175,7 @@ class Answers:
                 )
             return result
 
-        return self._averaged(names, called)
+        return self._averaged(names, on_cells)
 
     def quantile(self, name: str, levels: np.ndarray) -> np.ndarray:
         """Quantiles of a node on the grid, number by number, shape ``(*levels.shape, *plates, *event)``.
@@ -221,24 +222,37 @@ class Answers:
     # ---- private -------------------------------------------------------------------------------
 
     def _averaged(
-        self, names: Sequence[str], called: Callable[[Sequence[np.ndarray], int], np.ndarray]
-    ) -> np.ndarray:
-        """The average of a function over all cells, of arguments ``(cells, *value_shape)``."""
+        self, names: Sequence[str], on_cells: Callable[[Sequence[np.ndarray], int], np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The average of a function over all cells, of arguments ``(cells, *value_shape)``; its error."""
         values = {n: self._value(n) for n in names}
         kept = [(self._node(n), v, 0) for n, v in values.items() if v is not None]
         labels = self._used(kept)
-        found = self._over_fine(names, called, labels)
+        found = self._over_fine(names, on_cells, labels)
         if found is not None:
             return found
         sizes = self._sizes()
         grid = tuple(sizes[x] if x in labels else 1 for x in self._labels())
         cells = math.prod(grid)
         arguments = [self._wide(node, value, grid) for node, value, _ in kept]
-        result = called(arguments, cells).astype(float)
+        result = on_cells(arguments, cells).astype(float)
         weights = self._marginal(labels).reshape(
             (cells, *self.model.lead) + (1,) * (result.ndim - 1 - len(self.model.lead))
         )
-        return np.where(weights > 0, weights * result, 0.0).sum(axis=0)
+        mean = np.where(weights > 0, weights * result, 0.0).sum(axis=0)
+        unseen = (result == 0).all(axis=0) | (result == 1).all(axis=0)
+        return mean, np.where(unseen, self._widest(labels, mean.ndim), 0.0)
+
+    def _widest(self, labels: set[Label], rank: int) -> np.ndarray:
+        """The largest probability of a cell of any one number, shape ``(*apart, 1, ...)`` of this rank."""
+        first, apart = self.model.slices.first, len(self.model.lead)
+        widest = np.zeros(self.model.lead)
+        for x in labels:
+            node = first[str(x[0]).removesuffix(PREVIOUS)]  # type: ignore[index]
+            if node.domain is None and not node.is_discrete:
+                shares = self._marginal({x}).reshape(-1, *self.model.lead)
+                widest = np.maximum(widest, shares.max(axis=0))
+        return widest.reshape(self.model.lead + (1,) * (rank - apart))
 
     def _wide(self, node: CompiledNode, value: np.ndarray, grid: Sequence[int]) -> np.ndarray:
         """Values over the grid with one axis for all its cells."""
@@ -250,9 +264,9 @@ class Answers:
     def _over_fine(
         self,
         names: Sequence[str],
-        called: Callable[[Sequence[np.ndarray], int], np.ndarray],
+        on_cells: Callable[[Sequence[np.ndarray], int], np.ndarray],
         labels: set[Label],
-    ) -> np.ndarray | None:
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """The same on finer cells of the one number that is read; None where there is none, or several."""
         first = self.model.slices.first
         numbers = [x for x in labels if first[str(x[0]).removesuffix(PREVIOUS)].domain is None]  # type: ignore[index]
@@ -282,11 +296,16 @@ class Answers:
                 wide = self._wide(own, value, grid)
                 wide = wide.reshape(math.prod(grid[:spot]), len(points), -1, *own.value_shape)
                 arguments.append(np.moveaxis(wide, 1, 0).reshape(-1, *own.value_shape))
-            result = called(arguments, len(points) * states)
+            result = on_cells(arguments, len(points) * states)
             return result.reshape(len(points), states, *result.shape[1:])
 
         masses = fine.masses.reshape(len(fine.points), states, *self.model.lead)
-        return over_line(evaluate, 1, fine.points, masses[None])[0].sum(axis=0)
+        means, errors = (x[0] for x in over_line(evaluate, 1, fine.points, masses[None]))
+        mean = means.sum(axis=0)
+        # a state in which the event never holds beside one in which it does says nothing of points
+        unseen = (errors > 0).any(axis=0) & ((means == 0) | (errors > 0)).all(axis=0)
+        unseen &= (mean == 0) | (np.abs(mean - masses.sum(axis=(0, 1)).max()) < 1e-9)
+        return mean, np.where(unseen, errors.sum(axis=0), 0.0)
 
     def _fine(self, label: Label, labels: set[Label]) -> Fine | None:
         """The belief on finer cells of a number, shape (J, *others, *apart); None where it has none."""
@@ -314,15 +333,17 @@ class Answers:
             return None
         front = [1 + plates.index(p) for p in apart]
 
-        def called(values: Sequence[np.ndarray], cells: int) -> np.ndarray:
+        def on_cells(values: Sequence[np.ndarray], cells: int) -> np.ndarray:
             result = np.asarray(function(values[0]))
             return np.moveaxis(result, front, range(1, 1 + len(front)))
 
         value = self._value(node.name)
         assert value is not None
-        found = self._over_fine([node.name], called, self._used([(node, value, 0)]))
+        found = self._over_fine([node.name], on_cells, self._used([(node, value, 0)]))
         return (
-            None if found is None else np.moveaxis(found, range(len(front)), [k - 1 for k in front])
+            None
+            if found is None
+            else np.moveaxis(found[0], range(len(front)), [k - 1 for k in front])
         )
 
     def _node(self, name: str) -> CompiledNode:

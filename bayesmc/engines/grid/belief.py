@@ -138,12 +138,12 @@ class GridBelief(OnlineBelief):
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Mean of a function of nodes of the slice, whose arguments have a leading axis of cells."""
         with self._quiet():
-            return self._answers.expectation(function)
+            return self._answers.expectation(function)[0]
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probability of an event (a function that returns booleans)."""
         with self._quiet():
-            return self._answers.expectation(function, as_event)
+            return self._answers.expectation(function, as_event)[0]
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles of a node of one number, shape ``(*q.shape, *plates)``."""

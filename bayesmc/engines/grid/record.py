@@ -9,7 +9,7 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.averages import as_event
+from bayesmc.engines.averages import as_event, naming
 from bayesmc.engines.exact import readable_bytes
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.grid.answers import Answers
@@ -44,6 +44,7 @@ class GridRecord:
         self.unanswered: set[str] = set()
         self.answers: dict[int, Answers] | None = {} if densities else None
         self.queries: dict[str, list[Any]] = {n: [None] * steps for n in queries}
+        self.errors: dict[str, list[Any]] = {n: [None] * steps for n in queries}
         for name in problem.hidden:
             node = problem.model[name]
             if _one_domain(problem, name):
@@ -74,7 +75,8 @@ class GridRecord:
         for name, kept in self.densities.items():
             kept[k] = answers.density(name)
         for name, function in self.asked.items():
-            self.queries[name][k] = answers.expectation(function)
+            with naming(name):
+                self.queries[name][k], self.errors[name][k] = answers.expectation(function)
 
     def posterior(
         self, engine: Any, kind: str, increments: np.ndarray, steps: int | None = None
@@ -97,6 +99,7 @@ class GridRecord:
             queries={n: np.stack(rows[:k]) for n, rows in self.queries.items()},
             start=self.problem.series.start,
         )
+        found.queries_mcse = {n: np.stack(rows[:k]) for n, rows in self.errors.items()}
         if self.answers is not None:
             found.answers = [self.answers[t] for t in range(k)]
         return found
@@ -145,11 +148,11 @@ class GridPosterior(SeriesPosterior):
         ------
         UnknownNodeError, QueryError
         """
-        return self._of_all("expectation", lambda one: one.expectation(function))
+        return self._of_all("expectation", lambda one: one.expectation(function)[0])
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probabilities of an event (a function that returns booleans), time first."""
-        return self._of_all("probability", lambda one: one.expectation(function, as_event))
+        return self._of_all("probability", lambda one: one.expectation(function, as_event)[0])
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles of a node, number by number, shape ``(time, *q.shape, *plates, *event)``."""
@@ -197,6 +200,7 @@ class GridPosterior(SeriesPosterior):
             tables=cut._tables, means=cut._means, variances=cut._variances, queries=cut.queries,
             steps=steps, start=cut.start,
         )  # fmt: skip
+        found.queries_mcse = cut.queries_mcse
         found.answers = None if self.answers is None else self.answers[-steps:]
         return found
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.averages import naming
 from bayesmc.engines.filtering import Queries, observed_answers
 from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.passes import Filtered, Smoothed
@@ -86,7 +87,8 @@ def _answers(
     found.predictive = filtered.innovations.predictive()
     found.view = View(layout, means, spreads, _known(problem, data, steps))
     for name, function in (queries or {}).items():
-        found.queries[name], found.queries_mcse[name] = expectation(found.view, function)
+        with naming(name):
+            found.queries[name], found.queries_mcse[name] = expectation(found.view, function)
     return found
 
 

@@ -111,7 +111,8 @@ class GaussianSeries(SeriesPosterior):
         """Means of a function of nodes of a slice, time first, its arguments with an axis of points first.
 
         One number is averaged to rounding, jumps included; several over 4,096 points that make cubic
-        functions exact (``queries=`` has the standard errors in ``queries_mcse``).
+        functions exact (``queries=`` has the standard errors in ``queries_mcse``). An event that no point
+        saw, or every point, is known no better than what lies between two points, some 0.002 for one number.
         """
         return expectation(self.view, function)[0]
 

@@ -15,7 +15,7 @@ from scipy.special import ndtri
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.averages import as_event, over_normal, over_normals
+from bayesmc.engines.averages import as_event, called, over_normal, over_normals
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network.reading import nodes_read
@@ -106,9 +106,13 @@ def expectation(
             return _called(view, function, names, at, numbers, event)
 
         if several:
-            return over_normals(evaluate, len(chosen), dimension)
-        mean = over_normal(evaluate, len(chosen))
-        return mean, np.zeros(mean.shape)
+            mean, error = over_normals(evaluate, len(chosen), dimension)
+        else:
+            mean, error = over_normal(evaluate, len(chosen))
+        varies = roots[chosen].any(axis=(-2, -1))  # what is known is seen at its only point
+        return mean, np.where(
+            varies.reshape(varies.shape + (1,) * (mean.ndim - varies.ndim)), error, 0.0
+        )
 
     found: tuple[Any, Any] = (None, None)
     for several in (False, True):
@@ -164,7 +168,7 @@ def _called(
             value = known[at] if timed else np.broadcast_to(known, (len(at), *known.shape))
         arguments.append(node.decode(value))
     with marking_invalid(), np.errstate(all="ignore"):
-        values = np.asarray(function(*arguments))
+        values = np.asarray(called(function, arguments))
     if values.shape[: 1 + len(layout.lead)] != (len(at), *layout.lead):
         more = f", the plates {layout.apart} next" if layout.apart else ""
         raise QueryError(

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.engines.averages import called
 from bayesmc.engines.particles.cloud import Cloud, Layout
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
@@ -43,7 +44,7 @@ def evaluated(
         node = model[name]
         shape = (len(cloud.weights), *node.value_shape)
         arguments.append(node.decode(np.broadcast_to(cloud.values[name], shape)))
-    values = read(np.asarray(function(*arguments)))
+    values = read(np.asarray(called(function, arguments)))
     if not values.ndim or len(values) != len(cloud.weights):
         raise QueryError(
             f"a query returns shape {values.shape}; it must return one value per particle, the axis of "

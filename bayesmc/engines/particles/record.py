@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.averages import naming
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.particles.accuracy import MeanErrors, value_errors
 from bayesmc.engines.particles.answers import (
@@ -99,7 +100,8 @@ class Record:
             else:
                 self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
         for name, function in self.asked.items():
-            values = evaluated(layout, cloud, self.problem.model, function)
+            with naming(name):
+                values = evaluated(layout, cloud, self.problem.model, function)
             mean = weighted_mean(cloud, values)
             self.queries[name].append(mean)
             if families is not None:
