@@ -232,15 +232,15 @@ def _least_within(posterior: DrawsPosterior, names: Sequence[str]) -> float:
             code, count = code * domain.size + element, count * domain.size
             if count > _WEIGHTED:
                 return 0.0
-    code = code.ravel()
+    states = code.ravel()
     logs = np.zeros(posterior._shape) if posterior.log_weights is None else posterior.log_weights
     logs = np.ravel(logs)
     largest = np.full(count, -np.inf)
-    np.maximum.at(largest, code, logs)
+    np.maximum.at(largest, states, logs)
     if not np.isfinite(largest).all():  # a state without draws, or none of them possible
         return 0.0
-    weights = np.exp(logs - largest[code])
-    total, squares = (np.bincount(code, w, count) for w in (weights, weights**2))
+    weights = np.exp(logs - largest[states])
+    total, squares = (np.bincount(states, w, count) for w in (weights, weights**2))
     return float((total**2 / squares).min())
 
 
