@@ -218,7 +218,7 @@ def _screen(values: np.ndarray, block: int) -> tuple[float, float]:
     if draws < 4 * block:
         return np.nan, np.nan
     count = min(_BATCHES, draws // block)
-    values = values[:, : draws // block // count * block * count]
+    values = values[:, : draws // block // count * block * count].astype(float, copy=False)  # flags
     sample = values.ravel()[:: (values.size // _SAMPLE) | 1]
     with np.errstate(all="ignore"):  # infinite draws, and scalars that hardly ever move
         low, middle, high = np.quantile(sample, [0.05, 0.5, 0.95])

@@ -622,3 +622,13 @@ def test_the_check_is_cheap(chains: int, draws: int, size: int) -> None:
     start = time.process_time()
     assert poor_mixing(posterior, frozenset()) == []
     assert time.process_time() - start < 1.0
+
+
+def test_flags_that_are_computed_are_judged_too() -> None:
+    """Truth values of a deterministic node are numbers to the screen of convergence."""
+    net = bmc.BayesNet()
+    net.add("m", bmc.Normal(0.0, 1.0))
+    net.add("big", lambda m: m > 0.3)
+    net.add("y", lambda m, big: bmc.StudentT(3, m + big, 1))
+    posterior = bmc.infer(net, {"y": 0.5}, engine=bmc.Gibbs(300, 100), rng=1)
+    assert posterior.mean("big") == (posterior["m"] > 0.3).mean()

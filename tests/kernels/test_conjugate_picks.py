@@ -210,7 +210,7 @@ def test_a_state_that_breaks_the_form_takes_a_slice() -> None:
 
 # ---- rows, which take no slice -------------------------------------------------------------------
 
-COUNTS = np.array([18, 1, 1])
+COUNTS = np.array([12, 4, 4])
 
 
 def rows(switches: int, breaks: bool) -> bmc.BayesNet:
