@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtri
 
-from bayesmc.errors import BayesmcError, QueryError
+from bayesmc.errors import QueryError
 
 #: what a function returns at points ``(count, [dimension])`` of beliefs ``(count,)``
 Evaluated = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -35,6 +35,10 @@ _POINTS, _REACH = 1024, 8.5
 #: shifted sets for several numbers, points in each at least and at most, and in those of all beliefs;
 #: dimensions up to which they are Kronecker's
 _SETS, _FEW, _MANY, _ALL, _KRONECKER = 8, 512, 1 << 14, 1 << 22, 16
+
+
+#: what functions raise that are written for single numbers
+_OF_ONE_NUMBER = (TypeError, ValueError, AttributeError, IndexError)
 
 
 @contextmanager
@@ -57,9 +61,9 @@ def called(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
     """
     try:
         return function(*arguments)
-    except BayesmcError:
-        raise
-    except Exception as error:
+    except _OF_ONE_NUMBER as error:
+        if type(error) not in _OF_ONE_NUMBER:  # an error of the user's own
+            raise
         shapes = ", ".join(str(np.shape(a)) for a in arguments)
         raise QueryError(
             f"the function fails on arrays of shape {shapes} ({type(error).__name__}: {error}); it gets many "
