@@ -16,6 +16,9 @@ import bayesmc as bmc
 from bayesmc.errors import GridWarning
 from bayesmc.testing import session
 
+#: levels shift and bursts come that the models do not have
+pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ModelMisfitWarning")
+
 Made = tuple[bmc.DynamicBayesNet, dict[str, Any], Any]
 
 

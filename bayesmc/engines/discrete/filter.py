@@ -259,7 +259,7 @@ class DiscreteFilter(FilterEngine):
                 queries=answer_queries(answers, queries),
                 start=problem.series.start,
             )  # fmt: skip
-            found.predictive = rows_compared(problem, run, seed)
+            found.predictive = rows_compared(problem, run)
             run.forget()
             bar.advance()
         return found.read_from(answers)
