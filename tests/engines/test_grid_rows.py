@@ -62,7 +62,7 @@ def test_the_grid_that_is_taken_unasked_notices_rows_of_another_kind(name: str) 
     y = drawn(dbn, 60, 1)
     found = bmc.filter(dbn, {"y": y}, rng=2)  # warnings are errors
     assert isinstance(found.engine, bmc.GridFilter)
-    assert np.isfinite(found.row_ranks).sum() >= 8 and np.nanmean(found.row_deficits) < 1.0
+    assert np.isfinite(found.row_ranks).sum() >= 5 and np.nanmean(found.row_deficits) < 1.0
     wrong = series(0.05, 0.15) if name == "binomial" else dbn
     with pytest.warns(ModelMisfitWarning, match="GridFilter: .* rows compared in slices") as said:
         lost = bmc.filter(wrong, {"y": other(y)}, rng=2)
