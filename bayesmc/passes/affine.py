@@ -7,7 +7,7 @@ matrices.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -203,9 +203,10 @@ def _chosen(condition: Expression, first: Affine, second: Affine, shape: tuple[i
     return Affine(broadcast(offset, shape), both.reads)
 
 
-def _mapped(form: Affine, move: object, shape: tuple[int, ...]) -> Affine:
+def _mapped(
+    form: Affine, move: Callable[[Expression], Expression], shape: tuple[int, ...]
+) -> Affine:
     """Elements looked up along the first axis."""
-    assert callable(move)
     offset = move(broadcast(form.offset, shape))
     return Affine(offset, {n: Read(move(r.gain), move(r.at)) for n, r in form.reads.items()})
 
