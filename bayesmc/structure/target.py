@@ -16,8 +16,10 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError, DensityError
+from bayesmc.errors import BayesmcError, DensityError, TraceError
+from bayesmc.expression import Expression
 from bayesmc.network import Model, Observed, Problem
+from bayesmc.network.expressions import Followed, Opaque, density, log_density_of
 from bayesmc.network.model import invalid_error
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
@@ -55,6 +57,27 @@ class Term:
     def scope(self) -> tuple[str, ...]:
         """The nodes it reads directly, its own among them."""
         return self.parents if self.is_potential else (*self.parents, self.name)
+
+    @cached_property
+    def read(self) -> Followed | Opaque:
+        """What its function computes of stochastic nodes and inputs."""
+        if self.is_potential:
+            return Opaque("it is a potential", frozenset(self.parents))
+        return density(self.model, self.name)
+
+    @cached_property
+    def expression(self) -> Expression | None:
+        """Its log density, shape its plates, of stored values of stochastic nodes and inputs.
+
+        None where the function could not be followed, or the family has no closed form. Its mask is left
+        to those who sum.
+        """
+        if isinstance(self.read, Opaque):
+            return None
+        try:
+            return log_density_of(self.model, self.name)
+        except TraceError:
+            return None
 
     @cached_property
     def rejects(self) -> bool:
