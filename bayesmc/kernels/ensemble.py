@@ -202,6 +202,8 @@ class BlockWalk(Kernel):
         return {**memory, "steps": self.steps.frozen(memory["steps"])}
 
     def acceptance(self, memory: Memory) -> np.ndarray | None:
+        if self.anew == 1.0 and memory["mixture"] is None:
+            return None
         return memory["accepted"] / max(memory["moves"], 1)
 
     def replaced(self, memory: Memory, rows: np.ndarray) -> Memory:

@@ -7,7 +7,7 @@ their shares, which chains that start in one of them cannot know.
 References
 ----------
 Cappe, Douc, Guillin, Marin and Robert (2008), Adaptive importance sampling in general mixture classes,
-Statistics and Computing 18; Del Moral, Doucet and Jasra (2006), Sequential Monte Carlo samplers, JRSS B 68
+Statistics and Computing 18; Ionides (2008), Truncated importance sampling, JCGS 17; Del Moral, Doucet and Jasra (2006), Sequential Monte Carlo samplers, JRSS B 68
 (temperatures); Givens and Raftery (1996), Local adaptive importance sampling, JASA 91 (local covariances).
 """
 
@@ -24,8 +24,10 @@ from bayesmc.resampling import systematic
 
 #: components of a mixture, and degrees of freedom of each
 _COMPONENTS, _DF = 128, 4.0
-#: share of the mass that lies about a component, whose spread it has
-_NEAR = 0.05
+#: share of the mass that lies about a component, whose spread it has: hills that weigh less look too wide
+_NEAR = 0.03
+#: share of all draws that come from the first, wide mixture, and its components that are kept for that
+_WIDE, _KEPT = 0.05, 32
 #: share of draws that a temperature leaves effective, and temperatures at most
 _LEFT, _ROUNDS = 0.2, 40
 #: share of the final draws that must be effective for the mixture to be of use
@@ -111,9 +113,10 @@ def fitted_mixture(
         heat = _hotter(target - from_first, from_first - log_q, heat)
         log_w = heat * (target - from_first) + from_first - log_q
         weights = np.exp(log_w - log_w.max())
-        weights /= weights.sum()
-        current = _about(u, weights, rng)
-        effective = 1.0 / (weights @ weights) / count
+        effective = weights.sum() ** 2 / (weights @ weights) / count
+        # one draw far out must not be all that the next are drawn about (Ionides 2008)
+        weights = np.minimum(weights, weights.mean() * math.sqrt(count))
+        current = _with(_about(u, weights / weights.sum(), rng), first)
         if heat == 1.0 and effective >= 0.5 * _LEFT:
             return current
     return current if heat == 1.0 and effective >= _USEFUL else None
@@ -142,6 +145,17 @@ def _hotter(gain: np.ndarray, base: np.ndarray, heat: float) -> float:
     return max(low, heat)
 
 
+def _with(mixture: MixtureOfT, wide: MixtureOfT) -> MixtureOfT:
+    """A mixture that has some of a wide one's components, too, which bound the weights of its draws."""
+    at = slice(None, None, -(-len(wide.shares) // _KEPT))
+    shares = (1.0 - _WIDE) * mixture.shares, _WIDE * wide.shares[at] / wide.shares[at].sum()
+    return MixtureOfT(
+        np.concatenate(shares),
+        np.concatenate([mixture.centres, wide.centres[at]]),
+        np.concatenate([mixture.roots, wide.roots[at]]),
+    )
+
+
 def _about(u: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> MixtureOfT:
     """A mixture about weighted points, each component as wide as the mass around it."""
     chosen, times = np.unique(systematic(weights, _COMPONENTS, rng), return_counts=True)
@@ -164,6 +178,7 @@ def _about(u: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> Mixt
     local /= local.sum(axis=1, keepdims=True)
     cov = np.einsum("kn,knd,kne->kde", local, off, off)
     wide = np.trace(cov, axis1=1, axis2=2) / d
-    cov = cov + (0.02 * wide + 1e-12)[:, None, None] * np.eye(d)
+    # of a few points in many directions a covariance comes out too small
+    cov = (1.0 + 0.25 * d) * cov + (0.02 * wide + 1e-12)[:, None, None] * np.eye(d)
     roots = np.linalg.cholesky(cov) * spread[:, None]
     return MixtureOfT(times / times.sum(), centres, roots)
