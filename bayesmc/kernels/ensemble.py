@@ -44,7 +44,7 @@ _NOISE = 1e-2
 #: kinds of moves: a Gaussian step, a difference of adapted length, a difference as it is, a draw anew
 _GAUSSIAN, _DIFFERENCE, _JUMP, _ANEW = 0, 1, 2, 3
 #: numbers to which a mixture is fitted, at most; draws it is fitted with; share of moves that draw from it
-FEW, _DRAWS, AFRESH = 6, 1000, 0.25
+FEW, _DRAWS, AFRESH = 6, 1000, 0.5
 #: numbers that one evaluation of the mixture's draws may take
 _ELEMENTS = 1 << 23
 

@@ -7,8 +7,9 @@ their shares, which chains that start in one of them cannot know.
 References
 ----------
 Cappe, Douc, Guillin, Marin and Robert (2008), Adaptive importance sampling in general mixture classes,
-Statistics and Computing 18; Ionides (2008), Truncated importance sampling, JCGS 17; Del Moral, Doucet and Jasra (2006), Sequential Monte Carlo samplers, JRSS B 68
-(temperatures); Givens and Raftery (1996), Local adaptive importance sampling, JASA 91 (local covariances).
+Statistics and Computing 18; Del Moral, Doucet and Jasra (2006), Sequential Monte Carlo samplers, JRSS B 68
+(temperatures); Givens and Raftery (1996), Local adaptive importance sampling, JASA 91 (local covariances);
+Ionides (2008), Truncated importance sampling, JCGS 17.
 """
 
 from __future__ import annotations
