@@ -26,6 +26,8 @@ from bayesmc.tracing.standin import TracedCall, is_traced
 _CHANGING = frozenset(("time", "random", "datetime", "secrets", "uuid", "os"))
 #: modules whose functions are left as they are
 _KNOWN = frozenset(("numpy", "scipy", "bayesmc", "builtins", "math"))
+#: of these, where some functions are replaced
+_REPLACED = frozenset(("numpy", "scipy"))
 #: of these, where functions stand that users call in theirs
 _OPEN = ("bayesmc.robotics", "bayesmc.distributions")
 
@@ -50,8 +52,7 @@ def tells_time_or_chance(function: Any) -> str | None:
             found = _changing(name, held, value)
             if found is not None:
                 return found
-            if isinstance(held, types.FunctionType) and _is_open(held):
-                todo.append(held)
+            todo += _behind(held, value)
     return None
 
 
@@ -94,6 +95,19 @@ def _globals(code: types.CodeType) -> frozenset[str]:
     return frozenset(found).union(
         *(_globals(c) for c in code.co_consts if isinstance(c, types.CodeType))
     )
+
+
+def _behind(value: Any, function: types.FunctionType) -> list[types.FunctionType]:
+    """Functions of users that one calls through what it reads: itself, a module's, methods of an object."""
+    if isinstance(value, (types.FunctionType, types.MethodType)):
+        found = [getattr(value, "__func__", value)]
+    else:
+        holder = value if isinstance(value, (type, types.ModuleType)) else type(value)
+        if isinstance(holder, type) and _room(holder) in _KNOWN:
+            return []
+        names = ("__init__", "__call__", *_names(function.__code__))
+        found = [vars(kind).get(n) for kind in (holder, *getattr(holder, "__mro__", ())) for n in names]
+    return [f for f in found if isinstance(f, types.FunctionType) and _is_open(f)]
 
 
 def _changing(name: str, value: Any, function: types.FunctionType) -> str | None:
@@ -147,7 +161,7 @@ def _lifted(value: Any, seen: dict[int, types.FunctionType]) -> Any:
         return TracedArray(constant(value))
     if isinstance(value, types.FunctionType) and _is_open(value):
         return _lifted_function(value, seen)
-    if isinstance(value, types.ModuleType) and value.__name__.split(".")[0] in ("numpy", "scipy"):
+    if isinstance(value, types.ModuleType) and not _is_left(value):
         return _Module(value)
     try:
         return _INSTEAD.get(value, value)
@@ -156,19 +170,18 @@ def _lifted(value: Any, seen: dict[int, types.FunctionType]) -> Any:
 
 
 class _Module:
-    """A module of NumPy or SciPy with some functions replaced."""
+    """A module with what it holds lifted when it is asked for."""
 
     def __init__(self, module: types.ModuleType) -> None:
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        value = getattr(self._module, name)
-        if isinstance(value, types.ModuleType):
-            return _Module(value)
-        try:
-            return _INSTEAD.get(value, value)
-        except TypeError:
-            return value
+        return _lifted(getattr(self._module, name), {})
+
+
+def _is_left(module: types.ModuleType) -> bool:
+    """Whether a module's functions are called as they are."""
+    return module.__name__.split(".")[0] in _KNOWN - _REPLACED and not module.__name__.startswith(_OPEN)
 
 
 def _if_traced(original: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:

@@ -18,6 +18,7 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support
 from bayesmc.errors import ModelError, ParameterError, ShapeError
+from bayesmc.expression import as_one_call
 from bayesmc.robotics.pose_distributions import POSES
 from bayesmc.shapes import Shape, first_index, read_only
 
@@ -168,6 +169,7 @@ class OccupancyGrid:
         """
         return self._within(self.cell_of(points))
 
+    @as_one_call
     def cell_of(self, points: Any) -> np.ndarray:
         """The cell of each point; beyond the map, an index below 0 or of ``shape`` and above.
 
@@ -318,6 +320,7 @@ class FreeSpace(Distribution):
         cells = np.stack(np.divmod(self._cells, self.grid.shape[1]), axis=-1)
         return read_only(self.grid.center_of(cells))
 
+    @as_one_call
     def cell_of(self, poses: Any) -> np.ndarray:
         """Which of its cells (their number in ``centers``) poses lie in, shape (...): -1 for none."""
         poses = np.asarray(poses, dtype=float)
