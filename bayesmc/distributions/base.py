@@ -7,8 +7,6 @@ log probability the broadcast of the value's and the distribution's batch. A fam
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,6 +15,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from bayesmc.distributions.keywords import check_keywords, signature
 from bayesmc.distributions.reading import read_floats
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Transform, transform_of
@@ -59,10 +58,12 @@ class Distribution:
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """A new distribution; of traced parameters, a record of the call in its place."""
+        if kwargs:
+            check_keywords(cls, kwargs.keys())
         if not _may_be_traced(args) and not (kwargs and _may_be_traced(kwargs.values())):
             return super().__new__(cls)
         if any(map(is_traced, args)) or any(map(is_traced, kwargs.values())):
-            bound = _signature(cls).bind(*args, **kwargs)  # type: ignore[arg-type]
+            bound = signature(cls).bind(*args, **kwargs)  # type: ignore[arg-type]
             bound.apply_defaults()
             return TracedCall(cls, dict(bound.arguments))
         return super().__new__(cls)
@@ -424,11 +425,6 @@ def _may_be_traced(parameters: Iterable[Any]) -> bool:
         if type(parameter) not in _PLAIN:
             return True
     return False
-
-
-@functools.cache
-def _signature(family: type) -> inspect.Signature:
-    return inspect.signature(family)
 
 
 def as_float(value: Any) -> np.ndarray:

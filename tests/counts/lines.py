@@ -96,7 +96,9 @@ def report() -> Iterator[str]:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _docstring(node: ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) -> set[int]:
+def _docstring(
+    node: ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef,
+) -> set[int]:
     if ast.get_docstring(node, clean=False) is None:
         return set()
     first = node.body[0]
