@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import io
 import tokenize
 from collections import Counter
@@ -34,13 +35,19 @@ class Length:
     what: str
 
 
+@functools.lru_cache(maxsize=2048)
+def parsed(text: str) -> ast.Module:
+    """The syntax tree of a module, which several counts read."""
+    return ast.parse(text)
+
+
 def code_lines(text: str) -> int:
     """Lines that hold code: docstrings, comments and blank lines apart."""
     lines: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(text).readline):
         if token.type not in _SILENT:
             lines.update(range(token.start[0], token.end[0] + 1))
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(parsed(text)):
         if isinstance(node, _WITH_DOCSTRING):
             lines -= _docstring(node)
     return len(lines)
@@ -107,7 +114,7 @@ def _docstring(
 
 
 def _functions(path: str, text: str) -> Iterator[Length]:
-    for node in ast.walk(ast.parse(text)):
+    for node in ast.walk(parsed(text)):
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
             assert node.end_lineno is not None
             lines = node.end_lineno - node.lineno + 1 - len(_docstring(node))
