@@ -50,6 +50,9 @@ class Distribution:
 
     event_shape: Shape = ()
     batch_shape: Shape = ()
+    #: a family's log density as a NumPy function of a value and the parameters by name, for engines that read
+    #: its form (conjugate updates, derivatives); ``log_prob`` is it, too, unless ``_log_prob`` is given
+    log_density: ClassVar[Callable[..., Any] | None] = None
     #: batch elements with parameters out of range (only while these are marked), else None
     invalid: np.ndarray | None = None
     problem: ParameterError | None = None
@@ -236,7 +239,10 @@ class Distribution:
         raise NotImplementedError
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
+        form = type(self).log_density
+        if form is None:
+            raise NotImplementedError
+        return form(x, **{name: getattr(self, name) for name in self.parameter_ndim})
 
     # ---- what went wrong, once something has ------------------------------------------------
 
