@@ -1,8 +1,8 @@
 """Log densities of families as expressions of value and parameters.
 
 Closed forms in NumPy, one for each family; what ``Distribution.log_prob`` computes in tuned code is the same
-to rounding, which the tests hold. Outside the support they are minus infinity. A family of a user's own brings
-its form along (``Distribution.log_density``), which is held against its ``log_prob`` where it is used.
+to rounding, which the tests hold. Outside the support they are minus infinity. A user's family brings its
+form along (``Distribution.log_density``), which is held against its ``log_prob`` where it is used.
 
 References
 ----------
@@ -107,14 +107,15 @@ def _log_density(family: Family, x: Any) -> Any:
 
 def _own_form(family: Family, x: Any) -> Any:
     """The form that a family brings along, read like any function of a user's."""
-    names = [n for n in family.make.parameter_ndim if family.parameters.get(n) is not None]
-    form = family.make.log_density
+    make: Any = family.make
+    names = [n for n in make.parameter_ndim if family.parameters.get(n) is not None]
+    form = make.log_density
     found = trace(
         lambda value, *parameters: form(value, **dict(zip(names, parameters, strict=True))),
         [x, *(_stand_in(family.parameters[n]) for n in names)],
     )
     if not isinstance(found, Expression):
-        raise TraceError(f"{family.make.__name__}.log_density returns no array")
+        raise TraceError(f"{make.__name__}.log_density returns no array")
     return TracedArray(found)
 
 
