@@ -29,61 +29,61 @@ from bayesmc.shapes import Shape, broadcast_shapes
 class LikelihoodField:
     """The end points of a scan as a density given the pose, by the distance to the nearest obstacle.
 
-        The density of one range is ``z_hit * N(d; 0, sigma) + z_rand / max_range``, where d is the
-        distance of its end point from the nearest obstacle; a scan's is the product over its beams, to
-        the power ``tempering``.
+    The density of one range is ``z_hit * N(d; 0, sigma) + z_rand / max_range``, where d is the
+    distance of its end point from the nearest obstacle; a scan's is the product over its beams, to
+    the power ``tempering``.
 
-        Parameters
-        ----------
-        grid : OccupancyGrid
-            Its ``threshold`` decides what is an obstacle; unknown cells are none.
-        sigma : float
-            Standard deviation (m) of an end point about its obstacle.
-        z_hit, z_rand : float
-            Shares of beams that hit an obstacle of the map and that end anywhere; at most 1 together.
-            The rest are no returns.
-        max_range : float
-            Range (m) from which on a reading is no return.
-        mount : (float, float, float)
-            Pose of the laser in the robot's frame (m, m, rad).
-        tempering : float
-            Exponent of the density of a scan: beams are less independent than the product makes them.
-            Positive; 1 leaves it as it is.
+    Parameters
+    ----------
+    grid : OccupancyGrid
+        Its ``threshold`` decides what is an obstacle; unknown cells are none.
+    sigma : float
+        Standard deviation (m) of an end point about its obstacle.
+    z_hit, z_rand : float
+        Shares of beams that hit an obstacle of the map and that end anywhere; at most 1 together.
+        The rest are no returns.
+    max_range : float
+        Range (m) from which on a reading is no return.
+    mount : (float, float, float)
+        Pose of the laser in the robot's frame (m, m, rad).
+    tempering : float
+        Exponent of the density of a scan: beams are less independent than the product makes them.
+        Positive; 1 leaves it as it is.
 
-        Raises
-        ------
-        ParameterError
-            A parameter is out of range, or the mount's heading beyond a full turn (in degrees, most likely).
-        TypeError
-            ``grid`` is no OccupancyGrid.
+    Raises
+    ------
+    ParameterError
+        A parameter is out of range, or the mount's heading beyond a full turn (in degrees, most likely).
+    TypeError
+        ``grid`` is no OccupancyGrid.
 
-        Notes
-        -----
-        - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
-          Evidence of a net is finite, so put scans through ``clean_ranges`` before they become a net's rows.
-        - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
-          all have. Where all of several poses are farther off the map
-          than it is wide, and than the longest beam reaches, that is an error.
-        - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
-          end point within 0.001 cells of a border may count for the cell next to it.
-        - The density is not normalised over ranges (Thrun et al., section 6.4); evidence computed with
-          it compares maps or parameters with each other only roughly.
+    Notes
+    -----
+    - No returns (at or beyond ``max_range``, negative, not finite) are left out: their factor is 1.
+      Evidence of a net is finite, so put scans through ``clean_ranges`` before they become a net's rows.
+    - An end point beyond the map has the density ``z_rand / max_range``; of a robot beyond the map,
+      all have. Where all of several poses are farther off the map
+      than it is wide, and than the longest beam reaches, that is an error.
+    - Tables and sums are single precision: a log density is right to about 1e-5 per beam, and an
+      end point within 0.001 cells of a border may count for the cell next to it.
+    - The density is not normalised over ranges (Thrun et al., section 6.4); evidence computed with
+      it compares maps or parameters with each other only roughly.
 
-        References
-        ----------
-        Thrun, Burgard and Fox, Probabilistic Robotics, 2005, table 6.3.
+    References
+    ----------
+    Thrun, Burgard and Fox, Probabilistic Robotics, 2005, table 6.3.
 
-        Examples
-        --------
-        >>> import numpy as np
-        >>> from bayesmc.robotics.field import LikelihoodField
-    from bayesmc.robotics.grid import OccupancyGrid
-        >>> room = OccupancyGrid(np.pad(np.zeros((40, 20)), 1, constant_values=1.0), 0.1)
-        >>> field = LikelihoodField(room, sigma=0.2, max_range=10.0)
-        >>> particles = np.array([[1.05, 1.05, 0.0], [2.05, 1.05, 0.0]])
-        >>> scan = field.given(particles, np.deg2rad([-90.0, 0.0, 90.0]))
-        >>> scan.log_prob([1.0, 3.1, 1.0]).round(2).tolist()  # as the first one would see it
-        [1.32, -3.08]
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.robotics.field import LikelihoodField
+    >>> from bayesmc.robotics.grid import OccupancyGrid
+    >>> room = OccupancyGrid(np.pad(np.zeros((40, 20)), 1, constant_values=1.0), 0.1)
+    >>> field = LikelihoodField(room, sigma=0.2, max_range=10.0)
+    >>> particles = np.array([[1.05, 1.05, 0.0], [2.05, 1.05, 0.0]])
+    >>> scan = field.given(particles, np.deg2rad([-90.0, 0.0, 90.0]))
+    >>> scan.log_prob([1.0, 3.1, 1.0]).round(2).tolist()  # as the first one would see it
+    [1.32, -3.08]
     """
 
     grid: OccupancyGrid
