@@ -58,7 +58,6 @@ LONG_MODULES = {
     "expression/functions.py",
     "expression/graph.py",
     "kernels/labels.py",
-    "markov/chain.py",
     "network/compile.py",
     "network/factor_graph.py",
     "network/model.py",
