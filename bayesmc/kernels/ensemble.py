@@ -242,7 +242,8 @@ class BlockWalk(Kernel):
             return tried, moves, 0.0
         tried, moves, log_backward = tried.copy(), moves.copy(), np.zeros(len(rows))
         tried[far], moves[far] = mixture.draw(rng, len(far)), _ANEW
-        log_backward[far] = mixture.log_prob(u[rows][far]) - mixture.log_prob(tried[far])
+        log_q = mixture.log_prob(np.concatenate([u[rows[far]], tried[far]]))
+        log_backward[far] = log_q[: len(far)] - log_q[len(far) :]
         return tried, moves, log_backward
 
     def _stepped(

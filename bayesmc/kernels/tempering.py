@@ -28,7 +28,7 @@ _COMPONENTS, _DF = 128, 4.0
 #: share of the mass that lies about a component, whose spread it has: hills that weigh less look too wide
 _NEAR = 0.03
 #: share of all draws that come from the first, wide mixture, and its components that are kept for that
-_WIDE, _KEPT = 0.05, 32
+_WIDE, _KEPT = 0.05, 16
 #: share of draws that a temperature leaves effective, and temperatures at most
 _LEFT, _ROUNDS = 0.2, 40
 #: share of the final draws that must be effective for the mixture to be of use
@@ -47,11 +47,27 @@ class MixtureOfT(NamedTuple):
     centres : ndarray, shape (components, numbers)
     roots : ndarray, shape (components, numbers, numbers)
         Lower Cholesky factors of the scale matrices.
+    whitening : ndarray, shape (components, numbers, numbers)
+        Inverses of the roots.
+    heights : ndarray, shape (components,)
+        Log densities at the centres, shares included.
     """
 
     shares: np.ndarray
     centres: np.ndarray
     roots: np.ndarray
+    whitening: np.ndarray
+    heights: np.ndarray
+
+    @classmethod
+    def of(cls, shares: np.ndarray, centres: np.ndarray, roots: np.ndarray) -> MixtureOfT:
+        """A mixture by its shares, centres and roots."""
+        d = centres.shape[1]
+        constant = special.gammaln(0.5 * (_DF + d)) - special.gammaln(0.5 * _DF)
+        constant -= 0.5 * d * math.log(_DF * math.pi)
+        pivots = np.diagonal(roots, axis1=1, axis2=2)
+        heights = np.log(shares) - np.log(pivots).sum(axis=1) + constant
+        return cls(shares, centres, roots, np.linalg.inv(roots), heights)
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Independent draws, shape ``(count, numbers)``."""
@@ -63,19 +79,10 @@ class MixtureOfT(NamedTuple):
     def log_prob(self, u: np.ndarray) -> np.ndarray:
         """Log density of ``u``, shape ``(rows,)``."""
         d = self.centres.shape[1]
-        inverse = np.linalg.inv(self.roots)
-        # rows times components: (u - c) whitened, as one product for each component
-        z = np.matmul(inverse, u.T[None]) - np.matvec(inverse, self.centres)[:, :, None]
-        squares = np.einsum("kdn,kdn->kn", z, z)
-        constant = (
-            special.gammaln(0.5 * (_DF + d))
-            - special.gammaln(0.5 * _DF)
-            - 0.5 * d * math.log(_DF * math.pi)
-        )
-        pivots = np.diagonal(self.roots, axis1=1, axis2=2)
-        height = np.log(self.shares) - np.log(pivots).sum(axis=1) + constant
-        logs = height[:, None] - 0.5 * (_DF + d) * np.log1p(squares / _DF)
-        return np.asarray(special.logsumexp(logs, axis=0))
+        z = np.matvec(self.whitening, u[:, None, :] - self.centres)
+        logs = self.heights - 0.5 * (_DF + d) * np.log1p(np.vecdot(z, z) / _DF)
+        top = logs.max(axis=1)
+        return np.asarray(top + np.log(np.exp(logs - top[:, None]).sum(axis=1)))
 
 
 def fitted_mixture(
@@ -150,7 +157,7 @@ def _with(mixture: MixtureOfT, wide: MixtureOfT) -> MixtureOfT:
     """A mixture that has some of a wide one's components, too, which bound the weights of its draws."""
     at = slice(None, None, -(-len(wide.shares) // _KEPT))
     shares = (1.0 - _WIDE) * mixture.shares, _WIDE * wide.shares[at] / wide.shares[at].sum()
-    return MixtureOfT(
+    return MixtureOfT.of(
         np.concatenate(shares),
         np.concatenate([mixture.centres, wide.centres[at]]),
         np.concatenate([mixture.roots, wide.roots[at]]),
@@ -182,4 +189,4 @@ def _about(u: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> Mixt
     # of a few points in many directions a covariance comes out too small
     cov = (1.0 + 0.25 * d) * cov + (0.02 * wide + 1e-12)[:, None, None] * np.eye(d)
     roots = np.linalg.cholesky(cov) * spread[:, None]
-    return MixtureOfT(times / times.sum(), centres, roots)
+    return MixtureOfT.of(times / times.sum(), centres, roots)
