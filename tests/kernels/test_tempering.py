@@ -10,6 +10,7 @@ import pytest
 from scipy import special, stats
 
 import bayesmc as bmc
+from bayesmc.errors import ConvergenceWarning
 from bayesmc.kernels.tempering import MixtureOfT, fitted_mixture
 
 Density = Callable[[np.ndarray], np.ndarray]
@@ -115,7 +116,7 @@ def test_hills_have_their_shares(model: Callable, engine: bmc.Engine | None) -> 
     truth = np.exp(log[line < 0] - special.logsumexp(log)).sum()
     with warnings.catch_warnings():
         warnings.simplefilter(
-            "ignore", bmc.ConvergenceWarning
+            "ignore", ConvergenceWarning
         )  # what is stated must hold all the same
         found = bmc.infer(net, evidence, engine=engine, rng=3)
     on_left = (lambda a: a < 0) if name == "a" else (lambda x: x < 0)
