@@ -112,6 +112,11 @@ class Repeated:
             found = self.function(*args, **kwargs)
         return np.asarray(found if self.output is None else found[self.output])
 
+    def operand(self, argument: int) -> int | None:
+        """The number of the array that is this argument by place, or None."""
+        slot = self.args[argument]
+        return slot.number if isinstance(slot, _Slot) else None
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Repeated) and self.key == other.key
 

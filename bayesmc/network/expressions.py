@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterator, Mapping
+from dataclasses import dataclass, field
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ from bayesmc.expression import (
     gather,
     leaf,
     rebuilt,
+    substituted,
     trace,
 )
 from bayesmc.network.align import Aligner
@@ -75,12 +77,41 @@ class Opaque:
     leaves: frozenset[str]
 
 
-def density(model: Model, name: str) -> Followed | Opaque:
-    """What a node's function computes; it is read, and checked, once for each model."""
+@dataclass(frozen=True, eq=False)
+class Boundary:
+    """Where reading ends above a function, besides stochastic nodes and inputs.
+
+    Attributes
+    ----------
+    leaves : frozenset of str
+        Deterministic nodes that are leaves with their stored values.
+    values : dict
+        Stored values of some nodes, a batch in front or not. Functions that cannot be followed otherwise are
+        read with these in place of leaves; expressions have the batch in their shape then.
+    """
+
+    leaves: frozenset[str] = frozenset()
+    values: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+#: nothing is a leaf but stochastic nodes and inputs
+_NONE = Boundary()
+
+
+def density(model: Model, name: str, boundary: Boundary = _NONE) -> Followed | Opaque:
+    """What a node's function computes; it is read, and checked, once for each model.
+
+    With values that are known it is read again where it cannot be followed without them.
+    """
     known = model.cache.setdefault("expressions", {})
-    if name not in known:
-        known[name] = _read(model, name)
-    return known[name]
+    cut = boundary.leaves and boundary.leaves.intersection(computed_above(model, model[name]))
+    if (name, cut) not in known:
+        known[name, cut] = _read(model, name, Boundary(cut))
+    found = known[name, cut]
+    if isinstance(found, Followed) or not found.leaves & boundary.values.keys():
+        return found
+    values = {n: v for n, v in boundary.values.items() if n in found.leaves}
+    return _read(model, name, Boundary(cut, values))
 
 
 def log_density_of(model: Model, name: str) -> Expression:
@@ -103,11 +134,13 @@ def log_density_of(model: Model, name: str) -> Expression:
     return broadcast(log_density(family, value), node.plate_shape)
 
 
-def argument(model: Model, parent: str, link: Aligner) -> Any:
-    """The stand-in that a function receives for a parent."""
+def argument(model: Model, parent: str, link: Aligner, boundary: Boundary = _NONE) -> Any:
+    """The stand-in that a function receives for a parent, or its value where that is known."""
     node = model[parent]
-    if node.kind == "deterministic":
-        value: Any = TracedArray(value_of(model, parent))
+    if parent in boundary.values:
+        return link(boundary.values[parent])
+    if node.kind == "deterministic" and parent not in boundary.leaves:
+        value: Any = TracedArray(value_of(model, parent, boundary))
         labels = None if node.domain is None else node.domain.labels
         value = value if labels is None else TracedStates(value, labels)
     else:
@@ -118,19 +151,16 @@ def argument(model: Model, parent: str, link: Aligner) -> Any:
     return placed
 
 
-def value_of(model: Model, name: str) -> Expression:
+def value_of(model: Model, name: str, boundary: Boundary = _NONE) -> Expression:
     """The user value of a deterministic node; a call of its function where that cannot be followed."""
     node = model[name]
-    found = density(model, name)
+    found = density(model, name, boundary)
     if isinstance(found, Followed):
-        return broadcast(found.result, node.value_shape)
+        known = {n: constant(v) for n, v in boundary.values.items()}
+        value = substituted(found.result, known) if known else found.result
+        return broadcast(value, np.broadcast_shapes(value.shape, node.value_shape))
     parents = tuple(dict.fromkeys(node.parents))
-    operands = [
-        _stored_value(model, p)
-        if model[p].kind == "deterministic"
-        else stored_leaf(model, model[p])
-        for p in parents
-    ]
+    operands = [_stored_value(model, p, boundary) for p in parents]
     stored = call(_NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
     return stored if node.domain is None else _decoded_values(stored, node)
 
@@ -139,6 +169,22 @@ def stored_leaf(model: Model, node: CompiledNode) -> Expression:
     """A node's stored value as a leaf."""
     states = None if node.domain is None else node.domain.size
     return leaf(node.name, node.value_shape, _dtype(model, node), states)
+
+
+def computed_above(
+    model: Model, node: CompiledNode, leaves: Container[str] = frozenset()
+) -> tuple[str, ...]:
+    """Deterministic nodes above one but for leaves, those first on which others depend."""
+    found: dict[str, None] = {}
+
+    def visit(name: str) -> None:
+        for parent in model[name].parents:
+            if model[parent].kind == "deterministic" and not (parent in found or parent in leaves):
+                visit(parent)
+                found[parent] = None
+
+    visit(node.name)
+    return tuple(found)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -198,10 +244,14 @@ def _decoded_values(stored: Expression, node: CompiledNode) -> Expression:
     return _numbers(stored, node.domain)
 
 
-def _stored_value(model: Model, name: str) -> Expression:
-    """The stored value of a deterministic node."""
+def _stored_value(model: Model, name: str, boundary: Boundary = _NONE) -> Expression:
+    """The stored value of a node."""
     node = model[name]
-    value = value_of(model, name)
+    if name in boundary.values:
+        return constant(boundary.values[name])
+    if node.kind != "deterministic" or name in boundary.leaves:
+        return stored_leaf(model, node)
+    value = value_of(model, name, boundary)
     if node.domain is None or node.domain.labels is not None:
         return value
     numbers = node.domain.numbers
@@ -211,54 +261,47 @@ def _stored_value(model: Model, name: str) -> Expression:
     return gather(constant(order), found.expression)
 
 
-def _read(model: Model, name: str) -> Followed | Opaque:
+def _read(model: Model, name: str, boundary: Boundary) -> Followed | Opaque:
     node = model[name]
     try:
-        result = _traced(model, node)
+        result = _traced(model, node, boundary)
         if node.is_stochastic and not isinstance(result, (Family, Distribution)):
             raise TraceError(f"it returns {type(result).__name__}")
         if isinstance(result, Density) and node.links:
             raise TraceError("its Density may read parents where that cannot be seen")
         found = Followed(result)
         if not _is_known(model, node, found):
-            _check(model, node, found)
+            _check(model, node, found, boundary)
         return found
     except TraceError as error:
-        return Opaque(str(error), _leaves_above(model, name))
+        return Opaque(str(error), _leaves_above(model, node, boundary))
 
 
-def _leaves_above(model: Model, name: str) -> frozenset[str]:
-    found: frozenset[str] = frozenset()
-    for parent in model[name].parents:
-        above = _leaves_above(model, parent) if model[parent].kind == "deterministic" else {parent}
-        found = found | above
-    return found
+def _leaves_above(model: Model, node: CompiledNode, boundary: Boundary) -> frozenset[str]:
+    inner = computed_above(model, node, boundary.leaves)
+    above = {p for n in (node.name, *inner) for p in model[n].parents}
+    return frozenset(above.difference(inner))
 
 
-def _traced(model: Model, node: CompiledNode) -> Any:
+def _traced(model: Model, node: CompiledNode, boundary: Boundary) -> Any:
     declaration = node.declaration
     if declaration.value is not None:
         return constant(declaration.value)
     if declaration.probs is not None:
-        return _of_table(model, node)
+        return _of_table(model, node, boundary)
     if declaration.vectorize:
         raise TraceError("it is called element by element (vectorize=True)")
     assert declaration.function is not None
-    arguments = [argument(model, parent, link) for parent, link in node.links]
+    arguments = [argument(model, parent, link, boundary) for parent, link in node.links]
     return trace(declaration.function, arguments)
 
 
-def _of_table(model: Model, node: CompiledNode) -> Family:
+def _of_table(model: Model, node: CompiledNode, boundary: Boundary) -> Family:
     probs = node.declaration.probs
     assert probs is not None
     rows: Any = 0
     for card, (parent, link) in zip(probs.shape[:-1], node.links, strict=True):
-        parent_node = model[parent]
-        if parent_node.kind == "deterministic":
-            stored = _stored_value(model, parent)
-        else:
-            stored = stored_leaf(model, parent_node)
-        placed: Any = TracedArray(stored)
+        placed: Any = TracedArray(_stored_value(model, parent, boundary))
         rows = rows * card + link.place(placed)
     table = constant(probs.reshape(-1, probs.shape[-1]))
     rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
@@ -270,20 +313,26 @@ def _is_known(model: Model, node: CompiledNode, found: Followed) -> bool:
     code = getattr(node.declaration.function, "__code__", None)
     if code is None:
         return False
-    keys = tuple(template(e).key for e in expressions_of(found.result))
+    key = _steps(code), *(template(e).key for e in expressions_of(found.result))
     times = model.cache.setdefault("expressions checked", {})
-    times[code, keys] = times.get((code, keys), 0) + 1
-    return times[code, keys] > _CHECKED
+    times[key] = times.get(key, 0) + 1
+    return times[key] > _CHECKED
 
 
-def _check(model: Model, node: CompiledNode, found: Followed) -> None:
+def _steps(code: CodeType) -> tuple[Any, ...]:
+    """What code does, but for its constants."""
+    inner = tuple(_steps(c) for c in code.co_consts if isinstance(c, CodeType))
+    return code.co_code, code.co_names, inner
+
+
+def _check(model: Model, node: CompiledNode, found: Followed, boundary: Boundary) -> None:
     """Refuse a reading that gives something else than the function at probe points."""
     program = Program(list(expressions_of(found.result)))
-    for values in _probes(model, node, found.leaves):
+    for values in _probes(model, _leaves_above(model, node, boundary), boundary.values):
         with marking_invalid(), np.errstate(all="ignore"):
             try:
                 whole = dict(values)
-                for name in _between(model, node):
+                for name in computed_above(model, node, boundary.leaves):
                     whole[name] = model.evaluate(name, whole)[0]
                 expected, batch = model.evaluate(node.name, whole)
             except BayesmcError:
@@ -298,30 +347,22 @@ def _check(model: Model, node: CompiledNode, found: Followed) -> None:
                 raise TraceError("what was read of it gives other values than the function")
 
 
-def _between(model: Model, node: CompiledNode) -> list[str]:
-    """Deterministic nodes above one, those first on which others depend."""
-    found: dict[str, None] = {}
-
-    def visit(name: str) -> None:
-        for parent in model[name].parents:
-            if model[parent].kind == "deterministic" and parent not in found:
-                visit(parent)
-                found[parent] = None
-
-    visit(node.name)
-    return list(found)
-
-
 def _probes(
-    model: Model, node: CompiledNode, leaves: frozenset[str]
+    model: Model, above: frozenset[str], known: Mapping[str, np.ndarray]
 ) -> Iterator[Mapping[str, np.ndarray]]:
-    """Stored values of unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks."""
-    above = leaves | _leaves_above(model, node.name)
+    """Stored values of unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks.
+
+    Beside known values, which have batches of their own, single entries.
+    """
     whole = {n: model.probe[n] for n in above}
+    ranks = {n: v.ndim - len(model[n].value_shape) for n, v in whole.items()}
+    if known:
+        for end in (0, -1):
+            yield {n: known[n] if n in known else v[(end,) * ranks[n]] for n, v in whole.items()}
+        return
     yield whole
     if not whole or not model.probe_shape:
         return
-    ranks = {n: v.ndim - len(model[n].value_shape) for n, v in whole.items()}
     yield {n: v[-1] if ranks[n] == 2 else v for n, v in whole.items()}
     yield {n: v[(0,) * ranks[n]] for n, v in whole.items()}
     yield {
