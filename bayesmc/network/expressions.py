@@ -156,7 +156,7 @@ def value_of(model: Model, name: str, boundary: Boundary = _NONE) -> Expression:
     node = model[name]
     found = density(model, name, boundary)
     if isinstance(found, Followed):
-        known = {n: constant(v) for n, v in boundary.values.items()}
+        known: dict[str, Expression] = {n: constant(v) for n, v in boundary.values.items()}
         value = substituted(found.result, known) if known else found.result
         return broadcast(value, np.broadcast_shapes(value.shape, node.value_shape))
     parents = tuple(dict.fromkeys(node.parents))

@@ -324,7 +324,8 @@ def _mean(
             ) from error
         parts = [e for r in form.reads.values() for e in (r.gain, r.at)]
         forms[like, places] = Program([form.offset, *parts]), tuple(form.reads)
-    return LinearMean(*forms[like, places], names, constants)
+    program, read = forms[like, places]
+    return LinearMean(program, read, names, constants)
 
 
 def _first_bent(

@@ -175,7 +175,7 @@ def _composed(layout: Layout, known: dict[str, np.ndarray], batch: tuple[int, ..
     for name in layout.placed:
         place = layout.place(name)
         result, gains = _at_zero(layout, name, values)
-        found = layout.moments_of(layout.model[name], result, batch, batch)
+        found = layout.moments_of(layout.model[name], result, batch)
         own = slice(spent, spent + found.mean.shape[-1])
         offset[..., place] = found.mean
         matrix = _matrix(layout, name, gains, batch)
@@ -213,15 +213,15 @@ def _matrix(
         if called in gains:
             parent = layout.slices.first[stem]
             places = np.arange(int(np.prod(parent.value_shape))).reshape(parent.value_shape)
-            column = np.empty(places.size, dtype=np.intp)
+            column = np.empty(places.size, np.intp)
             column[layout.packed(parent, places)] = np.arange(width)
             found = gains[called]
             shape = (*batch, *node.value_shape, found.gain.shape[-1])
             gain = _by_row(layout, node, np.broadcast_to(found.gain, shape))
-            at = _by_row(layout, node, np.broadcast_to(column[found.at], shape))
-            index = np.arange(len(gain))[:, None] * width + at
-            total = np.bincount(index.reshape(-1), gain.reshape(-1), len(gain) * width)
-            part = total.reshape(part.shape)
+            into = _by_row(layout, node, np.broadcast_to(column[found.at], shape))
+            index = np.arange(len(gain))[:, None] * width + into
+            sums = np.bincount(index.reshape(-1), gain.reshape(-1), len(gain) * width)
+            part = sums.astype(float).reshape(part.shape)
         parts.append(part)
     return np.concatenate(parts, axis=-1)
 

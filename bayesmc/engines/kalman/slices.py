@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Slices
-from bayesmc.distributions import MvNormal
+from bayesmc.distributions import Distribution, MvNormal
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.network.model import invalid_error
@@ -213,12 +213,14 @@ class Layout:
         ParameterError
         """
         result, own = self.model.evaluate(name, values)
-        return self.moments_of(self.model[name], result, own, batch)
+        return self.moments_of(self.model[name], result, batch, own)
 
-    def moments_of(self, node: CompiledNode, result: Any, own: Shape, batch: Shape) -> Moments:
+    def moments_of(
+        self, node: CompiledNode, result: Any, batch: Shape, own: Shape | None = None
+    ) -> Moments:
         """Of a distribution or values, of parents with a batch ``own`` that broadcasts to ``batch``."""
-        full = batch + node.value_shape
-        if isinstance(result, np.ndarray):
+        full, own = batch + node.value_shape, batch if own is None else own
+        if not isinstance(result, Distribution):
             return Moments(self.packed(node, np.broadcast_to(result, full)), None)
         if result.invalid is not None:
             error = invalid_error(node, result, np.ones(own, dtype=bool), own, noiseless=True)
