@@ -50,8 +50,8 @@ def mean(density: Family | Distribution) -> Expression:
     >>> from bayesmc.expression import TracedArray, evaluate, leaf, trace
     >>> from bayesmc.passes.mean import mean
     >>> density = trace(lambda x: bmc.Gamma(x, 2.0), [TracedArray(leaf("x", ()))])
-    >>> evaluate([mean(density)], {"x": np.array(3.0)})
-    [array(1.5)]
+    >>> evaluate([mean(density)], {"x": np.array([3.0, 5.0])})
+    [array([1.5, 2.5])]
     """
     return expression_of(_mean(density))
 
