@@ -430,6 +430,8 @@ class _Probe(dict[str, np.ndarray]):
     def __missing__(self, name: str) -> np.ndarray:
         node = self.model[name]
         if node.kind == "deterministic":
+            for above in _deterministic_above(self.model, name, self):
+                self[above] = self.model.evaluate(above, self)[0]
             value = self.model.evaluate(name, self)[0]
         else:
             value = self.model.probe[name]
