@@ -11,9 +11,26 @@ import numpy as np
 
 from bayesmc.distributions import Distribution, MvNormal, Normal
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression, Family, Program, broadcast, expressions_of, rebuilt
+from bayesmc.expression import (
+    Call,
+    Expression,
+    Family,
+    Program,
+    broadcast,
+    expressions_of,
+    ordered,
+    rebuilt,
+)
 from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.expressions import Boundary, Opaque, computed_above, density
+from bayesmc.network.expressions import (
+    Followed,
+    NodeCall,
+    Opaque,
+    density,
+    deterministic_above,
+    value_of,
+)
+from bayesmc.network.given import read_given
 from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import ZERO
 from bayesmc.passes.templates import without_names
@@ -106,31 +123,49 @@ class LinearMean:
         return offset, {self.names[n]: Gains(*p) for n, p in zip(self.hidden, pairs, strict=True)}
 
 
-def linear_node(model: Model, name: str, hidden: Collection[str], boundary: Boundary) -> LinearNode:
+def linear_node(
+    model: Model,
+    name: str,
+    hidden: Collection[str],
+    cut: frozenset[str],
+    values: Mapping[str, np.ndarray],
+) -> LinearNode:
     """A node as an affine mean and a scale free of hidden nodes.
 
     Parameters
     ----------
     hidden : collection of str
         Continuous nodes whose values are not known.
-    boundary : Boundary
-        Deterministic nodes that are leaves, and values of other nodes for functions that cannot be followed
-        without.
+    cut : frozenset of str
+        Deterministic nodes that are leaves, too.
+    values : dict
+        Of other leaves, a batch in front or not: functions that cannot be followed without are read with
+        these in place.
 
     Raises
     ------
     NotLinearError
     """
-    found = density(model, name, boundary)
+    found = density(model, name, cut)
     above = found.leaves.intersection(hidden)
-    if isinstance(found, Opaque):
+    if isinstance(found, Followed):
+        known = model.cache.setdefault("linear nodes", {})
+        key = found, above
+        try:
+            if key not in known:
+                known[key] = _linear(model, model[name], found.result, above, cut)
+            return known[key]
+        except NotLinearError:
+            if not _calls_nodes(found):
+                raise
+    try:
+        if isinstance(found, Opaque) and above == found.leaves:  # nothing that is known would help
+            raise TraceError(found.reason)
+        result = read_given(model, name, {n: values[n] for n in values if n not in above})
+    except TraceError as error:
         on = f"depends on the continuous {_nodes(model, above)} in a way that " if above else ""
-        raise NotLinearError(f"{on}cannot be traced ({found.reason})")
-    known = model.cache.setdefault("linear nodes", {})
-    key = found, above
-    if key not in known:
-        known[key] = _linear(model, model[name], found.result, above, boundary)
-    return known[key]
+        raise NotLinearError(f"{on}cannot be traced ({error})") from error
+    return _linear(model, model[name], result, above, cut)
 
 
 def is_hidden(node: CompiledNode, observed: Mapping[str, Observed]) -> bool:
@@ -183,11 +218,11 @@ def affine_nodes(
 ) -> Iterator[str]:
     """Deterministic nodes that are affine in hidden continuous ones."""
     found = _carried(model, observed)
-    hidden, boundary = _question(model, observed, inputs)
+    question = _question(model, observed, inputs)
     for name, node in model.nodes.items():
         if node.kind == "deterministic" and found[name] and node.domain is None:
             try:
-                linear_node(model, name, hidden, boundary)
+                linear_node(model, name, *question)
             except NotLinearError:
                 continue
             yield name
@@ -219,8 +254,8 @@ def _reaching(parents: Iterable[str], found: Mapping[str, tuple[str, ...]]) -> t
 
 def _question(
     model: Model, observed: Mapping[str, Observed], inputs: Mapping[str, np.ndarray]
-) -> tuple[frozenset[str], Boundary]:
-    """Hidden continuous nodes, and possible values of all others."""
+) -> tuple[frozenset[str], frozenset[str], dict[str, np.ndarray]]:
+    """Hidden continuous nodes, finite leaves, and possible values of all others."""
     hidden = frozenset(n for n, node in model.nodes.items() if is_hidden(node, observed))
     seen = {n: o.value for n, o in observed.items() if o.mask is None}
     leaves = finite_leaves(model)
@@ -230,14 +265,14 @@ def _question(
         for n, v in {**possible, **inputs, **seen}.items()
         if model[n].kind != "deterministic" or n in leaves
     }
-    return hidden, Boundary(leaves, values)
+    return hidden, leaves, values
 
 
 def _find_reason(
     model: Model, observed: Mapping[str, Observed], inputs: Mapping[str, np.ndarray]
 ) -> str | None:
     found = _carried(model, observed)
-    hidden, boundary = _question(model, observed, inputs)
+    question = _question(model, observed, inputs)
     for name, node in model.nodes.items():
         above = _reaching(node.parents, found)
         why = None
@@ -252,7 +287,7 @@ def _find_reason(
                 why = f"is a matrix of shape {node.event_shape}"
             else:
                 try:
-                    linear_node(model, name, hidden, boundary)
+                    linear_node(model, name, *question)
                 except NotLinearError as error:
                     why = str(error)
         if why is not None:
@@ -277,17 +312,17 @@ def _why_not_discrete_child(
 
 
 def _linear(
-    model: Model, node: CompiledNode, result: Any, hidden: frozenset[str], boundary: Boundary
+    model: Model, node: CompiledNode, result: Any, hidden: frozenset[str], cut: frozenset[str]
 ) -> LinearNode:
     if not node.is_stochastic:
-        return LinearNode(_mean(model, node, result, hidden, boundary), None)
+        return LinearNode(_mean(model, node, result, hidden, cut), None)
     family = result.make if isinstance(result, Family) else type(result)
     if family not in _GAUSSIAN:
         on = f" (it depends on the continuous {_nodes(model, hidden)})" if hidden else ""
         name = getattr(family, "__name__", "a distribution of scipy.stats")
         raise NotLinearError(f"is {name}, not Normal or MvNormal{on}")
     if isinstance(result, Distribution):
-        return LinearNode(_mean(model, node, ZERO, hidden, boundary), result)
+        return LinearNode(_mean(model, node, ZERO, hidden, cut), result)
     for key, value in result.parameters.items():
         bent = frozenset().union(*(e.leaves for e in expressions_of(value))) & hidden
         if key != "loc" and bent:
@@ -295,7 +330,7 @@ def _linear(
                 f"has a {key} that depends on the continuous {_nodes(model, bent)}"
             )
     parameters = dict(result.parameters)
-    mean = _mean(model, node, parameters.pop("loc"), hidden, boundary)
+    mean = _mean(model, node, parameters.pop("loc"), hidden, cut)
     return LinearNode(mean, Family(result.make, parameters))
 
 
@@ -304,7 +339,7 @@ def _mean(
     node: CompiledNode,
     value: Expression,
     hidden: frozenset[str],
-    boundary: Boundary,
+    cut: frozenset[str],
 ) -> LinearMean:
     """The affine form of a mean, in the shape of the node's values."""
     value = broadcast(value, np.broadcast_shapes(value.shape, node.value_shape))
@@ -317,7 +352,7 @@ def _mean(
         except TraceError as error:
             above = _nodes(model, value.leaves & hidden)
             after = str(error).removesuffix(" is not affine")
-            where = _first_bent(model, node, hidden, boundary)
+            where = _first_bent(model, node, hidden, cut)
             what = "a mean that is" if node.is_stochastic else "values that are"
             raise NotLinearError(
                 f"has {what} not known to be affine in {above} (after {after}{where})"
@@ -328,17 +363,21 @@ def _mean(
     return LinearMean(program, read, names, constants)
 
 
+def _calls_nodes(found: Followed) -> bool:
+    """Whether a deterministic node above cannot be followed."""
+    return any(
+        isinstance(node, Call) and isinstance(node.call, NodeCall)
+        for node in ordered(*expressions_of(found.result))
+    )
+
+
 def _first_bent(
-    model: Model, node: CompiledNode, hidden: frozenset[str], boundary: Boundary
+    model: Model, node: CompiledNode, hidden: frozenset[str], cut: frozenset[str]
 ) -> str:
     """The first deterministic node above one that is not affine, if any, in words."""
-    for name in computed_above(model, node, boundary.leaves):
-        found = density(model, name, boundary)
+    for name in deterministic_above(model, node.name, cut):
         try:
-            if isinstance(found, Opaque) and found.leaves & hidden:
-                raise TraceError(found.reason)
-            for value in expressions_of(getattr(found, "result", None)):
-                affine(value, hidden)
+            affine(value_of(model, name, cut), hidden)
         except TraceError:
             return f" in node {name!r}"
     return ""

@@ -19,7 +19,7 @@ from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors import LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor
 from bayesmc.network import Model, Observed
-from bayesmc.network.expressions import Boundary, density
+from bayesmc.network.expressions import density
 from bayesmc.structure.affine import affine_nodes, finite_leaves, gaussian_nodes
 from bayesmc.structure.discrete import InvalidRows, Variable, known_values
 from bayesmc.structure.reading import Reading, hidden_elements
@@ -112,7 +112,7 @@ class _Reader:
         self.kept: dict[str, tuple[Any, Reading]] = model.cache.setdefault("linear readings", {})
 
     def __call__(self, name: str) -> Reading:
-        leaves = density(self.model, name, Boundary(finite_leaves(self.model))).leaves
+        leaves = density(self.model, name, finite_leaves(self.model)).leaves
         key = tuple((n, self._seen(n)) for n in sorted(leaves))
         latest = self.kept.get(name)
         if latest is None or latest[0] != key:

@@ -14,7 +14,7 @@ from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.expression import Expression, Family, expressions_of
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, compressed, likelihood_rows
 from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.expressions import Boundary, Followed, computed_above, density
+from bayesmc.network.expressions import Followed, density, deterministic_above
 from bayesmc.passes.elements import MANY, NOTHING, elements, merged
 from bayesmc.shapes import Shape
 from bayesmc.structure.affine import (
@@ -70,7 +70,7 @@ class Reading:
         self.d = math.prod(self.node.event_shape)
         #: for every element of this node the element that it reads of a finite or hidden one
         self.places: dict[str, np.ndarray] = {}
-        leaves = density(model, name, Boundary(finite_leaves(model))).leaves
+        leaves = density(model, name, finite_leaves(model)).leaves
         free = [n for n in model.nodes if n in leaves and n not in known]
         hidden = [n for n in free if is_hidden(model[n], observed)]
         self._place([n for n in free if n not in hidden])
@@ -145,7 +145,7 @@ class Reading:
         node, parent = self.node, self.model[name]
         count = math.prod(parent.plate_shape)
         leaves = finite_leaves(self.model)
-        found = density(self.model, node.name, Boundary(leaves))
+        found = density(self.model, node.name, leaves)
         if isinstance(found, Followed):
             parts = [
                 self._by_element(elements(part, name, count), event_ndim)
@@ -153,7 +153,7 @@ class Reading:
             ]
             return merged(np.stack(parts), 0)
         if count > 1:  # what is known is that plates are aligned
-            direct = not computed_above(self.model, node, leaves)
+            direct = not deterministic_above(self.model, node.name, leaves)
             if not (direct and set(parent.plates) <= set(node.plates)):
                 return np.full(self.count, MANY)
         at = np.arange(count).reshape(parent.plate_shape)
@@ -194,9 +194,8 @@ class Reading:
             values, _ = configure(self.model, known, self.alone, self.whole, names)
             given = {n: v for n, v in values.items() if n not in hidden}
             try:
-                linear = linear_node(
-                    self.model, self.node.name, hidden, Boundary(finite_leaves(self.model), given)
-                )
+                leaves = finite_leaves(self.model)
+                linear = linear_node(self.model, self.node.name, hidden, leaves, given)
             except NotLinearError as error:
                 raise UnsupportedError(f"node {self.node.name!r} {error}") from error
             result, gains = linear(values)

@@ -12,7 +12,7 @@ from bayesmc.errors import TraceError
 from bayesmc.expression import Expression, Leaf, Program, broadcast, expressions_of, leaf, ordered
 from bayesmc.expression import rebuilt as made_of
 from bayesmc.network import Model
-from bayesmc.network.expressions import Boundary, Opaque, density
+from bayesmc.network.expressions import Opaque, density
 from bayesmc.passes.derivatives import jumps, tangent
 from bayesmc.passes.mean import mean
 
@@ -53,10 +53,10 @@ class Followed:
         self.nodes = [model[n] for n in nodes]
         self.reads = tuple(reads)
         given = {n for n in (*self.reads, *known) if n in model.nodes}
-        boundary = Boundary(frozenset(n for n in given if model[n].kind == "deterministic"))
+        cut = frozenset(n for n in given if model[n].kind == "deterministic")
         self.results = []
         for name in nodes:
-            found = density(model, name, boundary)
+            found = density(model, name, cut)
             if isinstance(found, Opaque):
                 raise TraceError(found.reason)
             self.results.append(found.result)

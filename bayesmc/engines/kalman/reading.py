@@ -16,7 +16,6 @@ from bayesmc.dbn import PREVIOUS, TIME
 from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, put_noise
 from bayesmc.errors import ModelError, ParameterError, UnsupportedError
-from bayesmc.network.expressions import Boundary
 from bayesmc.structure.affine import Gains, LinearNode, NotLinearError, linear_node
 
 #: numbers of coefficients that are worked out at once
@@ -143,7 +142,7 @@ def _linear(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> Line
     hidden = {n + PREVIOUS for n in layout.before}.union(layout.drawn)
     known = {n: np.asarray(v) for n, v in values.items() if n in model.nodes}
     leaves = frozenset(n for n in (*hidden, *known) if model[n].kind == "deterministic")
-    return linear_node(model, name, hidden, Boundary(leaves, known))
+    return linear_node(model, name, hidden, leaves, known)
 
 
 def _together(

@@ -30,7 +30,6 @@ from bayesmc.engines.particles.guarded import Guarded
 from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import Model, Observed
-from bayesmc.network.expressions import Boundary
 from bayesmc.network.forward import Step
 from bayesmc.structure.affine import NotLinearError, linear_node
 
@@ -255,7 +254,7 @@ def _prove_affine(model: Model, group: Group) -> bool:
     known = {n: v for n, v in known.items() if model[n].kind != "deterministic"}
     try:
         for name in (*group.block, *group.seen):
-            linear_node(model, name, group.block, Boundary(values=known))
+            linear_node(model, name, group.block, frozenset(), known)
     except NotLinearError:
         return False
     return True
