@@ -237,8 +237,10 @@ class Reading:
             value = np.where(np.repeat(seen.mask.reshape(-1), d), seen.value.reshape(-1), 0.0)
             self.offset += (gain * value[at]).sum(axis=-1).reshape(lead)
             gain = np.where(seen.mask.reshape(-1)[at // d], 0.0, gain)
-        read = np.where(gain != 0, at // d, NOTHING).reshape(-1, self.count, self.d, k)
-        place = merged(read, (0, 2, 3))
+        place = np.zeros(self.count, dtype=np.intp)
+        if count > 1:
+            read = np.where(gain != 0, at // d, NOTHING).reshape(-1, self.count, self.d, k)
+            place = merged(read, (0, 2, 3))
         width, column = d, at % d
         columns: list[tuple[str, int | None]] = [(name, None)] * d
         if (place == MANY).any():
