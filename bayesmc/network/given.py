@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Distribution, as_distribution
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError, TraceError
-from bayesmc.expression import Expression, Family, Program, constant, expressions_of, rebuilt
-from bayesmc.network.expressions import agree, deterministic_above, stored_leaf
+from bayesmc.distributions import Distribution
+from bayesmc.errors import TraceError
+from bayesmc.expression import Expression, Family, Program, constant, expressions_of
+from bayesmc.network.agreement import Probe, deterministic_above, hold_against
+from bayesmc.network.expressions import stored_leaf
 from bayesmc.network.model import Model
 from bayesmc.network.readings import Argument, read_function
 
@@ -56,7 +56,7 @@ def read_given(model: Model, name: str, values: Mapping[str, np.ndarray]) -> Any
                 return found if isinstance(found, Distribution) else constant(found)
             known[other] = found
     result = _read(model, name, known)
-    _check(model, name, known, [n for n in above if n not in known], result)
+    _check(model, name, known, result)
     return result
 
 
@@ -88,34 +88,14 @@ def _read(model: Model, name: str, known: Mapping[str, np.ndarray]) -> Any:
     return result
 
 
-def _check(
-    model: Model,
-    name: str,
-    known: Mapping[str, np.ndarray],
-    between: Iterable[str],
-    result: Any,
-) -> None:
+def _check(model: Model, name: str, known: Mapping[str, np.ndarray], result: Any) -> None:
     """Refuse what gives something else than the function, at single entries of the probe."""
-    program, node = Program(list(expressions_of(result))), model[name]
+    parts = list(expressions_of(result))
+    program = Program(parts)
     for end in (0, -1):
-        values = {}
-        for other in model.nodes:
-            if other in model.probe:
-                rank = model.probe[other].ndim - len(model[other].value_shape)
-                values[other] = np.asarray(model.probe[other][(end,) * rank])
-        values |= known
-        with marking_invalid(), np.errstate(all="ignore"):
-            try:
-                for other in between:
-                    values[other] = model.evaluate(other, values)[0]
-                expected, batch = model.evaluate(name, values)
-            except BayesmcError:
-                continue  # the function's own fault, or out of range: nothing to compare
-            try:
-                made = rebuilt(result, iter(program(values)))
-                if node.is_stochastic and not isinstance(made, Distribution):
-                    made = as_distribution(made)
-            except (BayesmcError, ValueError, TypeError, IndexError) as error:
-                raise TraceError(f"what was read of it fails: {error}") from error
-            if not agree(node, expected, made, batch + node.plate_shape):
-                raise TraceError("what was read of it gives other values than the function")
+        values = Probe(model, 2)
+        for leaf in frozenset().union(*(e.leaves for e in parts)):
+            rank = model.probe[leaf].ndim - len(model[leaf].value_shape)
+            values[leaf] = np.asarray(model.probe[leaf][(end,) * rank])
+        values.update(known)
+        hold_against(model, name, result, program, lambda values: values, values)

@@ -22,12 +22,12 @@ from bayesmc.expression import (
     rebuilt,
 )
 from bayesmc.network import CompiledNode, Model, Observed
+from bayesmc.network.agreement import deterministic_above
 from bayesmc.network.expressions import (
     Followed,
     NodeCall,
     Opaque,
     density,
-    deterministic_above,
     value_of,
 )
 from bayesmc.network.given import read_given

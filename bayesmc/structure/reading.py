@@ -14,7 +14,8 @@ from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.expression import Expression, Family, expressions_of
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, compressed, likelihood_rows
 from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.expressions import Followed, density, deterministic_above
+from bayesmc.network.agreement import deterministic_above
+from bayesmc.network.expressions import Followed, density
 from bayesmc.passes.elements import MANY, NOTHING, elements, merged
 from bayesmc.shapes import Shape
 from bayesmc.structure.affine import (

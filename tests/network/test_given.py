@@ -1,4 +1,4 @@
-"""Functions that can be followed only where some values are known, which exact engines answer all the same."""
+"""Functions that can be followed only where some values are known: exact engines answer all the same."""
 
 from __future__ import annotations
 
