@@ -55,7 +55,7 @@ def as_product(node: Call, operand: Expression) -> Expression:
     if not isinstance(made, Repeated) or made.output is not None or "dtype" in made.kwargs:
         raise TraceError(f"{node.detail} is not affine")
     places = [k for k in _LINEAR.get(made.function, ()) if k < len(made.args)]
-    at = [made.operand(k) for k in places]
+    at = [made.slots[k] for k in places]
     if not any(k is not None and node.operands[k] is operand for k in at):
         raise TraceError(f"{node.detail} is not affine")
     if sum(a is operand or not isinstance(a, Constant) for a in node.operands) > 1:
