@@ -28,7 +28,7 @@ from bayesmc.expression import (
     mapped,
     replaced,
 )
-from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against
+from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against, hold_form
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered
@@ -40,7 +40,7 @@ from bayesmc.network.readings import (
     read_function,
     read_table,
 )
-from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.passes.log_density import family_of, has_own_form, log_density
 
 #: readings of one shape, and uses of one reading, that are checked at all probe points
 _CHECKED = 3
@@ -161,7 +161,10 @@ def log_density_of(model: Model, name: str) -> Expression:
     value: Expression = stored_leaf(model, node)
     if node.domain is not None and node.domain.low:
         value = elementwise(np.add, value, node.domain.low)
-    return broadcast(log_density(family, value), node.plate_shape)
+    result = broadcast(log_density(family, value), node.plate_shape)
+    if has_own_form(family):
+        hold_form(model, name, result)
+    return result
 
 
 def log_factor_of(model: Model, name: str) -> Expression:
