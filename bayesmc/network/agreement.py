@@ -123,8 +123,8 @@ def hold_against(
             raise TraceError("what was read of it gives other values than the function")
 
 
-def hold_form_against(model: Model, name: str, form: Expression) -> None:
-    """Refuse a family's own form of a log density where ``log_prob`` gives something else.
+def hold_form(model: Model, name: str, form: Expression) -> None:
+    """Refuse a family's own log density where ``log_prob`` gives something else.
 
     Raises
     ------

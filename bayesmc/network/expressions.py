@@ -33,7 +33,7 @@ from bayesmc.network.agreement import (
     Probe,
     deterministic_above,
     hold_against,
-    hold_form_against,
+    hold_form,
 )
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
@@ -184,7 +184,7 @@ def log_density_of(model: Model, name: str) -> Expression:
         value = elementwise(np.add, value, node.domain.low)
     result = broadcast(log_density(family, value), node.plate_shape)
     if has_own_form(family):
-        hold_form_against(model, node.name, result)
+        hold_form(model, name, result)
     return result
 
 

@@ -15,6 +15,7 @@ from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.conjugate import conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
+from bayesmc.kernels.ensemble import BlockWalk, may_be_drawn_anew
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_search import forest_blocks
@@ -34,7 +35,7 @@ from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_children import with_like_children
-from bayesmc.structure.stacked import Forms, stacks
+from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
 #: components that move together along learnt directions, at most
@@ -188,6 +189,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     moved = set(names)
     kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets)
+    if slow and may_be_drawn_anew(target, names):
+        kernels.append(BlockWalk(target, names, anew=1.0))
     return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 
@@ -199,7 +202,7 @@ def _conjugate(
     refusals: dict[str, str] = {}
     asked: dict[Hashable, str] = {}
     for name in names:
-        key = forms.key(blankets[name])
+        key = forms.key(blankets[name]) if len(names) >= FEWEST else None
         first = None if key is None else asked.get(key)
         if first is not None:
             one, other = forms.of(blankets[first]), forms.of(blankets[name])
