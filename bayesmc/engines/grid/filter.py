@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes

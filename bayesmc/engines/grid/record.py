@@ -10,7 +10,7 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.averages import as_event, naming
-from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.tables import GridModel

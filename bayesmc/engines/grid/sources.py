@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 from bayesmc.dbn import PREVIOUS, TIME, Slices
-from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.grid.axes import Axes
 from bayesmc.engines.grid.terms import Label
 from bayesmc.engines.slice_steps import plates_apart
