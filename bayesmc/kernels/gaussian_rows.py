@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.distributions import MvNormal
 from bayesmc.expression import Constant, Expression, Gather
 from bayesmc.kernels.gaussian_band import cholesky
 from bayesmc.kernels.gaussian_layout import BlockSums, Layout
@@ -84,22 +83,21 @@ class NormalRows:
 
     def add(self, values: Values, sums: BlockSums) -> None:
         """Add what the terms say, given values of all nodes outside of the block."""
-        known = self.program.are_known(values)
-        kept = self._kept if known else {}
+        kept = self._kept if self.program.are_known(values) else {}
         if "all" not in kept:
             try:
                 found = self.program(values)
             except IndexError:
                 self._ask(values, None)
                 raise
-            root, wrong = self._noise(found[-1])
-            if wrong:
+            root, is_wrong = self._noise(found[-1])
+            if is_wrong:
                 self._ask(values, sums)
-            summed = (self._scaled if root.ndim == 1 else self._whitened)(found, root, kept)
+            summed = self._summed(found, root, kept)
             if not np.isfinite(summed[1]).all():  # a mean that overflows
                 self._ask(values, sums)
                 sums.bad |= ~np.isfinite(summed[1]).all(axis=-1)
-            if not self._frozen:
+            if not self._frozen or kept is not self._kept:
                 sums.add(*summed)
                 return
             kept["all"] = tuple(a[:1] for a in summed)
@@ -112,105 +110,116 @@ class NormalRows:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _scaled(self, found: Sequence[np.ndarray], scale: np.ndarray, kept: dict[str, Any]) -> Sums:
-        """With one scale for all elements of a chain: sums without it, times its inverse square."""
-        if "rest" not in kept:
-            rows = self._rows(found, kept)
-            unit = self._masked(rows, rows.gains, rows.rest)
+    def _summed(self, found: Sequence[np.ndarray], root: np.ndarray, kept: dict[str, Any]) -> Sums:
+        is_scalar = root.ndim == 3 and self.d == 1
+        if is_scalar and root.shape[1] == 1:  # one for all elements of a chain
+            scale = root[:, 0, 0]
+            precision, linear, constant = self._without_noise(found, kept)
+            weight = scale**-2.0
+            constant = weight * constant - self._seen * np.log(scale)
+            return weight[:, None] * precision, weight[:, None] * linear, constant
+        columns, rest = self._rows(found, kept)
+        if is_scalar and not columns.is_common:
+            pairs, line, squares = self._products(columns, rest, kept)
+            weight = (root * root)[..., 0]
+            pairs, line = pairs / weight[..., None, None], line / weight[..., None]
+            products = pairs, line, squares / weight
+        else:
+            gains, rest = _whitened(columns.gains, rest, root)
+            products = self._products(columns._replace(gains=gains), rest, {})
+        scale = root if root.ndim == 3 else np.linalg.diagonal(root)
+        log_det = np.log(scale).sum(axis=-1)
+        if log_det.shape[1] == 1:
+            log_det = log_det[:, 0] * self._seen
+        else:
+            log_det = (log_det if self._mask is None else log_det * self._mask).sum(axis=-1)
+        precision, linear, constant = self._scattered(columns, *products)
+        return precision, linear, constant - log_det
+
+    def _without_noise(self, found: Sequence[np.ndarray], kept: dict[str, Any]) -> Sums:
+        """Sums for a scale of one."""
+        summed = kept.get("summed")
+        if summed is None:
+            columns, rest = self._rows(found, kept)
+            pairs, line, squares = self._products(columns, rest, kept)
             precision = kept.get("precision")
-            precision = self._precision(unit) if precision is None else precision
+            summed = self._scattered(columns, pairs, line, squares, precision)
             if self._columns_known:
-                kept["precision"] = precision
-            rest = precision, *self._linear(unit)
+                kept["precision"] = summed[0]
             if self._fixed:
-                kept["rest"] = rest
-        else:
-            rest = kept["rest"]
-        precision, linear, constant = rest
-        weight = scale**-2.0
-        constant = weight * constant - self._seen * np.log(scale)
-        return weight[:, None] * precision, weight[:, None] * linear, constant
+                kept["summed"] = summed
+        return summed
 
-    def _whitened(
-        self, found: Sequence[np.ndarray], root: np.ndarray, kept: dict[str, Any]
-    ) -> Sums:
-        """Rows over the noise, summed."""
-        rows = self._rows(found, kept)
-        gains, rest = rows.gains, rows.rest
-        if root.ndim == 4:
-            lead = np.broadcast_shapes(gains.shape[:3], rest.shape)
-            right = np.concatenate(
-                [
-                    np.broadcast_to(gains, (*lead, gains.shape[-1])),
-                    np.broadcast_to(rest, lead)[..., None],
-                ],
-                axis=-1,
-            )
-            solved = np.linalg.solve(root, right)
-            gains, rest = solved[..., :-1], solved[..., -1]
-            log_scale = np.log(np.linalg.diagonal(root)).sum(axis=-1)
-        else:
-            gains, rest = gains / root[..., None], rest / root
-            log_scale = np.log(root).sum(axis=-1)
-        if self._mask is not None:
-            log_scale = log_scale * self._mask
-        rows = self._masked(rows, gains, rest)
-        linear, constant = self._linear(rows)
-        return self._precision(rows), linear, constant - log_scale.sum(axis=-1)
+    def _products(
+        self, columns: _Columns, rest: np.ndarray, kept: dict[str, Any]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Of each element: products of columns, of columns and constants, and of constants.
 
-    def _masked(self, rows: _Rows, gains: np.ndarray, rest: np.ndarray) -> _Rows:
-        """Rows with those of elements that do not count as zeros."""
+        Of elements that do not count zero; summed where all elements have the same columns.
+        """
+        gains = columns.gains
         if self._mask is not None:
             gains, rest = gains * self._mask[:, None, None], rest * self._mask[:, None]
-        return rows._replace(gains=gains, rest=rest)
-
-    def _precision(self, rows: _Rows) -> np.ndarray:
-        gains = rows.gains
-        if rows.is_common:
-            flat = gains.reshape(len(gains), -1, gains.shape[-1])
-            pairs = (np.swapaxes(flat, -1, -2) @ flat)[:, None]
-        else:
-            pairs = np.einsum("...ka,...kb->...ab", gains, gains)
-        return _scattered(pairs, rows.entries, self.layout.entries)
-
-    def _linear(self, rows: _Rows) -> tuple[np.ndarray, np.ndarray]:
-        gains, rest = rows.gains, rows.rest
-        if rows.is_common:
-            flat = gains.reshape(len(gains), -1, gains.shape[-1])
-            line = -np.vecmat(rest.reshape(len(rest), -1), flat)[:, None]
-        else:
-            line = -np.einsum("...ka,...k->...a", gains, rest)
-        return _scattered(line, rows.places, self.layout.size), -0.5 * (rest * rest).sum((-2, -1))
-
-    def _rows(self, found: Sequence[np.ndarray], kept: dict[str, Any]) -> _Rows:
-        """Coefficients, constants and positions, from values of the roots."""
-        rows = kept.get("rows")
-        if rows is None:
-            rows = self._joined(found)
+        if columns.is_common:
+            gains = _wide(gains, self.elements).reshape(len(gains), 1, -1, gains.shape[-1])
+            rest = _wide(rest, self.elements).reshape(len(rest), 1, -1)
+        pairs = kept.get("pairs")
+        if pairs is None:
+            pairs = np.swapaxes(gains, -1, -2) @ gains
             if self._columns_known:
-                kept["rows"] = rows
-        return rows._replace(rest=self._full(found[0], self.event) + rows.rest)
+                kept["pairs"] = pairs
+        return pairs, -np.vecmat(rest, gains), np.vecdot(rest, rest)
 
-    def _joined(self, found: Sequence[np.ndarray]) -> _Rows:
-        """The columns of all nodes side by side; constants of what was seen."""
+    def _scattered(
+        self,
+        columns: _Columns,
+        pairs: np.ndarray,
+        line: np.ndarray,
+        squares: np.ndarray,
+        precision: np.ndarray | None = None,
+    ) -> Sums:
+        """Sums over elements, each in its place."""
+        if precision is None:
+            precision = columns.pair_spots(pairs)
+        times = 1 if columns.is_common else self.elements // squares.shape[1]
+        return precision, columns.spots(line), -0.5 * times * squares.sum(axis=-1)
+
+    def _rows(
+        self, found: Sequence[np.ndarray], kept: dict[str, Any]
+    ) -> tuple[_Columns, np.ndarray]:
+        """Columns, and constants ``(lead, elements, d)``, from values of the roots."""
+        columns = kept.get("columns")
+        if columns is None:
+            columns = self._joined(found)
+            if self._columns_known:
+                kept["columns"] = columns
+        rest = self._full(found[0], self.event)
+        return columns, rest if columns.seen is None else rest + columns.seen
+
+    def _joined(self, found: Sequence[np.ndarray]) -> _Columns:
+        """The columns of all nodes side by side."""
         n, free, base = len(self._columns), self.components.free, self.components.base
         gains, at = [], []
         for column, gain, place in zip(
             self._columns, found[1 : n + 1], found[n + 1 : -1], strict=True
         ):
-            shape = (*self.event, column.read.at.shape[-1])
-            gains.append(self._full(gain, shape))
+            gains.append(self._full(gain, (*self.event, column.read.at.shape[-1])))
             at.append(self._at(place, column))
-        gains, at = _beside(gains), _beside(at)
-        rest: Any = 0.0
+        gain, place = _beside(gains), _beside(at)
+        seen = None
         if free is not None:
-            rest = (gains * base[at]).sum(axis=-1)
-            gains = gains * free[at]
-        gains, at = _by_element(gains, at)
-        is_common = bool((at == at[:, :1]).all())
-        places = self.layout.position[at[:, :1] if is_common else at]
-        entries = self.layout.entry(places[..., :, None], places[..., None, :])
-        return _Rows(gains, rest, places, entries, is_common)
+            seen = (gain * base[place]).sum(axis=-1)
+            gain = gain * free[place]
+        gain, place = _by_element(gain, place)
+        if self._columns_known and (gain == gain[:, :1]).all():
+            gain = gain[:, :1]
+        is_common = bool((place == place[:, :1]).all())
+        spots = self.layout.position[place[:, :1] if is_common else place]
+        entries = self.layout.entry(spots[..., :, None], spots[..., None, :])
+        layout = self.layout
+        return _Columns(
+            gain, seen, Spots(spots, layout.size), Spots(entries, layout.entries), is_common
+        )
 
     def _at(self, place: np.ndarray, column: _Column) -> np.ndarray:
         """Natural positions of components of the block, shape (lead, elements, d, k)."""
@@ -220,55 +229,52 @@ class NormalRows:
 
     def _meeting(self) -> Meeting:
         at, varying = [np.empty((self.elements, 0), np.intp)], []
-        for column in self._columns:
+        for k, column in enumerate(self._columns, 1 + len(self._columns)):
             place = column.read.at
             if not self.program.is_known(place):
                 (start,) = column.starts  # such terms stay by themselves
                 size, dims = self.components.size_of(column.name)
                 varying.append((start, start + size, _is_one_element(place, dims)))
                 continue
-            known = self.program.known()
-            k = 1 + len(self._columns) + self._columns.index(column)
-            own = self._at(known[k], column)[0]
+            own = self._at(self.program.known()[k], column)[0]
             alike = bool((own == own[:, :1]).all())
             at.append(own[:, 0] if alike else own.reshape(self.elements, -1))
         return Meeting(np.concatenate(at, axis=1), tuple(varying))
 
     def _full(self, array: np.ndarray, inner: Shape) -> np.ndarray:
-        """``(*lead, members, *plates, *inner)``, or what broadcasts to it, as ``(lead, elements, ...)``.
-
-        The last axes are ``d`` and what comes after the event.
-        """
-        shape = (*self.plates, *inner)
-        members = () if len(self.names) == 1 else (len(self.names),)
-        lead = array.shape[: max(array.ndim - len(shape) - len(members), 0)]
-        full = np.broadcast_to(array, (*lead, *members, *shape))
-        tail = inner[len(self.event) :]
-        return full.reshape(math.prod(lead), self.elements, self.d, *tail)
+        """``(*lead, members, *plates, *inner)`` as ``(lead, elements, d, ...)``; one for what all share."""
+        shape = (*(() if len(self.names) == 1 else (len(self.names),)), *self.plates)
+        n = array.ndim - len(inner)
+        lead, middle = (
+            array.shape[: max(n - len(shape), 0)],
+            array.shape[max(n - len(shape), 0) : n],
+        )
+        elements = 1
+        if math.prod(middle) != 1:
+            elements = self.elements
+            if middle != shape:
+                array = np.broadcast_to(array, (*lead, *shape, *inner))
+        return array.reshape(math.prod(lead), elements, self.d, *inner[len(self.event) :])
 
     def _noise(self, value: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Scales ``(lead, elements, d)``, roots of matrices, or one scale for each chain; and if all are.
-
-        Ones in the place of what is no scale.
-        """
-        member, own = self.like.members[0], self.like.scale.shape
-        is_matrix = member.spread in ("cov", "scale_tril")
+        """Scales ``(lead, elements, d)`` or roots of matrices, and whether some are none (ones there)."""
+        own = self.like.scale.shape
+        is_matrix = self.like.members[0].spread in ("cov", "scale_tril")
         inner = (*self.event, *self.event) if is_matrix else self.event
         batch = value.shape[: value.ndim - len(own)]
-        if member.spread == "cov":
+        if self.like.members[0].spread == "cov":
             value, wrong = cholesky(value)
         else:
             checked = np.linalg.diagonal(value) if is_matrix else value
             wrong = ~((checked > 0) & (checked < np.inf))
             if wrong.any():
-                wrong = wrong.any(axis=-1)[..., None, None] if is_matrix else wrong
-                value = np.where(wrong, np.eye(self.d) if is_matrix else 1.0, value)
-        bad = bool(wrong.any())
-        lead = batch if len(self.names) == 1 else batch[:-1]
-        if member.family is not MvNormal and value.size == math.prod(lead):
-            return value.reshape(-1), bad
+                where = wrong.any(axis=-1)[..., None, None] if is_matrix else wrong
+                value = np.where(where, np.eye(self.d) if is_matrix else 1.0, value)
         pad = len(self.plates) + len(inner) - len(own)
-        return self._full(value.reshape(*batch, *(1,) * pad, *own), inner), bad
+        value = value.reshape(*batch, *(1,) * pad, *own) if pad else value
+        if value.shape[value.ndim - len(inner) :] != inner:
+            value = np.broadcast_to(value, value.shape[: value.ndim - len(inner)] + inner)
+        return self._full(value, inner), bool(wrong.any())
 
     def _ask(self, values: Values, sums: BlockSums | None) -> None:
         """Let the terms' own functions say what is wrong: they raise, or mark chains."""
@@ -298,18 +304,60 @@ class _Column:
     name: str
 
 
-class _Rows(NamedTuple):
-    """Of every element: coefficients ``(lead, elements, d, columns)``, constants ``(lead, elements, d)``.
+class Spots:
+    """Where numbers of elements are added up.
 
-    Where the columns and their pairs stand, ``(lead, elements, columns)``; one element where all have the
-    same.
+    Parameters
+    ----------
+    at : ndarray of int, shape (lead or 1, elements, ...)
+    count : int
+        Places that there are.
+    """
+
+    def __init__(self, at: np.ndarray, count: int) -> None:
+        self.at, self.count = at, count
+        self._flat = np.empty(0, dtype=np.intp)
+        self._lead = 0
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Sums of ``values (lead or 1, elements or 1, ...)`` by place, shape (lead, count)."""
+        lead = max(len(values), len(self.at))
+        if lead != self._lead:
+            at = np.broadcast_to(self.at, (lead, *self.at.shape[1:])).reshape(lead, -1)
+            self._flat = (at + np.arange(lead)[:, None] * self.count).reshape(-1)
+            self._lead = lead
+        shape = (lead, *self.at.shape[1:])
+        if values.shape != shape:
+            values = np.broadcast_to(values, shape)
+        found = np.bincount(self._flat, values.reshape(-1), lead * self.count)
+        return found.reshape(lead, self.count)
+
+
+class _Columns(NamedTuple):
+    """Of every element: coefficients ``(lead, elements, d, columns)``, and where columns and pairs stand.
+
+    One element where all have the same; ``seen`` is what components that were seen add to constants.
     """
 
     gains: np.ndarray
-    rest: np.ndarray
-    places: np.ndarray
-    entries: np.ndarray
+    seen: np.ndarray | None
+    spots: Spots
+    pair_spots: Spots
     is_common: bool
+
+
+def _whitened(
+    gains: np.ndarray, rest: np.ndarray, root: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients and constants over the noise."""
+    if root.ndim == 3:
+        return gains / root[..., None], rest / root
+    return np.linalg.solve(root, gains), np.linalg.solve(root, rest[..., None])[..., 0]
+
+
+def _wide(array: np.ndarray, elements: int) -> np.ndarray:
+    """What all elements share, for each."""
+    return np.broadcast_to(array, (len(array), elements, *array.shape[2:]))
 
 
 def _mask(like: LikeNormals, shape: Shape) -> np.ndarray | None:
@@ -345,15 +393,3 @@ def _is_one_element(at: Expression, dims: int) -> bool:
         elements = at.table.value.reshape(at.table.shape[0], -1) // dims
         return bool((elements == elements[:, :1]).all())
     return at.size == 1
-
-
-def _scattered(values: np.ndarray, spots: np.ndarray, count: int) -> np.ndarray:
-    """Sums of ``values (lead, *rest)`` by ``spots (lead or 1, *rest)``, shape (lead, count)."""
-    lead = max(len(values), len(spots))
-    values = np.broadcast_to(values, (lead, *values.shape[1:])).reshape(lead, -1)
-    spots = np.broadcast_to(spots, (lead, *spots.shape[1:])).reshape(lead, -1)
-    if lead == 1:
-        return np.bincount(spots[0], weights=values[0], minlength=count)[None]
-    offsets = np.arange(lead)[:, None] * count
-    flat = np.bincount((spots + offsets).ravel(), weights=values.ravel(), minlength=lead * count)
-    return flat.reshape(lead, count)

@@ -131,7 +131,8 @@ class StateProgram:
             rows = np.concatenate(arrays).reshape(len(arrays), *first.shape)
         except ValueError:  # some have one row for all chains
             rows = np.stack(np.broadcast_arrays(*arrays))
-        return np.moveaxis(rows, 0, rows.ndim - 1 - len(shape))
+        axis = rows.ndim - 1 - len(shape)
+        return rows.swapaxes(0, 1) if axis == 1 else np.moveaxis(rows, 0, axis)
 
 
 # ---- private ------------------------------------------------------------------------------------
