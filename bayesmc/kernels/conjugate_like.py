@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.conjugate_children import Partner
 from bayesmc.kernels.conjugate_kinds import Kind
@@ -22,15 +21,13 @@ from bayesmc.kernels.conjugate_labels import ByLabel
 from bayesmc.kernels.conjugate_matching import Match
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.like_children import as_one_child, in_model_of, like_children
+from bayesmc.structure.like_children import as_one_child, like_children
 from bayesmc.structure.like_functions import Slots
 from bayesmc.structure.like_terms import LikeTerms
 from bayesmc.structure.target import Term, Values
 
 #: elements of one child from which on arrays, not calls, take the time
 _LARGE = 512
-#: relative error that sums of many terms may have
-_ROUNDING = 1e-9
 
 
 class LikePartner(Partner):
@@ -56,7 +53,6 @@ class LikePartner(Partner):
     ) -> None:
         self.children = tuple(m.child for m in matches)
         self._like = like
-        self._asked = in_model_of(blanket, like.model)
         own = like.term.name
         sources = like.slots.sources
         above = {name: these for name, these in sources.items() if name != own}
@@ -87,7 +83,7 @@ class LikePartner(Partner):
     def _distribution(self, state: Values) -> tuple[Distribution, Shape, tuple[Any, ...]]:
         gathered = self._parents.gathered(state)
         if self.relation.kind == "lookup":
-            return self._asked.distribution_looked_up(self.child, gathered)
+            return self.blanket.distribution_looked_up(self.child, gathered)
         return (*self.term.distribution(gathered), ())
 
     def _value(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -138,35 +134,6 @@ def partners_of(blanket: Blanket, kind: Kind, matches: Sequence[Match]) -> list[
 
 
 def _as_one(blanket: Blanket, matches: Sequence[Match], kind: Kind) -> LikePartner | None:
-    """Like children as one partner; None where that would not add what they add."""
-    states = blanket.target.states
-    if states is None:
-        return None
-    try:
-        one = as_one_child(blanket, [m.child for m in matches], states)
-        if one is None:
-            return None
-        partner = LikePartner(blanket, matches, kind, *one)
-        return partner if _agrees(partner, matches, states) else None
-    except BayesmcError:  # at some state, perhaps one that is impossible
-        return None
-
-
-def _agrees(partner: LikePartner, matches: Sequence[Match], states: Values) -> bool:
-    """Whether the group adds at some states what its children add one by one."""
-    blanket = partner.blanket
-    members = blanket.classes[0]
-    with marking_invalid(), np.errstate(all="ignore"):
-        together = partner.natural(states, members)
-        totals: list[Any] = [0.0] * len(together)
-        sizes: list[Any] = [0.0] * len(together)
-        for match in matches:
-            alone = Partner(blanket, match, partner.kind, settle=False).natural(states, members)
-            for i, added in enumerate(alone):
-                totals[i], sizes[i] = totals[i] + added, sizes[i] + np.abs(added)
-        return all(map(_near, together, totals, sizes))
-
-
-def _near(a: np.ndarray, b: np.ndarray, size: np.ndarray) -> bool:
-    same = (a == b) | (np.isnan(a) & np.isnan(b))
-    return bool((same | (np.abs(a - b) <= _ROUNDING * size)).all())
+    """Like children as one partner; None where it is not known what each of them looks up."""
+    one = as_one_child(blanket, [m.child for m in matches])
+    return None if one is None else LikePartner(blanket, matches, kind, *one)

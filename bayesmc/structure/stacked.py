@@ -5,9 +5,7 @@ blanket of one of them then serves all: its neighbours' names stand for arrays i
 of them are stacked, with the group as one more batch axis, after the chains. Functions broadcast over batch
 axes, so nothing else has to know.
 
-Numbers by which the functions of a group differ (``t=t``) are stacked as well, but a function need not
-broadcast over those; the stacked blanket is compared with the single ones on a few states, and what does not
-agree is left alone.
+Constants by which the functions of a group differ (``t=t``) are stacked as well (``like_functions``).
 """
 
 from __future__ import annotations
@@ -18,25 +16,21 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_functions import (
     LikeFunctions,
     Signature,
     Slots,
-    close,
-    in_model,
+    StackedFunction,
     stack_arrays,
     value_key,
 )
+from bayesmc.structure.like_terms import one_term
 from bayesmc.structure.target import Target, Values
 
 #: nodes that are worth a group
 FEWEST = 4
-#: values of finite nodes that are tried, to compare a stack with its members
-_TRIED = 6
 
 
 class StackedBlanket:
@@ -137,14 +131,8 @@ def stacks(
     found: list[StackedBlanket] = []
     for group in alike.values():
         for members in _apart(group):
-            if len(members) < FEWEST:
-                continue
-            states = target.states
-            if states is None:
-                return [], list(names)
-            stack = _stacked(target, members, states)
-            if stack is not None:
-                found.append(stack)
+            if len(members) >= FEWEST:
+                found.append(_stacked(target, members))
     taken = {n for stack in found for n in stack.names}
     return found, [n for n in names if n not in taken]
 
@@ -229,65 +217,33 @@ def _apart(group: Sequence[_Form]) -> Iterator[list[_Form]]:
         yield [group[i] for i in members]
 
 
-def _stacked(target: Target, forms: Sequence[_Form], states: Values) -> StackedBlanket | None:
-    """The stack of some nodes that are alike and apart; None where it would not say what they say."""
-    try:
-        one = _representative(target, forms, states)
-        if one is None:
-            return None
-        slots = Slots(target, _sources(forms), len(forms))
-        stack = StackedBlanket(one, [f.blanket for f in forms], slots)
-        return stack if _agrees(stack, states) else None
-    except BayesmcError:  # at some state, perhaps one that is impossible
-        return None
+def _stacked(target: Target, forms: Sequence[_Form]) -> StackedBlanket:
+    """The stack of some nodes that are alike and apart."""
+    slots = Slots(target, _sources(forms), len(forms))
+    return StackedBlanket(_representative(target, forms), [f.blanket for f in forms], slots)
 
 
-def _sources(forms: Sequence[_Form], with_path: bool = False) -> dict[str, tuple[str, ...]]:
+def _sources(forms: Sequence[_Form]) -> dict[str, tuple[str, ...]]:
     """What each name around the first node stands for."""
     first = forms[0]
     found = {first.blanket.name: tuple(f.blanket.name for f in forms)}
     for at, name in enumerate(first.others):
         found[name] = tuple(f.others[at] for f in forms)
-    for at, name in enumerate(first.blanket.path if with_path else ()):
-        found[name] = tuple(f.parts[at] for f in forms)
     return found
 
 
-def _representative(target: Target, forms: Sequence[_Form], states: Values) -> Blanket | None:
-    """The first node's blanket, where need be in a model whose functions have the numbers of all."""
+def _representative(target: Target, forms: Sequence[_Form]) -> Blanket:
+    """The first node's blanket, where need be with functions that have the constants of all."""
     first = forms[0]
-    gathered = Slots(target, _sources(forms, with_path=True), len(forms)).gathered(states)
-    model, terms = target.model, dict(target.terms)
+    terms, links = dict(target.terms), dict[str, StackedFunction]()
     for at, name in enumerate(first.parts):
         alike = LikeFunctions(
             tuple(f.parts[at] for f in forms), tuple(f.signatures[at] for f in forms)
         )
         if name in terms:
-            terms[name] = replace(terms[name], mask=alike.mask(target))
-        if alike.varying:
-            made = alike.as_one(target, model, gathered, states)
-            if made is None:
-                return None
-            model = made
-    if model is target.model and all(terms[n].mask is t.mask for n, t in target.terms.items()):
+            terms[name] = one_term(target, terms[name], alike)
+        elif alike.stacked is not None:
+            links[name] = alike.stacked
+    if not links and all(terms[n] is t for n, t in target.terms.items()):
         return first.blanket
-    return Blanket(in_model(target, model, terms), first.blanket.name)
-
-
-def _agrees(stack: StackedBlanket, states: Values) -> bool:
-    """Whether the stack says of some states, with values in other states' places, what its members say."""
-    now = stack.current(states)
-    if stack.one.node.domain is not None:
-        size = stack.one.node.domain.size
-        tried = [(now + k) % size for k in range(min(size, _TRIED))]
-    else:
-        tried = [now, np.roll(now, 1, axis=0), np.roll(now, 1, axis=1)]
-    candidate = np.stack(tried).astype(now.dtype)
-    shape = candidate.shape[: candidate.ndim - len(stack.one.event_shape)]
-    with marking_invalid(), np.errstate(all="ignore"):
-        together = np.broadcast_to(stack.log_density(states, candidate), shape)
-        for i, blanket in enumerate(stack.blankets):
-            alone = blanket.log_density(states, candidate[:, :, i])
-            if not close(together[:, :, i], np.broadcast_to(alone, shape[:2] + shape[3:])):
-                return False
-    return True
+    return Blanket(replace(target, terms=terms, stacked_links=links, _below={}), first.blanket.name)

@@ -19,11 +19,11 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, DensityError, TraceError
 from bayesmc.expression import Expression
 from bayesmc.network import Model, Observed, Problem
-from bayesmc.network.expressions import Followed, Opaque, density, log_density_of
+from bayesmc.network.expressions import Followed, Opaque, density, log_density_of, log_factor_of
 from bayesmc.network.model import invalid_error
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
-from bayesmc.structure.like_functions import Signatures
+from bayesmc.structure.like_functions import Signatures, StackedFunction
 from bayesmc.structure.like_links import FEWEST, LinkSteps
 
 Values = dict[str, np.ndarray]
@@ -61,13 +61,11 @@ class Term:
     @cached_property
     def read(self) -> Followed | Opaque:
         """What its function computes of stochastic nodes and inputs."""
-        if self.is_potential:
-            return Opaque("it is a potential", frozenset(self.parents))
         return density(self.model, self.name)
 
     @cached_property
     def expression(self) -> Expression | None:
-        """Its log density, shape its plates, of stored values of stochastic nodes and inputs.
+        """Its log factors, shape its plates, of stored values of stochastic nodes and inputs.
 
         None where the function could not be followed, or the family has no closed form. Its mask is left
         to those who sum.
@@ -75,6 +73,8 @@ class Term:
         if isinstance(self.read, Opaque):
             return None
         try:
+            if self.is_potential:
+                return log_factor_of(self.model, self.name)
             return log_density_of(self.model, self.name)
         except TraceError:
             return None
@@ -168,6 +168,8 @@ class Target:
     terms: dict[str, Term]
     #: deterministic nodes between the chain and the terms, parents first
     links: tuple[str, ...]
+    #: deterministic nodes that stand for like ones, with other constants than the model's
+    stacked_links: Mapping[str, StackedFunction] = field(default_factory=dict, repr=False)
     _below: dict[str, tuple[str, ...]] = field(default_factory=dict, repr=False)
 
     @property
@@ -278,9 +280,11 @@ class Target:
 
     def compute(self, values: Values, links: tuple[str, ...]) -> None:
         """Recompute some deterministic nodes, given parents first; many like ones in one call."""
-        if len(links) < FEWEST:
+        if len(links) < FEWEST or self.stacked_links:
             for link in links:
-                values[link], _ = self.model.evaluate(link, values)
+                stacked = self.stacked_links.get(link)
+                found = self.model.evaluate(link, values) if stacked is None else stacked(values)
+                values[link] = found[0]
             return
         steps = self._link_steps.get(links)
         if steps is None:

@@ -290,7 +290,7 @@ def test_few_unlike_and_large_children_stay_alone() -> None:
     for t in range(3):
         net.add(f"few[{t}]", lambda rate: bmc.Poisson(rate), parents=["rate"])
     for t in range(4):
-        net.add(f"power[{t}]", lambda rate, t=t: bmc.Poisson(rate if t > 1 else 2 * rate),
+        net.add(f"power[{t}]", lambda rate, t=t: bmc.Poisson(rate / 3 if t > 1 else 2 * rate),
                 parents=["rate"])  # fmt: skip
         net.add(f"large[{t}]", lambda rate: bmc.Poisson(rate), parents=["rate"], plates="i")
     evidence: dict[str, Any] = {f"few[{t}]": t for t in range(3)}
