@@ -18,8 +18,9 @@ from bayesmc.expression import Constant, Expression, Gather
 from bayesmc.kernels.gaussian_band import cholesky
 from bayesmc.kernels.gaussian_layout import BlockSums, Layout
 from bayesmc.kernels.gaussian_order import Components, Meeting
-from bayesmc.kernels.gaussian_terms import LikeNormals
+from bayesmc.kernels.gaussian_terms import NormalTerm
 from bayesmc.passes.affine import Read, affine
+from bayesmc.passes.templates import stacked_rows
 from bayesmc.shapes import Shape
 from bayesmc.structure.programs import StateProgram
 from bayesmc.structure.target import Target, Values
@@ -34,7 +35,8 @@ class NormalRows:
     Parameters
     ----------
     target : Target
-    like : LikeNormals
+    members : sequence of NormalTerm
+        Of one key, which the block's nodes enter in the same places.
     components : Components
         Of the block.
 
@@ -52,41 +54,48 @@ class NormalRows:
 
     layout: Layout
 
-    def __init__(self, target: Target, like: LikeNormals, components: Components) -> None:
-        self.target, self.like, self.components = target, like, components
-        self.names = like.names
+    def __init__(
+        self, target: Target, members: Sequence[NormalTerm], components: Components
+    ) -> None:
+        self.target, self.components = target, components
+        self.members, first = tuple(members), members[0]
+        self.names = tuple(m.term.name for m in members)
         self.own = self.names[0] in components.start
-        first = like.members[0]
         self.plates, self.event = first.term.shape, target.model[self.names[0]].event_shape
         self.elements = len(self.names) * math.prod(self.plates)
         self.d = math.prod(self.event)
+        like = stacked_rows([(m.residual, m.scale) for m in members], [m.template for m in members])
+        assert like is not None, "they have one key"
+        residual, scale = like.roots
         inside = {n: k for k, n in enumerate(first.leaves) if n in components.start}
-        form = affine(like.residual, inside)
+        form = affine(residual, inside)
         self._columns = [
-            _Column(read, components.starts([m.leaves[inside[n]] for m in like.members]), n)
+            _Column(read, components.starts([m.leaves[inside[n]] for m in members]), n)
             for n, read in form.reads.items()
         ]
         reads = [c.read for c in self._columns]
         gains, places = [r.gain for r in reads], [r.at for r in reads]
-        roots = [form.offset, *gains, *places, like.scale]
-        self.program = StateProgram(target, roots, [m.leaves for m in like.members], like.constants)
+        roots = [form.offset, *gains, *places, scale]
+        self.program = StateProgram(target, roots, like.leaves, like.constants)
         known = self.program.is_known
         self._columns_known = all(map(known, (*gains, *places)))
         #: all but the noise stays what it is; everything does
         self._fixed = self._columns_known and known(form.offset)
-        self._frozen = self._fixed and known(like.scale)
-        self._mask = _mask(like, self.plates)
+        self._frozen = self._fixed and known(scale)
+        self._mask = _mask(members, self.plates)
         #: elements that count
         self._seen = float(self.elements if self._mask is None else self._mask.sum())
-        self.meeting = self._meeting()
+        self._scale_shape = scale.shape
         self._kept: dict[str, Any] = {}
+        self.meeting = self._meeting()
 
     def add(self, values: Values, sums: BlockSums) -> None:
         """Add what the terms say, given values of all nodes outside of the block."""
-        kept = self._kept if self.program.are_known(values) else {}
+        still = self.program.are_known(values)
+        kept = self._kept if still else {}
         if "all" not in kept:
             try:
-                found = self.program(values)
+                found = self.program(values, still)
             except IndexError:
                 self._ask(values, None)
                 raise
@@ -97,7 +106,7 @@ class NormalRows:
             if not np.isfinite(summed[1]).all():  # a mean that overflows
                 self._ask(values, sums)
                 sums.bad |= ~np.isfinite(summed[1]).all(axis=-1)
-            if not self._frozen or kept is not self._kept:
+            if not (self._frozen and still):
                 sums.add(*summed)
                 return
             kept["all"] = tuple(a[:1] for a in summed)
@@ -207,7 +216,7 @@ class NormalRows:
             at.append(self._at(place, column))
         gain, place = _beside(gains), _beside(at)
         seen = None
-        if free is not None:
+        if free is not None and base is not None:
             seen = (gain * base[place]).sum(axis=-1)
             gain = gain * free[place]
         gain, place = _by_element(gain, place)
@@ -229,6 +238,7 @@ class NormalRows:
 
     def _meeting(self) -> Meeting:
         at, varying = [np.empty((self.elements, 0), np.intp)], []
+        known = self.program.known()
         for k, column in enumerate(self._columns, 1 + len(self._columns)):
             place = column.read.at
             if not self.program.is_known(place):
@@ -236,14 +246,14 @@ class NormalRows:
                 size, dims = self.components.size_of(column.name)
                 varying.append((start, start + size, _is_one_element(place, dims)))
                 continue
-            own = self._at(self.program.known()[k], column)[0]
+            own = self._at(known[k], column)[0]
             alike = bool((own == own[:, :1]).all())
             at.append(own[:, 0] if alike else own.reshape(self.elements, -1))
         return Meeting(np.concatenate(at, axis=1), tuple(varying))
 
     def _full(self, array: np.ndarray, inner: Shape) -> np.ndarray:
         """``(*lead, members, *plates, *inner)`` as ``(lead, elements, d, ...)``; one for what all share."""
-        shape = (*(() if len(self.names) == 1 else (len(self.names),)), *self.plates)
+        shape = (len(self.names), *self.plates)
         n = array.ndim - len(inner)
         lead, middle = (
             array.shape[: max(n - len(shape), 0)],
@@ -258,15 +268,15 @@ class NormalRows:
 
     def _noise(self, value: np.ndarray) -> tuple[np.ndarray, bool]:
         """Scales ``(lead, elements, d)`` or roots of matrices, and whether some are none (ones there)."""
-        own = self.like.scale.shape
-        is_matrix = self.like.members[0].spread in ("cov", "scale_tril")
+        own = self._scale_shape
+        is_matrix = self.members[0].spread in ("cov", "scale_tril")
         inner = (*self.event, *self.event) if is_matrix else self.event
         batch = value.shape[: value.ndim - len(own)]
-        if self.like.members[0].spread == "cov":
+        if self.members[0].spread == "cov":
             value, wrong = cholesky(value)
         else:
             checked = np.linalg.diagonal(value) if is_matrix else value
-            wrong = ~((checked > 0) & (checked < np.inf))
+            wrong = np.asarray(~((checked > 0) & (checked < np.inf)))
             if wrong.any():
                 where = wrong.any(axis=-1)[..., None, None] if is_matrix else wrong
                 value = np.where(where, np.eye(self.d) if is_matrix else 1.0, value)
@@ -280,7 +290,7 @@ class NormalRows:
         """Let the terms' own functions say what is wrong: they raise, or mark chains."""
         state = {**values, **self.components.state}
         self.target.compute(state, self.target.below(self.components.names))
-        for member in self.like.members:
+        for member in self.members:
             dist: Any = member.term.distribution(state)[0]
             if dist.invalid is None or sums is None:
                 continue
@@ -360,9 +370,9 @@ def _wide(array: np.ndarray, elements: int) -> np.ndarray:
     return np.broadcast_to(array, (len(array), elements, *array.shape[2:]))
 
 
-def _mask(like: LikeNormals, shape: Shape) -> np.ndarray | None:
+def _mask(members: Sequence[NormalTerm], shape: Shape) -> np.ndarray | None:
     """Ones for the elements that count, zeros for others; None where all do."""
-    masks = [m.term.mask for m in like.members]
+    masks = [m.term.mask for m in members]
     if all(m is None for m in masks):
         return None
     full = [np.ones(shape) if m is None else m.astype(float) for m in masks]

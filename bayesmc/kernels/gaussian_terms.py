@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Hashable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from bayesmc.expression import (
     Expression,
     Family,
     as_expression,
-    broadcast,
     call,
     elementwise,
     pick,
@@ -28,7 +26,7 @@ from bayesmc.expression import (
 from bayesmc.network.expressions import Opaque, stored_leaf, value_of
 from bayesmc.passes.affine import Affine, affine
 from bayesmc.passes.log_density import family_of
-from bayesmc.passes.templates import stacked, template
+from bayesmc.passes.templates import Template, template
 from bayesmc.structure.target import Target, Term
 
 _FAMILIES = (Normal, MvNormal, LogNormal)
@@ -41,58 +39,32 @@ class NormalTerm:
     Attributes
     ----------
     term : Term
-    family : type
+    family : callable
         ``Normal``, ``MvNormal``, or ``LogNormal``, of which the logarithm is meant.
     spread : str
         What ``scale`` is: ``"scale"`` standard deviations, ``"cov"``, ``"scale_tril"`` or ``"scale_diag"``.
-    parts : Expression
-        The residual and the scale as the operands of one expression.
-    leaves : tuple of str
-        The nodes that it reads, in the order in which like terms correspond.
+    residual : Expression
+        The value less the mean, shape ``(*plates, *event)``.
+    scale : Expression
+        As it was given: of a shape that broadcasts to the residual's, or of matrices.
+    template : Template
+        Of the two.
     key : hashable
         Equal for like terms.
     """
 
     term: Term
-    family: type
+    family: Any
     spread: str
-    parts: Expression
-    leaves: tuple[str, ...]
+    residual: Expression
+    scale: Expression
+    template: Template
     key: Hashable
 
     @property
-    def residual(self) -> Expression:
-        """The value less the mean, shape ``(*plates, *event)``."""
-        return self.parts.operands[0]
-
-    @property
-    def scale(self) -> Expression:
-        """As it was given: of a shape that broadcasts to the residual's, or of matrices."""
-        return self.parts.operands[1]
-
-
-@dataclass(frozen=True, eq=False)
-class LikeNormals:
-    """Like Normal terms as one.
-
-    Attributes
-    ----------
-    members : tuple of NormalTerm
-    residual, scale : Expression
-        Of the names that the first reads, and of ``constants``.
-    constants : dict
-        Leaf -> what it is for each member, shape ``(members, *shape)``.
-    """
-
-    members: tuple[NormalTerm, ...]
-    residual: Expression
-    scale: Expression
-    constants: dict[str, np.ndarray]
-
-    @cached_property
-    def names(self) -> tuple[str, ...]:
-        """Names of the terms."""
-        return tuple(m.term.name for m in self.members)
+    def leaves(self) -> tuple[str, ...]:
+        """The nodes that it reads, in the order in which like terms correspond."""
+        return self.template.leaves
 
 
 class NormalTerms:
@@ -154,24 +126,15 @@ class NormalTerms:
             for n in read.at.leaves
         )
 
-    def like(self, terms: Sequence[Term], inside: Collection[str]) -> list[LikeNormals]:
-        """Terms by likeness, in the order in which they begin, those that ``inside`` enters alike.
-
-        Parameters
-        ----------
-        inside : collection of str
-            Nodes of the block.
-        """
+    def like(self, terms: Sequence[Term], inside: Collection[str]) -> list[list[NormalTerm]]:
+        """Terms by likeness, in the order in which they begin, those that ``inside`` enters alike."""
         groups: dict[Hashable, list[NormalTerm]] = {}
         for term in terms:
             found = self.of(term.name)
             assert found is not None, "a block has Normal terms only"
-            own = term.name in inside
             within = tuple(n in inside for n in found.leaves)
-            groups.setdefault((found.key, within, own), []).append(found)
-        made = [like for group in groups.values() for like in _as_one(group)]
-        place = {t.name: k for k, t in enumerate(terms)}
-        return sorted(made, key=lambda like: place[like.names[0]])
+            groups.setdefault((found.key, within, term.name in inside), []).append(found)
+        return list(groups.values())
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -187,12 +150,11 @@ class NormalTerms:
             value = elementwise(np.log, value)
         loc = as_expression(family.parameters["loc"])
         scale = as_expression(family.parameters[kinds[0]])
-        residual = broadcast(elementwise(np.subtract, value, loc), node.value_shape)
-        parts = pick([residual, scale], np.arange(residual.size + scale.size))
-        found = template(parts)
-        known = tuple(self.target.is_known(n) for n in found.leaves)
-        key = found.key, known, family.make, kinds[0]
-        return NormalTerm(term, family.make, kinds[0], parts, found.leaves, key)
+        residual = elementwise(np.subtract, value, loc)
+        made = template(residual, scale)
+        known = tuple(self.target.is_known(n) for n in made.leaves)
+        key = made.key, known, family.make, kinds[0]
+        return NormalTerm(term, family.make, kinds[0], residual, scale, made, key)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -257,16 +219,3 @@ def _form(found: NormalTerm, names: Sequence[str]) -> Affine | None:
         return affine(found.residual, names)
     except TraceError:
         return None
-
-
-def _as_one(group: Sequence[NormalTerm]) -> list[LikeNormals]:
-    """Like terms as one, or each for itself where their constants stand where they may not vary."""
-    if len(group) > 1:
-        try:
-            made = stacked([m.parts for m in group])
-        except TraceError:
-            made = None
-        if made is not None and len(made.root.operands) == 2:
-            residual, scale = made.root.operands
-            return [LikeNormals(tuple(group), residual, scale, made.constants)]
-    return [LikeNormals((m,), m.residual, m.scale, {}) for m in group]
