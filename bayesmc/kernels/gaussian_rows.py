@@ -278,7 +278,7 @@ class NormalRows:
             checked = np.linalg.diagonal(value) if is_matrix else value
             wrong = np.asarray(~((checked > 0) & (checked < np.inf)))
             if wrong.any():
-                where = wrong.any(axis=-1)[..., None, None] if is_matrix else wrong
+                where = np.asarray(wrong.any(axis=-1))[..., None, None] if is_matrix else wrong
                 value = np.where(where, np.eye(self.d) if is_matrix else 1.0, value)
         pad = len(self.plates) + len(inner) - len(own)
         value = value.reshape(*batch, *(1,) * pad, *own) if pad else value
