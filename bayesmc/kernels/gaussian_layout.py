@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.kernels.gaussian_band import Band, cholesky, lapack
 from bayesmc.kernels.gaussian_order import Components, order_of
+from bayesmc.linalg.patterns import Band, cholesky, lapack
 from bayesmc.structure.target import Values
 
 #: components up to which triangles are solved by one call for all chains

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bayesmc.kernels.gaussian_band import Band, Blocks, Pattern
+from bayesmc.linalg.patterns import Band, Blocks, Pattern
 from bayesmc.structure.target import Target
 
 #: components up to which one dense matrix is best
@@ -272,8 +272,9 @@ def _two_of(count: int) -> tuple[np.ndarray, np.ndarray]:
 def _narrow(size: int, pairs: np.ndarray) -> tuple[np.ndarray, int]:
     """An order in which pairs stand near each other: the given one, or Cuthill and McKee's; and how near."""
     natural = np.arange(size)
-    if not len(pairs):
-        return natural, 0
+    width = int(np.abs(np.subtract(*pairs.T)).max(initial=0))
+    if width < 2:  # no order is narrower
+        return natural, width
     # imported here: sparse matrices take long to load, and few blocks need them
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -282,5 +283,5 @@ def _narrow(size: int, pairs: np.ndarray) -> tuple[np.ndarray, int]:
     graph = coo_array((np.ones(len(a)), (a, b)), shape=(size, size)).tocsr()
     place = np.empty(size, dtype=np.intp)
     place[reverse_cuthill_mckee(graph, symmetric_mode=True)] = natural
-    widths = [int(np.abs(np.subtract(*p[pairs].T)).max()) for p in (natural, place)]
-    return (place, widths[1]) if widths[1] < widths[0] else (natural, widths[0])
+    other = int(np.abs(np.subtract(*place[pairs].T)).max())
+    return (place, other) if other < width else (natural, width)

@@ -17,10 +17,10 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_order
-from bayesmc.kernels.gaussian_band import Band, Blocks, Pattern
 from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
 from bayesmc.kernels.gaussian_layout import solved
 from bayesmc.kernels.gaussian_order import Order
+from bayesmc.linalg.patterns import Band, Blocks, Pattern
 from bayesmc.network import pose
 from bayesmc.structure.target import Target, Values, target_of
 
