@@ -6,6 +6,7 @@ models.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -22,6 +23,7 @@ from bayesmc.kernels.gaussian_layout import solved
 from bayesmc.kernels.gaussian_order import Order
 from bayesmc.linalg.patterns import Band, Blocks, Pattern
 from bayesmc.network import pose
+from bayesmc.network.expressions import Opaque
 from bayesmc.structure.target import Target, Values, target_of
 
 CHAINS = 3
@@ -200,6 +202,39 @@ def through_nodes() -> tuple[bmc.BayesNet, dict[str, Any]]:
     return net, evidence
 
 
+def crossed() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """Effects of two groupings by fixed indices, a slope, their sum, and every element's own noise."""
+    rng = np.random.default_rng(7)
+    first, second, x = np.arange(12) % 4, np.arange(12) // 5, rng.normal(size=12)
+    net = bmc.BayesNet(plates={"i": 12, "g": 4, "h": 3})
+    net.add("mean", bmc.Normal(0.3, 2.0))
+    net.add("tau", bmc.Gamma(3.0, 3.0))
+    net.add("w", bmc.Gamma(3.0, 3.0), plates="i")
+    net.add("a", lambda mean, tau: bmc.Normal(mean, tau**-0.5), plates="g")
+    net.add("b", bmc.Normal(0.0, 1.0), plates="h")
+    net.add(
+        "y",
+        lambda a, b, mean, w: bmc.Normal(a[first] + b[second] + mean * x, w**-0.5),
+        plates="i",
+    )
+    net.add("total", lambda a: bmc.Normal(a.sum(), 0.5))
+    return net, {"y": np.where(np.arange(12) == 3, np.nan, rng.normal(size=12)), "total": 1.0}
+
+
+def unfollowed() -> tuple[bmc.BayesNet, dict[str, Any]]:
+    """A prior whose mean and scale are computed by what shows no expression."""
+    net = bmc.BayesNet(plates={"k": 4})
+    cosine = np.vectorize(math.cos, otypes=[float])
+    net.add("h", bmc.Normal(0.0, 1.0))
+    net.add("twice", lambda h: 2 * cosine(h))
+    net.add("x", lambda h, twice: bmc.Normal(cosine(h) + twice, 1.5 + cosine(h)), plates="k")
+    net.add("z", bmc.Normal(0.0, 1.0), plates="k")
+    net.add("v", lambda z: bmc.Normal(z, 0.5), plates="k")
+    for t in range(6):
+        net.add(f"y[{t}]", lambda x, z, v: bmc.Normal(x + z - v / 2, 0.5), plates="k")
+    return net, {f"y[{t}]": np.array([0.3, -1.0, 2.0, 0.1]) * t for t in range(6)}
+
+
 def sparse(seed: int) -> Callable[[], tuple[bmc.BayesNet, dict[str, Any]]]:
     def made() -> tuple[bmc.BayesNet, dict[str, Any]]:
         """Every node has some earlier ones as parents, near ones mostly; noise differs by chain."""
@@ -235,6 +270,8 @@ NETS = {
     "moving": moving,
     "labelled": labelled,
     "through nodes": through_nodes,
+    "crossed": crossed,
+    "unfollowed": unfollowed,
 } | {f"sparse {seed}": sparse(seed) for seed in range(3)}
 
 
@@ -278,7 +315,7 @@ def by_differences(
         for n, v in values.items()
         if n in (*target.chain, *target.links)
     }
-    state = {**target.known, **state}
+    state = {**values, **state}
     joined = np.broadcast_to(points[:, None], (*lead, size)).reshape(-1, size)
     free = free_of(block)
     for name in block.names:
@@ -314,6 +351,12 @@ def law_of(block: GaussianBlock, values: Values) -> tuple[np.ndarray, np.ndarray
     free = free_of(block)
     roots = np.stack(steps)[:, :, layout.position][..., free]
     return mean[:, layout.position][:, free], np.einsum("kci,kcj->cij", roots, roots), log_det
+
+
+def replaced_data(target: Target, block: GaussianBlock, values: Values) -> Values:
+    """Other data, as far as the block's terms have any."""
+    seen = [t.name for t in block.terms if t.name not in target.chain]
+    return {**values, **{n: values[n] + 0.3 for n in seen}}
 
 
 def each_order(block: GaussianBlock) -> list[Order]:
@@ -368,6 +411,21 @@ def test_a_term_that_is_forgotten_shows(name: str) -> None:
     block.parts = [part for part in block.parts if part is not forgotten]
     block._standing = None
     assert np.abs(law_of(block, values)[1] - cov).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["lagged", "labelled", "crossed"])
+def test_data_that_are_replaced_are_read_anew(name: str) -> None:
+    target, values = posed(NETS[name])
+    block = the_block(target)
+    before = [law_of(block, values) for _ in range(2)][1]
+    other = replaced_data(target, block, values)
+    precision, line, _ = by_differences(target, block, other)
+    free = free_of(block)
+    precision, line = precision[:, free][:, :, free], line[:, free]
+    mean = np.linalg.solve(precision, line[..., None])[..., 0]
+    np.testing.assert_allclose(law_of(block, other)[0], mean, atol=1e-8)
+    assert np.abs(before[0] - mean).max() > 1e-3  # the control: the old data say something else
+    np.testing.assert_array_equal(law_of(block, values)[0], before[0])
 
 
 @pytest.mark.parametrize("name", NETS)
@@ -460,6 +518,12 @@ def test_the_mean_of_a_chain_is_that_of_the_kalman_smoother(name: str, steps: in
         # the control: smoothing is not what the filter says
         filtered = np.asarray(bmc.filter(dbn, {"y": seen}, engine=bmc.KalmanFilter()).mean(s))
         assert np.abs(together - filtered[: len(inside)]).max() > 1e-2
+
+
+def test_priors_that_cannot_be_followed_belong_to_blocks() -> None:
+    target, _ = posed(unfollowed)
+    assert isinstance(target.terms["x"].read, Opaque)
+    assert "x" in the_block(target).names
 
 
 def test_like_terms_are_one_part() -> None:
