@@ -475,8 +475,10 @@ def _near(a: np.ndarray, b: np.ndarray) -> bool:
     if a.shape != b.shape:
         return False
     a, b = np.asarray(a), np.asarray(b)
+    if (a == b).all():
+        return True
     if a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
-        return bool(np.array_equal(a, b))
+        return False
     a, b = a.astype(float), b.astype(float)
     scale = np.maximum(np.abs(a), np.abs(b))
     largest = np.max(np.where(np.isfinite(scale), scale, 0.0), initial=0.0)

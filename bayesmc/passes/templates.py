@@ -117,11 +117,13 @@ def stacked_rows(
     instead: dict[int, Expression] = {}
     for k, column in enumerate(zip(*(t.constants for t in found), strict=True)):
         first = column[0]
-        if all(c is first or np.array_equal(c, first, equal_nan=True) for c in column):
+        if all(c is first for c in column):
             continue
-        name = f"constant {len(values)}"
-        values[name] = np.stack(column)
-        instead[k] = leaf(name, first.shape, first.dtype)
+        stack = np.stack(column)
+        if not np.array_equal(stack, np.broadcast_to(first, stack.shape), equal_nan=True):
+            name = f"constant {len(values)}"
+            values[name] = stack
+            instead[k] = leaf(name, first.shape, first.dtype)
     return Stacked(_with_leaves(rows[0], instead), values, tuple(t.leaves for t in found))
 
 

@@ -26,6 +26,7 @@ from bayesmc.expression import (
     expressions_of,
     leaf,
     mapped,
+    ordered,
     pick,
     rebuilt,
     replaced,
@@ -266,7 +267,7 @@ class LikeFunctions:
             rank = len(node.plate_shape if node.is_stochastic else node.value_shape)
         result = with_axes(mapped(reading.open, lambda e: replaced(e, instead)), rank)
         shapes = {p: a.shape for p, a in zip(first.parents, first.arguments, strict=True)}
-        return StackedFunction(result, constants, shapes, len(self.names))
+        return StackedFunction(*_computed_once(result, constants), shapes, len(self.names))
 
 
 def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:
@@ -337,6 +338,22 @@ def _of_all(readings: Sequence[Reading]) -> tuple[Reading, dict[str, np.ndarray]
     assert one is not None
     roots = iter(one.roots)
     return Reading(mapped(first.open, lambda _: next(roots))), one.constants
+
+
+def _computed_once(
+    result: Any, constants: dict[str, np.ndarray]
+) -> tuple[Any, dict[str, np.ndarray]]:
+    """The same with what follows from the constants alone as constants."""
+    roots = tuple(expressions_of(result))
+    fixed = {n for n in ordered(*roots) if n.leaves and n.leaves <= constants.keys()}
+    used = [a for n in ordered(*roots) if n not in fixed for a in n.operands]
+    needed = [n for n in dict.fromkeys([*used, *roots]) if n in fixed]
+    names = [f"constant {k}" for k in range(len(needed))]
+    instead: dict[Expression, Expression] = {
+        n: leaf(name, n.shape, n.dtype) for n, name in zip(needed, names, strict=True)
+    }
+    values = dict(zip(names, Program(needed)(constants), strict=True))
+    return mapped(result, lambda e: replaced(e, instead)), values
 
 
 def _is_one(stack: np.ndarray) -> bool:

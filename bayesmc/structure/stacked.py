@@ -11,6 +11,7 @@ Constants by which the functions of a group differ (``t=t``) are stacked as well
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -83,7 +84,10 @@ class StackedBlanket:
 
 
 def stacks(
-    target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]
+    target: Target,
+    blankets: Mapping[str, Blanket],
+    names: Sequence[str],
+    forms: Forms | None = None,
 ) -> tuple[list[StackedBlanket], list[str]]:
     """Groups of like nodes that may be updated as one, and the nodes that are left.
 
@@ -93,6 +97,8 @@ def stacks(
         Of every chain node (or of ``names`` at least).
     names : sequence of str
         Chain nodes to be grouped.
+    forms : Forms, optional
+        Of the target, where they are known.
 
     Returns
     -------
@@ -122,8 +128,8 @@ def stacks(
     """
     if len(names) < FEWEST:
         return [], list(names)
-    forms = _Forms(target)
-    alike: dict[Hashable, list[_Form]] = {}
+    forms = Forms(target) if forms is None else forms
+    alike: dict[Hashable, list[Form]] = {}
     for name in names:
         form = forms.of(blankets[name])
         if form is not None:
@@ -137,11 +143,8 @@ def stacks(
     return found, [n for n in names if n not in taken]
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
-class _Form:
+class Form:
     """A blanket in a way that can be compared.
 
     Attributes
@@ -160,17 +163,38 @@ class _Form:
     signatures: tuple[Signature, ...]
     others: tuple[str, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All nodes around, like ones in like places."""
+        return (self.blanket.name, *self.parts, *self.others)
 
-class _Forms:
-    """Reads blankets; signatures get numbers, so that parts can be brought into one order."""
+    def said_of(self, like: Form, words: str) -> str:
+        """What is said of this node as it is of one that is like it."""
+        names = dict(zip(self.names, like.names, strict=True))
+        return re.sub(r"'([^']*)'", lambda m: f"'{names.get(m[1], m[1])}'", words)
+
+
+class Forms:
+    """The forms of a target's nodes, each found once; parts are brought into one order."""
 
     def __init__(self, target: Target) -> None:
         self.target = target
         self._signatures = target.signatures
         self._numbers: dict[Hashable, int] = {}
+        self._found: dict[str, Form | None] = {}
 
-    def of(self, blanket: Blanket) -> _Form | None:
+    def of(self, blanket: Blanket) -> Form | None:
         """The form of a blanket; None where its node is updated in turns, or in other ways."""
+        if blanket.name not in self._found:
+            self._found[blanket.name] = self._read(blanket)
+        return self._found[blanket.name]
+
+    def key(self, blanket: Blanket) -> Hashable | None:
+        """Equal for nodes around which functions, and what is known, are alike; None of no form."""
+        form = self.of(blanket)
+        return form and (form.key, tuple(map(self.target.is_known, form.names)))
+
+    def _read(self, blanket: Blanket) -> Form | None:
         node = blanket.node
         if blanket.classes != (None,) or self.target.seen(blanket.name) is not None:
             return None
@@ -192,7 +216,7 @@ class _Forms:
         pattern = tuple(tuple(place[n] for n in scope) for scope in read)
         shape = (len(blanket.path), len(own))
         key = (value_key(node), node.support, shape, numbers, pattern)
-        return _Form(key, blanket, parts, signatures, others)
+        return Form(key, blanket, parts, signatures, others)
 
     def _number(self, name: str, roles: Mapping[str, Hashable]) -> int:
         """A number for what a part is, and where it reads the node and what is on its path."""
@@ -203,7 +227,10 @@ class _Forms:
         return self._numbers.setdefault(key, len(self._numbers))
 
 
-def _apart(group: Sequence[_Form]) -> Iterator[list[_Form]]:
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _apart(group: Sequence[Form]) -> Iterator[list[Form]]:
     """Like nodes by colour: those of one share no term."""
     if len(group) < FEWEST:
         return
@@ -217,13 +244,13 @@ def _apart(group: Sequence[_Form]) -> Iterator[list[_Form]]:
         yield [group[i] for i in members]
 
 
-def _stacked(target: Target, forms: Sequence[_Form]) -> StackedBlanket:
+def _stacked(target: Target, forms: Sequence[Form]) -> StackedBlanket:
     """The stack of some nodes that are alike and apart."""
     slots = Slots(target, _sources(forms), len(forms))
     return StackedBlanket(_representative(target, forms), [f.blanket for f in forms], slots)
 
 
-def _sources(forms: Sequence[_Form]) -> dict[str, tuple[str, ...]]:
+def _sources(forms: Sequence[Form]) -> dict[str, tuple[str, ...]]:
     """What each name around the first node stands for."""
     first = forms[0]
     found = {first.blanket.name: tuple(f.blanket.name for f in forms)}
@@ -232,7 +259,7 @@ def _sources(forms: Sequence[_Form]) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _representative(target: Target, forms: Sequence[_Form]) -> Blanket:
+def _representative(target: Target, forms: Sequence[Form]) -> Blanket:
     """The first node's blanket, where need be with functions that have the constants of all."""
     first = forms[0]
     terms, links = dict(target.terms), dict[str, StackedFunction]()
