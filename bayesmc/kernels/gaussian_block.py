@@ -94,7 +94,7 @@ class GaussianBlock(Kernel):
         noise = rng.standard_normal(sums.linear.shape)
         factor = self._factored(sums.precision)
         if (sums.bad | factor.bad).any():
-            raise DensityError(self._why_bad(sums))
+            raise DensityError(self._why_bad(values))
         draw = factor.solved(sums.linear, noise)
         new = self.layout.split(draw, values)
         if self.debug:
@@ -149,9 +149,10 @@ class GaussianBlock(Kernel):
             map(is_, map(values.__getitem__, seen), seen.values())
         )
 
-    def _why_bad(self, sums: BlockSums) -> str:
-        if sums.problem is not None:
-            return str(sums.problem)
+    def _why_bad(self, values: Values) -> str:
+        for part in self.parts:
+            if (problem := part.problem(values)) is not None:
+                return problem
         return (
             f"nodes {shortened(self.names, quoted=True)}: their joint precision given the others is not "
             "positive definite; a scale is near zero or infinite"

@@ -148,7 +148,6 @@ class BlockSums:
         self.linear = np.zeros((chains, layout.size))
         self.constant = np.zeros(chains)
         self.bad = np.zeros(chains, dtype=bool)
-        self.problem: str | None = None
 
     def add(self, precision: np.ndarray, linear: np.ndarray, constant: np.ndarray) -> None:
         if len(precision) > len(self.precision):
@@ -157,11 +156,6 @@ class BlockSums:
             self.precision += precision
         self.linear += linear
         self.constant += constant
-
-    def mark(self, bad: np.ndarray, problem: str) -> None:
-        """Chains in which a term has no meaning."""
-        self.bad |= bad
-        self.problem = self.problem or problem
 
 
 @dataclass(frozen=True, eq=False)

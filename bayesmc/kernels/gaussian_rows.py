@@ -93,24 +93,31 @@ class NormalRows:
         """Add what the terms say, given values of all nodes outside of the block."""
         still = self.program.are_known(values)
         kept = self._kept if still else {}
-        if "all" not in kept:
-            try:
-                found = self.program(values, still)
-            except IndexError:
-                self._ask(values, None)
-                raise
-            root, is_wrong = self._noise(found[-1])
-            if is_wrong:
-                self._ask(values, sums)
-            summed = self._summed(found, root, kept)
-            if not np.isfinite(summed[1]).all():  # a mean that overflows
-                self._ask(values, sums)
-                sums.bad |= ~np.isfinite(summed[1]).all(axis=-1)
-            if not (self._frozen and still):
-                sums.add(*summed)
-                return
+        if "all" in kept:
+            sums.add(*kept["all"])
+            return
+        try:
+            found = self.program(values, still)
+        except IndexError:
+            self.problem(values)  # raises in the user's words
+            raise
+        root, bad = self._noise(found[-1])
+        summed = self._summed(found, root, kept)
+        bad = bad | ~np.isfinite(summed[1]).all(axis=-1)  # or a mean overflows
+        sums.bad |= bad
+        sums.add(*summed)
+        if self._frozen and still and not bad.any():
             kept["all"] = tuple(a[:1] for a in summed)
-        sums.add(*kept["all"])
+
+    def problem(self, values: Values) -> str | None:
+        """What the terms' own functions find wrong, which may raise."""
+        state = {**values, **self.components.state}
+        self.target.compute(state, self.target.below(self.components.names))
+        for member in self.members:
+            dist: Any = member.term.distribution(state)[0]
+            if dist.problem is not None:
+                return f"node {member.term.name!r}: {dist.problem}"
+        return None
 
     @property
     def standing(self) -> Sums | None:
@@ -266,8 +273,8 @@ class NormalRows:
                 array = np.broadcast_to(array, (*lead, *shape, *inner))
         return array.reshape(math.prod(lead), elements, self.d, *inner[len(self.event) :])
 
-    def _noise(self, value: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Scales ``(lead, elements, d)`` or roots of matrices, and whether some are none (ones there)."""
+    def _noise(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Scales ``(lead, elements, d)`` or roots of matrices, and the chains where some are none."""
         own = self._scale_shape
         is_matrix = self.members[0].spread in ("cov", "scale_tril")
         inner = (*self.event, *self.event) if is_matrix else self.event
@@ -280,26 +287,12 @@ class NormalRows:
             if wrong.any():
                 where = np.asarray(wrong.any(axis=-1))[..., None, None] if is_matrix else wrong
                 value = np.where(where, np.eye(self.d) if is_matrix else 1.0, value)
-        pad = len(self.plates) + len(inner) - len(own)
-        value = value.reshape(*batch, *(1,) * pad, *own) if pad else value
+        pad = (1,) * (len(self.plates) + len(inner) - len(own))
+        value = value.reshape((*batch, *pad, *own))
         if value.shape[value.ndim - len(inner) :] != inner:
             value = np.broadcast_to(value, value.shape[: value.ndim - len(inner)] + inner)
-        return self._full(value, inner), bool(wrong.any())
-
-    def _ask(self, values: Values, sums: BlockSums | None) -> None:
-        """Let the terms' own functions say what is wrong: they raise, or mark chains."""
-        state = {**values, **self.components.state}
-        self.target.compute(state, self.target.below(self.components.names))
-        for member in self.members:
-            dist: Any = member.term.distribution(state)[0]
-            if dist.invalid is None or sums is None:
-                continue
-            shape = member.term.shape
-            lead = dist.invalid.shape[: max(dist.invalid.ndim - len(shape), 0)]
-            each = np.broadcast_to(dist.invalid, lead + shape)
-            bad = np.asarray(each.reshape(*lead, -1).any(axis=-1))
-            if bad.any():
-                sums.mark(bad, f"node {member.term.name!r}: {dist.problem}")
+        bad = wrong.reshape(math.prod(batch[:-1]), -1).any(axis=-1)
+        return self._full(value, inner), np.asarray(bad)
 
 
 # ---- private ------------------------------------------------------------------------------------
