@@ -44,8 +44,6 @@ class NormalRows:
     ----------
     names : tuple of str
         The terms.
-    own : bool
-        They are densities of nodes of the block.
     meeting : Meeting
         Which components meet in their elements.
     layout : Layout
@@ -60,7 +58,6 @@ class NormalRows:
         self.target, self.components = target, components
         self.members, first = tuple(members), members[0]
         self.names = tuple(m.term.name for m in members)
-        self.own = self.names[0] in components.start
         self.plates, self.event = first.term.shape, target.model[self.names[0]].event_shape
         self.elements = len(self.names) * math.prod(self.plates)
         self.d = math.prod(self.event)
