@@ -53,12 +53,15 @@ class Signature:
         Equal where functions are, up to constants, and values have the same shapes and states.
     scope : tuple of str
         What it reads: parents in the order of arguments, and itself.
+    rank : int
+        Axes of what its function computes, of a density those of the plates.
     read : Followed or None
         What its function computes; None where that cannot be followed.
     """
 
     key: Hashable
     scope: tuple[str, ...]
+    rank: int
     read: Followed | None
 
 
@@ -85,6 +88,7 @@ class Signatures:
             if declaration.vectorize:
                 return None
             function, scope = declaration.function, (*node.parents, name)
+            rank = len(node.plate_shape if node.is_stochastic else node.value_shape)
             if node.table is not None:  # of a deterministic node: its positions
                 table = node.table.shape, node.table.tobytes()
         else:
@@ -92,7 +96,7 @@ class Signatures:
             if potential.index is not None:
                 return None
             function, scope = potential.function, potential.parents
-            table = potential.plates
+            table, rank = potential.plates, len(potential.plates)
         found = density(model, name)
         what: Hashable
         if isinstance(found, Followed):
@@ -103,7 +107,8 @@ class Signatures:
         else:
             what = id(function)
         read = tuple(self._value(n) for n in scope)
-        return Signature((what, table, read), scope, found if isinstance(found, Followed) else None)
+        followed = found if isinstance(found, Followed) else None
+        return Signature((what, table, read), scope, rank, followed)
 
     def _value(self, name: str) -> Hashable:
         if name not in self._values:
@@ -222,52 +227,25 @@ class StackedFunction:
             raise ModelError(str(error)) from error
 
 
-@dataclass(frozen=True, eq=False)
-class LikeFunctions:
-    """Terms or deterministic nodes whose functions differ in constants at most.
-
-    Attributes
-    ----------
-    names : tuple of str
-        The group; the first stands for all.
-    signatures : tuple of Signature
-        Theirs, with equal keys.
-    """
-
-    names: tuple[str, ...]
-    signatures: tuple[Signature, ...]
-
-    def mask(self, target: Target) -> np.ndarray | None:
-        """The elements that count, of terms ``(group, *plates)``; None where all do."""
-        terms = [target.terms[n] for n in self.names]
-        if all(t.mask is None for t in terms):
-            return None
-        return np.stack([np.ones(t.shape, bool) if t.mask is None else t.mask for t in terms])
-
-    @cached_property
-    def stacked(self) -> StackedFunction | None:
-        """The functions as one where they differ in constants; None where the first is that of all."""
-        read = [s.read for s in self.signatures if s.read is not None]
-        if len(read) < len(self.names):
-            return None
-        first = read[0]
-        reading, constants = _of_all([r.reading for r in read])
-        for k, numbers in enumerate(zip(*(r.numbers for r in read), strict=True)):
-            constants[f"number {k}"] = np.stack(numbers)
-        if all(_is_one(c) for c in constants.values()):
-            return None
-        instead: dict[Expression, Expression] = {
-            a.leaf: leaf(parent, a.shape, a.dtype, a.states)
-            for parent, a in zip(first.parents, first.arguments, strict=True)
-        }
-        node, name = first.model.nodes.get(self.names[0]), self.names[0]
-        if node is None:
-            rank = len(first.model.potentials[name][0].plates)
-        else:
-            rank = len(node.plate_shape if node.is_stochastic else node.value_shape)
-        result = with_axes(mapped(reading.open, lambda e: replaced(e, instead)), rank)
-        shapes = {p: a.shape for p, a in zip(first.parents, first.arguments, strict=True)}
-        return StackedFunction(*_computed_once(result, constants), shapes, len(self.names))
+def as_one(signatures: Sequence[Signature]) -> StackedFunction | None:
+    """Functions of equal signatures as one; None where they do not differ: the first is that of all."""
+    read = [s.read for s in signatures if s.read is not None]
+    if len(read) < len(signatures):
+        return None
+    first = read[0]
+    reading, constants = _of_all([r.reading for r in read])
+    for k, numbers in enumerate(zip(*(r.numbers for r in read), strict=True)):
+        constants[f"number {k}"] = np.stack(numbers)
+    if all(_is_one(c) for c in constants.values()):
+        return None
+    instead: dict[Expression, Expression] = {
+        a.leaf: leaf(parent, a.shape, a.dtype, a.states)
+        for parent, a in zip(first.parents, first.arguments, strict=True)
+    }
+    rank = signatures[0].rank
+    result = with_axes(mapped(reading.open, lambda e: replaced(e, instead)), rank)
+    shapes = {p: a.shape for p, a in zip(first.parents, first.arguments, strict=True)}
+    return StackedFunction(*_computed_once(result, constants), shapes, len(signatures))
 
 
 def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:

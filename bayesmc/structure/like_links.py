@@ -13,7 +13,7 @@ import numpy as np
 
 from bayesmc.errors import BayesmcError
 from bayesmc.shapes import Shape
-from bayesmc.structure.like_functions import LikeFunctions, Signature, Slots
+from bayesmc.structure.like_functions import Signature, Slots, as_one
 
 if TYPE_CHECKING:  # a target recomputes its links with this
     from bayesmc.structure.target import Target, Values
@@ -93,7 +93,7 @@ class LikeLinks:
     ) -> None:
         self.target = target
         self.names = tuple(names)
-        self.function = LikeFunctions(self.names, tuple(signatures)).stacked
+        self.function = as_one(signatures)
         scopes = [s.scope[:-1] for s in signatures]  # the last is the link itself
         sources = {name: tuple(s[i] for s in scopes) for i, name in enumerate(scopes[0])}
         self.slots = Slots(target, sources, len(names))

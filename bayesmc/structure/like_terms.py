@@ -12,7 +12,7 @@ from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.errors import BayesmcError, DensityError
 from bayesmc.expression import Program
 from bayesmc.shapes import Shape, broadcast_shapes
-from bayesmc.structure.like_functions import LikeFunctions, Slots, StackedFunction
+from bayesmc.structure.like_functions import Signature, Slots, StackedFunction, as_one
 from bayesmc.structure.relation import Relation
 from bayesmc.structure.target import Target, Term, Values
 
@@ -141,21 +141,24 @@ class TermSum:
 def like_terms(target: Target, terms: Sequence[Term]) -> LikeTerms:
     """Terms of equal signatures as one."""
     found = [target.signatures.of(t.name) for t in terms]
-    alike = LikeFunctions(tuple(t.name for t in terms), tuple(s for s in found if s is not None))
-    scopes = [s.scope for s in alike.signatures]
+    signatures = [s for s in found if s is not None]
+    scopes = [s.scope for s in signatures]
     sources = {name: tuple(s[i] for s in scopes) for i, name in enumerate(scopes[0])}
     slots = Slots(target, sources, len(terms))
-    return LikeTerms(one_term(target, terms[0], alike), alike.names, slots)
+    return LikeTerms(one_term(terms, signatures), [t.name for t in terms], slots)
 
 
-def one_term(target: Target, first: Term, alike: LikeFunctions) -> Term:
+def one_term(terms: Sequence[Term], signatures: Sequence[Signature]) -> Term:
     """The first of some like terms, for all of them."""
-    mask = alike.mask(target)
-    if alike.stacked is None:
-        return first if mask is first.mask else replace(first, mask=mask)
+    first, mask = terms[0], None
+    if any(t.mask is not None for t in terms):
+        mask = np.stack([np.ones(t.shape, bool) if t.mask is None else t.mask for t in terms])
+    function = as_one(signatures)
+    if function is None:
+        return first if mask is None else replace(first, mask=mask)
     return StackedTerm(
         first.model, first.name, first.plates, first.shape, first.parents, first.is_potential,
-        mask, alike.stacked,
+        mask, function,
     )  # fmt: skip
 
 

@@ -20,10 +20,10 @@ import numpy as np
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_functions import (
-    LikeFunctions,
     Signature,
     Slots,
     StackedFunction,
+    as_one,
     stack_arrays,
     value_key,
 )
@@ -264,13 +264,13 @@ def _representative(target: Target, forms: Sequence[Form]) -> Blanket:
     first = forms[0]
     terms, links = dict(target.terms), dict[str, StackedFunction]()
     for at, name in enumerate(first.parts):
-        alike = LikeFunctions(
-            tuple(f.parts[at] for f in forms), tuple(f.signatures[at] for f in forms)
-        )
+        signatures = [f.signatures[at] for f in forms]
         if name in terms:
-            terms[name] = one_term(target, terms[name], alike)
-        elif alike.stacked is not None:
-            links[name] = alike.stacked
+            terms[name] = one_term([target.terms[f.parts[at]] for f in forms], signatures)
+            continue
+        function = as_one(signatures)
+        if function is not None:
+            links[name] = function
     if not links and all(terms[n] is t for n, t in target.terms.items()):
         return first.blanket
     return Blanket(replace(target, terms=terms, stacked_links=links, _below={}), first.blanket.name)
