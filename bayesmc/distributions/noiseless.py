@@ -7,6 +7,7 @@ probability, which is one where the value is right.
 from __future__ import annotations
 
 import math
+
 import numpy as np
 
 from bayesmc.distributions.base import Distribution

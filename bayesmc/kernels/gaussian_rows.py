@@ -25,6 +25,8 @@ from bayesmc.shapes import Shape
 from bayesmc.structure.programs import StateProgram
 from bayesmc.structure.target import Target, Values
 
+#: pairs of columns that are held at a time
+_MOST_PAIRS = 1 << 23
 #: precision, linear term and constant, chains in front
 Sums = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -132,7 +134,7 @@ class NormalRows:
             constant = weight * constant - self._seen * np.log(scale)
             return weight[:, None] * precision, weight[:, None] * linear, constant
         columns, rest = self._rows(found, kept)
-        if is_scalar and not columns.is_common:
+        if is_scalar and not columns.is_common and columns.pair_spots is not None:
             pairs, line, squares = self._products(columns, rest, kept)
             weight = (root * root)[..., 0]
             pairs, line = pairs / weight[..., None, None], line / weight[..., None]
@@ -178,10 +180,25 @@ class NormalRows:
             rest = _wide(rest, self.elements).reshape(len(rest), 1, -1)
         pairs = kept.get("pairs")
         if pairs is None:
-            pairs = np.swapaxes(gains, -1, -2) @ gains
+            pairs = self._pairs(columns, gains)
             if self._columns_known:
                 kept["pairs"] = pairs
         return pairs, -np.vecmat(rest, gains), np.vecdot(rest, rest)
+
+    def _pairs(self, columns: _Columns, gains: np.ndarray) -> np.ndarray:
+        """Products of columns for each element; where they are too many, summed bit by bit."""
+        if columns.pair_spots is not None:
+            return np.swapaxes(gains, -1, -2) @ gains
+        gains, layout = _wide(gains, self.elements), self.layout
+        total = np.zeros((1, layout.entries))
+        step = max(_MOST_PAIRS // gains.shape[-1] ** 2, 1)
+        for begin in range(0, self.elements, step):
+            part = gains[:, begin : begin + step]
+            at = columns.spots.at[:, begin : begin + step]
+            entries = layout.entry(at[..., :, None], at[..., None, :])
+            pairs = np.swapaxes(part, -1, -2) @ part
+            total = total + Spots(entries, layout.entries)(pairs)
+        return total
 
     def _scattered(
         self,
@@ -193,7 +210,7 @@ class NormalRows:
     ) -> Sums:
         """Sums over elements, each in its place."""
         if precision is None:
-            precision = columns.pair_spots(pairs)
+            precision = pairs if columns.pair_spots is None else columns.pair_spots(pairs)
         times = 1 if columns.is_common else self.elements // squares.shape[1]
         return precision, columns.spots(line), -0.5 * times * squares.sum(axis=-1)
 
@@ -228,11 +245,11 @@ class NormalRows:
             gain = gain[:, :1]
         is_common = bool((place == place[:, :1]).all())
         spots = self.layout.position[place[:, :1] if is_common else place]
-        entries = self.layout.entry(spots[..., :, None], spots[..., None, :])
-        layout = self.layout
-        return _Columns(
-            gain, seen, Spots(spots, layout.size), Spots(entries, layout.entries), is_common
-        )
+        layout, pair_spots = self.layout, None
+        if is_common or spots[0].size * spots.shape[-1] <= _MOST_PAIRS:
+            entries = layout.entry(spots[..., :, None], spots[..., None, :])
+            pair_spots = Spots(entries, layout.entries)
+        return _Columns(gain, seen, Spots(spots, layout.size), pair_spots, is_common)
 
     def _at(self, place: np.ndarray, column: _Column) -> np.ndarray:
         """Natural positions of components of the block, shape (lead, elements, d, k)."""
@@ -336,13 +353,14 @@ class Spots:
 class _Columns(NamedTuple):
     """Of every element: coefficients ``(lead, elements, d, columns)``, and where columns and pairs stand.
 
-    One element where all have the same; ``seen`` is what components that were seen add to constants.
+    One element where all have the same; no places of pairs where these are too many. ``seen`` is what
+    components that were seen add to constants.
     """
 
     gains: np.ndarray
     seen: np.ndarray | None
     spots: Spots
-    pair_spots: Spots
+    pair_spots: Spots | None
     is_common: bool
 
 

@@ -17,7 +17,7 @@ import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.errors import DensityError
-from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_order
+from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_order, gaussian_rows
 from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
 from bayesmc.kernels.gaussian_layout import solved
 from bayesmc.kernels.gaussian_order import Order
@@ -411,6 +411,21 @@ def test_a_term_that_is_forgotten_shows(name: str) -> None:
     block.parts = [part for part in block.parts if part is not forgotten]
     block._standing = None
     assert np.abs(law_of(block, values)[1] - cov).max() > 1e-3
+
+
+@pytest.mark.parametrize("name", ["lagged", "moving", "labelled", "crossed"])
+def test_pairs_that_are_too_many_are_summed_bit_by_bit(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, values = posed(NETS[name])
+    at_once = law_of(the_block(target), values)
+    monkeypatch.setattr(gaussian_rows, "_MOST_PAIRS", 8)
+    block = the_block(target)
+    for found in (law_of(block, values), law_of(block, values)):
+        for a, b in zip(found, at_once, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-10)
+    cut = [c for p in block.parts if (c := p._kept.get("columns")) and c.pair_spots is None]
+    assert cut or name == "labelled"
 
 
 @pytest.mark.parametrize("name", ["lagged", "labelled", "crossed"])
