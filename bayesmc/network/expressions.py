@@ -28,12 +28,19 @@ from bayesmc.expression import (
     mapped,
     replaced,
 )
-from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against
+from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against, hold_form
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered
-from bayesmc.network.readings import Argument, Reading, numbers_of, read_function, read_table
-from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.network.readings import (
+    Argument,
+    Reading,
+    identity,
+    numbers_of,
+    read_function,
+    read_table,
+)
+from bayesmc.passes.log_density import family_of, has_own_form, log_density
 
 #: readings of one shape, and uses of one reading, that are checked at all probe points
 _CHECKED = 3
@@ -154,7 +161,10 @@ def log_density_of(model: Model, name: str) -> Expression:
     value: Expression = stored_leaf(model, node)
     if node.domain is not None and node.domain.low:
         value = elementwise(np.add, value, node.domain.low)
-    return broadcast(log_density(family, value), node.plate_shape)
+    result = broadcast(log_density(family, value), node.plate_shape)
+    if has_own_form(family):
+        hold_form(model, name, result)
+    return result
 
 
 def log_factor_of(model: Model, name: str) -> Expression:
@@ -292,11 +302,13 @@ def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:
         plates = potential.plates
     parents = tuple(parent for parent, _ in links)
     arguments = _arguments(model, links)
-    what: Hashable = id(function)
+    what: Hashable
     if table is not None:
         what = table.shape, table.tobytes()
-    elif isinstance(function, Numbered):
-        what = id(function.func), function.places, None if for_all_numbers else function.number
+    elif for_all_numbers:
+        what = identity(function.func), function.places
+    else:
+        what = identity(function)
     known = model.cache.setdefault("readings", {})
     key = what, plates, arguments
     if key not in known:

@@ -415,7 +415,8 @@ def test_what_cannot_be_followed_is_stacked_only_where_it_is_one_function() -> N
         return bmc.Density(lambda y: -np.abs(y - x), support="real")
 
     assert chain_of({}, lambda t: density) == ALL
-    assert not chain_of({}, lambda t: lambda x: density(x))
+    assert chain_of({}, lambda t: lambda x: density(x)) == ALL
+    assert not chain_of({}, lambda t: lambda x, t=t: density(x + 0 * t))
 
 
 @pytest.mark.parametrize(
