@@ -35,6 +35,7 @@ factors | montecarlo
 passes
 distributions
 expression
+linalg
 resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
 errors | shapes
 """

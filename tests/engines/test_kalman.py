@@ -18,7 +18,7 @@ from bayesmc.engines.kalman import base as kalman_base
 from bayesmc.engines.kalman import covariances as kalman_covariances
 from bayesmc.engines.kalman import means as kalman_means
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.kernels.kalman import Conditioned, condition
+from bayesmc.linalg.square_root import Conditioned, condition
 from bayesmc.testing import session
 from bayesmc.testing.makers.linear_dbns import LinearSeries, random_linear_dbn
 

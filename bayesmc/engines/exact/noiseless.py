@@ -20,7 +20,7 @@ from bayesmc.distributions.noiseless import ALLOWED, FLOOR, ROUNDED
 from bayesmc.errors import UnsupportedError
 from bayesmc.factors import LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, along
-from bayesmc.kernels.kalman import (
+from bayesmc.linalg.square_root import (
     HALF_LOG_2PI,
     condition,
     log_densities,

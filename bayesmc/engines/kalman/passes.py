@@ -25,7 +25,7 @@ from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.means import all_means
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import multiplied, turned
+from bayesmc.linalg.square_root import multiplied, turned
 
 
 class State(NamedTuple):
