@@ -32,6 +32,7 @@ passes
 distributions
 expression
 resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
+categorical
 errors | shapes
 """
 DEPTH = {

@@ -11,7 +11,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+from bayesmc.categorical import pick_log
+from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms, conditional_of
 from bayesmc.kernels.tables import TableSweep
@@ -134,15 +135,7 @@ class JointStates(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         log = self.log_density(values)
-        top = log.max(axis=0)
-        if not np.isfinite(top).all():
-            raise ZeroProbabilityError(
-                f"nodes {list(self.names)}: no joint state has positive probability given the others; the "
-                "chain is at an impossible configuration"
-            )
-        cumulative = np.cumsum(np.exp(log - top), axis=0)
-        level = rng.random(top.shape) * cumulative[-1]
-        drawn = np.minimum((level >= cumulative).sum(axis=0), len(log) - 1)
+        drawn = pick_log(log, rng.random(log.shape[1:]), f"nodes {list(self.names)}")
         moved = zip(self.names, self.states, self.dtypes, strict=True)
         return {n: codes[drawn].astype(dtype) for n, codes, dtype in moved}, memory
 

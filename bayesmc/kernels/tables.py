@@ -13,10 +13,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from bayesmc.categorical import edges, pick_log
 from bayesmc.errors import ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conditionals import Conditional, FiniteTerm, FiniteTerms, conditional_of
-from bayesmc.kernels.enumerate import draw_states
 from bayesmc.network import Model
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
@@ -164,7 +164,8 @@ class RowSums(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         name = self.blanket.name
-        new = draw_states(self.log_density(values), rng, name).astype(self.domain.dtype)
+        log = self.log_density(values)
+        new = pick_log(log, rng.random(log.shape[1:]), f"node {name!r}").astype(self.domain.dtype)
         free = self.blanket.target.free_elements(name)
         if free is not None:
             new = self.blanket.moved(values, new.reshape(len(new), -1)[:, free], free)
@@ -225,8 +226,8 @@ class _Group:
 
     def _compare(self, index: np.ndarray, levels: np.ndarray) -> np.ndarray:
         new = np.zeros(levels.shape, dtype=np.uint8)
-        for count, edges in self.edges:
-            passed = levels[:count] >= edges.take(index[:count])
+        for count, table in self.edges:
+            passed = levels[:count] >= table.take(index[:count])
             new[:count] += passed.view(np.uint8)
         return new
 
@@ -371,10 +372,10 @@ def _neighbours(
 
 def _compared(part: Sequence[Conditional]) -> list[tuple[int, np.ndarray]]:
     """For each k the number of conditionals that have a k-th edge, and those edges over all rows."""
-    edges = [_thresholds(c.probs) for c in part]
+    rows = [edges(c.probs) for c in part]
     found = []
-    for k in range(max(e.shape[1] for e in edges)):
-        having = [e[:, k] for e in edges if e.shape[1] > k]
+    for k in range(max(e.shape[1] for e in rows)):
+        having = [e[:, k] for e in rows if e.shape[1] > k]
         found.append((len(having), np.concatenate(having)))
     return found
 
@@ -384,16 +385,6 @@ def _searched(part: Sequence[Conditional], width: int) -> list[tuple[int, np.nda
     padded = []
     for c in part:
         rows = np.full((len(c.probs), width), np.inf)
-        rows[:, : c.states - 1] = _thresholds(c.probs)
+        rows[:, : c.states - 1] = edges(c.probs)
         padded.append(rows.ravel())
     return [(len(part), np.concatenate(padded))]
-
-
-def _thresholds(probs: np.ndarray) -> np.ndarray:
-    """Cumulative rows, shape (rows, states - 1); states of probability zero have no width at all."""
-    cumulative = np.cumsum(probs, axis=1)
-    last = cumulative[:, -1:]
-    edges = cumulative / np.where(last > 0, last, 1.0)
-    top = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
-    edges[np.arange(probs.shape[1]) >= top[:, None]] = np.inf
-    return edges[:, :-1]
