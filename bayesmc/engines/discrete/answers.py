@@ -13,12 +13,12 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.averages import called, naming
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
-from bayesmc.engines.discrete.rows import Rows, Term
+from bayesmc.engines.discrete.rows import Rows, Term, Variable
 from bayesmc.engines.discrete.run import Run, bad_parameters
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
-from bayesmc.engines.discrete.sums import Variable, groups, log_max, product
 from bayesmc.engines.filtering import Answers, Queries
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.factors.named import connected, log_product
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
@@ -335,7 +335,7 @@ def best_path(run: Run) -> dict[Variable, np.ndarray] | None:
     plan = run.plan
     found: dict[Variable, np.ndarray] = {}
     for number, chain in enumerate(plan.chains):
-        path = most_likely(run.blocks(number, log_max), run.steps, run.sequences, chain.size)
+        path = most_likely(run.blocks(number, np.max), run.steps, run.sequences, chain.size)
         if path is None:
             return None
         shape = tuple(plan.cards[v] for v in chain.state)
@@ -359,7 +359,7 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
     for start, stop in run.stretches(plan.widest(chain) * run.sequences):
         rows = plan.rows(run.series, start, stop)
         pieces = run.pieces(number, rows)
-        for group in groups(chain.inside, [p.scope for p in pieces]):
+        for group in connected(chain.inside, [p.scope for p in pieces]):
             members = [p for p in pieces if set(group) & set(p.scope)]
             border = tuple(dict.fromkeys(v for p in members for v in p.scope if v not in group))
             sizes = tuple(plan.cards[v] for v in group)
@@ -370,7 +370,7 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
                     "meet in one density; observe more of them",
                     int(min(8 * entries, 2**62)),
                 )
-            table = product(members, (*border, *group), plan.cards)
+            table = log_product(members, (*border, *group), plan.cards)
             table = table.reshape(*table.shape[: 2 + len(border)], -1)
             here = np.arange(rows.count)[:, None] if len(table) > 1 else 0
             there = np.arange(run.sequences) if table.shape[1] > 1 else 0

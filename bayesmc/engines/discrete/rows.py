@@ -21,6 +21,35 @@ if TYPE_CHECKING:
 
 #: slices back, node
 Key = tuple[int, str]
+#: slices back, node, element of its plates
+Variable = tuple[int, str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A log factor over finite variables.
+
+    Attributes
+    ----------
+    node : str
+        Whose conditional density it is.
+    scope : tuple of Variable
+    values : ndarray, shape (rows or 1, sequences or 1, *cards)
+    is_evidence : bool
+        It says what was seen, not what is possible.
+    invalid : ndarray of bool or None
+        Configurations with bad parameters, where ``values`` is 0; same shape.
+    """
+
+    node: str
+    scope: tuple[Variable, ...]
+    values: np.ndarray
+    is_evidence: bool = False
+    invalid: np.ndarray | None = None
+
+
+#: a factor of one
+NEUTRAL = Piece("", (), np.zeros((1, 1)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,18 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import log_sum_exp
 from bayesmc.dbn import PREVIOUS, TIME, Series, Slices
-from bayesmc.engines.discrete.rows import Rows
-from bayesmc.engines.discrete.sums import (
-    Piece,
-    Variable,
-    eliminate,
-    groups,
-    log_sum,
-    product,
-    width,
-)
+from bayesmc.engines.discrete.rows import NEUTRAL, Piece, Rows, Variable
 from bayesmc.engines.discrete.terms import SliceReader
+from bayesmc.factors.named import connected, largest, log_product, summed
 
 #: entries of tables of many slices that are worked out together: they stay near the processor
 STRETCH_ENTRIES = 1 << 18
@@ -198,13 +191,13 @@ class DiscreteSlices:
         number: int,
         pieces: Sequence[Piece],
         rows: Rows,
-        reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum,
+        reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum_exp,
     ) -> Block:
         """The tables of one chain, with what is inside its slices summed (or maximised) out."""
         chain = self.chains[number]
         inside = {*chain.before, *chain.state, *chain.inside}
         own = [p for p in pieces if p.scope and p.scope[0] in inside]
-        bound = groups(chain.inside, [p.scope for p in own])
+        bound = connected(chain.inside, [p.scope for p in own])
         fixed: list[Piece] = []
         varying: list[Piece] = []
         for group in bound:
@@ -215,7 +208,7 @@ class DiscreteSlices:
             if still and key in self._fixed:
                 fixed.append(self._fixed[key])
                 continue
-            part = eliminate(members, keep, self.cards, reduce)
+            part = Piece("", keep, summed(members, keep, self.cards, reduce))
             if still:
                 self._fixed[key] = part
             (fixed if still else varying).append(part)
@@ -237,17 +230,17 @@ class DiscreteSlices:
         keep = (*chain.before, *chain.state)
         inside = {*keep, *chain.inside}
         scopes = [s for _, s in self.scopes(2) if inside & set(s)]
-        return width(scopes, keep, self.cards)
+        return largest(scopes, keep, self.cards)
 
     def _entries_of(self, chain: Chain) -> float:
         members = {*chain.before, *chain.state, *chain.inside}
         scopes = [(n, s) for n, s in self.scopes(2) if members & set(s)]
         widest = float(chain.size)
-        for group in groups(chain.inside, [s for _, s in scopes]):
+        for group in connected(chain.inside, [s for _, s in scopes]):
             part = [(n, s) for n, s in scopes if set(group) & set(s)]
             if any(self._may_move(n) for n, _ in part):
                 keep = {v for _, s in part for v in s if v not in group}
-                widest = max(widest, width([s for _, s in part], keep, self.cards))
+                widest = max(widest, largest([s for _, s in part], keep, self.cards))
                 if any(v in keep for v in chain.before):
                     widest = max(widest, float(chain.size) ** 2)
         for name, scope in scopes:
@@ -263,22 +256,25 @@ class DiscreteSlices:
         chain = self.chains[number]
         size, scope = chain.size, chain.state
         if rows.kind == 0:
-            table = product([*fixed, *varying], scope, self.cards)
+            table = self._product([*fixed, *varying], scope)
             return Block(rows.start, rows.stop, None, None, _full(table, rows, (size,)))
         pair = (*chain.before, *scope)
         here = [p for p in varying if not set(p.scope) & set(chain.before)]
         both = [p for p in varying if set(p.scope) & set(chain.before)]
-        likelihood = _full(product(here, scope, self.cards), rows, (size,))
+        likelihood = _full(self._product(here, scope), rows, (size,))
         # which factors are fixed depends on what is observed, and that on the row where rows come singly
         key = (number, rows.kind, reduce, frozenset(id(p) for p in fixed))
         if key not in self._fixed:
-            table = product(fixed, pair, self.cards)
+            table = self._product(fixed, pair)
             self._fixed[key] = table.reshape(table.shape[1], size, size)
         moving = None
         if both:
-            table = product(both, pair, self.cards)
+            table = self._product(both, pair)
             moving = _full(table, rows, (size, size))
         return Block(rows.start, rows.stop, self._fixed[key], moving, likelihood)
+
+    def _product(self, pieces: Sequence[Piece], scope: Sequence[Variable]) -> np.ndarray:
+        return log_product(pieces or [NEUTRAL], scope, self.cards)
 
     def _moves(self, piece: Piece) -> bool:
         """Whether a piece may differ from row to row."""
@@ -330,7 +326,7 @@ class DiscreteSlices:
                     read |= {v for v in scope if v[0] == 1}
         flat = [[(0, *v[1:]) for v in s] for s in scopes]
         chains = []
-        for members in groups(own, flat):
+        for members in connected(own, flat):
             state = tuple(v for v in members if (1, *v[1:]) in read)
             before = tuple((1, *v[1:]) for v in state)
             inside = tuple(v for v in members if v not in state)

@@ -16,8 +16,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, TIME, Slices
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.discrete.rows import Key, Rows, Term
-from bayesmc.engines.discrete.sums import Piece, Variable
+from bayesmc.engines.discrete.rows import Key, Piece, Rows, Term, Variable
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network import CompiledNode, Model
 

@@ -14,10 +14,10 @@ from bayesmc.engines.averages import called, over_line
 from bayesmc.engines.grid.moves import COUNTS
 from bayesmc.engines.grid.refined import Fine, cell_quantiles, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
-from bayesmc.engines.grid.sources import is_previous, previous
+from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label, Term, contract, dense
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.factors.named import Named, aligned, contract
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
@@ -46,11 +46,11 @@ class Answers:
         before: Placed | None,
         now: Placed,
         probs: np.ndarray,
-        pair: Callable[[], list[Term]],
+        pair: Callable[[], list[Named]],
     ) -> None:
         self.model, self.before, self.now, self.pair = model, before, now, pair
         self.first = now.row.t == 0
-        self.own = Term((*now.labels, *model.apart), probs)
+        self.own = Named((*now.labels, *model.apart), probs)
         self.base = model.base(before, now)
 
     def table(self, name: str) -> np.ndarray:
@@ -122,9 +122,8 @@ class Answers:
             if not all(label in held for label in labels):
                 continue
             shape = (*cells, *model.lead)
-            table = dense(
-                contract([self.own], (*labels, *model.apart)), (*labels, *model.apart), shape
-            )
+            scope = (*labels, *model.apart)
+            table = aligned(contract([self.own], scope), scope, shape)
             for k, label in enumerate(labels):
                 widths = held[label].widths
                 ones = (1,) * k, (1,) * (events - 1 - k)
@@ -187,7 +186,7 @@ class Answers:
         if name not in model.axes.of or name in model.leaves or node.domain is not None:
             raise UnsupportedError(
                 f"quantile({name!r}): the node is not on the grid itself; ask of one that is (here "
-                f"{sorted({str(s.label[0]) for s in self.now.scalars})}), "  # type: ignore[index]
+                f"{sorted({s.label[0] for s in self.now.scalars})}), "
                 "or of the probability of an event, probability(function)"
             )
         inner = [
@@ -248,7 +247,7 @@ class Answers:
         first, apart = self.model.slices.first, len(self.model.lead)
         widest = np.zeros(self.model.lead)
         for x in labels:
-            node = first[str(x[0]).removesuffix(PREVIOUS)]  # type: ignore[index]
+            node = first[x[0].removesuffix(PREVIOUS)]
             if node.domain is None and not node.is_discrete:
                 shares = self._marginal({x}).reshape(-1, *self.model.lead)
                 widest = np.maximum(widest, shares.max(axis=0))
@@ -269,11 +268,11 @@ class Answers:
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """The same on finer cells of the one number that is read; None where there is none, or several."""
         first = self.model.slices.first
-        numbers = [x for x in labels if first[str(x[0]).removesuffix(PREVIOUS)].domain is None]  # type: ignore[index]
+        numbers = [x for x in labels if first[x[0].removesuffix(PREVIOUS)].domain is None]
         fine = self._fine(numbers[0], labels) if len(numbers) == 1 else None
         if fine is None:
             return None
-        name, spot = str(numbers[0][0]), self._labels().index(numbers[0])  # type: ignore[index]
+        name, spot = numbers[0][0], self._labels().index(numbers[0])
         node, sizes = self._node(name), self._sizes()
         others = [sizes[x] if x in labels and x != numbers[0] else 1 for x in self._labels()]
         carried = {n for n in self.now.values if n not in self.model.own}
@@ -313,8 +312,8 @@ class Answers:
         if any(x not in held for x in labels) or label not in held:
             return None  # of the slice before, or seen
         scalar = held[label]
-        axes = self.model.axes.of[str(label[0])]  # type: ignore[index]
-        number = int(label[1])  # type: ignore[index]
+        axes = self.model.axes.of[label[0]]
+        number = label[1]
         if scalar.points.size != scalar.size:  # some elements are seen
             return None
         order = [x for x in self._labels() if x in labels]
@@ -392,7 +391,7 @@ class Answers:
         keep = (*[x for x in labels if x in used], *apart)
         shape = (*(sizes[x] if x in used else 1 for x in labels), *self.model.lead)
         found = contract(terms, keep)
-        return np.array(dense(found, (*labels, *apart), shape))
+        return np.array(aligned(found, (*labels, *apart), shape))
 
     def _average(self, node: CompiledNode, value: np.ndarray, more: int = 0) -> np.ndarray:
         """Expectation of values ``(*batch, *plates, *event)`` with ``more`` axes behind."""

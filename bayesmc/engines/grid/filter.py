@@ -22,8 +22,8 @@ from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord
 from bayesmc.engines.grid.search import GridSearch, known_static, quiet
 from bayesmc.engines.grid.slice import same_points
+from bayesmc.engines.grid.sources import Label
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label
 from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError

@@ -16,8 +16,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.grid.axes import Axes
-from bayesmc.engines.grid.sources import GridStructure
-from bayesmc.engines.grid.terms import Label, Labels
+from bayesmc.engines.grid.sources import GridStructure, Label
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.shapes import Shape
@@ -56,7 +55,7 @@ class Placed:
     values: Values
 
     @property
-    def labels(self) -> Labels:
+    def labels(self) -> tuple[Label, ...]:
         return tuple(s.label for s in self.scalars)
 
     @property
@@ -98,7 +97,7 @@ class GridSlices(GridStructure):
                 self.static[name] = slices.first.evaluate(name, self.static)[0]
         self._whole: set[tuple[bool, str]] = set()
         self._open: dict[tuple[bool, str], list[tuple[int, tuple[Any, ...], Any]]] = {}
-        self._spread: dict[tuple[bool, str, Labels], np.ndarray] = {}
+        self._spread: dict[tuple[bool, str, tuple[Label, ...]], np.ndarray] = {}
 
     def place(self, row: Row) -> Placed:
         """The scalars of a slice, and values that run over them.

@@ -11,9 +11,11 @@ from dataclasses import dataclass
 from bayesmc.dbn import PREVIOUS, TIME, Slices
 from bayesmc.engines.exact import readable_bytes
 from bayesmc.engines.grid.axes import Axes
-from bayesmc.engines.grid.terms import Label
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import ModelError
+
+#: node (with ``_prev`` in the slice after its own), number of a scalar among the node's
+Label = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,12 +139,11 @@ class GridStructure:
 
 def is_previous(label: Label) -> bool:
     """Whether an axis is one of the slice before."""
-    return isinstance(label, tuple) and label[0].endswith(PREVIOUS)
+    return label[0].endswith(PREVIOUS)
 
 
 def previous(label: Label) -> Label:
     """What a scalar's axis is called in the slice after."""
-    assert isinstance(label, tuple)
     return (label[0] + PREVIOUS, label[1])
 
 
