@@ -13,8 +13,8 @@ import numpy as np
 
 from bayesmc.categorical import pick_log
 from bayesmc.distributions.transforms import transform_of
-from bayesmc.engines.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
-from bayesmc.engines.start_faults import fault_at, impossible, refuse_impossible
+from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
+from bayesmc.engines.mcmc.start_faults import fault_at, impossible, refuse_impossible
 from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.network.nearer import nearer
