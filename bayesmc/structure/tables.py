@@ -7,14 +7,15 @@ nodes above.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.network import CompiledNode, Model
+from bayesmc.network.model import potential_shape
 from bayesmc.shapes import Shape
 
 #: table entries up to which a function is evaluated on all configurations of its parents
@@ -37,6 +38,87 @@ class Table:
     parents: tuple[str, ...]
     probs: np.ndarray
     invalid: np.ndarray | None = None
+
+
+class Reads(NamedTuple):
+    """What a function reads, through the deterministic nodes between.
+
+    Attributes
+    ----------
+    alone : tuple of str
+        Finite nodes of which an element reads the one of its own place.
+    whole : tuple of str
+        Finite nodes of which it may read all elements.
+    others : tuple of str
+        Stochastic nodes that are not finite.
+    """
+
+    alone: tuple[str, ...]
+    whole: tuple[str, ...]
+    others: tuple[str, ...]
+
+
+def reads_of(
+    model: Model,
+    names: Sequence[str],
+    plates: Sequence[str],
+    is_known: Callable[[str], bool],
+    through: bool = False,
+) -> Reads:
+    """What stands above a function in some plates that reads these nodes.
+
+    What is known is left out. Finite nodes that are computed are not looked behind, unless ``through``.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.tables import reads_of
+    >>> net = bmc.BayesNet(plates={"i": 3})
+    >>> net.add("k", bmc.Bernoulli(0.5), plates="i")
+    >>> net.add("m", bmc.Normal(0.0, 1.0))
+    >>> net.add("f", lambda k, m: k * m, plates="i")
+    >>> reads_of(pose(net).model, ["f"], ["i"], lambda name: False)
+    Reads(alone=('k',), whole=(), others=('m',))
+    """
+    finite: dict[str, bool] = {}
+    others: dict[str, None] = {}
+
+    def visit(names: Sequence[str], plates: Sequence[str], whole: bool) -> None:
+        for name in names:
+            if is_known(name):
+                continue
+            node = model[name]
+            foreign = whole or any(p not in plates for p in node.plates)
+            if node.domain is not None and (node.is_stochastic or not through):
+                finite[name] = finite.get(name, False) or foreign
+            elif node.is_stochastic:
+                others[name] = None
+            else:
+                visit(node.parents, node.plates, foreign)
+
+    visit(names, plates, False)
+    alone = tuple(n for n, is_whole in finite.items() if not is_whole)
+    return Reads(alone, tuple(n for n in finite if n not in alone), tuple(others))
+
+
+def indexed_table(
+    model: Model, name: str, known: Mapping[str, np.ndarray], entries: Sequence[int]
+) -> np.ndarray:
+    """Logs of a potential over rows of an index at all states of some entries, shape ``(*cards, rows)``.
+
+    The others are known.
+    """
+    potential, links = model.potentials[name]
+    cards = tuple(model[potential.scope[i]].domain.size for i in entries)  # type: ignore[union-attr]
+    stored = [
+        _along(entries.index(i), cards[entries.index(i)], len(cards) + 1, ())
+        if i in entries
+        else link.place(known[parent])
+        for i, (parent, link) in enumerate(links)
+    ]
+    table = model.potential_at(name, stored)
+    return np.broadcast_to(table, (*cards, *potential_shape(model.sizes, potential)))
 
 
 def tabulate(
