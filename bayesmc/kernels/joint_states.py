@@ -1,4 +1,4 @@
-"""Small blocks of finite nodes, drawn jointly: all joint states given the rest.
+"""Finite nodes, alone or in small blocks that are drawn jointly: all their states given the rest.
 
 One at a time, nodes tied by (nearly) deterministic tables hardly move, or not at all. Which nodes those are
 is found in ``coupling``.
@@ -13,9 +13,12 @@ import numpy as np
 
 from bayesmc.categorical import pick_log
 from bayesmc.errors import UnsupportedError
+from bayesmc.factors.named import Named, aligned
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms, conditional_of
 from bayesmc.kernels.tables import TableSweep
+from bayesmc.network import Model
+from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
 
@@ -63,9 +66,28 @@ def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None
     if conditional is not None and conditional.states <= _STATES:
         return TableSweep(target, (conditional,))
     around = terms.around(names)
-    if around is None or any(table.plates for table in around):
-        return JointStates(target, names)
-    return TabulatedStates(target, names, around)
+    return JointStates(target, names) if around is None else RowSums(target, names, around)
+
+
+def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
+    """The kernel of one finite node whose own density and children are tables; None where they are not.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    terms : FiniteTerms, optional
+        Tables made before, to be shared between nodes.
+    """
+    if blanket.node.domain is None:
+        return None
+    terms = FiniteTerms(blanket.target) if terms is None else terms
+    conditional = conditional_of(terms, (blanket.name,))
+    if conditional is not None:
+        return TableSweep(blanket.target, (conditional,))
+    around = terms.around((blanket.name,))
+    if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
+        return None
+    return RowSums(blanket.target, (blanket.name,), around)
 
 
 class JointStates(Kernel):
@@ -87,7 +109,7 @@ class JointStates(Kernel):
         domains = [n.domain for n in nodes]
         self.plates = nodes[0].plates
         cards = [d.size for d in domains if d is not None]
-        if len(cards) < len(nodes) or math.prod(cards) > _STATES:
+        if len(cards) < len(nodes) or (len(cards) > 1 and math.prod(cards) > _STATES):
             raise UnsupportedError(
                 f"nodes {list(names)} have no joint states to try, or more than {_STATES}; leave some out"
             )
@@ -124,6 +146,11 @@ class JointStates(Kernel):
         for term, relation in self.terms:
             log = term.log(state)
             total = total + (log if relation is None else relation.collect(log, term.shape))
+        return self._with_seen(total)
+
+    def _with_seen(self, total: np.ndarray) -> np.ndarray:
+        """What was seen of the elements leaves no other state."""
+        axes = (1,) * (total.ndim - 1)
         for name, codes in zip(self.names, self.states, strict=True):
             seen = self.target.seen(name)
             if seen is not None and seen.mask is not None:
@@ -140,8 +167,8 @@ class JointStates(Kernel):
         return {n: codes[drawn].astype(dtype) for n, codes, dtype in moved}, memory
 
 
-class TabulatedStates(JointStates):
-    """As `JointStates`, where all terms are tables without plates: their log rows are gathered and summed.
+class RowSums(JointStates):
+    """As `JointStates`, where all terms are tables: the log rows that the rest selects are summed.
 
     Parameters
     ----------
@@ -151,39 +178,60 @@ class TabulatedStates(JointStates):
 
     def __init__(self, target: Target, names: Sequence[str], around: Sequence[FiniteTerm]) -> None:
         super().__init__(target, names)
-        self.rows = [_Rows(table, self.names, self.states) for table in around]
+        if len(self.names) == 1:
+            self.label, self.match = "enumerate", "sum of tabulated log rows"
+        relations = {term.name: relation for term, relation in self.terms}
+        self.parts = [
+            (_Rows(target.model, table, self.names, self.states), relations[table.term.name])
+            for table in around
+        ]
 
     def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        total = np.zeros((self.states.shape[1], len(values[self.names[0]])))
-        for rows in self.rows:
-            total += rows(values)
-        return total
+        total = np.zeros((self.states.shape[1], *values[self.names[0]].shape))
+        for rows, relation in self.parts:
+            log = rows(values)
+            total += (
+                log if relation is None or not rows.shape else relation.collect(log, rows.shape)
+            )
+        return self._with_seen(total)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
 class _Rows:
-    """Log factors of one table for all joint states of a block, gathered by the states of the others."""
+    """Log factors of one term for all joint states of a block, gathered by the states of the others."""
 
-    def __init__(self, table: FiniteTerm, names: Sequence[str], states: np.ndarray) -> None:
-        inside = [i for i, n in enumerate(table.scope) if n in names]
-        outside = [i for i, n in enumerate(table.scope) if n not in names]
-        log = table.log.transpose(*inside, *outside)
-        cards = log.shape[: len(inside)]
-        self.others = [table.scope[i] for i in outside]
-        sizes = log.shape[len(inside) :]
-        self.strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
-        self.log = np.ascontiguousarray(log.reshape(math.prod(cards), -1))
-        own = [states[names.index(table.scope[i])] for i in inside]
-        self.local = np.ravel_multi_index(own, cards)
+    def __init__(
+        self, model: Model, table: FiniteTerm, names: Sequence[str], states: np.ndarray
+    ) -> None:
+        scope = table.scope
+        inside = [i for i, n in enumerate(scope) if n in names]
+        outside = [i for i, n in enumerate(scope) if n not in names]
+        log = table.log.transpose(*inside, *outside, *range(len(scope), table.log.ndim))
+        cards, sizes = log.shape[: len(inside)], log.shape[len(inside) :]
+        self.plates, self.shape = table.plates, sizes[len(outside) :]
+        self.others = [
+            (scope[i], model[scope[i]].plates, math.prod(sizes[k + 1 :]))
+            for k, i in enumerate(outside)
+        ]
+        self.offset = np.arange(math.prod(self.shape)).reshape(self.shape)
+        log = log.reshape(math.prod(cards), -1)
+        own = [states[names.index(scope[i])] for i in inside]
+        self.log = np.ascontiguousarray(log)
+        at = np.ravel_multi_index(own, cards)
+        self.local = None if np.array_equal(at, np.arange(len(log))) else at
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Shape ``(joint states, chains or 1)``."""
-        at = np.zeros(1, dtype=np.intp)
-        for name, stride in zip(self.others, self.strides, strict=True):
-            at = at + values[name].astype(np.intp) * stride
-        return self.log.take(at, axis=1).take(self.local, axis=0)
+        """Shape ``(joint states, chains or 1, *shape)``."""
+        index = self.offset[None]
+        for name, plates, stride in self.others:
+            at = values[name]
+            if self.shape:
+                at = aligned(Named(plates, at), self.plates)
+            index = index + at.astype(np.intp) * stride
+        found = self.log.take(index, axis=1)
+        return found if self.local is None else found.take(self.local, axis=0)
 
 
 def _enters(target: Target, name: str, term: Term) -> bool:

@@ -1,24 +1,20 @@
 """Finite nodes whose whole Markov blanket is finite tables: draws by lookup.
 
 Where the blanket has few configurations the full conditional stands in a table, and a draw is a gather and
-some comparisons; nodes, and small blocks of nodes, that do not meet are drawn together. Where it has many,
-or where nodes live in plates, the log rows of the terms are gathered and summed. Anything else is left to
-the general kernels.
+some comparisons; nodes, and small blocks of nodes, that do not meet are drawn together. Anything else is left
+to other kernels.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from bayesmc.categorical import edges, pick_log
+from bayesmc.categorical import edges
 from bayesmc.errors import ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import Conditional, FiniteTerm, FiniteTerms, conditional_of
-from bayesmc.network import Model
-from bayesmc.structure.blanket import Blanket
+from bayesmc.kernels.conditionals import Conditional, FiniteTerms, conditional_of
 from bayesmc.structure.target import Target, Values
 
 #: conditionals of more states are drawn by binary search
@@ -29,27 +25,6 @@ _GROUP_ENTRIES = 1 << 22
 _GROUP_SIZE = 48
 #: nodes of a blanket that are gathered one by one in groups of more: long chains, whose matrix is mostly zero
 _GATHERED = 4
-
-
-def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
-    """The kernel of one finite node whose own density and children are tables; None where they are not.
-
-    Parameters
-    ----------
-    blanket : Blanket
-    terms : FiniteTerms, optional
-        Tables made before, to be shared between nodes.
-    """
-    if blanket.node.domain is None:
-        return None
-    terms = FiniteTerms(blanket.target) if terms is None else terms
-    conditional = conditional_of(terms, (blanket.name,))
-    if conditional is not None:
-        return TableSweep(blanket.target, (conditional,))
-    around = terms.around((blanket.name,))
-    if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
-        return None
-    return RowSums(blanket, around)
 
 
 def table_kernels(
@@ -119,57 +94,6 @@ class TableSweep(Kernel):
             return dict(zip(self.names, new, strict=True)), memory
         moved = zip(self.names, new, self.dtypes, strict=True)
         return {n: row.astype(dtype, copy=False) for n, row, dtype in moved}, memory
-
-
-class RowSums(Kernel):
-    """Draws a finite node from the sum of the log rows that the rest selects, state by state.
-
-    Parameters
-    ----------
-    blanket : Blanket
-        All its relations are aligned.
-    around : sequence of FiniteTerm
-        All terms that the node enters.
-    """
-
-    label = "enumerate"
-    match = "sum of tabulated log rows"
-
-    def __init__(self, blanket: Blanket, around: Sequence[FiniteTerm]) -> None:
-        self.blanket = blanket
-        self.names = (blanket.name,)
-        domain = blanket.node.domain
-        assert domain is not None
-        self.domain = domain
-        relations = {c.term.name: c.relation for c in blanket.children}
-        self.parts = [
-            (_Rows(blanket.target.model, table, blanket.name), relations.get(table.term.name))
-            for table in around
-        ]
-
-    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Log full conditional of every state up to a constant, shape ``(states, chains, *plates)``."""
-        now = values[self.blanket.name]
-        total = np.zeros((self.domain.size, *now.shape))
-        for rows, relation in self.parts:
-            log = rows(values)
-            if relation is not None and rows.shape:
-                log = relation.collect(log, rows.shape)
-            elif not rows.shape:  # the node has no plates, else some node of the scope would have
-                log = log.reshape(log.shape[:2])
-            total += log
-        return total
-
-    def step(
-        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
-    ) -> tuple[Values, Memory]:
-        name = self.blanket.name
-        log = self.log_density(values)
-        new = pick_log(log, rng.random(log.shape[1:]), f"node {name!r}").astype(self.domain.dtype)
-        free = self.blanket.target.free_elements(name)
-        if free is not None:
-            new = self.blanket.moved(values, new.reshape(len(new), -1)[:, free], free)
-        return {name: new}, memory
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -251,38 +175,6 @@ class _Group:
                 f"{what}: no state has positive probability given the others; the chain is at an "
                 "impossible configuration"
             )
-
-
-class _Rows:
-    """Log factors of one term for all states of a node, gathered by the states of the others."""
-
-    def __init__(self, model: Model, table: FiniteTerm, name: str) -> None:
-        self.shape = table.log.shape[len(table.scope) :]
-        self.plates = table.plates
-        axis = table.scope.index(name)
-        self.others = [(n, model[n].plates) for n in table.scope if n != name]
-        log = np.moveaxis(table.log, axis, 0)
-        self.log = np.ascontiguousarray(log.reshape(len(log), -1))
-        cards = log.shape[1 : len(table.scope)]
-        elements = math.prod(self.shape)
-        self.strides = [math.prod(cards[i + 1 :]) * elements for i in range(len(cards))]
-        self.offset = np.arange(elements).reshape(self.shape)
-
-    def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Shape ``(states, chains or 1, *shape)``."""
-        index = self.offset[None]
-        for (name, plates), stride in zip(self.others, self.strides, strict=True):
-            at = _placed(values[name], plates, self.plates) if self.shape else values[name]
-            index = index + at.astype(np.intp) * stride
-        return self.log.take(index, axis=1)
-
-
-def _placed(value: np.ndarray, own: Sequence[str], plates: Sequence[str]) -> np.ndarray:
-    """``(chains, *own)`` with its axes where ``plates`` has them, size one elsewhere."""
-    order = sorted(range(len(own)), key=lambda i: plates.index(own[i]))
-    moved = value.transpose(0, *(1 + i for i in order))
-    sizes = dict(zip((own[i] for i in order), moved.shape[1:], strict=True))
-    return moved.reshape(len(value), *(sizes.get(p, 1) for p in plates))
 
 
 def _colours(conditionals: Sequence[Conditional]) -> list[list[Conditional]]:
