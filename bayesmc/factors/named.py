@@ -155,38 +155,34 @@ def maximise(
 
 
 def largest(
-    scopes: Iterable[Iterable[Variable]], keep: Collection[Variable], sizes: Sizes
+    scopes: Sequence[Iterable[Variable]], keep: Collection[Variable], sizes: Sizes
 ) -> float:
     """Entries of the largest table that an elimination makes."""
-    left = [frozenset(s) for s in scopes]
-    found = _entries(frozenset(keep), sizes)
-    for touched, gone, scope in steps(left, keep, sizes):
-        found = max(found, _entries((*scope, *gone), sizes))
-        left = [s for k, s in enumerate(left) if k not in touched] + [frozenset(scope)]
-    return found
+    made = (_entries((*scope, *gone), sizes) for _, gone, scope in steps(scopes, keep, sizes))
+    return max(_entries(frozenset(keep), sizes), *made, 1.0)
 
 
 def steps(
-    scopes: Iterable[Iterable[Variable]], keep: Collection[Variable], sizes: Sizes
+    scopes: Sequence[Iterable[Variable]], keep: Collection[Variable], sizes: Sizes
 ) -> Iterator[tuple[list[int], Scope, Scope]]:
     """Which tables are multiplied, which variables leave, and which stay: cheapest first.
 
     Every step takes its tables off the list and puts the result at its end.
     """
-    left = [tuple(s) for s in scopes]
-    kept = frozenset(keep)
-    while True:
-        free = dict.fromkeys(v for s in left for v in s if v not in kept)
-        if not free:
-            return
-        merged = {v: dict.fromkeys(u for s in left if v in s for u in s) for v in free}
-        first = min(free, key=lambda v: _entries(merged[v], sizes))
+    left = [frozenset(s) for s in scopes]
+    order = tuple(dict.fromkeys(v for s in scopes for v in s))
+    free = [v for v in order if v not in keep]
+    while free:
+        unions = {v: frozenset().union(*(s for s in left if v in s)) for v in free}
+        first = min(free, key=lambda v: _entries(unions[v], sizes))
         touched = [k for k, s in enumerate(left) if first in s]
-        elsewhere = {v for k, s in enumerate(left) if k not in touched for v in s}
-        gone = tuple(v for v in free if v in merged[first] and v not in elsewhere)
-        scope = tuple(v for v in merged[first] if v not in gone)
+        left = [s for s in left if first not in s]
+        others = frozenset().union(*left)
+        gone = tuple(v for v in free if v in unions[first] and v not in others)
+        scope = tuple(v for v in order if v in unions[first] and v not in gone)
         yield touched, gone, scope
-        left = [s for k, s in enumerate(left) if k not in touched] + [scope]
+        left.append(frozenset(scope))
+        free = [v for v in free if v not in gone]
 
 
 def connected(

@@ -109,30 +109,17 @@ class Answers:
         """
         node, model = self._node(name), self.model
         axes = model.axes.of[name]
-        cells = tuple(a.size for a in axes)
-        inner = [
-            1 if p in model.apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        out = np.full((*node.plate_shape, *cells), np.nan)
+        out = np.full((*node.plate_shape, *(a.size for a in axes)), np.nan)
         held = {s.label: s for s in self.now.scalars}
-        order = [model.apart.index(p) for p in node.plates if p in model.apart]
         events = math.prod(node.event_shape)
-        for number, plates in enumerate(np.ndindex(*inner)):
-            labels: list[Label] = [(name, number * events + k) for k in range(events)]
+        for number, at in enumerate(model.places(node)):
+            labels = [(name, number * events + k) for k in range(events)]
             if not all(label in held for label in labels):
                 continue
-            shape = (*cells, *model.lead)
-            scope = (*labels, *model.apart)
-            table = aligned(contract([self.own], scope), scope, shape)
-            for k, label in enumerate(labels):
-                widths = held[label].widths
-                ones = (1,) * k, (1,) * (events - 1 - k)
-                table = table / widths.reshape(*ones[0], len(widths), *ones[1], *widths.shape[1:])
-            table = table.transpose(*(events + a for a in order), *range(events))
-            at = tuple(
-                slice(None) if p in model.apart else k
-                for p, k in zip(node.plates, plates, strict=True)
-            )
+            scope = (*model.apart_of(node), *labels)
+            table = aligned(contract([self.own], scope), scope)
+            for label in labels:
+                table = table / aligned(Named((label, *model.apart), held[label].widths), scope)
             out[at] = table
         seen = self.now.row.seen.get(name)
         if seen is not None and seen.mask is not None:
@@ -189,18 +176,10 @@ class Answers:
                 f"{sorted({s.label[0] for s in self.now.scalars})}), "
                 "or of the probability of an event, probability(function)"
             )
-        inner = [
-            1 if p in model.apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        order = [model.apart.index(p) for p in node.plates if p in model.apart]
         held = {s.label: s for s in self.now.scalars}
         events = list(np.ndindex(*node.event_shape))
         out = np.empty((*levels.shape, *node.value_shape))
-        for number, plates in enumerate(np.ndindex(*inner)):
-            at = tuple(
-                slice(None) if p in model.apart else k
-                for p, k in zip(node.plates, plates, strict=True)
-            )
+        for number, at in enumerate(model.places(node)):
             for k, event in enumerate(events):
                 scalar = held.get((name, number * len(events) + k))
                 if scalar is None:  # seen in all elements that are apart
@@ -213,9 +192,8 @@ class Answers:
                 else:
                     share = self._marginal({scalar.label}).reshape(scalar.size, *model.lead)
                     found = cell_quantiles(scalar.points, share, levels, node.is_discrete)
-                found = found.reshape((*levels.shape, *model.lead))
-                ranks = range(levels.ndim)
-                out[(..., *at, *event)] = found.transpose(*ranks, *(levels.ndim + a for a in order))
+                each = Named(model.apart, found.reshape((*levels.shape, *model.lead)))
+                out[(..., *at, *event)] = aligned(each, model.apart_of(node))
         return out
 
     # ---- private -------------------------------------------------------------------------------
@@ -383,15 +361,16 @@ class Answers:
                     found.add(labels[len(labels) - lead + k])
         return found
 
+    def _belief(self, used: set[Label]) -> Named:
+        """Probabilities over some axes and the plates apart."""
+        terms = self.pair() if any(map(is_previous, used)) else [self.own]
+        return contract(terms, (*(x for x in self._labels() if x in used), *self.model.apart))
+
     def _marginal(self, used: set[Label]) -> np.ndarray:
         """Probabilities over some axes, of size one along the others: shape ``(*batch, *apart)``."""
-        labels, sizes, apart = self._labels(), self._sizes(), self.model.apart
-        was = any(is_previous(x) for x in used)
-        terms = self.pair() if was else [self.own]
-        keep = (*[x for x in labels if x in used], *apart)
+        labels, sizes = self._labels(), self._sizes()
         shape = (*(sizes[x] if x in used else 1 for x in labels), *self.model.lead)
-        found = contract(terms, keep)
-        return np.array(aligned(found, (*labels, *apart), shape))
+        return np.array(aligned(self._belief(used), (*labels, *self.model.apart), shape))
 
     def _average(self, node: CompiledNode, value: np.ndarray, more: int = 0) -> np.ndarray:
         """Expectation of values ``(*batch, *plates, *event)`` with ``more`` axes behind."""
@@ -428,20 +407,11 @@ class Answers:
 
     def _aligned(self, used: set[Label], node: CompiledNode, tail: int) -> np.ndarray:
         """Probabilities with axes where a node's values have them."""
-        count, apart = self._batch, self.model.apart
-        weights = self._marginal(used)
-        order = [p for p in node.plates if p in apart]
-        rest = [p for p in apart if p not in order]
-        weights = weights.transpose(
-            *range(count), *(count + apart.index(p) for p in (*order, *rest))
-        )
         # a node outside the plates that are apart depends on no cell of theirs
-        for _ in rest:
-            weights = weights[..., 0]
-        shape = list(weights.shape[:count])
-        sizes = iter(weights.shape[count:])
-        shape += [next(sizes) if p in apart else 1 for p in node.plates]
-        return weights.reshape(shape + [1] * tail)
+        rest = tuple(p for p in self.model.apart if p not in node.plates)
+        weights = aligned(self._belief(used), (*self._labels(), *node.plates, *rest))
+        weights = weights[(Ellipsis, *(0,) * len(rest))]
+        return weights.reshape(weights.shape + (1,) * tail)
 
     def _moments(self, node: CompiledNode, value: Any, var: Any) -> Moments:
         """Of values over the grid, or of distributions' means and variances; circular for angles."""
