@@ -178,31 +178,60 @@ def configure(
     then every element of the nodes ``whole``. ``points`` gives further values of some nodes, which run
     along one more batch axis, the last.
     """
-    sizes = [model[n].domain.size for n in alone]  # type: ignore[union-attr]
-    for name in whole:
-        node = model[name]
-        sizes += [node.domain.size] * math.prod(node.plate_shape)  # type: ignore[union-attr]
-    values = dict(known)
-    axes = len(sizes) + (points is not None)
-    for axis, name in enumerate(alone):
-        values[name] = _along(axis, sizes[axis], axes, model[name].plate_shape)
-    axis = len(alone)
-    for name in whole:
-        node = model[name]
-        count = math.prod(node.plate_shape)
-        batch = (1,) * axis + tuple(sizes[axis : axis + count]) + (1,) * (axes - axis - count)
-        value = np.empty((*batch, count), dtype=np.intp)
-        for element in range(count):
-            value[..., element] = _along(axis + element, sizes[axis + element], axes, ())
-        values[name] = value.reshape(batch + node.plate_shape)
-        axis += count
+    nodes = [model[n] for n in alone], [model[n] for n in whole]
+    axes, sizes = configurations(*nodes, behind=int(points is not None))
+    values = {**known, **dict(zip((*alone, *whole), axes, strict=True))}
     for name, value in (points or {}).items():
         values[name] = value.reshape((1,) * len(sizes) + value.shape)
     needed = _between(model, names, values)
     for name in model.nodes:
         if name in needed:
             values[name], _ = model.evaluate(name, values)
-    return values, tuple(sizes)
+    return values, sizes
+
+
+def configurations(
+    alone: Sequence[CompiledNode],
+    whole: Sequence[CompiledNode],
+    apart: Sequence[str] = (),
+    ahead: int = 0,
+    behind: int = 0,
+) -> tuple[list[np.ndarray], Shape]:
+    """All states of finite nodes along batch axes of their own, and the sizes of these axes.
+
+    Parameters
+    ----------
+    alone : sequence of CompiledNode
+        One axis each, all plate elements alike.
+    whole : sequence of CompiledNode
+        One axis for every element, those of plates ``apart`` together.
+    ahead, behind : int
+        Batch axes of size one before and after these.
+    """
+    inner = [
+        [1 if p in apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)]
+        for node in whole
+    ]
+    sizes = [node.domain.size for node in alone]  # type: ignore[union-attr]
+    for node, shape in zip(whole, inner, strict=True):
+        sizes += [node.domain.size] * math.prod(shape)  # type: ignore[union-attr]
+    ndim = ahead + len(sizes) + behind
+    found = [_along(ahead + k, sizes[k], ndim, node.plate_shape) for k, node in enumerate(alone)]
+    axis = len(alone)
+    for node, shape in zip(whole, inner, strict=True):
+        count, card = math.prod(shape), node.domain.size  # type: ignore[union-attr]
+        batch = np.ones(ndim, dtype=int)
+        batch[ahead + axis : ahead + axis + count] = card
+        value = np.empty((*batch, *node.plate_shape), dtype=np.intp)
+        for element, at in enumerate(np.ndindex(*shape)):
+            place = tuple(
+                slice(None) if p in apart else i for p, i in zip(node.plates, at, strict=True)
+            )
+            shared = (1,) * sum(p in apart for p in node.plates)
+            value[(Ellipsis, *place)] = _along(ahead + axis + element, card, ndim, shared)
+        found.append(value)
+        axis += count
+    return found, tuple(sizes)
 
 
 # ---- private ------------------------------------------------------------------------------------

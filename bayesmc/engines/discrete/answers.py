@@ -22,7 +22,7 @@ from bayesmc.factors.named import connected, log_product
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
-from bayesmc.shapes import unravelled
+from bayesmc.shapes import padded, unravelled
 
 
 class SliceAnswers:
@@ -169,7 +169,7 @@ class SliceAnswers:
         bad = result.invalid if isinstance(result, Distribution) else None
         if bad is not None:
             lead = 1 + len(self.reader.cards(term)) + len(self.model[term.name].plates)
-            bad = _padded(bad * 1.0, lead)
+            bad = padded(bad * 1.0, lead)
         return *self._averaged_of(term, rows), bad
 
     def _averaged_of(self, term: Term, rows: Rows) -> tuple[Any, ...]:
@@ -183,14 +183,14 @@ class SliceAnswers:
                 value = np.asarray(result)
                 if self._is_tabular(term.name):
                     one_hot = value[..., None] == np.arange(self.reader.card(term.name))
-                    return _padded(one_hot * 1.0, lead + 1), None
+                    return padded(one_hot * 1.0, lead + 1), None
                 value = np.asarray(own.decode(value), dtype=float)
-                value = _padded(value, lead + len(node.event_shape))
+                value = padded(value, lead + len(node.event_shape))
                 return value, np.zeros((1,) * value.ndim)
             if node.domain is not None:
-                return _padded(np.asarray(result.probs_table), lead + 1), None
+                return padded(np.asarray(result.probs_table), lead + 1), None
             ndim = lead + len(node.event_shape)
-            mean, var = _padded(result.mean, ndim), _padded(result.var, ndim)
+            mean, var = padded(result.mean, ndim), padded(result.var, ndim)
             if node.angles is None:
                 return mean, var
             length = np.exp(-0.5 * var)
@@ -393,7 +393,3 @@ def _averaged(weights: np.ndarray, values: np.ndarray, rest: int) -> np.ndarray:
     full = weights.reshape(weights.shape + (1,) * rest)
     axes = tuple(range(2, weights.ndim))
     return np.where(full > 0, full * values, 0.0).sum(axis=axes)
-
-
-def _padded(array: np.ndarray, ndim: int) -> np.ndarray:
-    return array.reshape((1,) * (ndim - array.ndim) + array.shape)

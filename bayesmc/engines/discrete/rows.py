@@ -15,6 +15,7 @@ import numpy as np
 from bayesmc.dbn import TIME, Series
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.structure.tables import configurations
 
 if TYPE_CHECKING:
     from bayesmc.engines.discrete.terms import SliceReader
@@ -111,35 +112,11 @@ class Rows:
 
     def on_axes(self, reader: SliceReader, term: Term) -> Rows:
         """With a term's variables along axes of their own."""
-        ndim = 1 + len(reader.cards(term))
-        axes: dict[Key, np.ndarray] = {}
-        axis = 1
-        for key in term.alone:
-            node, card = reader.slices.first[key[1]], reader.card(key[1])
-            values = _along(axis, card, ndim).reshape(
-                *_along(axis, card, ndim).shape, *(1,) * len(node.plates)
-            )
-            axes[key] = np.broadcast_to(values, (*values.shape[:ndim], *node.plate_shape))
-            axis += 1
-        for key in term.whole:
-            node, card = reader.slices.first[key[1]], reader.card(key[1])
-            count = reader.elements(key[1])
-            batch = [1] * ndim
-            batch[axis : axis + count] = [card] * count
-            value = np.empty((*batch, *node.plate_shape), dtype=np.intp)
-            inner = [n if p not in reader.apart else 1
-                     for p, n in zip(node.plates, node.plate_shape, strict=True)]  # fmt: skip
-            for element, at in enumerate(np.ndindex(*inner)):
-                place = tuple(
-                    slice(None) if p in reader.apart else i
-                    for p, i in zip(node.plates, at, strict=True)
-                )
-                along = _along(axis + element, card, ndim)
-                shared = sum(p in reader.apart for p in node.plates)
-                value[(Ellipsis, *place)] = along.reshape(*along.shape, *(1,) * shared)
-            axes[key] = value
-            axis += count
-        return Rows(self.series, self.start, self.stop, self.kind, reader, axes, ndim)
+        first = reader.slices.first
+        alone, whole = ([first[name] for _, name in keys] for keys in (term.alone, term.whole))
+        values, cards = configurations(alone, whole, reader.apart, ahead=1)
+        axes = dict(zip((*term.alone, *term.whole), values, strict=True))
+        return self.at(reader, axes, 1 + len(cards))
 
     def at(self, reader: SliceReader, values: Mapping[Key, np.ndarray], ndim: int) -> Rows:
         """With given values of variables, whose batch has ``ndim`` axes, that of time first."""
@@ -209,10 +186,6 @@ class Rows:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _along(axis: int, card: int, ndim: int) -> np.ndarray:
-    return np.arange(card).reshape((1,) * axis + (card,) + (1,) * (ndim - 1 - axis))
 
 
 def _handed_on(value: np.ndarray, source: CompiledNode, target: CompiledNode) -> np.ndarray:

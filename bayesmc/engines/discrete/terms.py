@@ -19,6 +19,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.discrete.rows import Key, Piece, Rows, Term, Variable
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.shapes import padded
 
 #: reads arrays off a term in some slices
 Read = Callable[["Term", "Rows"], tuple[Any, ...]]
@@ -235,7 +236,7 @@ class SliceReader:
         Sequences are one where nothing differs between them.
         """
         plates = len(node.plates)
-        array = _padded(array, 1 + cards + plates + rest)
+        array = padded(array, 1 + cards + plates + rest)
         inner = [k for k, p in enumerate(node.plates) if p not in self.apart]
         index: list[Any] = [slice(None)] * array.ndim
         if inner:
@@ -292,20 +293,20 @@ class SliceReader:
             lead = 1 + len(self.cards(term)) + len(node.plates)
             if not isinstance(result, Distribution):
                 size = self.card(term.name)
-                return np.log(_padded(np.asarray(result), lead)[..., None] == np.arange(size)), None
+                return np.log(padded(np.asarray(result), lead)[..., None] == np.arange(size)), None
             bad = result.invalid if result.invalid is not None and result.invalid.any() else None
             if term.name in self.variables:
                 table = result.probs_table
                 assert table is not None
-                log = _padded(np.log(table), lead + 1)
-                bad = None if bad is None else _padded(bad, lead)[..., None]
+                log = padded(np.log(table), lead + 1)
+                bad = None if bad is None else padded(bad, lead)[..., None]
             else:
                 seen = placed.observed(term.name, 0)
                 assert seen is not None
                 value, mask = seen
                 log = self.model(term.kind, 0).log_density(term.name, result, value)
-                log = _padded(log, lead)
-                bad = None if bad is None else _padded(bad, lead)
+                log = padded(log, lead)
+                bad = None if bad is None else padded(bad, lead)
                 if not mask.all():
                     log = np.where(mask, log, 0.0)
                     bad = None if bad is None else bad & mask
@@ -347,11 +348,6 @@ def _stacked(parts: Sequence[Any]) -> Any:
     shape = np.broadcast_shapes(*(p.shape[1:] for p in known))
     blank = np.zeros((1, *shape), dtype=known[0].dtype)
     return np.concatenate([blank if p is None else np.broadcast_to(p, blank.shape) for p in parts])
-
-
-def _padded(array: np.ndarray, ndim: int) -> np.ndarray:
-    """With ones in front."""
-    return array.reshape((1,) * (ndim - array.ndim) + array.shape)
 
 
 def _all_static(slices: Slices, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -21,6 +21,7 @@ from bayesmc.factors.named import Named, aligned, contract
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
+from bayesmc.shapes import padded
 
 Moments = tuple[np.ndarray, np.ndarray]
 
@@ -376,8 +377,7 @@ class Answers:
         """Expectation of values ``(*batch, *plates, *event)`` with ``more`` axes behind."""
         trailing = len(node.value_shape) + more
         value = np.asarray(value, dtype=float)
-        if value.ndim < trailing:
-            value = value.reshape((1,) * (trailing - value.ndim) + value.shape)
+        value = padded(value, trailing)
         lead = value.ndim - trailing
         full = (*node.value_shape, *value.shape[value.ndim - more :]) if more else node.value_shape
         used = self._used([(node, value, more)])
@@ -410,7 +410,8 @@ class Answers:
         # a node outside the plates that are apart depends on no cell of theirs
         rest = tuple(p for p in self.model.apart if p not in node.plates)
         weights = aligned(self._belief(used), (*self._labels(), *node.plates, *rest))
-        weights = weights[(Ellipsis, *(0,) * len(rest))]
+        at: Any = (Ellipsis, *(0,) * len(rest))
+        weights = weights[at]
         return weights.reshape(weights.shape + (1,) * tail)
 
     def _moments(self, node: CompiledNode, value: Any, var: Any) -> Moments:

@@ -18,8 +18,9 @@ from bayesmc.engines.grid.axes import Axes
 from bayesmc.engines.grid.slice import GridSlices, Placed, Values
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.errors import BudgetError, ParameterError
-from bayesmc.factors.named import Named, without_ones
+from bayesmc.factors.named import Named, aligned, without_ones
 from bayesmc.network import CompiledNode
+from bayesmc.shapes import padded
 
 #: entries that are evaluated at once: their temporaries stay in cache
 BLOCK = 1 << 16
@@ -207,8 +208,7 @@ class GridModel(GridSlices):
         """Log densities summed over plates whose elements meet, shape ``(*batch, *apart)``."""
         if mask is not None:
             log = np.where(mask, log, 0.0)
-        full = count + len(node.plates)
-        log = log.reshape((1,) * (full - log.ndim) + log.shape)
+        log = padded(log, count + len(node.plates))
         kept: list[str] = []
         for k in reversed(range(len(node.plates))):
             axis, n = count + k, node.plate_shape[k]
@@ -218,9 +218,7 @@ class GridModel(GridSlices):
                 log = log.sum(axis=axis)
             else:
                 log = log.take(0, axis=axis) * n
-        if self.apart:
-            log = log.transpose(*range(count), *(count + kept.index(p) for p in self.apart))
-        return log
+        return aligned(Named(tuple(kept), log), self.apart)
 
     def _reach(self, first: bool, name: str, before: Placed | None, now: Placed) -> set[Label]:
         hidden = {s.label[0] for s in now.scalars}
