@@ -70,6 +70,8 @@ class Term:
         Nodes that are no variables: their values come from the data.
     clock : bool
         It reads the time or an input.
+    hands_on : bool
+        It reads a computed node of the slice before that is no variable, so that slice 0 differs from others.
     """
 
     name: str
@@ -78,6 +80,7 @@ class Term:
     whole: tuple[Key, ...]
     reads: tuple[Key, ...]
     clock: bool
+    hands_on: bool = False
 
 
 @dataclass(frozen=True, eq=False)

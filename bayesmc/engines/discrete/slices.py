@@ -107,7 +107,7 @@ class DiscreteSlices:
             for e in range(self.reader.elements(n))
             for lag in (0, 1)
         }
-        self.has_second = any(self._hands_on(n) for n in slices.dynamic)
+        self.has_second = any(self.terms[n, 2].hands_on for n in slices.dynamic)
         self.chains = self._chains()
         self._home = {v: k for k, c in enumerate(self.chains) for v in (*c.state, *c.inside)}
         self._home |= {v: k for k, c in enumerate(self.chains) for v in c.before}
@@ -286,25 +286,6 @@ class DiscreteSlices:
 
     def _reads(self, name: str) -> bool:
         return any(t.clock or t.reads for t in (self.terms[name, k] for k in (1, 2)))
-
-    def _hands_on(self, name: str) -> bool:
-        """Whether a node reads a deterministic node of the slice before that is no variable."""
-        later, first = self.slices.later, self.slices.first
-        todo, visited = [name], set()
-        while todo:
-            current = todo.pop()
-            for parent in later[current].parents:
-                stem = parent.removesuffix(PREVIOUS)
-                if stem not in self.slices.dynamic or first[stem].is_stochastic:
-                    continue
-                if stem in self.reader.variables:
-                    continue
-                if stem != parent:
-                    return True
-                if stem not in visited:
-                    visited.add(stem)
-                    todo.append(stem)
-        return False
 
     def _nodes_by_chain(self) -> dict[int | None, tuple[str, ...]]:
         """The nodes whose densities hold variables of each chain, and those that hold none."""

@@ -63,10 +63,10 @@ class SliceReader:
         node = self.model(kind, 0)[name]
         found: dict[Key, bool] = {}
         reads: dict[Key, None] = {}
-        clock = False
+        clock = hands_on = False
 
         def visit(parents: Sequence[str], lag: int, own: tuple[str, ...], whole: bool) -> None:
-            nonlocal clock
+            nonlocal clock, hands_on
             for parent in parents:
                 stem, back = self.origin(parent, lag)
                 if stem == TIME or stem in self.slices.template.inputs:
@@ -83,12 +83,13 @@ class SliceReader:
                     reads[back, stem] = None
                 else:
                     self._check_back(name, stem, back)
+                    hands_on |= back > lag
                     visit(self.model(kind, back)[stem].parents, back, above.plates, foreign)
 
         visit(node.parents, 0, node.plates, False)
         alone = tuple(k for k, is_whole in found.items() if not is_whole)
         whole_keys = tuple(k for k, is_whole in found.items() if is_whole)
-        return Term(name, kind, alone, whole_keys, tuple(reads), clock)
+        return Term(name, kind, alone, whole_keys, tuple(reads), clock, hands_on)
 
     def origin(self, parent: str, lag: int) -> tuple[str, int]:
         """The node that a parent of the slice ``lag`` back is, and how far back it stands."""
