@@ -164,38 +164,28 @@ class SliceAnswers:
 
         Probabilities, or mean and variance (cosine and sine of angles).
         """
-        with marking_invalid(), np.errstate(all="ignore"):
-            result, _ = self.reader.evaluate(term, rows)
-        bad = result.invalid if isinstance(result, Distribution) else None
-        if bad is not None:
-            lead = 1 + len(self.reader.cards(term)) + len(self.model[term.name].plates)
-            bad = padded(bad * 1.0, lead)
-        return *self._averaged_of(term, rows), bad
-
-    def _averaged_of(self, term: Term, rows: Rows) -> tuple[Any, ...]:
-        """Probabilities, or mean and variance (cosine and sine of angles)."""
         node = self.model[term.name]
+        lead = 1 + len(self.reader.cards(term)) + len(node.plates)
+        ndim = lead + len(node.event_shape)
         with marking_invalid(), np.errstate(all="ignore"):
             result, _ = self.reader.evaluate(term, rows)
-            lead = 1 + len(self.reader.cards(term)) + len(node.plates)
             if not isinstance(result, Distribution):
                 own = self.reader.model(term.kind, 0)[term.name]
                 value = np.asarray(result)
                 if self._is_tabular(term.name):
                     one_hot = value[..., None] == np.arange(self.reader.card(term.name))
-                    return padded(one_hot * 1.0, lead + 1), None
-                value = np.asarray(own.decode(value), dtype=float)
-                value = padded(value, lead + len(node.event_shape))
-                return value, np.zeros((1,) * value.ndim)
+                    return padded(one_hot * 1.0, lead + 1), None, None
+                value = padded(np.asarray(own.decode(value), dtype=float), ndim)
+                return value, np.zeros((1,) * ndim), None
+            bad = None if result.invalid is None else padded(result.invalid * 1.0, lead)
             if node.domain is not None:
-                return padded(np.asarray(result.probs_table), lead + 1), None
-            ndim = lead + len(node.event_shape)
+                return padded(np.asarray(result.probs_table), lead + 1), None, bad
             mean, var = padded(result.mean, ndim), padded(result.var, ndim)
             if node.angles is None:
-                return mean, var
+                return mean, var, bad
             length = np.exp(-0.5 * var)
             cosine, sine = length * np.cos(mean), length * np.sin(mean)
-            return np.where(node.angles, cosine, mean), np.where(node.angles, sine, var)
+            return np.where(node.angles, cosine, mean), np.where(node.angles, sine, var), bad
 
     def _is_tabular(self, name: str) -> bool:
         """Whether a node has the same states in all slices; computed nodes may not, and are numbers then."""
