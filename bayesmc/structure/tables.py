@@ -78,7 +78,7 @@ def reads_of(
     >>> net.add("k", bmc.Bernoulli(0.5), plates="i")
     >>> net.add("m", bmc.Normal(0.0, 1.0))
     >>> net.add("f", lambda k, m: k * m, plates="i")
-    >>> reads_of(pose(net).model, ["f"], ["i"], lambda name: False)
+    >>> reads_of(pose(net, {}).model, ["f"], ["i"], lambda name: False)
     Reads(alone=('k',), whole=(), others=('m',))
     """
     finite: dict[str, bool] = {}
