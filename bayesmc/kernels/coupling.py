@@ -147,6 +147,8 @@ def _stuck(
     """
     tied = _without_safe(list(supports))
     several = [s.scope for s in tied if len(s.scope) > 1]
+    if not several:
+        return []
     return [
         scope
         for scope in connected((v for s in several for v in s), several)

@@ -15,79 +15,13 @@ from bayesmc.categorical import pick_log
 from bayesmc.errors import UnsupportedError
 from bayesmc.factors.named import Named, aligned
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms, conditional_of
-from bayesmc.kernels.tables import TableSweep
+from bayesmc.kernels.conditionals import FiniteTerm
 from bayesmc.network import Model
-from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
 
 #: joint states of a block
-_STATES = 1024
-
-
-def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None = None) -> Kernel:
-    """The kernel that draws some finite nodes jointly.
-
-    Parameters
-    ----------
-    target : Target
-    names : sequence of str
-        Chain nodes with few joint states. If they live in plates, in the same ones, and nothing they enter
-        reads them across elements; the blocks of all elements are then drawn at once.
-    terms : FiniteTerms, optional
-        Tables made before.
-
-    Raises
-    ------
-    UnsupportedError
-        The nodes make no such block.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import bayesmc as bmc
-    >>> from bayesmc.kernels.joint_states import joint_states
-    >>> from bayesmc.network import pose
-    >>> from bayesmc.structure.target import target_of
-    >>> net = bmc.BayesNet()
-    >>> net.add("x", bmc.Bernoulli(0.5))
-    >>> net.add("y", bmc.Bernoulli(0.5))
-    >>> net.add("parity", lambda x, y: bmc.Bernoulli((x + y) % 2 * 1.0))
-    >>> target = target_of(pose(net, {"parity": 1}))
-    >>> kernel = joint_states(target, ("x", "y"))
-    >>> start = {"x": np.ones(4, dtype=np.uint8), "y": np.zeros(4, dtype=np.uint8)}
-    >>> new, _ = kernel.step({**target.known, **start}, {}, np.random.default_rng(0), False)
-    >>> (new["x"] + new["y"]).tolist()
-    [1, 1, 1, 1]
-    """
-    terms = FiniteTerms(target) if terms is None else terms
-    conditional = conditional_of(terms, names)
-    if conditional is not None and conditional.states <= _STATES:
-        return TableSweep(target, (conditional,))
-    around = terms.around(names)
-    return JointStates(target, names) if around is None else RowSums(target, names, around)
-
-
-def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
-    """The kernel of one finite node whose own density and children are tables; None where they are not.
-
-    Parameters
-    ----------
-    blanket : Blanket
-    terms : FiniteTerms, optional
-        Tables made before, to be shared between nodes.
-    """
-    if blanket.node.domain is None:
-        return None
-    terms = FiniteTerms(blanket.target) if terms is None else terms
-    conditional = conditional_of(terms, (blanket.name,))
-    if conditional is not None:
-        return TableSweep(blanket.target, (conditional,))
-    around = terms.around((blanket.name,))
-    if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
-        return None
-    return RowSums(blanket.target, (blanket.name,), around)
+MOST_STATES = 1024
 
 
 class JointStates(Kernel):
@@ -97,7 +31,7 @@ class JointStates(Kernel):
     ----------
     target : Target
     names : sequence of str
-        As for `joint_states`.
+        As for `bayesmc.kernels.tables.joint_states`.
     """
 
     label = "enumerate jointly"
@@ -109,9 +43,9 @@ class JointStates(Kernel):
         domains = [n.domain for n in nodes]
         self.plates = nodes[0].plates
         cards = [d.size for d in domains if d is not None]
-        if len(cards) < len(nodes) or (len(cards) > 1 and math.prod(cards) > _STATES):
+        if len(cards) < len(nodes) or (len(cards) > 1 and math.prod(cards) > MOST_STATES):
             raise UnsupportedError(
-                f"nodes {list(names)} have no joint states to try, or more than {_STATES}; leave some out"
+                f"nodes {list(names)} have no joint states to try, or more than {MOST_STATES}; leave some out"
             )
         if any(n.plates != self.plates for n in nodes):
             raise UnsupportedError(

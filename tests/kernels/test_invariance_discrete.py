@@ -18,11 +18,11 @@ import bayesmc as bmc
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.forest_block import ForestBlock
-from bayesmc.kernels.joint_states import JointStates, RowSums, joint_states, table_kernel
+from bayesmc.kernels.joint_states import JointStates, RowSums
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import SiteCounts, SiteSums, lattice_kernel
-from bayesmc.kernels.tables import TableSweep, table_kernels
+from bayesmc.kernels.tables import TableSweep, joint_states, table_kernel, table_kernels
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
 from tests.kernels.invariance import (

@@ -14,8 +14,8 @@ from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels import tables
 from bayesmc.kernels.conditionals import FiniteTerms, conditional_of
-from bayesmc.kernels.joint_states import RowSums, table_kernel
-from bayesmc.kernels.tables import TableSweep, table_kernels
+from bayesmc.kernels.joint_states import RowSums
+from bayesmc.kernels.tables import TableSweep, table_kernel, table_kernels
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values, target_of

@@ -16,9 +16,9 @@ import pytest
 import bayesmc as bmc
 from bayesmc.errors import BudgetError, ShapeError, UnsupportedError, ZeroProbabilityError
 from bayesmc.kernels.enumerate import Enumerate
-from bayesmc.kernels.joint_states import table_kernel
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.lattice import lattice_kernel
+from bayesmc.kernels.tables import table_kernel
 from bayesmc.markov import MarkovChain
 from bayesmc.network import Problem, pose
 from bayesmc.structure.blanket import Blanket
