@@ -37,6 +37,7 @@ distributions
 expression
 linalg
 resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
+categorical
 errors | shapes
 """
 DEPTH = {
