@@ -1,7 +1,7 @@
 """Forward and backward over the slices of a series, whose coefficients are known beforehand.
 
 Covariances do not depend on the data, so they come first (``covariances``), and means follow (``means``). How
-one slice is conditioned is in ``kernels.kalman``.
+one slice is conditioned is in ``linalg.square_root``.
 """
 
 from __future__ import annotations
