@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,12 +28,12 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped
 from bayesmc.errors import BayesmcError
-from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance, turning
+from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import Block, accepted, instead
-from bayesmc.kernels.random_walk import counted, finite, some_support, walked
+from bayesmc.kernels.parts import Part, angles_of, parts_of
+from bayesmc.kernels.random_walk import counted, finite, walked
 from bayesmc.kernels.tempering import MixtureOfT, fitted_mixture
-from bayesmc.shapes import Shape
 from bayesmc.structure.target import Target, Values
 
 #: share of steps that follow a difference of two members, and of these with factor one
@@ -43,30 +42,10 @@ _DIFFERENCES, _JUMPS = 0.5, 0.2
 _NOISE = 1e-2
 #: kinds of moves: a Gaussian step, a difference of adapted length, a difference as it is, a draw anew
 _GAUSSIAN, _DIFFERENCE, _JUMP, _ANEW = 0, 1, 2, 3
-#: numbers to which a mixture is fitted, at most; draws it is fitted with; share of moves that draw from it
-FEW, _DRAWS, AFRESH = 6, 1000, 0.5
+#: draws with which a mixture is fitted; share of moves that draw from it
+_DRAWS, AFRESH = 1000, 0.5
 #: numbers that one evaluation of the mixture's draws may take
 _ELEMENTS = 1 << 23
-
-
-@dataclass(frozen=True)
-class Part:
-    """Where the numbers of one node stand in the vector of a block.
-
-    Attributes
-    ----------
-    free : ndarray or None
-        Flat plate elements that move; None where all do.
-    shape : tuple of int
-        Of the unconstrained numbers of one element.
-    start, stop : int
-    """
-
-    name: str
-    free: np.ndarray | None
-    shape: Shape
-    start: int
-    stop: int
 
 
 class BlockWalk(Kernel):
@@ -88,7 +67,7 @@ class BlockWalk(Kernel):
         Nothing else moves what the block depends on, so that densities can be kept between steps.
     anew : float
         Share of moves that are draws from a mixture fitted to the whole density, at the first step of a
-        warmup: of all hidden numbers, few and none of them an angle (``may_be_drawn_anew``). With 1 there are
+        warmup: of all hidden numbers, few and none of them an angle (``parts.may_be_drawn_anew``). With 1 there are
         no others.
 
     Examples
@@ -132,7 +111,7 @@ class BlockWalk(Kernel):
         self.anew = anew
         self.parts = parts_of(target, self.names, unconstrained)
         size = self.parts[-1].stop
-        angles = [_angles(target, part, unconstrained) for part in self.parts]
+        angles = [angles_of(target, part, unconstrained) for part in self.parts]
         self.steps = Steps(size, scale, adaptive, np.concatenate(angles))
         if ensemble > 1:
             self.label = "adaptive random walk and differential evolution"
@@ -404,21 +383,6 @@ class BlockWalk(Kernel):
         return ~stragglers(log.reshape(-1, self.ensemble)).ravel()
 
 
-def may_be_drawn_anew(target: Target, names: Sequence[str]) -> bool:
-    """Whether some nodes are all that is hidden, few numbers, each with a prior that can be drawn from.
-
-    Angles are left out, which a mixture does not know to be such, and nodes that are seen in part.
-    """
-    nodes = [target.model[n] for n in names]
-    if set(names) != set(target.chain) or any(n not in target.terms for n in names):
-        return False
-    if any(n.is_discrete or n.unsampled or target.seen(n.name) is not None for n in nodes):
-        return False
-    parts = parts_of(target, names)
-    angles = (turned for part in parts for turned in _angles(target, part, True))
-    return parts[-1].stop <= FEW and not any(angles)
-
-
 def stragglers(log: np.ndarray, ranges: float = 3.0) -> np.ndarray:
     """Members far below the others, shape (ensembles, members), by ranges between the quartiles.
 
@@ -430,28 +394,3 @@ def stragglers(log: np.ndarray, ranges: float = 3.0) -> np.ndarray:
     low, high = np.quantile(log, [0.25, 0.75], axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
         return log < low - ranges * (high - low) - 2.0
-
-
-def parts_of(target: Target, names: Sequence[str], unconstrained: bool = True) -> list[Part]:
-    """Where the numbers of each node stand in the vector of a block; names with parents first."""
-    parts, start = [], 0
-    for name in names:
-        node = target.model[name]
-        free = target.free_elements(name)
-        support = some_support(target.model, name)
-        shape = walked(support, node.event_shape, unconstrained).unconstrained_shape
-        count = math.prod(node.plate_shape) if free is None else len(free)
-        stop = start + count * math.prod(shape)
-        parts.append(Part(name, free, shape, start, stop))
-        start = stop
-    return parts
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _angles(target: Target, part: Part, unconstrained: bool) -> np.ndarray:
-    """Which numbers of a part are angles, shape (stop - start,)."""
-    support = some_support(target.model, part.name)
-    one = turning(support, target.model[part.name].event_shape, unconstrained)
-    return np.tile(one, (part.stop - part.start) // max(len(one), 1))

@@ -115,9 +115,7 @@ def test_hills_have_their_shares(model: Callable, engine: bmc.Engine | None) -> 
         log = special.logsumexp(whole, axis=1)
     truth = np.exp(log[line < 0] - special.logsumexp(log)).sum()
     with warnings.catch_warnings():
-        warnings.simplefilter(
-            "ignore", ConvergenceWarning
-        )  # what is stated must hold all the same
+        warnings.simplefilter("ignore", ConvergenceWarning)  # what is stated must hold all the same
         found = bmc.infer(net, evidence, engine=engine, rng=3)
     on_left = (lambda a: a < 0) if name == "a" else (lambda x: x < 0)
     share, error = found.expectation(on_left), found.mcse(on_left)

@@ -15,7 +15,7 @@ from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.conjugate import conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
-from bayesmc.kernels.ensemble import BlockWalk, may_be_drawn_anew
+from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_search import forest_blocks
@@ -24,6 +24,7 @@ from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import label_kernel
 from bayesmc.kernels.lattice import lattice_kernel
+from bayesmc.kernels.parts import may_be_drawn_anew
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.rescaled import rescaled_kernels

@@ -10,8 +10,9 @@ from typing import Any
 from bayesmc.engines.mcmc.proposals import RandomWalk, Read, read_proposals
 from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.kernels.base import Kernel
-from bayesmc.kernels.ensemble import AFRESH, BlockWalk, may_be_drawn_anew, parts_of
+from bayesmc.kernels.ensemble import AFRESH, BlockWalk
 from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.parts import may_be_drawn_anew, parts_of
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk
