@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS
-from bayesmc.engines.particles.cloud import along_plates
+from bayesmc.engines.particles.particles import along_plates
 from bayesmc.network.forward import Pass
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic

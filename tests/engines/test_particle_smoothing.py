@@ -18,9 +18,9 @@ import scipy.stats
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines.particles import smoothing
-from bayesmc.engines.particles.cloud import Layout, even_cloud
-from bayesmc.engines.particles.smoothing import Backward, lagged
+from bayesmc.engines.particles import backward as backward_simulation
+from bayesmc.engines.particles.backward import Backward, lagged
+from bayesmc.engines.particles.particles import Layout, evenly_weighted
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.testing import session
@@ -314,7 +314,7 @@ def filtered(case: Case, particles: int, rng: int = 0, **options: Any) -> tuple[
     """What draws backwards, and what it draws from: clouds and their rows."""
     engine = bmc.ParticleFilter(particles, **options)
     problem = pose_series(case.dbn, case.observations, case.inputs or None)
-    mover = engine._mover(problem.slices, {n: o.value for n, o in problem.series.static.items()})
+    step = engine.step_of(problem.slices, {n: o.value for n, o in problem.series.static.items()})
     found = bmc.filter(
         case.dbn,
         case.observations,
@@ -323,7 +323,7 @@ def filtered(case: Case, particles: int, rng: int = 0, **options: Any) -> tuple[
         rng=rng,
         keep="particles",
     )
-    return Backward(mover.plan, mover.layout), found.clouds, problem.series
+    return Backward(step.plan, step.layout), found.clouds, problem.series
 
 
 def rejected(found: list[tuple[float, str]], alpha: float) -> list[str]:
@@ -388,24 +388,28 @@ def test_a_forgotten_lag_is_caught(name: str, monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_bound_that_is_too_low_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the densities of a plate's elements the least, not their product."""
-    monkeypatch.setattr(smoothing, "summed", lambda log, node, apart: np.min(log, axis=-1))
+    monkeypatch.setattr(
+        backward_simulation, "summed", lambda log, node, apart: np.min(log, axis=-1)
+    )
     assert rejected(compared(team(), "by rejection"), ALPHA / len(TRIED))
 
 
 def test_a_bound_that_leaves_particles_out_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = smoothing.summed
-    monkeypatch.setattr(smoothing, "summed", lambda *given: real(*given).min(axis=0, keepdims=True))
+    real = backward_simulation.summed
+    monkeypatch.setattr(
+        backward_simulation, "summed", lambda *given: real(*given).min(axis=0, keepdims=True)
+    )
     assert rejected(compared(weather(), "by rejection"), ALPHA / len(TRIED))
 
 
 def test_an_acceptance_of_all_elements_at_once_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where elements of a plate are apart, one that was refused must not be taken with the others."""
-    put = smoothing._put
+    put = backward_simulation._put
 
     def careless(found: Any, rows: Any, values: Any, where: np.ndarray) -> None:
         put(found, rows, values, where | (where.any(axis=1, keepdims=True) & (where.ndim > 1)))
 
-    monkeypatch.setattr(smoothing, "_put", careless)
+    monkeypatch.setattr(backward_simulation, "_put", careless)
     assert rejected(compared(CASES["switching 4, a plate"](), "by rejection"), ALPHA / len(TRIED))
 
 
@@ -441,7 +445,7 @@ def test_a_bridge_between_two_values(move: Callable[[Any], Any], way: str) -> No
 
 def test_one_past_for_all_trajectories_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which leaves means alone, so only the number of pasts tells."""
-    real = smoothing._picked
+    real = backward_simulation._picked
     monkeypatch.setattr(
         smoothing, "_picked", lambda log, rng: np.repeat(real(log[:1], rng), len(log), axis=0)
     )
@@ -516,7 +520,7 @@ def test_neighbours_on_a_trajectory_belong_together(
 
     After one round of rejection, elements of the plate have other trajectories open each.
     """
-    monkeypatch.setattr(smoothing, "_ROUNDS", rounds)
+    monkeypatch.setattr(backward_simulation, "_ROUNDS", rounds)
     engine = bmc.ParticleFilter(PARTICLES, **WAYS[way][0])
     rows = np.stack([ROWS, ROWS - 1.0, -ROWS], axis=1)
     runs = [bmc.smooth(level(3), {"y": rows}, engine=engine, rng=k) for k in range(RUNS)]
@@ -540,7 +544,7 @@ def test_positions_are_supplied_by_weight_and_in_no_order() -> None:
     weights = np.array([[1.0, 0.0], [2.0, 3.0], [3.0, 1.0], [0.0, 4.0]])
     first, last = [], []
     for _ in range(2000):
-        supply = smoothing._Supply(weights, 4, rng)
+        supply = backward_simulation._Supply(weights, 4, rng)
         drawn = np.concatenate([supply.take(2), supply.take(1), supply.take(6)])
         first.append(drawn[0])
         last.append(drawn[-1])
@@ -557,10 +561,10 @@ def test_draws_packed_to_the_front_stay_with_their_trajectories() -> None:
     for lead in ((), (3,), (2, 4)):
         wanted = rng.random((9, *lead)) < 0.4
         own = np.broadcast_to(np.arange(9).reshape((-1,) + (1,) * len(lead)), wanted.shape)
-        rows, asked = smoothing._packed(own, wanted)
+        rows, asked = backward_simulation._packed(own, wanted)
         assert len(rows) == wanted.sum(axis=0).max()
         found = np.zeros(wanted.shape, dtype=np.intp)
-        smoothing._put(found, rows, 1 + rows, asked)
+        backward_simulation._put(found, rows, 1 + rows, asked)
         assert np.array_equal(found, np.where(wanted, 1 + own, 0))
 
 
@@ -739,7 +743,7 @@ def test_ancestors_of_elements_of_a_plate_end_each_for_itself() -> None:
     slices = pose_series(level(3), {"y": np.zeros((3, 3))}).slices
     clouds = []
     for t, anew in enumerate(([0, 0, 0], [0, 0, 1], [0, 1, 0])):
-        cloud = even_cloud(t, {"x": rng.normal(size=(40, 3))}, layout)
+        cloud = evenly_weighted(t, {"x": rng.normal(size=(40, 3))}, layout)
         weights = rng.random((40, 3))
         ancestors = np.sort(rng.integers(0, 40, (40, 3)), axis=0) if t else None
         clouds.append(

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles import smoothing
-from bayesmc.engines.particles.sharing import Sharing
+from bayesmc.engines.particles import backward as backward_simulation
+from bayesmc.engines.particles.coalescence import Sharing
 from bayesmc.errors import LowEssWarning
 from bayesmc.testing import session
 
@@ -194,5 +194,5 @@ def test_narrow_transitions_go_by_ancestors(monkeypatch: pytest.MonkeyPatch) -> 
     """Where no candidate would do but the ancestor; without it, others are taken that do not fit."""
     assert np.abs(drawn_backwards(session.seed())).max() < 0.6
     anyone = lambda cloud, index: np.zeros_like(index)  # noqa: E731
-    monkeypatch.setattr(smoothing, "_parents", anyone)
+    monkeypatch.setattr(backward_simulation, "_parents", anyone)
     assert np.abs(drawn_backwards(session.seed())).max() > 0.6

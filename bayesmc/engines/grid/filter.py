@@ -24,7 +24,7 @@ from bayesmc.engines.grid.search import GridSearch, known_static, quiet
 from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.grid.terms import Label
-from bayesmc.engines.particles.replicates import Replicates
+from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
 from bayesmc.network.forward import refuse_noiseless, refuse_parts

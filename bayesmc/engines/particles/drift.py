@@ -9,12 +9,13 @@ particle has made, or a model that is wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.particles import Layout, Particles
 from bayesmc.network import CompiledNode
 
 #: weight of what has been at each further slice: about ten are looked at together; and that of the largest
@@ -27,11 +28,28 @@ _LEAST = 0.05
 
 
 class Drift(NamedTuple):
-    """Moves of the means of numbers so far, in units of their spreads, shapes (numbers, many)."""
+    """Moves of the means of numbers so far, in units of their spreads.
 
-    moved: Any
-    variance: Any
-    worst: Any
+    Attributes
+    ----------
+    moved, variance : ndarray, shape (elements, numbers)
+    worst : ndarray, shape (*apart,)
+        The largest sum of moves of any number, in units of what is expected of it.
+    largest : float
+        That of the elements.
+    limit : float
+        From which on particles are missing.
+    """
+
+    moved: np.ndarray
+    variance: np.ndarray
+    worst: np.ndarray
+    largest: float
+    limit: float
+
+
+#: a slice of a block, which of its elements were not resampled (None: all), and the slice before
+Carried = tuple[int, np.ndarray | None, Particles]
 
 
 class Compass:
@@ -47,96 +65,86 @@ class Compass:
     def __init__(self, nodes: Iterable[CompiledNode], layout: Layout) -> None:
         self.layout = layout
         self.nodes = tuple(
-            (n, len(n.value_shape))
+            n
             for n in nodes
             if n.domain is None and n.angles is None and set(layout.apart) <= set(n.plates)
         )
-        count = max(sum(math.prod(n.value_shape) for n, _ in self.nodes), 1)
-        one = len(self.nodes) == 1 and not self.nodes[0][1] and not layout.apart
-        self.alone = self.nodes[0][0].name if one else None
-        self.limit = math.sqrt(IS**2 + 2.0 * math.log(count))
+        elements = math.prod(layout.lead)
+        self.counts = [math.prod(n.value_shape) // elements for n in self.nodes]
+        every = max(sum(math.prod(n.value_shape) for n in self.nodes), 1)
+        self.limit = math.sqrt(IS**2 + 2.0 * math.log(every))
 
-    def after(self, drift: Drift | None, earlier: Cloud | None, cloud: Cloud) -> Drift | None:
-        """The same after a slice, whose particles have been drawn from the model itself."""
-        if cloud.rejuvenated is not False:
-            return None
-        if self.alone is not None:
-            return self._after_one(drift, earlier, cloud)
-        before = None if earlier is None or np.all(cloud.resampled) else earlier
-        if before is not None and len(before.weights) != len(cloud.weights):
-            before = None
-        step = self._of_many([cloud.values[n.name] for n, _ in self.nodes], before, cloud)
-        moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
-        moved, spent = FADING * moved + step[0], FADING**2 * spent + step[1]
-        now = (np.abs(moved) / np.sqrt(spent + _LEAST)).max(axis=0)
-        return Drift(moved, spent, np.maximum(KEPT * worst, now))
+    def after(
+        self, drift: Drift | None, earlier: Particles | None, block: Block
+    ) -> Sequence[Drift | None]:
+        """The same after each slice of a block, whose particles have been drawn from the model itself.
+
+        A slice whose particles were drawn anew makes a block of its own.
+        """
+        if block.slices[0].rejuvenated is not False:
+            return [None]
+        carried = self._carried(earlier, block)
+        counts = zip(self.nodes, self.counts, strict=True)
+        parts = [_moves(block, node, count, carried) for node, count in counts]
+        moves = np.concatenate([m for m, _ in parts], axis=-1)
+        spent = np.concatenate([s for _, s in parts], axis=-1)
+        moved, variance = np.empty_like(moves), np.empty_like(spent)
+        before: Any = (0.0, 0.0) if drift is None else (drift.moved, drift.variance)
+        for k in range(len(moves)):
+            moved[k] = FADING * before[0] + moves[k]
+            variance[k] = FADING**2 * before[1] + spent[k]
+            before = moved[k], variance[k]
+        worst = (np.abs(moved) / np.sqrt(variance + _LEAST)).max(axis=-1)
+        last: Any = 0.0 if drift is None else drift.worst.reshape(-1)
+        for k in range(len(worst)):
+            worst[k] = last = np.maximum(KEPT * last, worst[k])
+        largest = worst.max(axis=-1).tolist()
+        figures = zip(moved, variance, worst.reshape(-1, *self.layout.lead), largest, strict=True)
+        return [Drift(*own, self.limit) for own in figures]
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _after_one(self, drift: Drift | None, earlier: Cloud | None, cloud: Cloud) -> Drift | None:
-        """The same of one number per particle, in few calls of NumPy."""
-        assert self.alone is not None
-        values = cloud.values[self.alone]
-        if values.ndim == 0:
-            return drift
-        same = earlier is not None and len(earlier.weights) == len(values)
-        prior = earlier if same and not cloud.resampled else None
-        weights, total = cloud.weights, cloud.total
-        if prior is None:
-            n = len(values)
-            mean = float(values.sum()) / n
-        else:
-            mean = float(prior.weights.dot(values)) / prior.total
-        off = values - mean
-        move = float(weights.dot(off)) / total
-        if prior is None:
-            wide = float(off.dot(off)) / n
-            off *= off
-        else:
-            off *= off
-            wide = float(prior.weights.dot(off)) / prior.total
-        if not wide > 0.0:
-            return drift
-        left = float(weights.dot(off)) / total - move * move
-        moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
-        moved = FADING * moved + move / math.sqrt(wide)
-        spent = FADING * FADING * spent + max(1.0 - left / wide, 0.0)
-        return Drift(moved, spent, max(KEPT * worst, abs(moved) / math.sqrt(spent + _LEAST)))
-
-    def _of_many(
-        self, values: list[np.ndarray], before: Cloud | None, cloud: Cloud
-    ) -> tuple[np.ndarray, np.ndarray]:
-        many = math.prod(self.layout.lead)
-        rows = []
-        for (node, rank), value in zip(self.nodes, values, strict=True):
-            if value.ndim == rank:  # the same for all particles
-                value = np.broadcast_to(value, (len(cloud.weights), *value.shape))
-            at = [1 + node.plates.index(p) for p in self.layout.apart]
-            first = np.moveaxis(value, at, range(1, 1 + len(at)))
-            rows.append(first.reshape(len(value), many, -1).transpose(2, 1, 0))
-        numbers = np.concatenate(rows).astype(float)
-        n = numbers.shape[-1]
-        posterior = (cloud.weights / cloud.total).reshape(n, many).T
-        if before is None:
-            prior: Any = np.full((many, n), 1.0 / n)
-        else:
-            shares = before.weights / before.total
-            prior = np.where(cloud.resampled, 1.0 / n, shares).reshape(n, many).T
-        mean = np.einsum("kin,in->ki", numbers, prior)
-        numbers -= mean[..., None]
-        move = np.einsum("kin,in->ki", numbers, posterior)
-        numbers *= numbers
-        wide = np.einsum("kin,in->ki", numbers, prior)
-        left = np.einsum("kin,in->ki", numbers, posterior) - move**2
-        return _scaled(move, wide, left)
+    def _carried(self, earlier: Particles | None, block: Block) -> list[Carried]:
+        """Slices into which particles bring the weights of the slice before, and that slice."""
+        found, n = [], block.particles
+        for k, now in enumerate(block.slices):
+            every = now.resampled if isinstance(now.resampled, bool) else now.resampled.all()
+            if not every and earlier is not None and len(earlier.weights) == n:
+                some = None if isinstance(now.resampled, bool) else ~now.resampled.reshape(-1)
+                found.append((k, some, earlier))
+            earlier = now
+        return found
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _scaled(move: np.ndarray, wide: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _moves(
+    block: Block,
+    node: CompiledNode,
+    count: int,
+    carried: Sequence[Carried],
+) -> tuple[np.ndarray, np.ndarray]:
+    """What rows do to a node's numbers, (slices, elements, numbers): moves of means, variances taken away."""
+    moments = block.moments(node)
+    if moments is None:  # the same for all particles
+        shape = (len(block.slices), block.elements, count)
+        return np.zeros(shape), np.zeros(shape)
+    off = moments.off
+    shift, wide = off.mean(axis=-1), np.vecdot(off, off) / block.particles
+    for k, some, earlier in carried:
+        weights = earlier.weights.reshape(block.particles, -1).T[:, None]
+        total = np.reshape(earlier.total, (-1, 1))
+        own = np.vecdot(weights, off[k]) / total
+        square = np.einsum(
+            "ekn,ekn,ekn->ek", np.broadcast_to(weights, off[k].shape), off[k], off[k]
+        )
+        shift[k] = own if some is None else np.where(some[:, None], own, shift[k])
+        wide[k] = (
+            square / total if some is None else np.where(some[:, None], square / total, wide[k])
+        )
+    wide = wide - shift**2
     some = wide > 0.0
     safe = np.where(some, wide, 1.0)
-    return np.where(some, move / np.sqrt(safe), 0.0), np.where(
-        some, np.maximum(1.0 - left / safe, 0.0), 0.0
-    )
+    taken = np.maximum(1.0 - moments.variance / safe, 0.0)
+    return np.where(some, -shift / np.sqrt(safe), 0.0), np.where(some, taken, 0.0)

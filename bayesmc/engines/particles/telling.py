@@ -7,8 +7,8 @@ from collections.abc import Collection, Mapping
 from typing import Any
 
 from bayesmc.dbn import SeriesProblem, Slices
+from bayesmc.engines.particles.auxiliary import PluggedIn
 from bayesmc.engines.particles.optimal import guidance
-from bayesmc.engines.particles.stages import PluggedIn
 from bayesmc.engines.slice_steps import SlicePlan, plates_apart
 from bayesmc.errors import ProposalWarning
 from bayesmc.kernels.proposal import names_of

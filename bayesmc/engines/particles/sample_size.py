@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud
-from bayesmc.engines.particles.families import Families
+from bayesmc.engines.particles.genealogy import Families
+from bayesmc.engines.particles.particles import Particles
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.errors import LowEssWarning
 
@@ -154,16 +154,18 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     )
 
 
-def warn_of_a_lonely_step(before: Cloud | None, families: Families | None, cloud: Cloud) -> None:
+def warn_of_a_lonely_step(
+    before: Particles | None, families: Families | None, now: Particles
+) -> None:
     """The first step that leaves little more than one particle says so; later ones know by the error."""
     if before is not None and families is not None and np.isinf(families.settled).any():
         return
-    worst = float(np.min(cloud.ess))
-    if worst >= min(COLLAPSED, 0.9 * len(cloud.weights)):
+    worst = float(np.min(now.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(now.weights)):
         return
     warnings.warn(
-        f"ParticleFilter: step leaves {len(cloud.weights)} particles that are worth {worst:.1f} equally "
-        f"weighted ones in slice {cloud.t}: from here on the belief cannot tell how far it is off "
+        f"ParticleFilter: step leaves {len(now.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {now.t}: from here on the belief cannot tell how far it is off "
         "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
         "looks at the observations",
         LowEssWarning,
@@ -179,7 +181,7 @@ def _more(filtered: FilteredParticles, engine: ParticleFilter) -> str:
     assert filtered.counts is not None
     if engine.particles is not None or engine.adapt is not None:
         return "more particles"
-    count, keep = int(filtered.counts.max()), filtered.clouds is not None
+    count, keep = int(filtered.counts.max()), filtered.held is not None
     if count >= MOST:
         return (
             f"more particles than the {MOST:_} that are tried at most, such as "
