@@ -319,7 +319,7 @@ def test_a_first_stage_does_not_spoil_a_sharp_sensor(monkeypatch: pytest.MonkeyP
         return belief._replace(log_density=-0.5 * (off[..., 0].reshape(-1, 50) / 0.3) ** 2)
 
     monkeypatch.setattr(LookAhead, "believed", at_the_mean)
-    monkeypatch.setattr(auxiliary, "_SHARE", 1e-12)
+    monkeypatch.setattr("bayesmc.engines.particles.auxiliary._SHARE", 1e-12)
     assert long_run(auxiliary=True).mean() < -5
 
 
@@ -653,12 +653,12 @@ def test_guards_bound_the_weights() -> None:
     """No weight is more than ten times that of the bootstrap filter, far from any tangent."""
     problem = pose_series(bent(), {"y": [1.3]})
     engine = bmc.ParticleFilter(5000, proposal="optimal")
-    mover = engine._mover(problem.slices, {})
+    made_by = engine.step_of(problem.slices, {})
     row = problem.series.row(0)
-    assert any(isinstance(step, Guarded) for step in mover.plan.steps(row))
-    cloud = mover.first(row, np.random.default_rng(0))
-    density = stats.norm.logpdf(1.3, cloud.values["x"] + 0.4 * np.sin(2 * cloud.values["x"]), 0.2)
-    assert (cloud.log_weights <= density + np.log(10.0) + 1e-9).all()
+    assert any(isinstance(step, Guarded) for step in made_by.plan.steps(row))
+    found = made_by(None, row, np.random.default_rng(0))
+    density = stats.norm.logpdf(1.3, found.values["x"] + 0.4 * np.sin(2 * found.values["x"]), 0.2)
+    assert (found.log_weights <= density + np.log(10.0) + 1e-9).all()
 
 
 def test_families_without_a_variance_are_left_to_themselves() -> None:

@@ -447,7 +447,7 @@ def test_one_past_for_all_trajectories_is_caught(monkeypatch: pytest.MonkeyPatch
     """Which leaves means alone, so only the number of pasts tells."""
     real = backward_simulation._picked
     monkeypatch.setattr(
-        smoothing, "_picked", lambda log, rng: np.repeat(real(log[:1], rng), len(log), axis=0)
+        backward_simulation, "_picked", lambda log, rng: np.repeat(real(log[:1], rng), len(log), axis=0)
     )
     dbn = bmc.DynamicBayesNet()
     dbn.add("x", leap, initial=bmc.Normal(0.0, 1.0))

@@ -335,7 +335,7 @@ MUTANTS = [
     ),
     Mutant(
         "particle Gibbs does not keep the trajectory",
-        (Edit("bayesmc.pmcmc.filters:ConditionalFilter._kept", "found[-1] = trajectory", "pass"),),
+        (Edit("bayesmc.pmcmc.filters:ConditionalStep.kept_among", "found[-1] = trajectory", "pass"),),
         matched(line, RISING, bmc.ParticleGibbs(draws=100, warmup=20, chains=40, particles=4)),
         "compare with exact(), 40 chains of 100 draws",
     ),
