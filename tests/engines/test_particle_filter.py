@@ -487,9 +487,20 @@ BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "no densities": ({"on_degeneracy": "rejuvenate"}, ValueError, "go together"),
     "a list": ({"proposal": [1]}, TypeError, r"ParticleFilter\(proposal=\[1\]\): give a dict"),
     "twice": ({"proposal": {"x": nearer, ("x",): nearer}}, ModelError, "'x' has two proposals"),
-    "backward": ({"backward": "fast"}, ValueError, 'give "rejection" or "exact"'),
     "auxiliary": ({"auxiliary": 3}, TypeError, "auxiliary=3"),
 }
+
+
+def test_bad_options_of_smoothing_say_what_to_give() -> None:
+    engine, rows = bmc.ParticleFilter(10), {"y": ROWS}
+    with pytest.raises(ValueError, match='backward=.fast.*give "rejection" or "exact"'):
+        bmc.smooth(linear(), rows, engine=engine, backward="fast")
+    with pytest.raises(
+        ValueError, match=r"smooth\(trajectories=0\): give a number of trajectories"
+    ):
+        bmc.smooth(linear(), rows, engine=engine, trajectories=0)
+    with pytest.raises(ValueError, match=r"smooth\(trajectories=9\).*KalmanFilter has none"):
+        bmc.smooth(linear(), rows, trajectories=9)
 
 
 @pytest.mark.parametrize("fault", BAD)

@@ -79,8 +79,8 @@ def level(case: Callable[[], tuple[bmc.DynamicBayesNet, str]]) -> float:
     labelled = exact.model[name].domain is not None
     found = []
     for k in range(RUNS):
-        engine = bmc.ParticleFilter(300, trajectories=1000)
-        drawn = bmc.smooth(dbn, rows, engine=engine, rng=session.seed() + k)
+        options: dict[str, Any] = {"engine": bmc.ParticleFilter(300), "trajectories": 1000}
+        drawn = bmc.smooth(dbn, rows, rng=session.seed() + k, **options)
         ask = (lambda p: p.probabilities(name)) if labelled else (lambda p: p.mean(name))
         found.append((ask(drawn) - ask(exact)) / drawn.mcse(name))
     return float(np.sqrt(np.mean(np.square(found))))
@@ -185,8 +185,9 @@ def drawn_backwards(seed: int) -> np.ndarray:
     )
     dbn.add("y", lambda x: bmc.Normal(x, 1.0))
     rows = {"y": dbn.sample(30, 1, rng=1)["y"][0]}
-    engine = bmc.ParticleFilter(4000, trajectories=500)
-    found, exact = bmc.smooth(dbn, rows, engine=engine, rng=seed), bmc.smooth(dbn, rows)
+    engine = bmc.ParticleFilter(4000)
+    found = bmc.smooth(dbn, rows, engine=engine, rng=seed, trajectories=500)
+    exact = bmc.smooth(dbn, rows)
     return (found.mean("v") - exact.mean("v")) / exact.std("v")
 
 

@@ -76,11 +76,12 @@ class ParticleBelief(OnlineBelief):
         inputs: Mapping[str, np.ndarray] | None = None,
         families: Families | None = None,
         tracker: Tracker | None = None,
+        block: Block | None = None,
     ) -> None:
         self.dbn, self.seed, self.static = dbn, seed, dict(static)
         self.made_by, self.now, self.chance = made_by, now, chance
         self.inputs = dict(inputs or {})
-        self.families, self.tracker = families, tracker
+        self.families, self.tracker, self.block = families, tracker, block
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if now is None else now.t
 
@@ -88,7 +89,7 @@ class ParticleBelief(OnlineBelief):
         """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
         step = self.made_by
         bare = None if step is None else Bare(step.slices, step.layout)
-        return {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None}
+        return {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None, "block": None}
 
     @property
     def slices(self) -> Slices | None:
@@ -217,7 +218,9 @@ class ParticleBelief(OnlineBelief):
 
     @property
     def _block(self) -> Block:
-        return Block(self._step.layout, [self._particles])
+        if self.block is None:
+            self.block = Block(self._step.layout, [self._particles])
+        return self.block
 
     @property
     def _step(self) -> FilterStep | Bare:

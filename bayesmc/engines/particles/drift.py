@@ -86,8 +86,10 @@ class Compass:
         carried = self._carried(earlier, block)
         counts = zip(self.nodes, self.counts, strict=True)
         parts = [_moves(block, node, count, carried) for node, count in counts]
-        moves = np.concatenate([m for m, _ in parts], axis=-1)
-        spent = np.concatenate([s for _, s in parts], axis=-1)
+        moves, spent = parts[0]
+        if len(parts) > 1:
+            moves = np.concatenate([m for m, _ in parts], axis=-1)
+            spent = np.concatenate([s for _, s in parts], axis=-1)
         moved, variance = np.empty_like(moves), np.empty_like(spent)
         before: Any = (0.0, 0.0) if drift is None else (drift.moved, drift.variance)
         for k in range(len(moves)):
@@ -130,10 +132,10 @@ def _moves(
     if moments is None:  # the same for all particles
         shape = (len(block.slices), block.elements, count)
         return np.zeros(shape), np.zeros(shape)
-    off = moments.off
-    shift, wide = off.mean(axis=-1), np.vecdot(off, off) / block.particles
+    off, n = moments.off, block.particles
+    shift, wide = np.add.reduce(off, axis=-1) / n, np.vecdot(off, off) / n
     for k, some, earlier in carried:
-        weights = earlier.weights.reshape(block.particles, -1).T[:, None]
+        weights = earlier.weights.reshape(n, -1).T[:, None]
         total = np.reshape(earlier.total, (-1, 1))
         own = np.vecdot(weights, off[k]) / total
         square = np.einsum(
@@ -144,7 +146,9 @@ def _moves(
             square / total if some is None else np.where(some[:, None], square / total, wide[k])
         )
     wide = wide - shift**2
-    some = wide > 0.0
-    safe = np.where(some, wide, 1.0)
-    taken = np.maximum(1.0 - moments.variance / safe, 0.0)
-    return np.where(some, -shift / np.sqrt(safe), 0.0), np.where(some, taken, 0.0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        moves, taken = -shift / np.sqrt(wide), np.maximum(1.0 - moments.variance / wide, 0.0)
+    none = ~(wide > 0.0)
+    if none.any():
+        moves[none] = taken[none] = 0.0
+    return moves, taken

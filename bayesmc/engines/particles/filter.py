@@ -43,6 +43,7 @@ from bayesmc.engines.particles.sample_size import (
     warn_of_a_lonely_step,
 )
 from bayesmc.engines.particles.smoothing import (
+    Backwards,
     backwards,
     by_lag,
     filtered_by,
@@ -113,14 +114,6 @@ class ParticleFilter(FilterEngine):
     recovery : Recovery, optional
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
 
-    trajectories : int, optional
-        Trajectories that ``smooth`` draws; by default as many as there are particles, 1,000 at most.
-    backward : "rejection" or "exact"
-        How ``smooth`` draws them: by rejection where the transition's height is known (the same law); what is
-        still open, and elsewhere all, among 500 particles of the slice drawn by weight and the filter's own
-        ancestor. So time is that of the filter, and at most some 500 densities per trajectory and slice (as
-        many times as lags reach back). ``"exact"`` tries all particles for each.
-
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
     budget : int
@@ -188,8 +181,6 @@ class ParticleFilter(FilterEngine):
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
     adapt: KLD | None = None
     recovery: Recovery | None = None
-    trajectories: int | None = None
-    backward: str = "rejection"
     tolerance: float = TOLERANCE
     budget: int = BUDGET
 
@@ -201,15 +192,8 @@ class ParticleFilter(FilterEngine):
         if self.particles is not None:
             check_count("particles", self.particles, "such as 10_000")
         check_budget(self.tolerance, self.budget)
-        if self.trajectories is not None:
-            check_count(
-                "trajectories",
-                self.trajectories,
-                "or None for as many as there are particles, 1,000 at most",
-            )
         check_threshold(self.ess_threshold)
         scheme_of(self.resampling)
-        check_choice("backward", self.backward, "rejection", "exact")
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
         check_kind("adapt", self.adapt, KLD)
         check_kind("recovery", self.recovery, Recovery)
@@ -298,7 +282,13 @@ class ParticleFilter(FilterEngine):
         lag: int | None = None,
         queries: Queries | None = None,
         progress: bool | None = None,
+        trajectories: int | None = None,
+        backward: str = "rejection",
     ) -> FilteredParticles:
+        if trajectories is not None:
+            what = "or None for as many as there are particles, 1,000 at most"
+            check_count("trajectories", trajectories, what, "smooth")
+        check_choice("backward", backward, "rejection", "exact", "smooth")
         if self.adapt is not None or self.recovery is not None:
             raise UnsupportedError(_NOT_SMOOTHED)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
@@ -309,7 +299,8 @@ class ParticleFilter(FilterEngine):
             sums = endless(problem.slices, seen_in_full(problem))
             if sums:
                 raise UnsupportedError(_not_backwards(sums[0]))
-            found, filtered = backwards(sized, problem, seed, queries or {}, progress)
+            asked = Backwards(trajectories, backward == "rejection")
+            found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
         self._warn(filtered)
         warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
@@ -383,7 +374,7 @@ class ParticleFilter(FilterEngine):
         return ParticleBelief(
             belief.dbn, belief.seed, belief.static, step, now,
             total if np.ndim(total) else float(total), rng.bit_generator.state,
-            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
+            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker, block,
         )  # fmt: skip
 
     # ---- private -------------------------------------------------------------------------------

@@ -71,7 +71,7 @@ class Sight:
         """
         if lost is not None and not here:
             lost = self._followed(lost, now)
-        if where is False or not np.any(where):
+        if where is False or not np.asarray(where).any():
             return lost
         fresh = np.broadcast_to(np.asarray(where, dtype=bool), self.layout.lead)
         wide = tuple(self._spread(node, now) for node in self.nodes)

@@ -140,7 +140,8 @@ def followed(
         Whether resampling leaves neighbours together the particles that their weight demands, but for one.
     sight : Sight
     """
-    found, gained = families, 0.0
+    found = families
+    gained: Any = 0.0
     if now.ancestors is not None:
         found = _moved(families, earlier, now, steady)
         if now.t % STRIDE == 0 and np.any(now.resampled):
@@ -269,9 +270,10 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
     """
     resampled = np.asarray(now.resampled)
     counts = (families.bounds[:, 1:] - families.bounds[:, :-1]) / len(now.weights)
-    if not families.kept.any() and not _matters(families, now, counts):
+    kept = families.kept.any()
+    if not kept and not _matters(families, now, counts):
         return families, 0.0
-    off = _off(families, counts * np.exp(families.kept))
+    off = _off(families, counts * np.exp(families.kept)) if kept else counts - families.shares
     variance = _variance(families, off)
     edge = np.zeros(resampled.shape, dtype=bool)
     if variance.max() > _level(len(now.weights)):
@@ -310,14 +312,17 @@ def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Fa
 def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bool) -> Families:
     """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
     groups = families.shares.shape[1]
-    bounds, shares = _even(len(now.weights), groups, now.weights.ndim - 1)
-    fresh: tuple[Any, ...] = (bounds, shares, 0.0, 0.0, now.t)
+    even = _even(len(now.weights), groups, now.weights.ndim - 1)
+    fresh: tuple[Any, ...] = (*even, 0.0, 0.0, now.t)
     found = []
     for value, new in zip(families[:5], fresh, strict=True):
         begun = np.empty_like(value)
         begun[OLD], begun[YOUNG] = new if both else value[YOUNG], new
         found.append(begun if where.ndim == 0 else np.where(where, begun, value))
-    return Families(*found, *families[5:])
+    bounds, shares, kept, explained, born = found
+    return families._replace(
+        bounds=bounds, shares=shares, kept=kept, explained=explained, born=born
+    )
 
 
 def _weights(families: Families, now: Particles) -> np.ndarray:

@@ -14,11 +14,11 @@ from bayesmc.errors import UnknownNodeError, did_you_mean
 from bayesmc.network.reading import nodes_read
 
 
-def check_count(option: str, given: Any, what: str) -> None:
+def check_count(option: str, given: Any, what: str, call: str = "ParticleFilter") -> None:
     """A whole number, 1 or more."""
     if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 1:
         raise ValueError(
-            f"ParticleFilter({option}={given!r}): give a number of {option}, 1 or more, {what}"
+            f"{call}({option}={given!r}): give a number of {option}, 1 or more, {what}"
         )
 
 
@@ -44,10 +44,12 @@ def check_threshold(given: Any) -> None:
         )
 
 
-def check_choice(option: str, given: Any, one: str, other: str) -> None:
+def check_choice(
+    option: str, given: Any, one: str, other: str, call: str = "ParticleFilter"
+) -> None:
     """One of two words."""
     if given not in (one, other):
-        raise ValueError(f'ParticleFilter({option}={given!r}): give "{one}" or "{other}"')
+        raise ValueError(f'{call}({option}={given!r}): give "{one}" or "{other}"')
 
 
 def check_kind(option: str, given: Any, kind: type) -> None:

@@ -175,7 +175,6 @@ class Record:
             particles = [p for w in self._written for p in w.particles]
             known = [f for w in self._written for f in w.families]
             held = Held(self.layout, particles[:k], known[:k], sharing)
-        errors = self._joined("errors", k) or None
         return FilteredParticles(
             self.problem.model,
             engine,
@@ -188,7 +187,7 @@ class Record:
                 "start": self.problem.series.start,
             },
             diagnostics=filter,
-            errors=(told, errors, self._joined("query errors", k)),
+            errors=(told, self._joined("errors", k), self._joined("query errors", k)),
             predictive=predictive,
             held=held,
         )
@@ -281,7 +280,7 @@ class FilteredParticles(SeriesPosterior):
         *,
         answers: Mapping[str, Any],
         diagnostics: Mapping[str, np.ndarray],
-        errors: tuple[Any, Mapping[str, np.ndarray] | None, Mapping[str, np.ndarray]],
+        errors: tuple[Any, Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
         predictive: Predictive | None = None,
         held: Held | None = None,
     ) -> None:

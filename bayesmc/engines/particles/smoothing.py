@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -29,20 +29,27 @@ if TYPE_CHECKING:
     from bayesmc.engines.particles.filter import ParticleFilter
 
 
+class Backwards(NamedTuple):
+    """How many trajectories are drawn backwards (None: as many as particles), and whether by rejection."""
+
+    trajectories: int | None = None
+    rejection: bool = True
+
+
 def backwards(
     engine: ParticleFilter,
     problem: SeriesProblem,
     seed: np.random.SeedSequence,
     queries: Queries,
     progress: bool | None,
+    asked: Backwards,
 ) -> tuple[FilteredParticles, FilteredParticles]:
     """Trajectories drawn backwards, and the filter's answer."""
     step = engine.step_of(problem.slices, static_of(problem))
     filtered = filtered_by(engine, step, problem, seed, True, {}, progress)
     assert filtered.held is not None
-    count = engine.trajectories or min(step.layout.particles, TRAJECTORIES)
-    by_bound = engine.backward == "rejection"
-    backward = Backward(step.plan, step.layout, by_bound, seen_in_full(problem))
+    count = asked.trajectories or min(step.layout.particles, TRAJECTORIES)
+    backward = Backward(step.plan, step.layout, asked.rejection, seen_in_full(problem))
     with quiet():
         rng = stream(seed, Purpose.SMOOTH)
         found = backward.trajectories(filtered.held.particles, problem.series, count, rng)
