@@ -76,12 +76,11 @@ class ParticleBelief(OnlineBelief):
         inputs: Mapping[str, np.ndarray] | None = None,
         families: Families | None = None,
         tracker: Tracker | None = None,
-        block: Block | None = None,
     ) -> None:
         self.dbn, self.seed, self.static = dbn, seed, dict(static)
         self.made_by, self.now, self.chance = made_by, now, chance
         self.inputs = dict(inputs or {})
-        self.families, self.tracker, self.block = families, tracker, block
+        self.families, self.tracker = families, tracker
         self.log_marginal_likelihood = log_marginal_likelihood
         self.t = -1 if now is None else now.t
 
@@ -89,7 +88,7 @@ class ParticleBelief(OnlineBelief):
         """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
         step = self.made_by
         bare = None if step is None else Bare(step.slices, step.layout)
-        return {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None, "block": None}
+        return {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None}
 
     @property
     def slices(self) -> Slices | None:
@@ -156,7 +155,7 @@ class ParticleBelief(OnlineBelief):
         """Mean, shape ``(*plates, *event)``; circular for angles."""
         node = self._node(name)
         if node.domain is None:
-            return self._block.mean_and_variance(node)[0][0]
+            return self._block.mean(node)[0]
         return self._block.table(node)[0] @ numbers_of(node)
 
     def var(self, name: str) -> np.ndarray:
@@ -218,9 +217,7 @@ class ParticleBelief(OnlineBelief):
 
     @property
     def _block(self) -> Block:
-        if self.block is None:
-            self.block = Block(self._step.layout, [self._particles])
-        return self.block
+        return Block(self._step.layout, [self._particles])
 
     @property
     def _step(self) -> FilterStep | Bare:

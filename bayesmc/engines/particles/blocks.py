@@ -125,6 +125,13 @@ class Block:
             self._kept[key] = None if rows is None else self._moments(node, rows)
         return self._kept[key]
 
+    def mean(self, node: CompiledNode) -> np.ndarray:
+        """Means of a node that is not finite, shape ``(slices, *plates, *event)``."""
+        rows = self.rows(node) if node.angles is None else None
+        if rows is None:
+            return self.mean_and_variance(node)[0]
+        return self.unturned(self.weighted(rows), node)
+
     def mean_and_variance(self, node: CompiledNode) -> tuple[np.ndarray, np.ndarray]:
         """The same, shapes ``(slices, *plates, *event)``, also where particles agree."""
         found = self.moments(node)

@@ -48,6 +48,8 @@ class Drift(NamedTuple):
     limit: float
 
 
+_FADED = np.array([FADING, FADING**2]).reshape(2, 1, 1)
+
 #: a slice of a block, which of its elements were not resampled (None: all), and the slice before
 Carried = tuple[int, np.ndarray | None, Particles]
 
@@ -86,20 +88,17 @@ class Compass:
         carried = self._carried(earlier, block)
         counts = zip(self.nodes, self.counts, strict=True)
         parts = [_moves(block, node, count, carried) for node, count in counts]
-        moves, spent = parts[0]
-        if len(parts) > 1:
-            moves = np.concatenate([m for m, _ in parts], axis=-1)
-            spent = np.concatenate([s for _, s in parts], axis=-1)
-        moved, variance = np.empty_like(moves), np.empty_like(spent)
-        before: Any = (0.0, 0.0) if drift is None else (drift.moved, drift.variance)
-        for k in range(len(moves)):
-            moved[k] = FADING * before[0] + moves[k]
-            variance[k] = FADING**2 * before[1] + spent[k]
-            before = moved[k], variance[k]
+        steps = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+        state: Any = 0.0 if drift is None else np.stack([drift.moved, drift.variance])
+        for k in range(steps.shape[1]):
+            steps[:, k] = state = _FADED * state + steps[:, k]
+        moved, variance = steps
         worst = (np.abs(moved) / np.sqrt(variance + _LEAST)).max(axis=-1)
-        last: Any = 0.0 if drift is None else drift.worst.reshape(-1)
-        for k in range(len(worst)):
-            worst[k] = last = np.maximum(KEPT * last, worst[k])
+        if drift is not None:
+            worst[0] = np.maximum(worst[0], KEPT * drift.worst.reshape(-1))
+        if len(worst) > 1:
+            kept = KEPT ** np.arange(len(worst))[:, None]
+            worst = np.maximum.accumulate(worst / kept) * kept
         largest = worst.max(axis=-1).tolist()
         figures = zip(moved, variance, worst.reshape(-1, *self.layout.lead), largest, strict=True)
         return [Drift(*own, self.limit) for own in figures]
@@ -126,29 +125,30 @@ def _moves(
     node: CompiledNode,
     count: int,
     carried: Sequence[Carried],
-) -> tuple[np.ndarray, np.ndarray]:
-    """What rows do to a node's numbers, (slices, elements, numbers): moves of means, variances taken away."""
+) -> np.ndarray:
+    """What rows do to a node's numbers: moves of means, and the variances that they take away.
+
+    Shape ``(2, slices, elements, numbers)``.
+    """
     moments = block.moments(node)
     if moments is None:  # the same for all particles
-        shape = (len(block.slices), block.elements, count)
-        return np.zeros(shape), np.zeros(shape)
+        return np.zeros((2, len(block.slices), block.elements, count))
     off, n = moments.off, block.particles
     shift, wide = np.add.reduce(off, axis=-1) / n, np.vecdot(off, off) / n
     for k, some, earlier in carried:
-        weights = earlier.weights.reshape(n, -1).T[:, None]
-        total = np.reshape(earlier.total, (-1, 1))
-        own = np.vecdot(weights, off[k]) / total
-        square = np.einsum(
-            "ekn,ekn,ekn->ek", np.broadcast_to(weights, off[k].shape), off[k], off[k]
-        )
+        weights, total = earlier.weights.reshape(n, -1).T, np.reshape(earlier.total, (-1, 1))
+        own = np.vecdot(weights[:, None], off[k]) / total
+        square = np.einsum("en,ekn,ekn->ek", weights, off[k], off[k])
         shift[k] = own if some is None else np.where(some[:, None], own, shift[k])
         wide[k] = (
             square / total if some is None else np.where(some[:, None], square / total, wide[k])
         )
     wide = wide - shift**2
+    found = np.empty((2, *wide.shape))
     with np.errstate(divide="ignore", invalid="ignore"):
-        moves, taken = -shift / np.sqrt(wide), np.maximum(1.0 - moments.variance / wide, 0.0)
+        np.divide(-shift, np.sqrt(wide), out=found[0])
+        np.maximum(1.0 - moments.variance / wide, 0.0, out=found[1])
     none = ~(wide > 0.0)
     if none.any():
-        moves[none] = taken[none] = 0.0
-    return moves, taken
+        found[:, none] = 0.0
+    return found

@@ -114,7 +114,7 @@ def unseen(share: np.ndarray, ess: Any) -> np.ndarray:
 def _variances(block: Block, families: Sequence[Families], weighted: np.ndarray) -> np.ndarray:
     """Variances ``(slices, elements, numbers)`` of means, by weights times what values lie off them."""
     rows, (numbers, n) = weighted.shape[0] * weighted.shape[1], weighted.shape[2:]
-    bounds = np.stack([f.bounds for f in families], axis=1)  # origins, slices, groups + 1, *apart
+    bounds = np.array([f.bounds for f in families]).swapaxes(0, 1)  # origins first, then slices
     bounds = bounds.reshape(*bounds.shape[:3], -1).swapaxes(2, 3).reshape(2, rows, -1)
     weighted, weights = weighted.reshape(rows, numbers, n), block.weights.reshape(rows, 1, n)
     total = block.total.reshape(rows, 1, 1)

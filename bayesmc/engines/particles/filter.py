@@ -366,7 +366,7 @@ class ParticleFilter(FilterEngine):
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with quiet():
             now = step(belief.now, row, rng)
-            block = Block(step.layout, [now])
+            block = Block(step.layout, [now], room=tracker.room)
             (families,) = tracker.after(belief.families, belief.now, block, [row])
         if self.particles is None:
             warn_of_a_lonely_step(belief.now, belief.families, now)
@@ -374,7 +374,7 @@ class ParticleFilter(FilterEngine):
         return ParticleBelief(
             belief.dbn, belief.seed, belief.static, step, now,
             total if np.ndim(total) else float(total), rng.bit_generator.state,
-            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker, block,
+            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
         )  # fmt: skip
 
     # ---- private -------------------------------------------------------------------------------

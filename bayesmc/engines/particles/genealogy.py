@@ -212,11 +212,10 @@ def family_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
     """
     rows, numbers, n = values.shape
     starts = bounds[:, None, :-1] + n * np.arange(rows * numbers).reshape(rows, numbers, 1)
-    some = np.broadcast_to((bounds[:, 1:] > bounds[:, :-1])[:, None], starts.shape)
-    flat = values.reshape(-1)
+    some, flat = bounds[:, 1:] > bounds[:, :-1], values.reshape(-1)
     if some.all():
         return np.add.reduceat(flat, starts.reshape(-1)).reshape(starts.shape)
-    found = np.zeros(starts.shape)
+    found, some = np.zeros(starts.shape), some[:, None].repeat(numbers, axis=1)
     found[some] = np.add.reduceat(flat, starts[some])
     return found
 

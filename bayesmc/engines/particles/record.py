@@ -31,7 +31,7 @@ from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
 #: slices that are written together, at most, and numbers of all their particles: what costs is calling NumPy
-TOGETHER, NUMBERS = 100, 1 << 15
+TOGETHER, NUMBERS = 100, 1 << 16
 
 
 class Waiting(NamedTuple):

@@ -7,6 +7,9 @@ may have missed. Nothing here touches the particles, or the numbers that they ar
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.particles.blocks import Block
@@ -28,6 +31,8 @@ class Tracker:
     """
 
     def __init__(self, step: FilterStep) -> None:
+        #: large arrays of blocks, which are nobody's once they have been followed
+        self.room: dict[Any, np.ndarray] = {}
         self.sight = Sight([step.slices.later[n] for n in step.slices.interface], step.layout)
         self.scouting = Scouting(step.slices, step.plan)
         blind = step.plan.guided or step.first_stage is not None or step.injection is not None
