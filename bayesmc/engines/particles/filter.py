@@ -20,15 +20,21 @@ from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
+    NOT_SMOOTHED,
     check_budget,
     check_choice,
     check_count,
     check_kind,
     check_threshold,
+    check_together,
+    described,
+    looks_told,
+    not_backwards,
     read_by,
     read_functions,
+    refused,
+    warn_of_what_is_not_guided,
 )
-from bayesmc.engines.particles.questions import check_together, described, refused
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
@@ -51,7 +57,6 @@ from bayesmc.engines.particles.smoothing import (
     seen_in_full,
     static_of,
 )
-from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
@@ -243,9 +248,9 @@ class ParticleFilter(FilterEngine):
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
-            return _NOT_SMOOTHED
+            return NOT_SMOOTHED
         sums = endless(problem.slices, seen_in_full(problem)) if asked.what == "smooth" else ()
-        return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
+        return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
@@ -290,7 +295,7 @@ class ParticleFilter(FilterEngine):
             check_count("trajectories", trajectories, what, "smooth")
         check_choice("backward", backward, "rejection", "exact", "smooth")
         if self.adapt is not None or self.recovery is not None:
-            raise UnsupportedError(_NOT_SMOOTHED)
+            raise UnsupportedError(NOT_SMOOTHED)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
@@ -298,7 +303,7 @@ class ParticleFilter(FilterEngine):
         else:
             sums = endless(problem.slices, seen_in_full(problem))
             if sums:
-                raise UnsupportedError(_not_backwards(sums[0]))
+                raise UnsupportedError(not_backwards(sums[0]))
             asked = Backwards(trajectories, backward == "rejection")
             found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
         self._warn(filtered)
@@ -435,20 +440,3 @@ class ParticleFilter(FilterEngine):
         assert not isinstance(self.proposal, str)
         first = self.initial_proposal or {}
         return SliceProposals(slices, self.proposal or {}, "ParticleFilter", first)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-_NOT_SMOOTHED = (
-    "ParticleFilter: particles whose number changes (adapt=), or that begin anew (recovery=), are not "
-    "smoothed; leave these out, and declare what can happen in the transition"
-)
-
-
-def _not_backwards(name: str) -> str:
-    return (
-        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
-        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
-        "engine=ParticleGibbs())"
-    )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from bayesmc.engines.particles.genealogy import Families
 from bayesmc.engines.particles.particles import Particles
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.errors import LowEssWarning
-
-if TYPE_CHECKING:
-    from bayesmc.engines.particles.filter import ParticleFilter
 
 #: particles of a filter that is not told how many, at least, and at most
 START, MOST = 1000, 100_000
@@ -81,7 +78,7 @@ def enough(
     return most
 
 
-def price(engine: ParticleFilter) -> int:
+def price(engine: Any) -> int:
     """What a particle of a slice costs, in draws from its own density."""
     guided = isinstance(engine.proposal, str) or engine.auxiliary is True
     return GUIDED if guided else 1
@@ -116,7 +113,7 @@ def collapsed(filtered: FilteredParticles) -> str | None:
     )
 
 
-def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None:
+def uncertain(filtered: FilteredParticles, engine: Any) -> str | None:
     """What is said where the log evidence is not known well.
 
     Who gives a number of particles may ask for states alone, which few may follow well: then it takes a
@@ -176,7 +173,7 @@ def warn_of_a_lonely_step(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _more(filtered: FilteredParticles, engine: ParticleFilter) -> str:
+def _more(filtered: FilteredParticles, engine: Any) -> str:
     """How to have more particles, by what set their number."""
     assert filtered.counts is not None
     if engine.particles is not None or engine.adapt is not None:

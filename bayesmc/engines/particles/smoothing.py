@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,9 +25,6 @@ from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 
-if TYPE_CHECKING:
-    from bayesmc.engines.particles.filter import ParticleFilter
-
 
 class Backwards(NamedTuple):
     """How many trajectories are drawn backwards (None: as many as particles), and whether by rejection."""
@@ -37,7 +34,7 @@ class Backwards(NamedTuple):
 
 
 def backwards(
-    engine: ParticleFilter,
+    engine: Any,
     problem: SeriesProblem,
     seed: np.random.SeedSequence,
     queries: Queries,
@@ -62,7 +59,7 @@ def backwards(
 
 
 def by_lag(
-    engine: ParticleFilter,
+    engine: Any,
     problem: SeriesProblem,
     seed: np.random.SeedSequence,
     lag: int,
@@ -86,7 +83,7 @@ def by_lag(
 
 
 def filtered_by(
-    engine: ParticleFilter,
+    engine: Any,
     step: FilterStep,
     problem: SeriesProblem,
     seed: np.random.SeedSequence,
