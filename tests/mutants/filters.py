@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import pickle
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -235,7 +234,7 @@ MUTANTS = [
         (Edit("bayesmc.engines.particles.backward:Backward._drawn",
               "self.log_densities(here, drawn, series, k, len(mine)) + here.log_weights",
               "np.broadcast_to(here.log_weights, (len(mine), *here.log_weights.shape))"),),
-        slices(partial(bmc.smooth, backward="exact"), line, RISING, bmc.ParticleFilter(300), 20),
+        slices(bmc.smooth, line, RISING, bmc.ParticleFilter(300), 20, backward="exact"),
         "repeated_test of smooth, 20 runs of 300 particles",
     ),
     Mutant(
