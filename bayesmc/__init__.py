@@ -57,8 +57,8 @@ from bayesmc.engines.mcmc.gibbs import Gibbs
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.filter import ParticleFilter
+from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.weighted.importance import Importance
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting

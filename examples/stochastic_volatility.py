@@ -90,10 +90,10 @@ def pooled(estimates: np.ndarray) -> tuple[float, float]:
 def beliefs(values: np.ndarray, particles: int, trajectories: int, cells: int) -> dict[str, Any]:
     """Filtered and smoothed by particles, and exactly."""
     rows, dbn = {"r": values}, volatility()
-    engine = bmc.ParticleFilter(particles, trajectories=trajectories)
+    engine = bmc.ParticleFilter(particles)
     return {
         "filtered": bmc.filter(dbn, rows, engine=engine, rng=2),
-        "smoothed": bmc.smooth(dbn, rows, engine=engine, rng=2),
+        "smoothed": bmc.smooth(dbn, rows, engine=engine, rng=2, trajectories=trajectories),
         "filtered exactly": bmc.filter(dbn, rows, engine=grid(cells)),
         "smoothed exactly": bmc.smooth(dbn, rows, engine=grid(cells)),
     }

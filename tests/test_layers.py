@@ -53,10 +53,7 @@ LONG_MODULES = {
     "engines/grid/answers.py",
     "engines/grid/filter.py",
     "engines/mcmc/chains.py",
-    "engines/particles/families.py",
-    "engines/particles/filter.py",
-    "engines/particles/lookahead.py",
-    "engines/particles/mover.py",
+    "engines/particles/linearisation.py",
     "expression/functions.py",
     "expression/graph.py",
     "kernels/labels.py",
@@ -75,8 +72,6 @@ LONG_FUNCTIONS: set[str] = set()
 #: modules that import each other for types
 TYPE_CIRCLES = {
     "engines.discrete.rows engines.discrete.terms",
-    "engines.particles.filter engines.particles.growth engines.particles.questions "
-    "engines.particles.smoothed",
     "factors.calibrated factors.cliquetree",
     "kernels.conjugate_children kernels.conjugate_matching kernels.conjugate_picks",
     "structure.like_functions structure.like_links structure.target",

@@ -105,7 +105,7 @@ def function_of(exact: Any, node: Any) -> tuple[Any, np.ndarray]:
 @pytest.mark.parametrize("variant", PARTICLES)
 def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
     """Evidence, filtered and smoothed figures, of fifty particles."""
-    engine = bmc.ParticleFilter(50, trajectories=20, **PARTICLES[variant])
+    engine = bmc.ParticleFilter(50, **PARTICLES[variant])
     tried = 0
     chosen = list(cases(kind, 3 * FEW))
     if not session.is_thorough():  # variants take turns at templates

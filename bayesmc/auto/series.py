@@ -108,10 +108,23 @@ def smooth(
     progress: bool | None = None,
     lag: int | None = None,
     queries: Queries | None = None,
+    trajectories: int | None = None,
+    backward: str | None = None,
 ) -> SeriesPosterior:
     """Beliefs about every slice given all rows, or with ``lag`` given those up to so many slices later.
 
-    Parameters and errors are those of ``filter``.
+    Other parameters and errors are those of ``filter``.
+
+    Parameters
+    ----------
+    lag : int, optional
+    trajectories : int, optional
+        How many a particle filter draws backwards; by default as many as there are particles, 1,000 at most.
+    backward : "rejection" or "exact", optional
+        How it draws them: by rejection where the transition's height is known (the same law); what is still
+        open, and elsewhere all, among 500 particles of the slice drawn by weight and the filter's own
+        ancestor. So time is that of the filter, and at most some 500 densities per trajectory and slice (as
+        many times as lags reach back). ``"exact"`` tries all particles for each.
 
     Examples
     --------
@@ -129,7 +142,16 @@ def smooth(
         raise ValueError(f"smooth(lag={lag!r}): lag is a number of slices, 0 or more, or None")
     kind = "smooth" if lag is None else "fixed-lag"
     chosen = _engine(problem, engine, Asked(kind, None, read_queries("smooth", queries)))
-    return chosen.smooth(problem, seed_sequence(rng), lag=lag, queries=queries, progress=progress)
+    own = {"trajectories": trajectories, "backward": backward}
+    options: dict[str, Any] = {n: given for n, given in own.items() if given is not None}
+    if options and not isinstance(chosen, ParticleFilter):
+        name = next(iter(options))
+        raise ValueError(
+            f"smooth({name}={options[name]!r}): it says how particles are smoothed, and "
+            f"{type(chosen).__name__} has none; leave it out, or give engine=ParticleFilter()"
+        )
+    options |= {"lag": lag, "queries": queries, "progress": progress}
+    return chosen.smooth(problem, seed_sequence(rng), **options)
 
 
 def forecast(

@@ -67,8 +67,8 @@ class BlockWalk(Kernel):
         Nothing else moves what the block depends on, so that densities can be kept between steps.
     anew : float
         Share of moves that are draws from a mixture fitted to the whole density, at the first step of a
-        warmup: of all hidden numbers, few and none of them an angle (``parts.may_be_drawn_anew``). With 1 there are
-        no others.
+        warmup: of all hidden numbers, few and none of them an angle (``parts.may_be_drawn_anew``). With 1
+        there are no others.
 
     Examples
     --------

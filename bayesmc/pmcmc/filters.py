@@ -12,14 +12,14 @@ and Schön (2014), Particle Gibbs with ancestor sampling, JMLR 15.
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS
-from bayesmc.engines.particles.cloud import along_plates
-from bayesmc.network.forward import Pass
+from bayesmc.engines.particles.particles import Layout, Particles, Selection, along_plates
+from bayesmc.engines.particles.smc import SMCStep
+from bayesmc.network.forward import Pass, Step
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic
 from bayesmc.structure.target import Values
@@ -30,34 +30,69 @@ _THRESHOLD = 0.5
 _CHAIN = "\0chain"
 
 
-class Selection(NamedTuple):
-    """Who has offspring: positions (None: everybody has one), and the log weights that these start with."""
-
-    ancestors: np.ndarray | None
-    carried: Any
-
-
-@dataclass(eq=False)
-class History:
+class History(NamedTuple):
     """What a run leaves.
 
     Attributes
     ----------
-    clouds : list of dict
-        For each slice hidden node -> values, shape ``(particles, chains, *plates, *event)``.
-    ancestors : list of ndarray or None
-        For each slice positions in the one before, shape ``(particles, chains, *apart)``; None where every
-        particle has itself.
-    log_weights : ndarray, shape (particles, chains, *apart)
-        Of the last slice.
+    slices : list of Particles
+        Values have shape ``(particles, chains, *plates, *event)``, weights ``(particles, chains, *apart)``.
     log_likelihood : ndarray, shape (chains,)
         Log of an estimate without bias (with a trajectory kept it is none).
     """
 
-    clouds: list[Values] = field(default_factory=list)
-    ancestors: list[np.ndarray | None] = field(default_factory=list)
-    log_weights: Any = None
-    log_likelihood: Any = 0.0
+    slices: list[Particles]
+    log_likelihood: np.ndarray
+
+
+class ChainStep(SMCStep):
+    """The step of the filters of all chains, given their static nodes.
+
+    Parameters
+    ----------
+    trellis : Trellis
+    particles : int
+    values : dict
+        Stored values of static nodes, ``(chains, *plates, *event)`` or without chains; where a trajectory is
+        kept, it is theirs.
+    chains : int
+    """
+
+    def __init__(self, trellis: Trellis, particles: int, values: Values, chains: int) -> None:
+        slices = trellis.series.slices
+        layout = Layout(particles, (_CHAIN, *trellis.apart), (chains, *trellis.lead), particles)
+        nodes = {n: trellis.model[n] for n in slices.dynamic}
+        super().__init__(
+            layout, nodes, slices.interface, slices.dynamic, systematic, _THRESHOLD, chains
+        )
+        self.trellis, self.values, self.static = trellis, values, trellis.statics(values)
+
+    def steps(self, row: Slice) -> Sequence[Step]:
+        return [step for _, step in row.moves]
+
+    def known(self, row: Slice) -> dict[str, np.ndarray]:
+        return {**self.static, **row.known}
+
+    def stored(self, row: Slice, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {n: values[n] for n in self.kept if n in values}
+
+    def weighted(
+        self, row: Slice, values: dict[str, np.ndarray], log: Any, selection: Selection
+    ) -> Particles:
+        """As ever; where a chain has no weight left, its particles go on alike, for nothing."""
+        found = super().weighted(row, values, log, selection)
+        dead = ~(found.total > 0)
+        if not dead.any():
+            return found
+        even = float(self.layout.particles)
+        return found._replace(
+            log_weights=np.where(dead, 0.0, found.log_weights),
+            weights=np.where(dead, 1.0, found.weights),
+            total=np.where(dead, even, found.total),
+            log_total=np.where(dead, np.log(even), found.log_total),
+            increment=np.where(dead, -np.inf, found.increment),
+            ess=np.where(dead, even, found.ess),
+        )
 
 
 class Filter:
@@ -73,12 +108,10 @@ class Filter:
 
     #: error of the log likelihood that is best aimed at
     best = 1.0
+    step: ClassVar[type[ChainStep]] = ChainStep
 
     def __init__(self, trellis: Trellis, particles: int, chosen: bool = False) -> None:
         self.trellis, self.particles, self.chosen = trellis, particles, chosen
-        self.plates = {n: (_CHAIN, *trellis.model[n].plates) for n in trellis.series.slices.dynamic}
-        self.trailing = {n: len(trellis.model[n].value_shape) for n in self.plates}
-        self.apart = (_CHAIN, *trellis.apart)
 
     def of(self, particles: int) -> Filter:
         """The filter with another number of particles."""
@@ -89,149 +122,99 @@ class Filter:
         return other
 
     def run(self, values: Values, chains: int, rng: np.random.Generator) -> History:
-        """One filter for the static nodes of every chain.
+        """One filter for the static nodes of every chain; ``values`` and ``chains`` as for ``ChainStep``."""
+        step = self.step_for(values, chains)
+        log, slices = np.zeros((chains, *self.trellis.lead)), list[Particles]()
+        now: Particles | None = None
+        with np.errstate(divide="ignore", invalid="ignore"):  # chains without a weight are no fault
+            for place in self.trellis.slices:
+                now = step(now, place, rng)
+                log = log + now.increment
+                slices.append(now)
+        return History(slices, log.reshape(chains, -1).sum(axis=1))
 
-        Parameters
-        ----------
-        values : dict
-            Stored values of static nodes, ``(chains, *plates, *event)`` or without chains; where a
-            trajectory is kept, it is theirs.
-        """
-        shape = (self.particles, chains, *self.trellis.lead)
-        static = self.trellis.statics(values)
-        history = History(log_likelihood=np.zeros(shape[1:]))
-        log, before = np.zeros(shape), dict[str, np.ndarray]()
-        for k, place in enumerate(self.trellis.slices):
-            known = {**static, **place.known}
-            start = self._start(shape)
-            if k:
-                start = self._selected(place, {**known, **before}, values, log, rng)
-                before = {n: self._taken(n, v, start.ancestors) for n, v in before.items()}
-            state = Pass(self._chance(rng, shape), shape[:2], {**known, **before})
-            self._pass(place, state, values)
-            log, gained = _normalised(np.broadcast_to(start.carried + state.log_weight, shape))
-            history.log_likelihood += gained
-            history.clouds.append({n: state.values[n] for n in place.hidden})
-            history.ancestors.append(start.ancestors)
-            interface = self.trellis.series.slices.interface
-            before = {n + PREVIOUS: state.values[n] for n in interface if n in state.values}
-        history.log_weights = log
-        history.log_likelihood = history.log_likelihood.reshape(chains, -1).sum(axis=1)
-        return history
+    def step_for(self, values: Values, chains: int) -> ChainStep:
+        """The step of a run."""
+        return self.step(self.trellis, self.particles, values, chains)
 
     def drawn(self, history: History, rng: np.random.Generator) -> Values:
         """One trajectory of every chain: name in the unrolled net -> values ``(chains, *plates, *event)``."""
         found: Values = {}
-        index = picked(history.log_weights, rng)[None]
-        for place, cloud, ancestors in zip(
-            self.trellis.slices[::-1], history.clouds[::-1], history.ancestors[::-1], strict=True
-        ):
+        if not history.slices:
+            return found
+        model, apart = self.trellis.model, (_CHAIN, *self.trellis.apart)
+        index = picked(history.slices[-1].log_weights, rng)[None]
+        for place, now in zip(self.trellis.slices[::-1], history.slices[::-1], strict=True):
             for name, own in place.hidden.items():
-                found[own] = along_plates(cloud[name], index, self.plates[name], self.apart)[0]
-            if ancestors is not None:
-                index = np.take_along_axis(ancestors, index, axis=0)
+                plates = (_CHAIN, *model[name].plates)
+                found[own] = along_plates(now.values[name], index, plates, apart)[0]
+            if now.ancestors is not None:
+                index = np.take_along_axis(now.ancestors, index, axis=0)
         return found
 
-    # ---- private -------------------------------------------------------------------------------
 
-    def _chance(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.random.Generator:
-        """What moves particles of a slice."""
-        return rng
-
-    def _start(self, shape: tuple[int, ...]) -> Selection:
-        return Selection(None, -np.log(self.particles))
-
-    def _selected(
-        self,
-        place: Slice,
-        known: Values,
-        values: Values,
-        log: np.ndarray,
-        rng: np.random.Generator,
-    ) -> Selection:
-        """Resample where weights are uneven."""
-        weights = np.exp(log)
-        poor = 1.0 / np.square(weights).sum(axis=0) < _THRESHOLD * self.particles
-        if not poor.any():
-            return Selection(None, log)
-        chosen = systematic(weights, self.particles, rng)
-        even = -np.log(self.particles)
-        if poor.all():
-            return Selection(chosen, even)
-        own = np.arange(self.particles).reshape((-1,) + (1,) * poor.ndim)
-        return Selection(np.where(poor, chosen, own), np.where(poor, even, log))
-
-    def _pass(self, place: Slice, state: Pass, values: Values) -> None:
-        for _, step in place.moves:
-            step(state)
-
-    def _taken(self, name: str, value: np.ndarray, ancestors: np.ndarray | None) -> np.ndarray:
-        """A node's values in the slice before, of the ancestors."""
-        own = name.removesuffix(PREVIOUS)
-        if ancestors is None or value.ndim < 2 + self.trailing[own]:
-            return value  # all particles agree
-        return along_plates(value, ancestors, self.plates[own], self.apart)
-
-
-class ConditionalFilter(Filter):
-    """Filters among whose particles one trajectory is kept, the last; its ancestors are drawn anew.
+class ConditionalStep(ChainStep):
+    """One of its particles, the last, is that of a trajectory; its ancestors are drawn anew.
 
     All others are resampled independently in every slice. A trajectory drawn at the end then leaves the
     distribution of trajectories given everything else invariant, whatever the number of particles.
     """
 
-    def _selected(
+    def selected(
         self,
-        place: Slice,
-        known: Values,
-        values: Values,
-        log: np.ndarray,
+        earlier: Particles,
+        before: Mapping[str, np.ndarray],
+        row: Slice,
         rng: np.random.Generator,
     ) -> Selection:
-        others = independent(np.exp(log), self.particles - 1, rng)
-        kept = self._ancestor(place, known, values, log, rng)
-        return Selection(np.concatenate([others, kept[None]]), -np.log(self.particles))
+        n = self.layout.particles
+        others = independent(earlier.weights, n - 1, rng)
+        kept = self.ancestor(earlier, before, row, rng)
+        everybody = np.ones(self.layout.lead, dtype=bool)
+        chosen = np.concatenate([others, kept[None]])
+        return Selection(n, chosen, everybody, 0.0, self._log_particles)
 
-    def _ancestor(
+    def ancestor(
         self,
-        place: Slice,
-        known: Values,
-        values: Values,
-        log: np.ndarray,
+        earlier: Particles,
+        before: Mapping[str, np.ndarray],
+        row: Slice,
         rng: np.random.Generator,
     ) -> np.ndarray:
         """The kept trajectory's ancestor: by weight, times the density of what comes after it."""
         if self.trellis.carries:
-            return np.full(log.shape[1:], self.particles - 1)
-        return picked(log + self._onward(place, known, values, log.shape, rng), rng)
+            return np.full(self.layout.lead, self.layout.particles - 1)
+        return picked(earlier.log_weights + self.onward(before, row, rng), rng)
 
-    def _onward(
-        self,
-        place: Slice,
-        known: Values,
-        values: Values,
-        shape: tuple[int, ...],
-        rng: np.random.Generator,
-    ) -> Any:
+    def onward(self, before: Mapping[str, np.ndarray], row: Slice, rng: np.random.Generator) -> Any:
         """Log density of the kept trajectory's slice after every particle of the one before."""
-        here = {n: values[own] for n, own in place.hidden.items()}
-        state = Pass(rng, shape[:2], {**known, **here})
-        for step in place.crossing:
+        here = {n: self.values[own] for n, own in row.hidden.items()}
+        shape = (self.layout.particles, *self.batch)
+        state = Pass(rng, shape, {**self.known(row), **before, **here})
+        for step in row.crossing:
             step(state)
         return state.log_weight
 
-    def _pass(self, place: Slice, state: Pass, values: Values) -> None:
-        for name, step in place.moves:
-            step(state)
-            if name in place.hidden:
-                state.values[name] = self._kept(state.values[name], values[place.hidden[name]])
+    def steps(self, row: Slice) -> Sequence[Step]:
+        found: list[Step] = []
+        for name, step in row.moves:
+            found.append(step)
+            if name in row.hidden:
+                found.append(_Keep(self, name, self.values[row.hidden[name]]))
+        return found
 
-    def _kept(self, drawn: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
+    def kept_among(self, drawn: np.ndarray, trajectory: np.ndarray) -> np.ndarray:
         """Draws with those of the last particle replaced."""
         found = np.array(drawn)
         found[-1] = trajectory
         found.flags.writeable = False
         return found
+
+
+class ConditionalFilter(Filter):
+    """Filters among whose particles one trajectory is kept."""
+
+    step = ConditionalStep
 
 
 def picked(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -277,13 +260,12 @@ def independent(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _normalised(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log weights that sum to one, and the log of their sum; even where all are zero."""
-    top = log.max(axis=0)
-    dead = ~(top > -np.inf)
-    level = np.where(dead, 0.0, top)
-    total = np.exp(log - level).sum(axis=0)
-    gained = np.where(dead, -np.inf, level + np.log(total))
-    if dead.any():
-        return np.where(dead, -np.log(len(log)), log - np.where(dead, 0.0, gained)), gained
-    return log - gained, gained
+class _Keep:
+    """Puts a kept trajectory's value in the place of the last draw."""
+
+    def __init__(self, step: ConditionalStep, name: str, trajectory: np.ndarray) -> None:
+        self.step, self.name, self.trajectory = step, name, trajectory
+
+    def __call__(self, state: Pass) -> None:
+        drawn = state.values[self.name]
+        state.values[self.name] = self.step.kept_among(drawn, self.trajectory)

@@ -19,13 +19,15 @@ ch. 17 (shifted lattices).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
 from bayesmc.dbn import PREVIOUS
-from bayesmc.pmcmc.filters import Filter, Selection
+from bayesmc.engines.particles.particles import Particles, Selection
+from bayesmc.pmcmc.filters import ChainStep, Filter
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic
 from bayesmc.structure.target import Values
@@ -40,6 +42,37 @@ def filter_of(trellis: Trellis, particles: int, chosen: bool = False) -> Filter:
     if key is None:
         return Filter(trellis, particles, chosen)
     return QuasiFilter(trellis, particles, chosen, key)
+
+
+class QuasiStep(ChainStep):
+    """Sorts particles by one number of each chain, and moves them by points that lie evenly."""
+
+    def __init__(
+        self, trellis: Trellis, particles: int, values: Values, chains: int, key: str
+    ) -> None:
+        super().__init__(trellis, particles, values, chains)
+        self.key = key + PREVIOUS
+
+    def propagated(self, steps: Any, row: Any, before: Any, selection: Selection, rng: Any) -> Any:
+        shape = (self.layout.particles, *self.layout.lead)
+        return super().propagated(steps, row, before, selection, Even(rng.bit_generator, shape))
+
+    def selected(
+        self,
+        earlier: Particles,
+        before: Mapping[str, np.ndarray],
+        row: Slice,
+        rng: np.random.Generator,
+    ) -> Selection:
+        """Resample in every slice: evenly, it costs next to nothing of what is known."""
+        value, weights = before.get(self.key), earlier.weights
+        if value is None or value.shape != weights.shape:  # seen, so that all agree
+            return super().selected(earlier, before, row, rng)
+        order = np.argsort(value, axis=0)
+        chosen = systematic(np.take_along_axis(weights, order, axis=0), len(weights), rng)
+        found = np.take_along_axis(order, chosen, axis=0)
+        everybody = np.ones(self.layout.lead, dtype=bool)
+        return Selection(len(weights), found, everybody, 0.0, self._log_particles)
 
 
 class QuasiFilter(Filter):
@@ -59,27 +92,10 @@ class QuasiFilter(Filter):
 
     def __init__(self, trellis: Trellis, particles: int, chosen: bool, key: str) -> None:
         super().__init__(trellis, particles, chosen)
-        self.key = key + PREVIOUS
+        self.key = key
 
-    def _chance(self, rng: np.random.Generator, shape: tuple[int, ...]) -> np.random.Generator:
-        return Even(rng.bit_generator, shape)
-
-    def _selected(
-        self,
-        place: Slice,
-        known: Values,
-        values: Values,
-        log: np.ndarray,
-        rng: np.random.Generator,
-    ) -> Selection:
-        """Resample in every slice: evenly, it costs next to nothing of what is known."""
-        before = known.get(self.key)
-        if before is None or before.shape != log.shape:  # seen, so that all agree
-            return super()._selected(place, known, values, log, rng)
-        order = np.argsort(before, axis=0)
-        weights = np.exp(np.take_along_axis(log, order, axis=0))
-        chosen = systematic(weights, self.particles, rng)
-        return Selection(np.take_along_axis(order, chosen, axis=0), -np.log(self.particles))
+    def step_for(self, values: Values, chains: int) -> QuasiStep:
+        return QuasiStep(self.trellis, self.particles, values, chains, self.key)
 
 
 class Even(np.random.Generator):

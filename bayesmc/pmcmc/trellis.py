@@ -30,6 +30,7 @@ class Slice:
 
     Attributes
     ----------
+    t : int
     known : dict
         Values in place: inputs, ``t``, what was observed and what follows from it.
     hidden : dict
@@ -42,6 +43,7 @@ class Slice:
         Whether anything in it is weighed.
     """
 
+    t: int
     known: Values
     hidden: dict[str, str]
     moves: tuple[tuple[str, Step], ...]
@@ -119,7 +121,7 @@ class Trellis:
         reached = {n + PREVIOUS for n in slices.interface if f"{n}[{k - 1}]" in varying}
         moves, crossing = self._steps(row, kinds, reached)
         hidden = {n: f"{n}[{k}]" for n, kind in kinds.items() if kind == _HIDDEN}
-        return Slice(known, hidden, moves, crossing, bool(row.seen))
+        return Slice(row.t, known, hidden, moves, crossing, bool(row.seen))
 
     def _steps(
         self, row: Row, kinds: dict[str, str], reached: set[str]

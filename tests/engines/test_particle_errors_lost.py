@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles import families
+from bayesmc.engines.particles import genealogy, record
 from bayesmc.engines.particles.drift import Compass
 from bayesmc.engines.particles.forgetting import Sight
-from bayesmc.engines.particles.scouts import Scouting
+from bayesmc.engines.particles.rare_states import Scouting
 from bayesmc.errors import BayesmcWarning, LowEssWarning
 
 
@@ -230,8 +230,9 @@ def test_a_level_that_no_particle_has_followed_is_told() -> None:
 
 def test_without_looking_a_level_claims_too_much(monkeypatch: pytest.MonkeyPatch) -> None:
     """The negative control."""
-    monkeypatch.setattr(Compass, "after", lambda *given: None)
-    monkeypatch.setattr(families, "_beyond", lambda *given: False)
+    monkeypatch.setattr(Compass, "after", lambda self, drift, earlier, block: [None])
+    monkeypatch.setattr(record, "TOGETHER", 1)
+    monkeypatch.setattr(genealogy, "_beyond", lambda *given: False)
     assert small_errors() > 2
 
 

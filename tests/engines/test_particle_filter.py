@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles import mover as particle
-from bayesmc.engines.particles.mover import Mover, Selection
+from bayesmc.engines.particles import filter_step
+from bayesmc.engines.particles.filter_step import FilterStep
+from bayesmc.engines.particles.particles import Selection
 from bayesmc.errors import (
     DegeneracyError,
     EvidenceError,
@@ -181,36 +182,36 @@ def test_the_evidence_of_random_templates_is_unbiased(scheme: str, threshold: fl
         assert abs(deviation(found, exact)) < 4, (seed, options)
 
 
-def forget_weights(mover: Mover, *arguments: Any) -> Selection:
-    found = REAL_SELECTED(mover, *arguments)
-    return found._replace(carried=0.0, spent=np.log(mover.particles))
+def forget_weights(step: FilterStep, *arguments: Any) -> Selection:
+    found = REAL_SELECTED(step, *arguments)
+    return found._replace(log_weights=0.0, log_normaliser=np.log(step.layout.particles))
 
 
-def forget_first_stage(mover: Mover, *arguments: Any) -> Selection:
-    found = REAL_SELECTED(mover, *arguments)
-    return found if not np.any(found.resampled) else found._replace(carried=0.0)
+def forget_first_stage(step: FilterStep, *arguments: Any) -> Selection:
+    found = REAL_SELECTED(step, *arguments)
+    return found if not np.any(found.resampled) else found._replace(log_weights=0.0)
 
 
-def keep_spent_weights(mover: Mover, cloud: Any, *arguments: Any) -> Selection:
-    found = REAL_SELECTED(mover, cloud, *arguments)
+def keep_weights(step: FilterStep, earlier: Any, *arguments: Any) -> Selection:
+    found = REAL_SELECTED(step, earlier, *arguments)
     if found.ancestors is None:
         return found
-    twice = np.take_along_axis(cloud.log_weights, found.ancestors, axis=0)
-    return found._replace(carried=twice, spent=np.log(np.exp(twice).sum(axis=0)))
+    twice = np.take_along_axis(earlier.log_weights, found.ancestors, axis=0)
+    return found._replace(log_weights=twice, log_normaliser=np.log(np.exp(twice).sum(axis=0)))
 
 
-REAL_SELECTED = Mover._selected
+REAL_SELECTED = FilterStep.selected
 FAULTS = {
     "weights forgotten where nothing was resampled": (forget_weights, {"ess_threshold": 0.3}),
     "first stage not divided out": (forget_first_stage, {"auxiliary": True, "ess_threshold": 2.0}),
-    "weights kept after resampling": (keep_spent_weights, {"ess_threshold": 2.0}),
+    "weights kept after resampling": (keep_weights, {"ess_threshold": 2.0}),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_planted_faults_bias_the_evidence(fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
     wrong, options = FAULTS[fault]
-    monkeypatch.setattr(Mover, "_selected", wrong)
+    monkeypatch.setattr(FilterStep, "selected", wrong)
     assert abs(deviation(estimates(**options), EVIDENCE)) > 4
 
 
@@ -267,10 +268,10 @@ def test_answers_are_those_of_the_unrolled_net(variant: str) -> None:
 
 def test_blocks_change_nothing_but_the_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Many small blocks give answers as good as one."""
-    monkeypatch.setattr(particle, "WHOLE", 10**6)
+    monkeypatch.setattr(filter_step, "WHOLE", 10**6)
     whole = bmc.filter(switching(), {"y": ROWS}, engine=bmc.ParticleFilter(20_000), rng=0)
-    monkeypatch.setattr(particle, "WHOLE", 0)
-    monkeypatch.setattr(particle, "BLOCK", 1000)
+    monkeypatch.setattr(filter_step, "WHOLE", 0)
+    monkeypatch.setattr(filter_step, "BLOCK", 1000)
     cut = bmc.filter(switching(), {"y": ROWS}, engine=bmc.ParticleFilter(20_000), rng=0)
     np.testing.assert_allclose(whole.mean("x"), cut.mean("x"), atol=0.05)
     np.testing.assert_allclose(whole.std("x"), cut.std("x"), rtol=0.05)
@@ -486,9 +487,20 @@ BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "no densities": ({"on_degeneracy": "rejuvenate"}, ValueError, "go together"),
     "a list": ({"proposal": [1]}, TypeError, r"ParticleFilter\(proposal=\[1\]\): give a dict"),
     "twice": ({"proposal": {"x": nearer, ("x",): nearer}}, ModelError, "'x' has two proposals"),
-    "backward": ({"backward": "fast"}, ValueError, 'give "rejection" or "exact"'),
     "auxiliary": ({"auxiliary": 3}, TypeError, "auxiliary=3"),
 }
+
+
+def test_bad_options_of_smoothing_say_what_to_give() -> None:
+    engine, rows = bmc.ParticleFilter(10), {"y": ROWS}
+    with pytest.raises(ValueError, match='backward=.fast.*give "rejection" or "exact"'):
+        bmc.smooth(linear(), rows, engine=engine, backward="fast")
+    with pytest.raises(
+        ValueError, match=r"smooth\(trajectories=0\): give a number of trajectories"
+    ):
+        bmc.smooth(linear(), rows, engine=engine, trajectories=0)
+    with pytest.raises(ValueError, match=r"smooth\(trajectories=9\).*KalmanFilter has none"):
+        bmc.smooth(linear(), rows, trajectories=9)
 
 
 @pytest.mark.parametrize("fault", BAD)

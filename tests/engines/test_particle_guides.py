@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles.curved import corrected
-from bayesmc.engines.particles.lookahead import LookAhead
+from bayesmc.engines.particles.laplace import corrected
+from bayesmc.engines.particles.linearisation import LookAhead
 from bayesmc.errors import ProposalWarning
 from bayesmc.testing import session
 

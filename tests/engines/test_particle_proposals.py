@@ -16,14 +16,14 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines.particles import guarded as guarding
-from bayesmc.engines.particles import lookahead, stages
-from bayesmc.engines.particles.cases import ByCase, Cases
-from bayesmc.engines.particles.guarded import Guarded
-from bayesmc.engines.particles.lookahead import Belief, LookAhead
+from bayesmc.engines.particles import defensive as guarding
+from bayesmc.engines.particles import linearisation
+from bayesmc.engines.particles.auxiliary import PluggedIn
+from bayesmc.engines.particles.defensive import Guarded
+from bayesmc.engines.particles.linearisation import Belief, LookAhead
 from bayesmc.engines.particles.looking import has_moments
+from bayesmc.engines.particles.mixtures import ByCase, Cases
 from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
-from bayesmc.engines.particles.stages import PluggedIn
 from bayesmc.errors import ModelError, ProposalWarning
 from bayesmc.network.forward import Pass
 from bayesmc.testing import session
@@ -319,7 +319,7 @@ def test_a_first_stage_does_not_spoil_a_sharp_sensor(monkeypatch: pytest.MonkeyP
         return belief._replace(log_density=-0.5 * (off[..., 0].reshape(-1, 50) / 0.3) ** 2)
 
     monkeypatch.setattr(LookAhead, "believed", at_the_mean)
-    monkeypatch.setattr(stages, "_SHARE", 1e-12)
+    monkeypatch.setattr("bayesmc.engines.particles.auxiliary._SHARE", 1e-12)
     assert long_run(auxiliary=True).mean() < -5
 
 
@@ -357,7 +357,7 @@ def factors(dbn: bmc.DynamicBayesNet, rows: dict[str, Any], t: int, particles: i
     engine = bmc.ParticleFilter(particles)
     filtered = bmc.filter(dbn, rows, engine=engine, rng=0, keep="particles")
     problem = pose_series(dbn, rows)
-    plan = engine._mover(problem.slices, {}).plan
+    plan = engine.step_of(problem.slices, {}).plan
     before = {n + "_prev": filtered.clouds[t - 1].values[n] for n in problem.slices.interface}
     stage = PluggedIn(plan, particles)
     return stage(before, problem.series.row(t), np.random.default_rng(0)), before
@@ -550,7 +550,7 @@ def test_a_bend_that_is_wide_beside_the_noise_is_followed(monkeypatch: pytest.Mo
     engine = bmc.ParticleFilter(2000, proposal="optimal")
     guarded = bmc.filter(bent(), rows, engine=engine, rng=0)
     assert abs(guarded.log_marginal_likelihood - exact) < 0.5
-    monkeypatch.setattr(lookahead, "_TURNS", 1)
+    monkeypatch.setattr(linearisation, "_TURNS", 1)
     monkeypatch.setattr(guarding, "SHARE", 1e-12)
     assert bmc.filter(bent(), rows, engine=engine, rng=0).log_marginal_likelihood < exact - 1
 
@@ -575,7 +575,7 @@ def test_angles_are_taken_the_short_way_round(case: str, monkeypatch: pytest.Mon
     assert abs(found.mean("x")[0] - exact.mean("x")[0]) < 0.02
     assert abs(found.log_marginal_likelihood - exact.log_marginal_likelihood) < 0.03
     assert found.weight_ess[0] > 0.85 * 5000
-    monkeypatch.setattr(lookahead, "wrap_angle", lambda x: x)
+    monkeypatch.setattr(linearisation, "wrap_angle", lambda x: x)
     assert bmc.filter(build(), rows, engine=engine, rng=0).weight_ess[0] < 0.5 * 5000
 
 
@@ -653,12 +653,12 @@ def test_guards_bound_the_weights() -> None:
     """No weight is more than ten times that of the bootstrap filter, far from any tangent."""
     problem = pose_series(bent(), {"y": [1.3]})
     engine = bmc.ParticleFilter(5000, proposal="optimal")
-    mover = engine._mover(problem.slices, {})
+    made_by = engine.step_of(problem.slices, {})
     row = problem.series.row(0)
-    assert any(isinstance(step, Guarded) for step in mover.plan.steps(row))
-    cloud = mover.first(row, np.random.default_rng(0))
-    density = stats.norm.logpdf(1.3, cloud.values["x"] + 0.4 * np.sin(2 * cloud.values["x"]), 0.2)
-    assert (cloud.log_weights <= density + np.log(10.0) + 1e-9).all()
+    assert any(isinstance(step, Guarded) for step in made_by.plan.steps(row))
+    found = made_by(None, row, np.random.default_rng(0))
+    density = stats.norm.logpdf(1.3, found.values["x"] + 0.4 * np.sin(2 * found.values["x"]), 0.2)
+    assert (found.log_weights <= density + np.log(10.0) + 1e-9).all()
 
 
 def test_families_without_a_variance_are_left_to_themselves() -> None:

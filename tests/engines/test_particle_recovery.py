@@ -11,8 +11,8 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.dbn import Row
-from bayesmc.engines.particles import anew
 from bayesmc.engines.particles import recovery as recovering
+from bayesmc.engines.particles import rejuvenation
 from bayesmc.network import Observed
 from bayesmc.testing import session
 
@@ -97,7 +97,7 @@ def short_ratios(draws: float, runs: int = 200, **options: Any) -> np.ndarray:
 
 def of_their_ancestors(selection: Any, lost: np.ndarray) -> np.ndarray:
     """The weights that particles would have, had they not begun anew."""
-    return np.broadcast_to(selection.carried, (selection.particles,))
+    return np.broadcast_to(selection.log_weights, (selection.particles,))
 
 
 @pytest.mark.parametrize("draws", [0.0, 0.3])
@@ -118,7 +118,7 @@ def test_lost_particles_have_no_weight_of_an_ancestor(
 ) -> None:
     # where they are chosen by what the row makes of their ancestors, those far off are never chosen;
     # where they are not resampled, few have a weight, and the lost rarely one of these
-    monkeypatch.setattr(anew, "start_weights", of_their_ancestors)
+    monkeypatch.setattr(rejuvenation, "start_weights", of_their_ancestors)
     found = short_ratios(0.3, ess_threshold=threshold, auxiliary=threshold > 0)
     assert np.log(found).std() > 2
     assert threshold == 0.0 or deviation(found) > 8
@@ -138,7 +138,9 @@ def test_readings_of_two_slices(
     threshold: float, fault: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if fault:  # ancestors by number, as if they all had the same weight
-        monkeypatch.setattr(anew.Lost, "_ancestors", lambda self, _, chosen, lost, rng: lost)
+        monkeypatch.setattr(
+            rejuvenation.Injection, "_ancestors", lambda self, _, chosen, lost, rng: lost
+        )
     rows = {**SHORT, "came": np.array([0.0, 0.1, 5.5, 0.2])}
     grid = bmc.GridFilter({"x": (-3.0, 13.0, 800)})
     wanted = bmc.filter(odometer(True), rows, engine=grid).log_marginal_likelihood
@@ -169,7 +171,7 @@ def test_draws_beyond_the_share_are_weighed_down(monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_proposal_that_is_not_weighed_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(anew._Density, "__call__", lambda self, state: None)
+    monkeypatch.setattr(rejuvenation._Density, "__call__", lambda self, state: None)
     assert deviation(ratios(bmc.Recovery({"x": ANYWHERE}, share=SHARE, proposal=AIMED))) > 8
 
 

@@ -18,9 +18,9 @@ import scipy.stats
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines.particles import smoothing
-from bayesmc.engines.particles.cloud import Layout, even_cloud
-from bayesmc.engines.particles.smoothing import Backward, lagged
+from bayesmc.engines.particles import backward as backward_simulation
+from bayesmc.engines.particles.backward import Backward, lagged
+from bayesmc.engines.particles.particles import Layout, evenly_weighted
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.testing import session
@@ -261,8 +261,8 @@ def compared(
 ) -> list[tuple[float, str]]:
     """P-values of all figures of all slices, least likely first."""
     given, lag = WAYS[way]
-    engine = bmc.ParticleFilter(particles, **{**given, **options})
-    ask: dict[str, Any] = {"engine": engine, "lag": lag, "inputs": case.inputs or None}
+    engine = bmc.ParticleFilter(particles, **options)
+    ask: dict[str, Any] = {"engine": engine, "lag": lag, "inputs": case.inputs or None, **given}
     found = [bmc.smooth(case.dbn, case.observations, rng=k, **ask) for k in range(runs)]
     assert {f.kind for f in found} == {"smooth" if lag is None else "fixed-lag"}
     result = []
@@ -314,7 +314,7 @@ def filtered(case: Case, particles: int, rng: int = 0, **options: Any) -> tuple[
     """What draws backwards, and what it draws from: clouds and their rows."""
     engine = bmc.ParticleFilter(particles, **options)
     problem = pose_series(case.dbn, case.observations, case.inputs or None)
-    mover = engine._mover(problem.slices, {n: o.value for n, o in problem.series.static.items()})
+    step = engine.step_of(problem.slices, {n: o.value for n, o in problem.series.static.items()})
     found = bmc.filter(
         case.dbn,
         case.observations,
@@ -323,7 +323,7 @@ def filtered(case: Case, particles: int, rng: int = 0, **options: Any) -> tuple[
         rng=rng,
         keep="particles",
     )
-    return Backward(mover.plan, mover.layout), found.clouds, problem.series
+    return Backward(step.plan, step.layout), found.clouds, problem.series
 
 
 def rejected(found: list[tuple[float, str]], alpha: float) -> list[str]:
@@ -388,24 +388,28 @@ def test_a_forgotten_lag_is_caught(name: str, monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_bound_that_is_too_low_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of the densities of a plate's elements the least, not their product."""
-    monkeypatch.setattr(smoothing, "summed", lambda log, node, apart: np.min(log, axis=-1))
+    monkeypatch.setattr(
+        backward_simulation, "summed", lambda log, node, apart: np.min(log, axis=-1)
+    )
     assert rejected(compared(team(), "by rejection"), ALPHA / len(TRIED))
 
 
 def test_a_bound_that_leaves_particles_out_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    real = smoothing.summed
-    monkeypatch.setattr(smoothing, "summed", lambda *given: real(*given).min(axis=0, keepdims=True))
+    real = backward_simulation.summed
+    monkeypatch.setattr(
+        backward_simulation, "summed", lambda *given: real(*given).min(axis=0, keepdims=True)
+    )
     assert rejected(compared(weather(), "by rejection"), ALPHA / len(TRIED))
 
 
 def test_an_acceptance_of_all_elements_at_once_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where elements of a plate are apart, one that was refused must not be taken with the others."""
-    put = smoothing._put
+    put = backward_simulation._put
 
     def careless(found: Any, rows: Any, values: Any, where: np.ndarray) -> None:
         put(found, rows, values, where | (where.any(axis=1, keepdims=True) & (where.ndim > 1)))
 
-    monkeypatch.setattr(smoothing, "_put", careless)
+    monkeypatch.setattr(backward_simulation, "_put", careless)
     assert rejected(compared(CASES["switching 4, a plate"](), "by rejection"), ALPHA / len(TRIED))
 
 
@@ -429,8 +433,8 @@ def test_a_bridge_between_two_values(move: Callable[[Any], Any], way: str) -> No
     x = np.linspace(-15.0, 20.0, 20_001)
     density = np.exp(move(1.0).log_prob(x) + move(x).log_prob(3.0))
     wanted = [float((density * x**m).sum() / density.sum()) for m in (1, 2)]
-    engine = bmc.ParticleFilter(1000, **WAYS[way][0])
-    runs = [bmc.smooth(dbn, {"x": [1.0, None, 3.0]}, engine=engine, rng=k) for k in range(RUNS)]
+    ask: dict[str, Any] = {"engine": bmc.ParticleFilter(1000), **WAYS[way][0]}
+    runs = [bmc.smooth(dbn, {"x": [1.0, None, 3.0]}, rng=k, **ask) for k in range(RUNS)]
     drawn = np.stack([r.particles("x")[1] for r in runs])
     assert min(len(np.unique(rows)) for rows in drawn) > 0.5 * drawn.shape[1]
     values = [
@@ -441,9 +445,11 @@ def test_a_bridge_between_two_values(move: Callable[[Any], Any], way: str) -> No
 
 def test_one_past_for_all_trajectories_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     """Which leaves means alone, so only the number of pasts tells."""
-    real = smoothing._picked
+    real = backward_simulation._picked
     monkeypatch.setattr(
-        smoothing, "_picked", lambda log, rng: np.repeat(real(log[:1], rng), len(log), axis=0)
+        backward_simulation,
+        "_picked",
+        lambda log, rng: np.repeat(real(log[:1], rng), len(log), axis=0),
     )
     dbn = bmc.DynamicBayesNet()
     dbn.add("x", leap, initial=bmc.Normal(0.0, 1.0))
@@ -457,8 +463,7 @@ def test_every_slice_seen_is_no_trouble() -> None:
     dbn.add("x", walk, initial=bmc.Normal(0.0, 1.0), plates="k")
     rows = {"x": np.arange(6.0).reshape(3, 2)}
     for way in ("by rejection", "exactly"):
-        engine = bmc.ParticleFilter(50, **WAYS[way][0])
-        found = bmc.smooth(dbn, rows, engine=engine, rng=0)
+        found = bmc.smooth(dbn, rows, engine=bmc.ParticleFilter(50), rng=0, **WAYS[way][0])
         assert np.array_equal(found.mean("x"), rows["x"])
         assert len(found.particles("x")[0]) == WAYS[way][0]["trajectories"]
 
@@ -516,10 +521,10 @@ def test_neighbours_on_a_trajectory_belong_together(
 
     After one round of rejection, elements of the plate have other trajectories open each.
     """
-    monkeypatch.setattr(smoothing, "_ROUNDS", rounds)
-    engine = bmc.ParticleFilter(PARTICLES, **WAYS[way][0])
+    monkeypatch.setattr(backward_simulation, "_ROUNDS", rounds)
+    ask: dict[str, Any] = {"engine": bmc.ParticleFilter(PARTICLES), **WAYS[way][0]}
     rows = np.stack([ROWS, ROWS - 1.0, -ROWS], axis=1)
-    runs = [bmc.smooth(level(3), {"y": rows}, engine=engine, rng=k) for k in range(RUNS)]
+    runs = [bmc.smooth(level(3), {"y": rows}, rng=k, **ask) for k in range(RUNS)]
     x = np.stack([r.particles("x") for r in runs])
     found = (x[:, :-1] * x[:, 1:]).mean(axis=2)
     seen = ~np.isnan(rows[:, 0])
@@ -540,7 +545,7 @@ def test_positions_are_supplied_by_weight_and_in_no_order() -> None:
     weights = np.array([[1.0, 0.0], [2.0, 3.0], [3.0, 1.0], [0.0, 4.0]])
     first, last = [], []
     for _ in range(2000):
-        supply = smoothing._Supply(weights, 4, rng)
+        supply = backward_simulation._Supply(weights, 4, rng)
         drawn = np.concatenate([supply.take(2), supply.take(1), supply.take(6)])
         first.append(drawn[0])
         last.append(drawn[-1])
@@ -557,10 +562,10 @@ def test_draws_packed_to_the_front_stay_with_their_trajectories() -> None:
     for lead in ((), (3,), (2, 4)):
         wanted = rng.random((9, *lead)) < 0.4
         own = np.broadcast_to(np.arange(9).reshape((-1,) + (1,) * len(lead)), wanted.shape)
-        rows, asked = smoothing._packed(own, wanted)
+        rows, asked = backward_simulation._packed(own, wanted)
         assert len(rows) == wanted.sum(axis=0).max()
         found = np.zeros(wanted.shape, dtype=np.intp)
-        smoothing._put(found, rows, 1 + rows, asked)
+        backward_simulation._put(found, rows, 1 + rows, asked)
         assert np.array_equal(found, np.where(wanted, 1 + own, 0))
 
 
@@ -569,8 +574,9 @@ def test_draws_packed_to_the_front_stay_with_their_trajectories() -> None:
 
 @pytest.mark.parametrize("order", [2, 3])
 def test_lags_on_a_trajectory_are_its_own_values(order: int) -> None:
-    engine = bmc.ParticleFilter(300, trajectories=50)
-    found = bmc.smooth(autoregression(order), {"y": LAGGED}, engine=engine, rng=0)
+    engine = bmc.ParticleFilter(300)
+    options: dict[str, Any] = {"engine": engine, "trajectories": 50}
+    found = bmc.smooth(autoregression(order), {"y": LAGGED}, rng=0, **options)
     x = found.particles("x")
     assert np.array_equal(found.particles("l")[1:], x[:-1])
     assert np.array_equal(found.particles("l")[0], found.particles("b")[0])
@@ -588,9 +594,10 @@ def test_a_lag_as_users_write_it_is_smoothed() -> None:
     dbn.add("l", lambda x_prev: x_prev, initial=lambda x: 0.0 * x)
     dbn.add("y", lambda x: bmc.Normal(x, 0.5))
     rows = {"y": dbn.sample(20, 1, rng=1)["y"][0]}
-    engine = bmc.ParticleFilter(500, trajectories=200)
+    engine = bmc.ParticleFilter(500)
     assert bmc.explain(dbn, rows, engine, question="smooth").refused == {}
-    runs = np.stack([bmc.smooth(dbn, rows, engine=engine, rng=k).mean("x") for k in range(10)])
+    drawn = [bmc.smooth(dbn, rows, engine=engine, rng=k, trajectories=200) for k in range(10)]
+    runs = np.stack([found.mean("x") for found in drawn])
     exact = bmc.smooth(dbn, rows, engine=bmc.KalmanFilter())
     error = exact.std("x") / np.sqrt(10 * 100)  # 100 of 200 trajectories count as independent
     assert (np.abs(runs.mean(axis=0) - exact.mean("x")) < 5 * error).all()
@@ -608,8 +615,8 @@ def test_what_is_the_same_for_all_particles_may_go_on_without_end() -> None:
     )
     dbn.add("y", lambda x: bmc.Normal(x, 0.6))
     rows = {"y": np.array([0.5, 1.4, 0.3, 1.9, 2.2])}
-    engine = bmc.ParticleFilter(2000, trajectories=1000)
-    found = bmc.smooth(dbn, rows, engine=engine, rng=0)
+    engine = bmc.ParticleFilter(2000)
+    found = bmc.smooth(dbn, rows, engine=engine, rng=0, trajectories=1000)
     exact = bmc.infer(dbn.unroll(5), dbn.unrolled_evidence(rows), engine=bmc.Exact())
     wanted = np.array([float(exact.mean(f"x[{t}]")) for t in range(5)])
     np.testing.assert_allclose(found.mean("x"), wanted, atol=0.1)  # some 5 standard errors
@@ -671,9 +678,9 @@ def test_a_slice_before_a_new_beginning_is_as_the_filter_left_it(
     move: Callable[[Any], Any], way: str
 ) -> None:
     """Whether its particles could have moved there (density 1e-200) or not (density 0); all count alike."""
-    engine = bmc.ParticleFilter(1000, **WAYS[way][0], **ANEW)
+    engine = bmc.ParticleFilter(1000, **ANEW)
     rows = {"y": [0.0, 30.0, 30.5]}
-    found = bmc.smooth(sharp(move), rows, engine=engine, rng=0)
+    found = bmc.smooth(sharp(move), rows, engine=engine, rng=0, **WAYS[way][0])
     assert found.rejuvenated.tolist() == [False, True, False]
     x = found.particles("x")
     first = bmc.Truncated(bmc.Normal(0.0, 1.0), -1.5, 1.5)
@@ -722,8 +729,9 @@ def test_elements_of_a_plate_begin_anew_each_for_itself() -> None:
     )
     values = []
     for way in ("by rejection", "exactly"):
-        engine = bmc.ParticleFilter(1000, **WAYS[way][0], **ANEW)
-        runs = [bmc.smooth(sharp(walk, 2), rows, engine=engine, rng=k) for k in range(RUNS)]
+        engine = bmc.ParticleFilter(1000, **ANEW)
+        ask: dict[str, Any] = {"engine": engine, **WAYS[way][0]}
+        runs = [bmc.smooth(sharp(walk, 2), rows, rng=k, **ask) for k in range(RUNS)]
         found = np.stack([r.mean("x") for r in runs])
         assert np.abs(found[:, 0, 1]).max() < 0.3 and np.abs(found[:, 1, 1] - 30.0).max() < 1.0
         values += [p_value(found[:, t, 0], float(alone.mean("x")[t]), False) for t in range(3)]
@@ -739,7 +747,7 @@ def test_ancestors_of_elements_of_a_plate_end_each_for_itself() -> None:
     slices = pose_series(level(3), {"y": np.zeros((3, 3))}).slices
     clouds = []
     for t, anew in enumerate(([0, 0, 0], [0, 0, 1], [0, 1, 0])):
-        cloud = even_cloud(t, {"x": rng.normal(size=(40, 3))}, layout)
+        cloud = evenly_weighted(t, {"x": rng.normal(size=(40, 3))}, layout)
         weights = rng.random((40, 3))
         ancestors = np.sort(rng.integers(0, 40, (40, 3)), axis=0) if t else None
         clouds.append(

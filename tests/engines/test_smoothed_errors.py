@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles import smoothing
-from bayesmc.engines.particles.sharing import Sharing
+from bayesmc.engines.particles import backward as backward_simulation
+from bayesmc.engines.particles.coalescence import Sharing
 from bayesmc.errors import LowEssWarning
 from bayesmc.testing import session
 
@@ -79,8 +79,8 @@ def level(case: Callable[[], tuple[bmc.DynamicBayesNet, str]]) -> float:
     labelled = exact.model[name].domain is not None
     found = []
     for k in range(RUNS):
-        engine = bmc.ParticleFilter(300, trajectories=1000)
-        drawn = bmc.smooth(dbn, rows, engine=engine, rng=session.seed() + k)
+        options: dict[str, Any] = {"engine": bmc.ParticleFilter(300), "trajectories": 1000}
+        drawn = bmc.smooth(dbn, rows, rng=session.seed() + k, **options)
         ask = (lambda p: p.probabilities(name)) if labelled else (lambda p: p.mean(name))
         found.append((ask(drawn) - ask(exact)) / drawn.mcse(name))
     return float(np.sqrt(np.mean(np.square(found))))
@@ -185,8 +185,9 @@ def drawn_backwards(seed: int) -> np.ndarray:
     )
     dbn.add("y", lambda x: bmc.Normal(x, 1.0))
     rows = {"y": dbn.sample(30, 1, rng=1)["y"][0]}
-    engine = bmc.ParticleFilter(4000, trajectories=500)
-    found, exact = bmc.smooth(dbn, rows, engine=engine, rng=seed), bmc.smooth(dbn, rows)
+    engine = bmc.ParticleFilter(4000)
+    found = bmc.smooth(dbn, rows, engine=engine, rng=seed, trajectories=500)
+    exact = bmc.smooth(dbn, rows)
     return (found.mean("v") - exact.mean("v")) / exact.std("v")
 
 
@@ -194,5 +195,5 @@ def test_narrow_transitions_go_by_ancestors(monkeypatch: pytest.MonkeyPatch) -> 
     """Where no candidate would do but the ancestor; without it, others are taken that do not fit."""
     assert np.abs(drawn_backwards(session.seed())).max() < 0.6
     anyone = lambda cloud, index: np.zeros_like(index)  # noqa: E731
-    monkeypatch.setattr(smoothing, "_parents", anyone)
+    monkeypatch.setattr(backward_simulation, "_parents", anyone)
     assert np.abs(drawn_backwards(session.seed())).max() > 0.6

@@ -41,7 +41,9 @@ def evidence_of(net: Make, evidence: Any, engine: Any, replications: int = 300) 
     )
 
 
-def slices(ask: Callable[..., Any], dbn: Make, observations: Any, engine: Any, runs: int) -> Test:
+def slices(
+    ask: Callable[..., Any], dbn: Make, observations: Any, engine: Any, runs: int, **options: Any
+) -> Test:
     """Means and probabilities of all slices, by ``filter`` or ``smooth``, in several runs.
 
     The exact ones are had slice by slice, of a filter from the rows so far.
@@ -51,7 +53,7 @@ def slices(ask: Callable[..., Any], dbn: Make, observations: Any, engine: Any, r
         template = dbn()
 
         def estimate(rng: np.random.Generator) -> dict[str, np.ndarray]:
-            return _figures(ask(template, observations, engine=engine, rng=rng))
+            return _figures(ask(template, observations, engine=engine, rng=rng, **options))
 
         return repeated_test(
             estimate, _exact_slices(ask, dbn(), observations),

@@ -22,7 +22,7 @@ from bayesmc.engines.mcmc import starts as starting
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import ReducibleWarning, UnsupportedError
 from bayesmc.pmcmc import ParticleGibbs
-from bayesmc.pmcmc.filters import ConditionalFilter, independent, picked
+from bayesmc.pmcmc.filters import ConditionalStep, independent, picked
 from bayesmc.testing.posteriors.matching import assert_matches
 from bayesmc.testing.verdict import holm
 from tests.pmcmc import templates
@@ -94,29 +94,28 @@ def _not_kept(self: Any, drawn: np.ndarray, trajectory: np.ndarray) -> np.ndarra
 
 
 def _blind_ancestor(
-    self: Any, place: Any, known: Any, values: Any, log: np.ndarray, rng: np.random.Generator
+    self: Any, earlier: Any, before: Any, row: Any, rng: np.random.Generator
 ) -> np.ndarray:
-    return picked(log, rng)
+    return picked(earlier.log_weights, rng)
 
 
-def _weightless(
-    self: Any, place: Any, known: Any, values: Any, log: np.ndarray, rng: np.random.Generator
-) -> Any:
-    log = log.copy()
-    log[-1] = -np.inf
-    return ORIGINAL(self, place, known, values, log, rng)
+def _weightless(self: Any, earlier: Any, before: Any, row: Any, rng: np.random.Generator) -> Any:
+    log, weights = np.array(earlier.log_weights), np.array(earlier.weights)
+    log[-1], weights[-1] = -np.inf, 0.0
+    earlier = earlier._replace(log_weights=log, weights=weights)
+    return ORIGINAL(self, earlier, before, row, rng)
 
 
-ORIGINAL = ConditionalFilter._selected
+ORIGINAL = ConditionalStep.selected
 
 
 @pytest.mark.parametrize(
     ("method", "fault"),
-    [("_kept", _not_kept), ("_ancestor", _blind_ancestor), ("_selected", _weightless)],
+    [("kept_among", _not_kept), ("ancestor", _blind_ancestor), ("selected", _weightless)],
     ids=["trajectory not kept", "ancestor without the transition", "kept particle's weight lost"],
 )
 def test_faults_are_seen(monkeypatch: pytest.MonkeyPatch, method: str, fault: Any) -> None:
-    monkeypatch.setattr(ConditionalFilter, method, fault)
+    monkeypatch.setattr(ConditionalStep, method, fault)
     assert rejected(templates.gaussian())
 
 
@@ -127,10 +126,10 @@ def test_no_ancestor_is_drawn_past_a_running_sum(monkeypatch: pytest.MonkeyPatch
     assert "with its own ancestors" in engine.describe(problem)["v[0]"]
     assert "with ancestor sampling" in engine.describe(_posed(templates.gaussian()))["x[0]"]
 
-    def drawn_all_the_same(self, place, known, values, log, rng):
-        return picked(log + self._onward(place, known, values, log.shape, rng), rng)
+    def drawn_all_the_same(self, earlier, before, row, rng):
+        return picked(earlier.log_weights + self.onward(before, row, rng), rng)
 
-    monkeypatch.setattr(ConditionalFilter, "_ancestor", drawn_all_the_same)
+    monkeypatch.setattr(ConditionalStep, "ancestor", drawn_all_the_same)
     assert rejected(case)
 
 

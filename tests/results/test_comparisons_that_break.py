@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.particles.replicates import Replicates
+from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.errors import EngineWarning
 
 COUNTS = np.repeat([1, 3, 6, 8, 10], 6)

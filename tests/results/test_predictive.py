@@ -18,7 +18,7 @@ import pytest
 from scipy import special
 
 import bayesmc as bmc
-from bayesmc.engines.particles import replicates
+from bayesmc.engines.particles import predictive
 from bayesmc.errors import (
     LowEssWarning,
     ModelMisfitWarning,
@@ -171,7 +171,7 @@ def test_looking_leaves_the_particles_as_they_are(monkeypatch: pytest.MonkeyPatc
     found = bmc.filter(level(), rows, engine=bmc.ParticleFilter(200), rng=7)
     again = bmc.filter(level(), rows, engine=bmc.ParticleFilter(200), rng=7)
     np.testing.assert_array_equal(found.row_ranks, again.row_ranks)
-    monkeypatch.setattr(replicates, "_FEW", 1000)
+    monkeypatch.setattr(predictive, "_FEW", 1000)
     without = bmc.filter(level(), rows, engine=bmc.ParticleFilter(200), rng=7)
     assert without.row_ranks is None
     np.testing.assert_array_equal(found.mean("x"), without.mean("x"))

@@ -10,7 +10,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.discrete.path import states_of
 from bayesmc.engines.discrete.rows import Variable
 from bayesmc.engines.discrete.run import Run
-from bayesmc.engines.particles.replicates import Replicates
+from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results.predictive import Predictive

@@ -2,8 +2,8 @@
 
 Information form has no place for a scale of 0. So what hangs together with such a node is written as ``mean +
 rows @ noise``, with independent standard normal noise, and conditioned by one triangularisation for every
-configuration of the discrete variables that switch it (``linalg.square_root``). What follows from other observed
-numbers counts as a probability, one where it is right.
+configuration of the discrete variables that switch it (``linalg.square_root``). What follows from other
+observed numbers counts as a probability, one where it is right.
 """
 
 from __future__ import annotations

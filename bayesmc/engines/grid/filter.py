@@ -23,7 +23,7 @@ from bayesmc.engines.grid.search import GridSearch, known_static
 from bayesmc.engines.grid.slice import quiet, same_points
 from bayesmc.engines.grid.sources import Label
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.particles.replicates import Replicates
+from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
 from bayesmc.network.forward import refuse_noiseless, refuse_parts

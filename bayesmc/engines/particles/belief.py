@@ -9,25 +9,24 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.engines.beliefs import OnlineBelief
-from bayesmc.engines.particles.accuracy import node_errors, value_errors
-from bayesmc.engines.particles.answers import (
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.errors import function_errors, node_errors
+from bayesmc.engines.particles.filter_step import FilterStep
+from bayesmc.engines.particles.genealogy import Families, evidence_error
+from bayesmc.engines.particles.particles import Bare, Particles
+from bayesmc.engines.particles.queries import (
+    at_scouts,
     covariance,
-    elsewhere,
     evaluated,
     expectation,
-    mean_of,
-    moments,
+    numbers_of,
     probability,
     quantiles,
-    table_of_states,
-    variance_of,
-    weighted_mean,
 )
-from bayesmc.engines.particles.cloud import Bare, Cloud
-from bayesmc.engines.particles.families import Families, evidence_error
-from bayesmc.engines.particles.mover import Mover
+from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode
+from bayesmc.results.posterior import table_variance
 
 
 class ParticleBelief(OnlineBelief):
@@ -70,104 +69,101 @@ class ParticleBelief(OnlineBelief):
         dbn: DynamicBayesNet | None,
         seed: np.random.SeedSequence,
         static: Mapping[str, Any],
-        mover: Mover | Bare | None = None,
-        cloud: Cloud | None = None,
+        made_by: FilterStep | Bare | None = None,
+        now: Particles | None = None,
         log_marginal_likelihood: Any = 0.0,
         chance: Mapping[str, Any] | None = None,
         inputs: Mapping[str, np.ndarray] | None = None,
         families: Families | None = None,
+        tracker: Tracker | None = None,
     ) -> None:
         self.dbn, self.seed, self.static = dbn, seed, dict(static)
-        self.mover, self.cloud, self.chance = mover, cloud, chance
+        self.made_by, self.now, self.chance = made_by, now, chance
         self.inputs = dict(inputs or {})
-        self.families = families
+        self.families, self.tracker = families, tracker
         self.log_marginal_likelihood = log_marginal_likelihood
-        self.t = -1 if cloud is None else cloud.t
+        self.t = -1 if now is None else now.t
 
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
-        mover = None if self.mover is None else Bare(self.mover.slices, self.mover.layout)
-        return {**self.__dict__, "dbn": None, "mover": mover}
+        step = self.made_by
+        bare = None if step is None else Bare(step.slices, step.layout)
+        return {**self.__dict__, "dbn": None, "made_by": bare, "tracker": None}
 
     @property
     def slices(self) -> Slices | None:
         """What rows are read against; None before the first."""
-        return None if self.mover is None else self.mover.slices
+        return None if self.made_by is None else self.made_by.slices
 
     @property
     def weights(self) -> np.ndarray:
-        cloud = self._cloud
-        return cloud.weights / cloud.total
+        now = self._particles
+        return now.weights / now.total
 
     @property
     def weight_ess(self) -> Any:
-        ess = self._cloud.ess
+        ess = self._particles.ess
         return ess if np.ndim(ess) else float(ess)
 
     @property
     def resampled(self) -> Any:
-        found = self._cloud.resampled
+        found = self._particles.resampled
         return found if np.ndim(found) else bool(found)
 
     @property
     def ancestors(self) -> np.ndarray | None:
-        return self._cloud.ancestors
+        return self._particles.ancestors
 
     @property
     def rejuvenated(self) -> Any:
-        found = self._cloud.rejuvenated
+        found = self._particles.rejuvenated
         return found if np.ndim(found) else bool(found)
 
     @property
     def names(self) -> tuple[str, ...]:
         """Nodes whose particles are kept."""
-        return tuple(self._cloud.values)
+        return tuple(self._particles.values)
 
     @property
     def log_marginal_likelihood_mcse(self) -> Any:
         """Root mean square error of ``log_marginal_likelihood``; infinite where particles cannot tell it."""
-        if self.cloud is None or self.families is None:
+        if self.now is None or self.families is None:
             return 0.0
-        return evidence_error(self.families, self.cloud)
+        return evidence_error(self.families, self.now)
 
     def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
         """Monte Carlo standard error of ``mean(name)`` or of a function's expectation or probability.
 
         Its shape; of each state's probability, for labels.
         """
-        cloud, layout = self._cloud, self._mover.layout
-        assert self.families is not None
-        if callable(what):
-            values = evaluated(layout, cloud, self._mover.slices.first, what)
-            mean = weighted_mean(cloud, values)
-            there = elsewhere(layout, cloud, self._mover.slices.first, what)
-            return value_errors(layout, cloud, self.families, values, mean, there)
-        node, value = self._found(what)
-        if value.ndim == len(node.value_shape):  # the same for all particles
-            labelled = node.domain is not None and node.domain.labels is not None
-            return np.zeros(np.shape(self.probabilities(what) if labelled else self.mean(what)))
-        if node.domain is not None:
-            centre: Any = (self.probabilities(what)[None], None)
-        else:
-            mean, variance = moments(layout, cloud, node, value)
-            centre = (np.asarray(mean)[None], np.asarray(variance)[None])
-        return node_errors(layout, cloud, self.families, node, centre)
+        families, block = self.families, self._block
+        assert families is not None
+        if not callable(what):
+            return node_errors(block, [families], self._node(what))[0]
+        now, layout, model = self._particles, self._step.layout, self._step.slices.first
+        values = evaluated(layout, now, model, what)
+        there = at_scouts(layout, now, families, model, what)
+        return function_errors(block, [families], [values], [there])[0]
 
     def particles(self, name: str) -> np.ndarray:
         """Values of all particles, ``(particles, *plates, *event)``, not weighted."""
-        node, value = self._found(name)
-        full = np.broadcast_to(value, (len(self._cloud.weights), *node.value_shape))
+        node, now = self._node(name), self._particles
+        full = np.broadcast_to(now.values[name], (len(now.weights), *node.value_shape))
         return np.array(node.decode(full), subok=True)
 
     def mean(self, name: str) -> np.ndarray:
         """Mean, shape ``(*plates, *event)``; circular for angles."""
-        node, value = self._found(name)
-        return mean_of(self._mover.layout, self._cloud, node, value)
+        node = self._node(name)
+        if node.domain is None:
+            return self._block.mean(node)[0]
+        return self._block.table(node)[0] @ numbers_of(node)
 
     def var(self, name: str) -> np.ndarray:
         """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
-        node, value = self._found(name)
-        return variance_of(self._mover.layout, self._cloud, node, value)
+        node = self._node(name)
+        if node.domain is None:
+            return self._block.mean_and_variance(node)[1][0]
+        return table_variance(self._block.table(node)[0], numbers_of(node))
 
     def std(self, name: str) -> np.ndarray:
         """Standard deviation, shape ``(*plates, *event)``."""
@@ -175,56 +171,63 @@ class ParticleBelief(OnlineBelief):
 
     def probabilities(self, name: str) -> np.ndarray:
         """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
-        node, value = self._found(name)
+        node = self._node(name)
         if node.domain is None:
             raise QueryError(
                 f"probabilities({name!r}): the node has no finite set of states; use mean, var or expectation"
             )
-        return table_of_states(self._mover.layout, self._cloud, node, value)
+        return self._block.table(node)[0]
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Mean of a function of nodes of the slice, whose arguments have a leading axis of particles."""
-        return expectation(self._mover.layout, self._cloud, self._mover.slices.first, function)
+        step = self._step
+        return expectation(step.layout, self._particles, step.slices.first, function)
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probability of an event: a function of nodes of the slice that returns booleans."""
-        return probability(self._mover.layout, self._cloud, self._mover.slices.first, function)
+        step = self._step
+        return probability(step.layout, self._particles, step.slices.first, function)
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(*q.shape, *plates, *event)``; those of angles are cut opposite the mean."""
-        node, value = self._found(name)
-        return quantiles(self._mover.layout, self._cloud, node, value, q)
+        node, now = self._node(name), self._particles
+        return quantiles(self._step.layout, now, node, now.values[name], q)
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrix of all numbers of the named nodes, in order; of one number, its variance."""
-        found = [self._found(name) for name in names]
-        return covariance(self._mover.layout, self._cloud, found)
+        now = self._particles
+        found = [(self._node(name), now.values[name]) for name in names]
+        return covariance(self._step.layout, now, found)
 
     def __repr__(self) -> str:
-        if self.cloud is None:
+        if self.now is None:
             return "ParticleBelief(nothing absorbed yet)"
         ess = np.round(self.weight_ess, 1)
-        return f"ParticleBelief(t={self.t}, {len(self._cloud.weights)} particles, ess={ess})"
+        return f"ParticleBelief(t={self.t}, {len(self._particles.weights)} particles, ess={ess})"
 
     # ---- private -------------------------------------------------------------------------------
 
     @property
-    def _cloud(self) -> Cloud:
-        if self.cloud is None:
+    def _particles(self) -> Particles:
+        if self.now is None:
             raise QueryError(
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
             )
-        return self.cloud
+        return self.now
 
     @property
-    def _mover(self) -> Mover | Bare:
-        assert self.mover is not None
-        return self.mover
+    def _block(self) -> Block:
+        return Block(self._step.layout, [self._particles])
 
-    def _found(self, name: str) -> tuple[CompiledNode, np.ndarray]:
-        cloud = self._cloud
-        if name not in cloud.values:
+    @property
+    def _step(self) -> FilterStep | Bare:
+        assert self.made_by is not None
+        return self.made_by
+
+    def _node(self, name: str) -> CompiledNode:
+        now = self._particles
+        if name not in now.values:
             raise UnknownNodeError(
-                f"particles of {name!r} are not kept; there are those of {list(cloud.values)}"
+                f"particles of {name!r} are not kept; there are those of {list(now.values)}"
             )
-        return self._mover.slices.first[name], cloud.values[name]
+        return self._step.slices.first[name]

@@ -9,12 +9,13 @@ particle has made, or a model that is wrong.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.particles import Layout, Particles
 from bayesmc.network import CompiledNode
 
 #: weight of what has been at each further slice: about ten are looked at together; and that of the largest
@@ -27,11 +28,30 @@ _LEAST = 0.05
 
 
 class Drift(NamedTuple):
-    """Moves of the means of numbers so far, in units of their spreads, shapes (numbers, many)."""
+    """Moves of the means of numbers so far, in units of their spreads.
 
-    moved: Any
-    variance: Any
-    worst: Any
+    Attributes
+    ----------
+    moved, variance : ndarray, shape (elements, numbers)
+    worst : ndarray, shape (*apart,)
+        The largest sum of moves of any number, in units of what is expected of it.
+    largest : float
+        That of the elements.
+    limit : float
+        From which on particles are missing.
+    """
+
+    moved: np.ndarray
+    variance: np.ndarray
+    worst: np.ndarray
+    largest: float
+    limit: float
+
+
+_FADED = np.array([FADING, FADING**2]).reshape(2, 1, 1)
+
+#: a slice of a block, which of its elements were not resampled (None: all), and the slice before
+Carried = tuple[int, np.ndarray | None, Particles]
 
 
 class Compass:
@@ -47,96 +67,88 @@ class Compass:
     def __init__(self, nodes: Iterable[CompiledNode], layout: Layout) -> None:
         self.layout = layout
         self.nodes = tuple(
-            (n, len(n.value_shape))
+            n
             for n in nodes
             if n.domain is None and n.angles is None and set(layout.apart) <= set(n.plates)
         )
-        count = max(sum(math.prod(n.value_shape) for n, _ in self.nodes), 1)
-        one = len(self.nodes) == 1 and not self.nodes[0][1] and not layout.apart
-        self.alone = self.nodes[0][0].name if one else None
-        self.limit = math.sqrt(IS**2 + 2.0 * math.log(count))
+        elements = math.prod(layout.lead)
+        self.counts = [math.prod(n.value_shape) // elements for n in self.nodes]
+        every = max(sum(math.prod(n.value_shape) for n in self.nodes), 1)
+        self.limit = math.sqrt(IS**2 + 2.0 * math.log(every))
 
-    def after(self, drift: Drift | None, earlier: Cloud | None, cloud: Cloud) -> Drift | None:
-        """The same after a slice, whose particles have been drawn from the model itself."""
-        if cloud.rejuvenated is not False:
-            return None
-        if self.alone is not None:
-            return self._after_one(drift, earlier, cloud)
-        before = None if earlier is None or np.all(cloud.resampled) else earlier
-        if before is not None and len(before.weights) != len(cloud.weights):
-            before = None
-        step = self._of_many([cloud.values[n.name] for n, _ in self.nodes], before, cloud)
-        moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
-        moved, spent = FADING * moved + step[0], FADING**2 * spent + step[1]
-        now = (np.abs(moved) / np.sqrt(spent + _LEAST)).max(axis=0)
-        return Drift(moved, spent, np.maximum(KEPT * worst, now))
+    def after(
+        self, drift: Drift | None, earlier: Particles | None, block: Block
+    ) -> Sequence[Drift | None]:
+        """The same after each slice of a block, whose particles have been drawn from the model itself.
+
+        A slice whose particles were drawn anew makes a block of its own.
+        """
+        if block.slices[0].rejuvenated is not False:
+            return [None]
+        carried = self._carried(earlier, block)
+        counts = zip(self.nodes, self.counts, strict=True)
+        parts = [_moves(block, node, count, carried) for node, count in counts]
+        steps = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
+        state: Any = 0.0 if drift is None else np.stack([drift.moved, drift.variance])
+        for k in range(steps.shape[1]):
+            steps[:, k] = state = _FADED * state + steps[:, k]
+        moved, variance = steps
+        worst = (np.abs(moved) / np.sqrt(variance + _LEAST)).max(axis=-1)
+        if drift is not None:
+            worst[0] = np.maximum(worst[0], KEPT * drift.worst.reshape(-1))
+        if len(worst) > 1:
+            kept = KEPT ** np.arange(len(worst))[:, None]
+            worst = np.maximum.accumulate(worst / kept) * kept
+        largest = worst.max(axis=-1).tolist()
+        figures = zip(moved, variance, worst.reshape(-1, *self.layout.lead), largest, strict=True)
+        return [Drift(*own, self.limit) for own in figures]
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _after_one(self, drift: Drift | None, earlier: Cloud | None, cloud: Cloud) -> Drift | None:
-        """The same of one number per particle, in few calls of NumPy."""
-        assert self.alone is not None
-        values = cloud.values[self.alone]
-        if values.ndim == 0:
-            return drift
-        same = earlier is not None and len(earlier.weights) == len(values)
-        prior = earlier if same and not cloud.resampled else None
-        weights, total = cloud.weights, cloud.total
-        if prior is None:
-            n = len(values)
-            mean = float(values.sum()) / n
-        else:
-            mean = float(prior.weights.dot(values)) / prior.total
-        off = values - mean
-        move = float(weights.dot(off)) / total
-        if prior is None:
-            wide = float(off.dot(off)) / n
-            off *= off
-        else:
-            off *= off
-            wide = float(prior.weights.dot(off)) / prior.total
-        if not wide > 0.0:
-            return drift
-        left = float(weights.dot(off)) / total - move * move
-        moved, spent, worst = drift if drift is not None else (0.0, 0.0, 0.0)
-        moved = FADING * moved + move / math.sqrt(wide)
-        spent = FADING * FADING * spent + max(1.0 - left / wide, 0.0)
-        return Drift(moved, spent, max(KEPT * worst, abs(moved) / math.sqrt(spent + _LEAST)))
-
-    def _of_many(
-        self, values: list[np.ndarray], before: Cloud | None, cloud: Cloud
-    ) -> tuple[np.ndarray, np.ndarray]:
-        many = math.prod(self.layout.lead)
-        rows = []
-        for (node, rank), value in zip(self.nodes, values, strict=True):
-            if value.ndim == rank:  # the same for all particles
-                value = np.broadcast_to(value, (len(cloud.weights), *value.shape))
-            at = [1 + node.plates.index(p) for p in self.layout.apart]
-            first = np.moveaxis(value, at, range(1, 1 + len(at)))
-            rows.append(first.reshape(len(value), many, -1).transpose(2, 1, 0))
-        numbers = np.concatenate(rows).astype(float)
-        n = numbers.shape[-1]
-        posterior = (cloud.weights / cloud.total).reshape(n, many).T
-        if before is None:
-            prior: Any = np.full((many, n), 1.0 / n)
-        else:
-            shares = before.weights / before.total
-            prior = np.where(cloud.resampled, 1.0 / n, shares).reshape(n, many).T
-        mean = np.einsum("kin,in->ki", numbers, prior)
-        numbers -= mean[..., None]
-        move = np.einsum("kin,in->ki", numbers, posterior)
-        numbers *= numbers
-        wide = np.einsum("kin,in->ki", numbers, prior)
-        left = np.einsum("kin,in->ki", numbers, posterior) - move**2
-        return _scaled(move, wide, left)
+    def _carried(self, earlier: Particles | None, block: Block) -> list[Carried]:
+        """Slices into which particles bring the weights of the slice before, and that slice."""
+        found, n = [], block.particles
+        for k, now in enumerate(block.slices):
+            every = now.resampled if isinstance(now.resampled, bool) else now.resampled.all()
+            if not every and earlier is not None and len(earlier.weights) == n:
+                some = None if isinstance(now.resampled, bool) else ~now.resampled.reshape(-1)
+                found.append((k, some, earlier))
+            earlier = now
+        return found
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _scaled(move: np.ndarray, wide: np.ndarray, left: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    some = wide > 0.0
-    safe = np.where(some, wide, 1.0)
-    return np.where(some, move / np.sqrt(safe), 0.0), np.where(
-        some, np.maximum(1.0 - left / safe, 0.0), 0.0
-    )
+def _moves(
+    block: Block,
+    node: CompiledNode,
+    count: int,
+    carried: Sequence[Carried],
+) -> np.ndarray:
+    """What rows do to a node's numbers: moves of means, and the variances that they take away.
+
+    Shape ``(2, slices, elements, numbers)``.
+    """
+    moments = block.moments(node)
+    if moments is None:  # the same for all particles
+        return np.zeros((2, len(block.slices), block.elements, count))
+    off, n = moments.off, block.particles
+    shift, wide = np.add.reduce(off, axis=-1) / n, np.vecdot(off, off) / n
+    for k, some, earlier in carried:
+        weights, total = earlier.weights.reshape(n, -1).T, np.reshape(earlier.total, (-1, 1))
+        own = np.vecdot(weights[:, None], off[k]) / total
+        square = np.einsum("en,ekn,ekn->ek", weights, off[k], off[k])
+        shift[k] = own if some is None else np.where(some[:, None], own, shift[k])
+        wide[k] = (
+            square / total if some is None else np.where(some[:, None], square / total, wide[k])
+        )
+    wide = wide - shift**2
+    found = np.empty((2, *wide.shape))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.divide(-shift, np.sqrt(wide), out=found[0])
+        np.maximum(1.0 - moments.variance / wide, 0.0, out=found[1])
+    none = ~(wide > 0.0)
+    if none.any():
+        found[:, none] = 0.0
+    return found

@@ -6,19 +6,39 @@ import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
-from bayesmc.engines.particles.anew import Lost, Rejuvenation
+from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
+from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.cloud import Cloud
-from bayesmc.engines.particles.counts import KLD
-from bayesmc.engines.particles.families import Families
-from bayesmc.engines.particles.growth import (
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.filter_step import FilterStep
+from bayesmc.engines.particles.kld import KLD
+from bayesmc.engines.particles.layers import endless
+from bayesmc.engines.particles.optimal import OptimalPlan
+from bayesmc.engines.particles.options import (
+    NOT_SMOOTHED,
+    check_budget,
+    check_choice,
+    check_count,
+    check_kind,
+    check_threshold,
+    check_together,
+    described,
+    looks_told,
+    not_backwards,
+    read_by,
+    read_functions,
+    refused,
+    warn_of_what_is_not_guided,
+)
+from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
+from bayesmc.engines.particles.sample_size import (
     BUDGET,
     START,
     TOLERANCE,
@@ -28,28 +48,18 @@ from bayesmc.engines.particles.growth import (
     uncertain,
     warn_of_a_lonely_step,
 )
-from bayesmc.engines.particles.layers import endless
-from bayesmc.engines.particles.mover import Mover
-from bayesmc.engines.particles.optimal import OptimalPlan
-from bayesmc.engines.particles.options import (
-    check_budget,
-    check_choice,
-    check_count,
-    check_kind,
-    check_threshold,
-    read_by,
-    read_functions,
+from bayesmc.engines.particles.smoothing import (
+    Backwards,
+    backwards,
+    by_lag,
+    filtered_by,
+    quiet,
+    seen_in_full,
+    static_of,
 )
-from bayesmc.engines.particles.questions import check_together, described, refused
-from bayesmc.engines.particles.record import FilteredParticles, Record
-from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.particles.replicates import Replicates
-from bayesmc.engines.particles.smoothed import backwards, by_lag, quiet, seen_in_full
-from bayesmc.engines.particles.stages import GivenStage, PluggedIn
-from bayesmc.engines.particles.telling import looks_told, warn_of_what_is_not_guided
+from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
-from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, resumed, seed_sequence, stream
 from bayesmc.resampling import Adaptive, checked, scheme_of
 from bayesmc.results.predictive import warn_of_misfit
@@ -108,14 +118,6 @@ class ParticleFilter(FilterEngine):
         is narrow. Particles are then resampled whenever their number changes.
     recovery : Recovery, optional
         Lets a share of the particles begin anew in every slice, so that a filter that is lost finds back.
-
-    trajectories : int, optional
-        Trajectories that ``smooth`` draws; by default as many as there are particles, 1,000 at most.
-    backward : "rejection" or "exact"
-        How ``smooth`` draws them: by rejection where the transition's height is known (the same law); what is
-        still open, and elsewhere all, among 500 particles of the slice drawn by weight and the filter's own
-        ancestor. So time is that of the filter, and at most some 500 densities per trajectory and slice (as
-        many times as lags reach back). ``"exact"`` tries all particles for each.
 
     tolerance : float
         Error of the log evidence that is aimed at where ``particles`` is left out.
@@ -184,8 +186,6 @@ class ParticleFilter(FilterEngine):
     rejuvenation: Mapping[Any, Any] | None = field(default=None, hash=False)
     adapt: KLD | None = None
     recovery: Recovery | None = None
-    trajectories: int | None = None
-    backward: str = "rejection"
     tolerance: float = TOLERANCE
     budget: int = BUDGET
 
@@ -197,15 +197,8 @@ class ParticleFilter(FilterEngine):
         if self.particles is not None:
             check_count("particles", self.particles, "such as 10_000")
         check_budget(self.tolerance, self.budget)
-        if self.trajectories is not None:
-            check_count(
-                "trajectories",
-                self.trajectories,
-                "or None for as many as there are particles, 1,000 at most",
-            )
         check_threshold(self.ess_threshold)
         scheme_of(self.resampling)
-        check_choice("backward", self.backward, "rejection", "exact")
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
         check_kind("adapt", self.adapt, KLD)
         check_kind("recovery", self.recovery, Recovery)
@@ -255,9 +248,9 @@ class ParticleFilter(FilterEngine):
 
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
-            return _NOT_SMOOTHED
+            return NOT_SMOOTHED
         sums = endless(problem.slices, seen_in_full(problem)) if asked.what == "smooth" else ()
-        return _not_backwards(sums[0]) if sums else super().unable(problem, asked)
+        return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
@@ -294,9 +287,15 @@ class ParticleFilter(FilterEngine):
         lag: int | None = None,
         queries: Queries | None = None,
         progress: bool | None = None,
+        trajectories: int | None = None,
+        backward: str = "rejection",
     ) -> FilteredParticles:
+        if trajectories is not None:
+            what = "or None for as many as there are particles, 1,000 at most"
+            check_count("trajectories", trajectories, what, "smooth")
+        check_choice("backward", backward, "rejection", "exact", "smooth")
         if self.adapt is not None or self.recovery is not None:
-            raise UnsupportedError(_NOT_SMOOTHED)
+            raise UnsupportedError(NOT_SMOOTHED)
         warn_of_what_is_not_guided(self, problem.slices, problem.series.observed)
         sized = self._sized(self._enough(problem, seed, lag is None, progress))
         if lag is not None:
@@ -304,11 +303,43 @@ class ParticleFilter(FilterEngine):
         else:
             sums = endless(problem.slices, seen_in_full(problem))
             if sums:
-                raise UnsupportedError(_not_backwards(sums[0]))
-            found, filtered = backwards(sized, problem, seed, queries or {}, progress)
+                raise UnsupportedError(not_backwards(sums[0]))
+            asked = Backwards(trajectories, backward == "rejection")
+            found, filtered = backwards(sized, problem, seed, queries or {}, progress, asked)
         self._warn(filtered)
         warn_of_misfit(filtered.predictive, type(self).__name__, filtered.start, 3)
         return found
+
+    def step_of(
+        self,
+        slices: Slices,
+        static: Mapping[str, np.ndarray],
+        kept: Sequence[str] | None = None,
+    ) -> FilterStep:
+        """The step of this filter on a template, whose particles hold some nodes (all by default)."""
+        self._require_functions()
+        scheme: Any = scheme_of(self.resampling)
+        threshold = float(self.ess_threshold)
+        if isinstance(scheme, Adaptive):
+            scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
+        assert self.particles is not None
+        apart = plates_apart(slices)
+        if isinstance(self.proposal, str):
+            plan: SlicePlan = OptimalPlan(slices, apart, static)
+        else:
+            plan = SlicePlan(slices, apart, static, self._proposals(slices))
+        stage: Any = None
+        if callable(self.auxiliary):
+            stage = GivenStage(plan, self.auxiliary, self.particles)
+        elif self.auxiliary:
+            stage = PluggedIn(plan, self.particles)
+        renewed = None if self.rejuvenation is None else Rejuvenation(plan, self.rejuvenation)
+        injection = None if self.recovery is None else Injection(plan, self.recovery)
+        wanted = kept if kept is None or self.adapt is None else [*kept, *self.adapt.widths]
+        return FilterStep(
+            plan, self.particles, checked(scheme), threshold, stage, renewed, wanted, self.adapt,
+            injection,
+        )  # fmt: skip
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> ParticleBelief:
         return ParticleBelief(dbn, seed_sequence(rng), static)
@@ -324,28 +355,31 @@ class ParticleFilter(FilterEngine):
                 f"ParticleFilter({most}).start: the belief has {held} particles; go on with the "
                 "engine that it was started with"
             )
-        mover = sized._mover(slices, read_static(slices, belief.static))
+        step = sized.step_of(slices, read_static(slices, belief.static))
         return ParticleBelief(
-            dbn, belief.seed, belief.static, mover, belief.cloud,
+            dbn, belief.seed, belief.static, step, belief.now,
             belief.log_marginal_likelihood, belief.chance, belief.inputs, belief.families,
         )  # fmt: skip
 
     def _absorbed(self, belief: ParticleBelief, slices: Slices, row: Row) -> ParticleBelief:
-        mover = belief.mover
-        if not isinstance(mover, Mover):
-            mover = self._sized(START)._mover(slices, read_static(slices, belief.static))
+        step, tracker = belief.made_by, belief.tracker
+        if not isinstance(step, FilterStep):
+            step = self._sized(START).step_of(slices, read_static(slices, belief.static))
             warn_of_what_is_not_guided(self, slices, row.seen)
+        tracker = Tracker(step) if tracker is None else tracker
         chance = belief.chance
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with quiet():
-            cloud, families = mover.moved(belief.cloud, belief.families, row, rng)
+            now = step(belief.now, row, rng)
+            block = Block(step.layout, [now], room=tracker.room)
+            (families,) = tracker.after(belief.families, belief.now, block, [row])
         if self.particles is None:
-            warn_of_a_lonely_step(belief.cloud, belief.families, cloud)
-        total = belief.log_marginal_likelihood + cloud.increment
+            warn_of_a_lonely_step(belief.now, belief.families, now)
+        total = belief.log_marginal_likelihood + now.increment
         return ParticleBelief(
-            belief.dbn, belief.seed, belief.static, mover, cloud,
+            belief.dbn, belief.seed, belief.static, step, now,
             total if np.ndim(total) else float(total), rng.bit_generator.state,
-            {n: row.inputs[n] for n in slices.template.inputs}, families,
+            {n: row.inputs[n] for n in slices.template.inputs}, families, tracker,
         )  # fmt: skip
 
     # ---- private -------------------------------------------------------------------------------
@@ -359,32 +393,11 @@ class ParticleFilter(FilterEngine):
         progress: bool | None,
         unit: int = 0,
     ) -> FilteredParticles:
-        """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far."""
-        static = {n: o.value for n, o in problem.series.static.items()}
+        """All slices, one by one."""
         asked = read_by(queries, problem.slices)
-        mover = self._mover(problem.slices, static, None if keep else [*problem.hidden, *asked])
-        record = Record(problem, mover.layout, queries, keep)
-        rng, rows = stream(seed, Purpose.FILTER, unit), problem.series
-        looks = Replicates(problem, mover.plan, stream(seed, Purpose.CHECK, unit))
-        cloud: Cloud | None = None
-        families: Families | None = None
-
-        def move(k: int) -> None:
-            nonlocal cloud, families
-            row, old = rows.row(k), cloud
-            if unit == 0:  # runs that only say how many particles are needed look at nothing
-                looks.look(k, old, row)
-            cloud, families = mover.moved(old, families, row, rng)
-            record.add(k, cloud, families)
-            if old is not None and not keep:
-                mover.recycle(old)
-
-        with Progress(problem.steps, self.label, progress) as bar, quiet():
-            so_far = partial(record.posterior, self, "filter")
-            pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
-        found = record.posterior(self)
-        found.predictive = looks.found() if unit == 0 else None
-        return found
+        kept = None if keep else [*problem.hidden, *asked]
+        step = self.step_of(problem.slices, static_of(problem), kept)
+        return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _sized(self, particles: int) -> ParticleFilter:
         """The same filter with so many particles, where their number was left out."""
@@ -427,50 +440,3 @@ class ParticleFilter(FilterEngine):
         assert not isinstance(self.proposal, str)
         first = self.initial_proposal or {}
         return SliceProposals(slices, self.proposal or {}, "ParticleFilter", first)
-
-    def _mover(
-        self,
-        slices: Slices,
-        static: Mapping[str, np.ndarray],
-        kept: Sequence[str] | None = None,
-    ) -> Mover:
-        self._require_functions()
-        scheme: Any = scheme_of(self.resampling)
-        threshold = float(self.ess_threshold)
-        if isinstance(scheme, Adaptive):
-            scheme, threshold = scheme_of(scheme.scheme), scheme.threshold
-        scheme = checked(scheme)
-        assert self.particles is not None
-        apart = plates_apart(slices)
-        if isinstance(self.proposal, str):
-            plan: SlicePlan = OptimalPlan(slices, apart, static)
-        else:
-            plan = SlicePlan(slices, apart, static, self._proposals(slices))
-        stage: Any = None
-        if callable(self.auxiliary):
-            stage = GivenStage(plan, self.auxiliary, self.particles)
-        elif self.auxiliary:
-            stage = PluggedIn(plan, self.particles)
-        anew = Rejuvenation(plan, self.rejuvenation) if self.rejuvenation is not None else None
-        lost = Lost(plan, self.recovery) if self.recovery is not None else None
-        wanted = kept if kept is None or self.adapt is None else [*kept, *self.adapt.widths]
-        return Mover(
-            slices, self.particles, scheme, threshold, plan, stage, anew, wanted, self.adapt, lost
-        )
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-_NOT_SMOOTHED = (
-    "ParticleFilter: particles whose number changes (adapt=), or that begin anew (recovery=), are not "
-    "smoothed; leave these out, and declare what can happen in the transition"
-)
-
-
-def _not_backwards(name: str) -> str:
-    return (
-        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
-        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
-        "engine=ParticleGibbs())"
-    )

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.particles import Layout, Particles
 from bayesmc.network import CompiledNode
 
 #: slices from one measurement to the next: a few, since lags and speeds pass noise on later
@@ -62,39 +62,41 @@ class Sight:
         self.nodes: tuple[CompiledNode, ...] = tuple(nodes)
         self.layout = layout
 
-    def after(self, lost: Lost | None, now: Any, cloud: Cloud, here: bool = False) -> Lost | None:
-        """What is lost after a slice in which some elements ``now`` were, shape (*apart).
+    def after(
+        self, lost: Lost | None, where: Any, now: Particles, here: bool = False
+    ) -> Lost | None:
+        """What is lost after a slice in which some elements ``where`` were, shape (*apart).
 
         ``here`` says that what was lost before is that of this slice already.
         """
         if lost is not None and not here:
-            lost = self._followed(lost, cloud)
-        if now is False or not np.any(now):
+            lost = self._followed(lost, now)
+        if where is False or not np.asarray(where).any():
             return lost
-        fresh = np.broadcast_to(np.asarray(now, dtype=bool), self.layout.lead)
-        wide = tuple(self._spread(node, cloud) for node in self.nodes)
+        fresh = np.broadcast_to(np.asarray(where, dtype=bool), self.layout.lead)
+        wide = tuple(self._spread(node, now) for node in self.nodes)
         if lost is None:
-            return Lost(fresh, wide, tuple(np.zeros_like(w) for w in wide), cloud.t)
+            return Lost(fresh, wide, tuple(np.zeros_like(w) for w in wide), now.t)
         rows, still = fresh.reshape(-1, 1), lost.where.reshape(-1, 1)
         both = [(w, np.maximum(w, old), old) for w, old in zip(wide, lost.wide, strict=True)]
         wide = tuple(np.where(rows, np.where(still, more, w), old) for w, more, old in both)
         gone = tuple(np.where(rows, 0.0, g) for g in lost.gone)
         return lost._replace(where=lost.where | fresh, wide=wide, gone=gone)
 
-    def _followed(self, lost: Lost, cloud: Cloud) -> Lost | None:
+    def _followed(self, lost: Lost, now: Particles) -> Lost | None:
         """The same one slice later; None where all is found."""
-        if cloud.rejuvenated is not False:
-            lost = lost._replace(where=lost.where & ~np.asarray(cloud.rejuvenated))
+        if now.rejuvenated is not False:
+            lost = lost._replace(where=lost.where & ~np.asarray(now.rejuvenated))
         roots = lost.roots
-        if cloud.ancestors is not None:
-            chosen = cloud.ancestors
+        if now.ancestors is not None:
+            chosen = now.ancestors
             if roots is None or chosen.ndim == 1:
                 roots = chosen if roots is None else roots.take(chosen)
             else:
                 roots = np.take_along_axis(roots, chosen, axis=0)
-        if cloud.t < lost.since + STRETCH or roots is None:
+        if now.t < lost.since + STRETCH or roots is None:
             return lost._replace(roots=roots)
-        moved = (self._spread(node, cloud, roots) for node in self.nodes)
+        moved = (self._spread(node, now, roots) for node in self.nodes)
         gone = tuple(g + m for g, m in zip(lost.gone, moved, strict=True))
         where = lost.where.copy().reshape(-1)
         back = np.ones_like(where)
@@ -103,17 +105,17 @@ class Sight:
         where &= ~back
         if not where.any():
             return None
-        return Lost(where.reshape(lost.where.shape), lost.wide, gone, cloud.t)
+        return Lost(where.reshape(lost.where.shape), lost.wide, gone, now.t)
 
     def _spread(
-        self, node: CompiledNode, cloud: Cloud, roots: np.ndarray | None = None
+        self, node: CompiledNode, now: Particles, roots: np.ndarray | None = None
     ) -> np.ndarray:
         """Variances of a node's numbers, shape (many, numbers); with roots, within what descends from each.
 
         The particles count alike: those that a row has left without weight were there, too.
         """
         many = int(np.prod(self.layout.lead))
-        value, labels = cloud.values[node.name], node.domain is not None
+        value, labels = now.values[node.name], node.domain is not None
         if value.ndim == len(node.value_shape):
             return np.zeros((many, 1))
         at = [1 + node.plates.index(p) for p in self.layout.apart if p in node.plates]

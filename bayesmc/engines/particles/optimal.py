@@ -25,9 +25,9 @@ from typing import NamedTuple
 import numpy as np
 
 from bayesmc.dbn import Row, Slices
-from bayesmc.engines.particles.cases import look_ahead
-from bayesmc.engines.particles.guarded import Guarded
+from bayesmc.engines.particles.defensive import Guarded
 from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
+from bayesmc.engines.particles.mixtures import look_ahead
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import Model, Observed
 from bayesmc.network.forward import Step

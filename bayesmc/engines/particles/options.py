@@ -1,24 +1,47 @@
-"""Options of a particle filter: what is wrong with them, read and frozen."""
+"""Options of a particle filter: what is wrong with them, and what they do to each node."""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import Slices
+from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import Queries
+from bayesmc.engines.particles.auxiliary import PluggedIn
+from bayesmc.engines.particles.optimal import guidance
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
-from bayesmc.errors import UnknownNodeError, did_you_mean
+from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
+from bayesmc.errors import ProposalWarning, UnknownNodeError, did_you_mean
+from bayesmc.kernels.proposal import names_of
+from bayesmc.network import Observed
+from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
 from bayesmc.network.reading import nodes_read
 
+#: why some particles are not smoothed
+NOT_SMOOTHED = (
+    "ParticleFilter: particles whose number changes (adapt=), or that begin anew (recovery=), are not "
+    "smoothed; leave these out, and declare what can happen in the transition"
+)
 
-def check_count(option: str, given: Any, what: str) -> None:
+
+def not_backwards(name: str) -> str:
+    """Why trajectories are not drawn backwards through a node."""
+    return (
+        f"ParticleFilter: {name!r} is computed from its own past without end, so trajectories cannot be "
+        "drawn backwards (lags of some slices can); smooth with lag=, or use infer(dbn, observations, "
+        "engine=ParticleGibbs())"
+    )
+
+
+def check_count(option: str, given: Any, what: str, call: str = "ParticleFilter") -> None:
     """A whole number, 1 or more."""
     if isinstance(given, bool) or not isinstance(given, (int, np.integer)) or given < 1:
         raise ValueError(
-            f"ParticleFilter({option}={given!r}): give a number of {option}, 1 or more, {what}"
+            f"{call}({option}={given!r}): give a number of {option}, 1 or more, {what}"
         )
 
 
@@ -44,10 +67,12 @@ def check_threshold(given: Any) -> None:
         )
 
 
-def check_choice(option: str, given: Any, one: str, other: str) -> None:
+def check_choice(
+    option: str, given: Any, one: str, other: str, call: str = "ParticleFilter"
+) -> None:
     """One of two words."""
     if given not in (one, other):
-        raise ValueError(f'ParticleFilter({option}={given!r}): give "{one}" or "{other}"')
+        raise ValueError(f'{call}({option}={given!r}): give "{one}" or "{other}"')
 
 
 def check_kind(option: str, given: Any, kind: type) -> None:
@@ -85,3 +110,141 @@ def read_by(queries: Queries, slices: Slices) -> list[str]:
                 )
             found.append(name)
     return found
+
+
+def check_together(engine: Any) -> None:
+    """Refuse options that only make sense with others, or without them.
+
+    Raises
+    ------
+    ValueError
+    """
+    if isinstance(engine.proposal, str) and engine.initial_proposal is not None:
+        raise ValueError(
+            'ParticleFilter: proposal="optimal" proposes for slice 0 too; leave initial_proposal= out'
+        )
+    if engine.recovery is not None and engine.rejuvenation is not None:
+        raise ValueError(
+            "ParticleFilter: recovery= and rejuvenation= both begin anew; give one of them"
+        )
+    if engine.adapt is not None and engine.auxiliary is not False:
+        raise ValueError("ParticleFilter: adapt= and auxiliary= do not go together")
+    if (engine.on_degeneracy == "rejuvenate") != (engine.rejuvenation is not None):
+        raise ValueError(
+            'ParticleFilter: on_degeneracy="rejuvenate" and rejuvenation={node: density} go together'
+        )
+
+
+def refused(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -> str | None:
+    """Why the filter does not answer, beside what all filters refuse; None where it does.
+
+    Raises
+    ------
+    ModelError
+        From the proposals that are ``asked`` for.
+    """
+    looks = [o for o in ("proposal", "initial_proposal", "auxiliary") if getattr(engine, o)]
+    parts = refuse_parts(problem.series.observed, f"ParticleFilter({looks[0]}=)") if looks else None
+    if parts is not None:
+        return parts
+    apart = plates_apart(problem.slices)
+    for option in ("adapt", "recovery"):
+        if getattr(engine, option) is not None and apart:
+            return (
+                f"ParticleFilter: {option}= is for one filter, and elements of plate {apart[0]!r} are "
+                "filtered separately; filter them one by one"
+            )
+    if engine.adapt is not None:
+        engine.adapt.check(problem.slices.later, problem.slices.interface)
+    known = {*problem.slices.template.static, *problem.series.observed}
+    if asked is not None:
+        seen = problem.series.observed
+        asked.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
+    for model in (problem.slices.first, problem.slices.later):
+        inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
+        reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
+            model, whole(problem.series.observed), "ParticleFilter"
+        )
+        if reason is not None:
+            return reason
+    return None
+
+
+def described(problem: SeriesProblem) -> dict[str, str]:
+    """What happens to each node, in words."""
+    found = {}
+    for name in problem.slices.template.later:
+        node = problem.model[name]
+        seen = problem.series.observed.get(name)
+        if name in problem.slices.template.inputs:
+            found[name] = "input"
+        elif name in problem.slices.template.static:
+            found[name] = "static, known"
+        elif not node.is_stochastic:
+            found[name] = "computed"
+        elif seen is None:
+            found[name] = "sampled given its parents"
+        else:
+            found[name] = "observed, weights the particles"
+            if seen.mask is not None:
+                found[name] += "; sampled where it is missing"
+    return found
+
+
+def looks_told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) -> dict[str, str]:
+    """What is done to nodes that a proposal or a look ahead concerns, given what is done to them otherwise.
+
+    Parameters
+    ----------
+    engine : ParticleFilter
+    problem : SeriesProblem
+    treated : dict
+        Node -> words.
+    """
+    slices, seen = problem.slices, problem.series.observed
+    found = dict(treated)
+    for key in engine.proposal if isinstance(engine.proposal, Mapping) else ():
+        for name in names_of(key):
+            found[name] = found[name].replace(
+                "sampled given its parents", "sampled from its proposal"
+            )
+    if engine.proposal == "optimal":
+        told = guidance(slices, seen, plates_apart(slices), min(problem.steps - 1, 1))
+        for name, by in told.guided.items():
+            found[name] = f"sampled with a look at {', '.join(map(repr, by))}"
+        for name in seen:
+            guided = [repr(n) for n, by in told.guided.items() if name in by]
+            if guided:
+                found[name] += f"; guides {', '.join(guided)}"
+        for name, why in told.unguided.items():
+            found[name] += f"; not guided: {why}"
+        for name, why in told.unheard.items():
+            found[name] += f"; guides nothing: {why}"
+    if engine.auxiliary is True and problem.steps > 1:
+        static = {n: o.value for n, o in problem.series.static.items()}
+        stage = PluggedIn(SlicePlan(slices, plates_apart(slices), static), engine.particles)
+        full = {n: Observed(o.value[1]) for n, o in seen.items()}
+        for name, how in stage.treated(problem.series.row(1)._replace(seen=full)).items():
+            found[name] += f"; {how} by the look ahead"
+    return found
+
+
+def warn_of_what_is_not_guided(engine: Any, slices: Slices, seen: Collection[str]) -> None:
+    """One warning where ``proposal="optimal"`` leaves a hidden number to its own density.
+
+    Call it from ``filter`` or ``smooth`` itself.
+
+    Warns
+    -----
+    ProposalWarning
+    """
+    if engine.proposal != "optimal":
+        return
+    missing = guidance(slices, seen, plates_apart(slices)).missing()
+    if missing is not None:
+        warnings.warn(
+            f'ParticleFilter(proposal="optimal") does not guide all that is hidden: {missing}. What is '
+            "not guided is drawn from its own density; give proposal={...} for it, or use more particles",
+            ProposalWarning,
+            stacklevel=4,
+        )

@@ -1,37 +1,64 @@
-"""What a run over many slices keeps of its clouds: answers of constant size, or the particles themselves."""
+"""What a run keeps of its particles: answers of constant size, or the particles themselves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem
+from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.averages import naming
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
-from bayesmc.engines.particles.accuracy import MeanErrors, value_errors
-from bayesmc.engines.particles.answers import (
+from bayesmc.engines.particles import coalescence
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.errors import function_errors, node_errors
+from bayesmc.engines.particles.genealogy import Families, evidence_error
+from bayesmc.engines.particles.particles import Layout, Particles
+from bayesmc.engines.particles.queries import (
+    at_scouts,
     covariance,
-    elsewhere,
     evaluated,
     expectation,
-    moments,
     probability,
     quantiles,
-    table_of_states,
-    weighted_mean,
 )
-from bayesmc.engines.particles.cloud import Cloud, Layout
-from bayesmc.engines.particles.families import Families, evidence_error
-from bayesmc.engines.particles.sharing import Sharing, function_errors
-from bayesmc.engines.particles.sharing import node_errors as smoothed_errors
+from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
+from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
+from bayesmc.results.predictive import Predictive
+
+#: slices that are written together, at most, and numbers of all their particles: what costs is calling NumPy
+TOGETHER, NUMBERS = 100, 1 << 16
+
+
+class Waiting(NamedTuple):
+    """A slice that is not written yet: its families, where they are known, and values of queries."""
+
+    k: int
+    particles: Particles
+    row: Row | None
+    families: Families | None
+    values: Mapping[str, np.ndarray]
+
+
+#: arrays by node or query, slices first, by what they are
+Rows = dict[str, dict[str, np.ndarray]]
+_KINDS = ("tables", "means", "variances", "queries", "errors", "query errors", "filter")
+
+
+class Written(NamedTuple):
+    """What is kept of slices in a row; particles are those of the last, where they are not held."""
+
+    rows: Rows
+    families: list[Families]
+    particles: list[Particles]
 
 
 class Record:
-    """Answers about each slice, written as the slices pass.
+    """Answers about each slice, written as the slices pass, some slices at a time.
 
     Parameters
     ----------
@@ -39,130 +66,182 @@ class Record:
     layout : Layout
     queries : dict
     keep : bool
-        Hold the clouds, too.
+        Hold the particles, too.
+    tracker : Tracker, optional
+        Follows the families; without it there are errors only of slices that come with theirs.
     """
 
     def __init__(
-        self, problem: SeriesProblem, layout: Layout, queries: Queries, keep: bool
+        self,
+        problem: SeriesProblem,
+        layout: Layout,
+        queries: Queries,
+        keep: bool,
+        tracker: Tracker | None = None,
     ) -> None:
-        self.problem, self.layout, self.asked = problem, layout, queries
-        steps, model = problem.steps, problem.model
-        self.clouds: list[Cloud] | None = [] if keep else None
-        self.tables: dict[str, np.ndarray] = {}
-        self.means: dict[str, np.ndarray] = {}
-        self.variances: dict[str, np.ndarray] = {}
-        for name in problem.hidden:
-            node = model[name]
-            if node.domain is not None:
-                self.tables[name] = np.empty((steps, *node.plate_shape, node.domain.size))
-            else:
-                self.means[name] = np.empty((steps, *node.value_shape))
-                self.variances[name] = np.empty((steps, *node.value_shape))
-        self.queries: dict[str, list[np.ndarray]] = {n: [] for n in queries}
-        self.increments = np.empty((steps, *layout.lead))
-        self.ess = np.empty((steps, *layout.lead))
-        self.resampled = np.zeros((steps, *layout.lead), dtype=bool)
-        self.rejuvenated = np.zeros((steps, *layout.lead), dtype=bool)
-        self.unique = np.full((steps, *layout.lead), layout.particles)
-        self.counts = np.empty(steps, dtype=np.intp)
-        self.anew = np.zeros(steps, dtype=np.intp)
-        self._nodes = [(n, model[n], len(model[n].value_shape)) for n in problem.hidden]
-        self.errors = MeanErrors(
-            layout,
-            [model[n] for n in problem.hidden],
-            steps,
-            (self.means, self.variances, self.tables),
-        )
-        self.query_errors: dict[str, list[np.ndarray]] = {n: [] for n in queries}
-        self._last: tuple[Families, Cloud] | None = None
-        self.families: list[Families] | None = [] if keep else None
+        self.problem, self.layout, self.asked, self.tracker = problem, layout, queries, tracker
+        self._nodes = [problem.model[n] for n in problem.hidden]
+        numbers = sum(max(1, math.prod(n.value_shape)) for n in self._nodes) or 1
+        self.together = max(1, min(TOGETHER, NUMBERS // (layout.particles * numbers)))
+        self._waiting: list[Waiting] = []
+        self._written: list[Written] = []
+        self._room: dict[Any, np.ndarray] = {}
+        self.keep = keep
 
-    def add(self, k: int, cloud: Cloud, families: Families | None = None) -> None:
-        """Take in the cloud of the k-th slice, and whose descendants its particles are."""
-        layout = self.layout
-        self.increments[k] = cloud.increment
-        self.ess[k] = cloud.ess
-        self.resampled[k] = cloud.resampled
-        self.counts[k], self.anew[k] = len(cloud.weights), cloud.anew
-        if cloud.ancestors is not None:
-            changes = cloud.ancestors[1:] != cloud.ancestors[:-1]
-            along = 0 if layout.apart else None  # without an axis it is ten times faster
-            self.unique[k] = np.count_nonzero(changes, axis=along) + 1
-        if cloud.rejuvenated is not False:
-            self.rejuvenated[k] = cloud.rejuvenated
-            self.unique[k] = np.where(cloud.rejuvenated, 0, self.unique[k])
-        for name, node, rank in self._nodes:
-            value = cloud.values[name]
-            if node.domain is not None:
-                self.tables[name][k] = table_of_states(layout, cloud, node, value)
-            elif value.ndim == rank:  # seen here, or the same for all particles
-                self.means[name][k], self.variances[name][k] = value, 0.0
-            else:
-                self.means[name][k], self.variances[name][k] = moments(layout, cloud, node, value)
+    def add(
+        self, k: int, particles: Particles, row: Row | None = None, families: Families | None = None
+    ) -> None:
+        """Take in the particles of the k-th slice."""
+        values = {}
         for name, function in self.asked.items():
             with naming(name):
-                values = evaluated(layout, cloud, self.problem.model, function)
-            mean = weighted_mean(cloud, values)
-            self.queries[name].append(mean)
-            if families is not None:
-                there = elsewhere(layout, cloud, self.problem.model, function)
-                errors = value_errors(layout, cloud, families, values, mean, there)
-                self.query_errors[name].append(errors)
-        if families is not None:
-            self.errors.add(k, cloud, families)
-            self._last = (families, cloud)
-        if self.clouds is not None:
-            self.clouds.append(cloud)
-            if self.families is not None and families is not None:
-                self.families.append(families)
+                values[name] = evaluated(self.layout, particles, self.problem.model, function)
+        if self._waiting and not self._fits(particles):
+            self.write()
+        self._waiting.append(Waiting(k, particles, row, families, values))
+        if len(self._waiting) >= self.together:
+            self.write()
+
+    @property
+    def is_written(self) -> bool:
+        """Whether nothing waits: then particles of the past are not needed any more."""
+        return not self._waiting
+
+    @property
+    def families(self) -> Families | None:
+        """Those of the last slice that is written."""
+        return (
+            self._written[-1].families[-1] if self._written and self._written[-1].families else None
+        )
+
+    def write(self) -> None:
+        """Work out the answers about all slices that wait, or none where it ends early."""
+        if self._waiting:
+            written, earlier = self._worked_out(self._waiting), self._written
+            if earlier and not self.keep:
+                earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
+            self._written, self._waiting = [*earlier, written], []
+
+    def _worked_out(self, waiting: Sequence[Waiting]) -> Written:
+        slices = [w.particles for w in waiting]
+        block = Block(self.layout, slices, room=self._room)
+        families = self._followed(waiting, block)
+        rows: Rows = {what: {} for what in _KINDS}
+        for node in self._nodes:
+            name = node.name
+            if node.domain is not None:
+                rows["tables"][name] = block.table(node)
+            else:
+                rows["means"][name], rows["variances"][name] = block.mean_and_variance(node)
+            if families:
+                rows["errors"][name] = node_errors(block, families, node)
+        for name, function in self.asked.items():
+            values = [w.values[name] for w in waiting]
+            mean = block.weighted(block.turned(values))
+            rows["queries"][name] = mean.reshape(len(values), *values[0].shape[1:])
+            if families:
+                model = self.problem.model
+                pairs = zip(slices, families, strict=True)
+                there = [at_scouts(self.layout, p, f, model, function) for p, f in pairs]
+                rows["query errors"][name] = function_errors(block, families, values, there)
+        rows["filter"] = _diagnosed(slices, self.layout.lead)
+        return Written(
+            rows, families if self.keep else families[-1:], slices if self.keep else slices[-1:]
+        )
 
     def posterior(
-        self, engine: Any, kind: str = "filter", steps: int | None = None
+        self,
+        engine: Any,
+        kind: str = "filter",
+        steps: int | None = None,
+        predictive: Predictive | None = None,
+        filtered: FilteredParticles | None = None,
+        sharing: coalescence.Sharing | None = None,
     ) -> FilteredParticles:
-        """The answers of all slices, or of the first so many."""
+        """The answers of all slices, or of the first so many; with the figures of a filter, or those here."""
+        self.write()
         k = self.problem.steps if steps is None else steps
+        tables, means, variances = (self._joined(w, k) for w in ("tables", "means", "variances"))
         seen = observed_answers(self.problem, k)
-        found = FilteredParticles(
+        if filtered is None:
+            filter, families = self._joined("filter", k), self.families
+            last = self._written[-1].particles[-1]
+            told = None if families is None else evidence_error(families, last)
+        else:
+            filter, told = filtered.diagnostics, filtered.log_marginal_likelihood_mcse
+            predictive = filtered.predictive
+        held = None
+        if self.keep:
+            particles = [p for w in self._written for p in w.particles]
+            known = [f for w in self._written for f in w.families]
+            held = Held(self.layout, particles[:k], known[:k], sharing)
+        return FilteredParticles(
             self.problem.model,
             engine,
             kind,
-            self.increments[:k],
-            tables={**seen.tables, **first_slices(self.tables, k)},
-            means={**seen.means, **first_slices(self.means, k)},
-            variances={**seen.variances, **first_slices(self.variances, k)},
-            queries={n: np.stack(rows[:k]) for n, rows in self.queries.items()},
-            start=self.problem.series.start,
+            answers={
+                "tables": {**seen.tables, **tables},
+                "means": {**seen.means, **means},
+                "variances": {**seen.variances, **variances},
+                "queries": self._joined("queries", k),
+                "start": self.problem.series.start,
+            },
+            diagnostics=filter,
+            errors=(told, self._joined("errors", k), self._joined("query errors", k)),
+            predictive=predictive,
+            held=held,
         )
-        found.weight_ess, found.resampled = self.ess[:k], self.resampled[:k]
-        found.unique_ancestors, found.rejuvenated = self.unique[:k], self.rejuvenated[:k]
-        found.counts, found.anew = self.counts[:k], self.anew[:k]
-        found.clouds = None if self.clouds is None else self.clouds[:k]
-        found.layout = self.layout
-        if self._last is not None:
-            found.log_marginal_likelihood_mcse = evidence_error(*self._last)
-            found.mean_errors = first_slices(self.errors.found(), k)
-            rows = self.query_errors.items()
-            found.queries_mcse = {n: np.stack(errors[:k]) for n, errors in rows}
-            found.families = self.families and self.families[:k]
-        return found
 
     def smoothed(
-        self, engine: Any, sharing: Sharing, filtered: FilteredParticles
+        self, engine: Any, sharing: coalescence.Sharing, filtered: FilteredParticles
     ) -> FilteredParticles:
         """The answers of trajectories, with their errors: infinite where the filter's are."""
-        found = self.posterior(engine, "smooth")
-        assert found.clouds is not None and filtered.mean_errors is not None
-        found.sharing, found.mean_errors = sharing, {}
-        for name, node, _ in self._nodes:
-            labels = node.domain is not None
-            centre: Any = (
-                (self.tables[name], None) if labels else (self.means[name], self.variances[name])
-            )
-            errors = smoothed_errors(sharing, self.layout, found.clouds, node, centre)
-            lost = np.isinf(filtered.mean_errors[name])
-            found.mean_errors[name] = np.where(lost, np.inf, errors)
-        found.queries_mcse = {n: found.mcse(function) for n, function in self.asked.items()}
-        return found
+        self.write()
+        assert filtered.mean_errors is not None
+        slices = [p for w in self._written for p in w.particles]
+        block, model = Block(self.layout, slices, whole=True), self.problem.model
+        rows = self._written[0].rows  # of all slices at once
+        for node in self._nodes:
+            errors = coalescence.node_errors(sharing, block, node)
+            lost = np.isinf(filtered.mean_errors[node.name])
+            rows["errors"][node.name] = np.where(lost, np.inf, errors)
+        for name, function in self.asked.items():
+            values = [evaluated(self.layout, p, model, function) for p in slices]
+            rows["query errors"][name] = coalescence.function_errors(sharing, np.stack(values))
+        return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _fits(self, particles: Particles) -> bool:
+        """Whether a slice can be written with those that wait: laid out alike, and none drawn anew."""
+        last = self._waiting[-1].particles
+        if len(particles.weights) != len(last.weights):
+            return False
+        ranks, alike = ([v.ndim for v in p.values.values()] for p in (particles, last))
+        return ranks == alike and last.rejuvenated is False and particles.rejuvenated is False
+
+    def _followed(self, waiting: Sequence[Waiting], block: Block) -> list[Families]:
+        """The families of slices that wait."""
+        if self.tracker is None:
+            return [w.families for w in waiting if w.families is not None]
+        rows = [w.row for w in waiting if w.row is not None]
+        earlier = self._written[-1].particles[-1] if self._written else None
+        return self.tracker.after(self.families, earlier, block, rows)
+
+    def _joined(self, what: str, steps: int) -> dict[str, np.ndarray]:
+        names = {n: None for w in self._written for n in w.rows[what]}
+        pieces = {n: [w.rows[what][n] for w in self._written if n in w.rows[what]] for n in names}
+        return first_slices({n: np.concatenate(rows) for n, rows in pieces.items()}, steps)
+
+
+class Held(NamedTuple):
+    """The particles of all slices, and what their errors are told by."""
+
+    layout: Layout
+    particles: list[Particles]
+    families: list[Families]
+    #: of trajectories that were drawn backwards
+    sharing: coalescence.Sharing | None = None
 
 
 class FilteredParticles(SeriesPosterior):
@@ -170,8 +249,8 @@ class FilteredParticles(SeriesPosterior):
 
     Attributes
     ----------
-    clouds : list of Cloud or None
-        Particles of all slices, with ``keep="particles"``; functions of nodes, quantiles and covariances can
+    clouds : list of Particles or None
+        Those of all slices, with ``keep="particles"``; functions of nodes, quantiles and covariances can
         be asked for then.
     counts : ndarray of int, shape (time,)
         Particles of each slice: always as many, unless ``adapt=`` says otherwise.
@@ -192,42 +271,60 @@ class FilteredParticles(SeriesPosterior):
 
     counts: np.ndarray | None = None
     anew: np.ndarray | None = None
-    clouds: list[Cloud] | None = None
-    layout: Layout | None = None
-    families: list[Families] | None = None
-    #: of trajectories that were drawn backwards
-    sharing: Sharing | None = None
+
+    def __init__(
+        self,
+        model: Model,
+        engine: Any,
+        kind: str,
+        *,
+        answers: Mapping[str, Any],
+        diagnostics: Mapping[str, np.ndarray],
+        errors: tuple[Any, Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
+        predictive: Predictive | None = None,
+        held: Held | None = None,
+    ) -> None:
+        super().__init__(model, engine, kind, diagnostics["increments"], **answers)
+        self.log_marginal_likelihood_mcse, self.mean_errors, mcse = errors
+        self.queries_mcse = dict(mcse)
+        self.weight_ess, self.resampled = diagnostics["weight_ess"], diagnostics["resampled"]
+        self.unique_ancestors = diagnostics["unique_ancestors"]
+        self.rejuvenated = diagnostics["rejuvenated"]
+        self.counts, self.anew = diagnostics["counts"], diagnostics["injected"]
+        self.diagnostics, self.predictive, self.held = dict(diagnostics), predictive, held
+
+    @property
+    def clouds(self) -> list[Particles] | None:
+        return None if self.held is None else self.held.particles
 
     def mcse(self, what: str | Callable[..., Any]) -> np.ndarray:
         """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
         if not callable(what):
             return super().mcse(what)
-        clouds, layout = self._kept("mcse of a function")
-        if self.sharing is not None:
-            values = np.stack([evaluated(layout, c, self.model, what) for c in clouds])
-            return function_errors(self.sharing, values, values.mean(axis=1))
-        assert self.families is not None
+        held = self._kept("mcse of a function")
+        values = [evaluated(held.layout, p, self.model, what) for p in held.particles]
+        if held.sharing is not None:
+            return coalescence.function_errors(held.sharing, np.stack(values))
         rows = []
-        for cloud, families in zip(clouds, self.families, strict=True):
-            values = evaluated(layout, cloud, self.model, what)
-            mean = weighted_mean(cloud, values)
-            there = elsewhere(layout, cloud, self.model, what)
-            rows.append(value_errors(layout, cloud, families, values, mean, there))
+        for own, families, value in zip(held.particles, held.families, values, strict=True):
+            there = at_scouts(held.layout, own, families, self.model, what)
+            block = Block(held.layout, [own])
+            rows.append(function_errors(block, [families], [value], [there])[0])
         return np.stack(rows)
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
-        clouds, layout = self._alike("particles")
+        held = self._alike("particles")
         node = self._node(name)
-        shape = (layout.particles, *node.value_shape)
-        rows = [np.broadcast_to(c.values[name], shape) for c in clouds]
+        shape = (held.layout.particles, *node.value_shape)
+        rows = [np.broadcast_to(p.values[name], shape) for p in held.particles]
         return np.array(node.decode(np.stack(rows)), subok=True)
 
     @property
     def weights(self) -> np.ndarray:
         """Normalised weights of all slices, shape ``(time, particles, *plates)``."""
-        clouds, _ = self._alike("weights")
-        return np.stack([c.weights / c.total for c in clouds])
+        held = self._alike("weights")
+        return np.stack([p.weights / p.total for p in held.particles])
 
     @property
     def ancestors(self) -> np.ndarray:
@@ -235,13 +332,13 @@ class FilteredParticles(SeriesPosterior):
 
         Particles that were drawn anew have none: -1.
         """
-        clouds, layout = self._alike("ancestors")
-        own = np.arange(layout.particles).reshape((-1,) + (1,) * len(layout.apart))
-        shape = (layout.particles, *layout.lead)
+        held = self._alike("ancestors")
+        shape = (held.layout.particles, *held.layout.lead)
+        own = np.arange(shape[0]).reshape((-1,) + (1,) * len(held.layout.apart))
         rows = []
-        for cloud in clouds:
-            found = own if cloud.ancestors is None else cloud.ancestors
-            rows.append(np.broadcast_to(np.where(cloud.rejuvenated, -1, found), shape))
+        for p in held.particles:
+            found = own if p.ancestors is None else p.ancestors
+            rows.append(np.broadcast_to(np.where(p.rejuvenated, -1, found), shape))
         return np.stack(rows)
 
     def last(self, steps: int, kind: str) -> SeriesPosterior:
@@ -251,37 +348,72 @@ class FilteredParticles(SeriesPosterior):
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Means of a function of nodes of a slice, time first; see ``ParticleBelief.expectation``."""
-        clouds, layout = self._kept("expectation")
-        return np.stack([expectation(layout, c, self.model, function) for c in clouds])
+        held = self._kept("expectation")
+        return np.stack([expectation(held.layout, p, self.model, function) for p in held.particles])
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probabilities of an event (a function that returns booleans), time first."""
-        clouds, layout = self._kept("probability")
-        return np.stack([probability(layout, c, self.model, function) for c in clouds])
+        held = self._kept("probability")
+        return np.stack([probability(held.layout, p, self.model, function) for p in held.particles])
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
-        clouds, layout = self._kept("quantile")
+        held = self._kept("quantile")
         node = self._node(name)
-        return np.stack([quantiles(layout, c, node, c.values[name], q) for c in clouds])
+        rows = [quantiles(held.layout, p, node, p.values[name], q) for p in held.particles]
+        return np.stack(rows)
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""
-        clouds, layout = self._kept("cov")
+        held = self._kept("cov")
         nodes = [self._node(name) for name in names]
-        rows = [covariance(layout, c, [(n, c.values[n.name]) for n in nodes]) for c in clouds]
+        rows = [
+            covariance(held.layout, p, [(n, p.values[n.name]) for n in nodes])
+            for p in held.particles
+        ]
         return np.stack(rows)
 
-    def _alike(self, what: str) -> tuple[list[Cloud], Layout]:
-        """The clouds, where each has as many particles."""
-        clouds, layout = self._kept(what)
-        if any(len(c.weights) != layout.particles for c in clouds):
+    def _alike(self, what: str) -> Held:
+        """What is held, where each slice has as many particles."""
+        held = self._kept(what)
+        if any(len(p.weights) != held.layout.particles for p in held.particles):
             raise QueryError(
                 f"{what}: the number of particles changes from slice to slice (adapt=); see .clouds"
             )
-        return clouds, layout
+        return held
 
-    def _kept(self, what: str) -> tuple[list[Cloud], Layout]:
-        if self.clouds is None or self.layout is None:
+    def _kept(self, what: str) -> Held:
+        if self.held is None:
             raise self._not_kept(what)
-        return self.clouds, self.layout
+        return self.held
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _diagnosed(slices: Sequence[Particles], lead: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Figures of the filter itself."""
+
+    def flags(each: list[Any]) -> np.ndarray:
+        return np.array(each if not lead else [np.broadcast_to(e, lead) for e in each], dtype=bool)
+
+    return {
+        "increments": np.array([p.increment for p in slices], dtype=float),
+        "weight_ess": np.array([p.ess for p in slices], dtype=float),
+        "resampled": flags([p.resampled for p in slices]),
+        "rejuvenated": flags([p.rejuvenated for p in slices]),
+        "counts": np.array([len(p.weights) for p in slices]),
+        "injected": np.array([p.injected for p in slices]),
+        "unique_ancestors": np.array([_unique(p, lead) for p in slices]),
+    }
+
+
+def _unique(particles: Particles, lead: tuple[int, ...]) -> Any:
+    """How many particles of the slice before have offspring, shape ``(*apart)``."""
+    chosen = particles.ancestors
+    if chosen is None:
+        found: Any = np.full(lead, len(particles.weights))
+    else:  # without an axis it is ten times faster
+        along = 0 if lead else None
+        found = np.count_nonzero(chosen[1:] != chosen[:-1], axis=along) + 1
+    return found if particles.rejuvenated is False else np.where(particles.rejuvenated, 0, found)

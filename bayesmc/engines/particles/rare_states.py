@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.cloud import Cloud
+from bayesmc.engines.particles.particles import Particles
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model
@@ -67,39 +67,39 @@ class Scouting:
         self.nodes = () if plan.apart else _looked_at(slices)
 
     def after(
-        self, scouts: Scouts | None, earlier: Cloud | None, cloud: Cloud, row: Row
+        self, scouts: Scouts | None, earlier: Particles | None, now: Particles, row: Row
     ) -> Scouts | None:
         """The scouts of a slice, after those of the slice before; None where nobody is needed."""
-        if cloud.rejuvenated is not False:
+        if now.rejuvenated is not False:
             return None
-        unmet = self._unmet(earlier, cloud, row)
-        if not unmet or not math.isfinite(cloud.increment):
+        unmet = self._unmet(earlier, now, row)
+        if not unmet or not math.isfinite(now.increment):
             return None
-        rng = np.random.default_rng([row.t, int(np.float64(cloud.increment).view(np.uint64))])
-        old = None if scouts is None else self._moved(scouts, cloud, row, rng)
+        rng = np.random.default_rng([row.t, int(np.float64(now.increment).view(np.uint64))])
+        old = None if scouts is None else self._moved(scouts, now, row, rng)
         parties = [] if old is None else [old]
         try:
-            parties += self._sent(unmet, earlier, cloud, row, rng)
+            parties += self._sent(unmet, earlier, now, row, rng)
         except BayesmcError:  # functions that break on what never came: nothing is said then
             return None
-        there = float(cloud.weights[_among(cloud.values, unmet)].sum() / cloud.total)
+        there = float(now.weights[_among(now.values, unmet)].sum() / now.total)
         return _together([_away(p, unmet) for p in parties], there, rng)
 
     # ---- private -------------------------------------------------------------------------------
 
     def _unmet(
-        self, earlier: Cloud | None, cloud: Cloud, row: Row
+        self, earlier: Particles | None, now: Particles, row: Row
     ) -> list[tuple[CompiledNode, np.ndarray]]:
         """Nodes of which a state has next to no particle, and such states."""
         found, kept = [], None
         if (
             earlier is not None
-            and cloud.resampled is False
-            and len(earlier.weights) == len(cloud.weights)
+            and now.resampled is False
+            and len(earlier.weights) == len(now.weights)
         ):
             kept = earlier.weights * (len(earlier.weights) / earlier.total)
         for node in self.nodes:
-            value = cloud.values.get(node.name)
+            value = now.values.get(node.name)
             if node.name in row.seen or value is None or value.ndim == 0:
                 continue
             assert node.domain is not None
@@ -113,13 +113,13 @@ class Scouting:
     def _sent(
         self,
         unmet: Sequence[tuple[CompiledNode, np.ndarray]],
-        earlier: Cloud | None,
-        cloud: Cloud,
+        earlier: Particles | None,
+        now: Particles,
         row: Row,
         rng: np.random.Generator,
     ) -> list[Scouts]:
         """New scouts in the rare states of nodes, from particles that were in none of them."""
-        before, carried = {}, -math.log(SCOUTS) - float(cloud.increment)
+        before, carried = {}, -math.log(SCOUTS) - float(now.increment)
         if earlier is not None:
             weights = np.where(_among(earlier.values, unmet), 0.0, earlier.weights)
             sums = weights.cumsum()
@@ -142,7 +142,7 @@ class Scouting:
         return found
 
     def _moved(
-        self, scouts: Scouts, cloud: Cloud, row: Row, rng: np.random.Generator
+        self, scouts: Scouts, now: Particles, row: Row, rng: np.random.Generator
     ) -> Scouts | None:
         """Scouts of the slice before, one slice later."""
         before = {n + PREVIOUS: scouts.values[n] for n in self.slices.interface}
@@ -151,7 +151,7 @@ class Scouting:
             passed(self.plan.steps(row), state)
         except BayesmcError:
             return None
-        return self._weighed(state, scouts.log_weights - float(cloud.increment))
+        return self._weighed(state, scouts.log_weights - float(now.increment))
 
     def _weighed(self, state: Pass, carried: float | np.ndarray) -> Scouts:
         log = np.broadcast_to(np.asarray(state.log_weight) + carried, state.batch)

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
-from bayesmc.engines.particles.cloud import Cloud
-from bayesmc.engines.particles.families import Families
+from bayesmc.engines.particles.genealogy import Families
+from bayesmc.engines.particles.particles import Particles
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.errors import LowEssWarning
-
-if TYPE_CHECKING:
-    from bayesmc.engines.particles.filter import ParticleFilter
 
 #: particles of a filter that is not told how many, at least, and at most
 START, MOST = 1000, 100_000
@@ -81,7 +78,7 @@ def enough(
     return most
 
 
-def price(engine: ParticleFilter) -> int:
+def price(engine: Any) -> int:
     """What a particle of a slice costs, in draws from its own density."""
     guided = isinstance(engine.proposal, str) or engine.auxiliary is True
     return GUIDED if guided else 1
@@ -116,7 +113,7 @@ def collapsed(filtered: FilteredParticles) -> str | None:
     )
 
 
-def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None:
+def uncertain(filtered: FilteredParticles, engine: Any) -> str | None:
     """What is said where the log evidence is not known well.
 
     Who gives a number of particles may ask for states alone, which few may follow well: then it takes a
@@ -154,16 +151,18 @@ def uncertain(filtered: FilteredParticles, engine: ParticleFilter) -> str | None
     )
 
 
-def warn_of_a_lonely_step(before: Cloud | None, families: Families | None, cloud: Cloud) -> None:
+def warn_of_a_lonely_step(
+    before: Particles | None, families: Families | None, now: Particles
+) -> None:
     """The first step that leaves little more than one particle says so; later ones know by the error."""
     if before is not None and families is not None and np.isinf(families.settled).any():
         return
-    worst = float(np.min(cloud.ess))
-    if worst >= min(COLLAPSED, 0.9 * len(cloud.weights)):
+    worst = float(np.min(now.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(now.weights)):
         return
     warnings.warn(
-        f"ParticleFilter: step leaves {len(cloud.weights)} particles that are worth {worst:.1f} equally "
-        f"weighted ones in slice {cloud.t}: from here on the belief cannot tell how far it is off "
+        f"ParticleFilter: step leaves {len(now.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {now.t}: from here on the belief cannot tell how far it is off "
         "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
         "looks at the observations",
         LowEssWarning,
@@ -174,12 +173,12 @@ def warn_of_a_lonely_step(before: Cloud | None, families: Families | None, cloud
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _more(filtered: FilteredParticles, engine: ParticleFilter) -> str:
+def _more(filtered: FilteredParticles, engine: Any) -> str:
     """How to have more particles, by what set their number."""
     assert filtered.counts is not None
     if engine.particles is not None or engine.adapt is not None:
         return "more particles"
-    count, keep = int(filtered.counts.max()), filtered.clouds is not None
+    count, keep = int(filtered.counts.max()), filtered.held is not None
     if count >= MOST:
         return (
             f"more particles than the {MOST:_} that are tried at most, such as "

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.lookahead import Belief, LookAhead, spread_varies
+from bayesmc.engines.particles.linearisation import Belief, LookAhead, spread_varies
 from bayesmc.engines.particles.looking import CASES, components_of
 from bayesmc.network import Model
 from bayesmc.network.forward import Pass

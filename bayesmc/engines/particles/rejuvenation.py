@@ -1,7 +1,7 @@
-"""Particles that begin anew: steps of a slice that draw its state from given densities.
+"""Rejuvenation and random-particle injection: steps of a slice that draw its state from given densities.
 
 *Rejuvenation* begins anew where no particle explains what was seen, and takes the given density for the
-model's there. *Lost* particles do so with a small probability in every slice (``recovery``); they may be
+model's there. *Injected* particles do so with a small probability in every slice (``recovery``); they may be
 drawn from where the sensor says, and are weighted by density over proposal.
 """
 
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.cloud import Cloud, Selection
+from bayesmc.engines.particles.particles import Particles, Selection
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import Propose
@@ -47,12 +47,12 @@ class Rejuvenation:
             if name in row.seen or name not in densities:
                 found.append(self.plan.step(row, name))
             elif name not in done:
-                found.append(Anew(model, row.seen, densities[name], self.plan.apart))
+                found.append(Unweighed(model, row.seen, densities[name], self.plan.apart))
                 done |= set(densities[name].names)
         return found
 
 
-class Lost:
+class Injection:
     """The particles that recovery lets begin anew.
 
     They stand for a share of the transition that does not depend on the slice before, so each of them
@@ -85,7 +85,7 @@ class Lost:
         self,
         row: Row,
         before: Mapping[str, np.ndarray],
-        earlier: Cloud,
+        earlier: Particles,
         selection: Selection,
         passed: tuple[dict[str, np.ndarray], Any],
         rng: np.random.Generator,
@@ -103,7 +103,7 @@ class Lost:
         values = {k: self._placed(k, v, state.values[k], lost, n) for k, v in values.items()}
         log = np.array(np.broadcast_to(log, (n,)), dtype=float)
         log[lost] = state.log_weight + math.log(share / drawn)
-        selection = selection._replace(carried=start_weights(selection, lost))
+        selection = selection._replace(log_weights=start_weights(selection, lost))
         return values, log, selection, lost.size
 
     def steps(self, row: Row) -> Sequence[Step]:
@@ -120,7 +120,7 @@ class Lost:
             elif name not in unknown:
                 found.append(_Density(model, prior))
             elif aimed is None and name not in seen:
-                found.append(Anew(model, seen, prior, apart))
+                found.append(Unweighed(model, seen, prior, apart))
             else:  # what is seen of the node, if it is in part, has its density, too
                 found += [Aimed(model, seen, aimed or prior, apart), _Density(model, prior)]
             unknown.discard(name)
@@ -141,7 +141,7 @@ class Lost:
                 )
 
     def _ancestors(
-        self, earlier: Cloud, selection: Selection, lost: np.ndarray, rng: np.random.Generator
+        self, earlier: Particles, selection: Selection, lost: np.ndarray, rng: np.random.Generator
     ) -> np.ndarray:
         """Positions in the slice before, for what looks at that."""
         if self._looks_back:
@@ -207,9 +207,9 @@ def given_densities(
 
 def start_weights(selection: Selection, lost: np.ndarray) -> np.ndarray:
     """Log weights that particles start with: the lost have equal parts of what all stand for."""
-    carried = np.array(np.broadcast_to(selection.carried, (selection.particles,)), dtype=float)
-    carried[lost] = selection.spent - math.log(selection.particles)
-    return carried
+    found = np.array(np.broadcast_to(selection.log_weights, (selection.particles,)), dtype=float)
+    found[lost] = selection.log_normaliser - math.log(selection.particles)
+    return found
 
 
 class Aimed(Propose):
@@ -226,7 +226,7 @@ class Aimed(Propose):
         self._compared = set(proposal.names)
 
 
-class Anew(Aimed):
+class Unweighed(Aimed):
     """Draws that are taken as they come: nothing is divided out of the weight."""
 
     def _divide(

@@ -1,7 +1,4 @@
-"""Clouds: the weighted particles of one slice, and how their arrays are laid out.
-
-``mover`` makes one cloud of another, ``belief`` answers questions about a cloud, ``record`` collects answers.
-"""
+"""The weighted particles of one slice, and how their arrays are laid out."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from bayesmc.engines.particles.recovery import Averages
 BLOCK = 8192
 
 
-class Cloud(NamedTuple):
+class Particles(NamedTuple):
     """Particles of one slice.
 
     Attributes
@@ -38,13 +35,13 @@ class Cloud(NamedTuple):
         Log density of the row given the rows before.
     ess : ndarray, shape (*apart,)
     ancestors : ndarray of int or None
-        Positions in the cloud before, sorted; None where every particle has itself.
+        Positions in the slice before, sorted; None where every particle has itself.
     resampled : ndarray of bool, shape (*apart,)
     rejuvenated : ndarray of bool, shape (*apart,)
         Whether they were drawn anew, since all weights had vanished; such particles have no ancestors.
     averages : Averages or None
         How well the last rows were explained, where recovery looks at that.
-    anew : int
+    injected : int
         Particles that recovery let begin anew.
     """
 
@@ -60,11 +57,11 @@ class Cloud(NamedTuple):
     resampled: Any = False
     rejuvenated: Any = False
     averages: Averages | None = None
-    anew: int = 0
+    injected: int = 0
 
 
 class Selection(NamedTuple):
-    """Who has offspring, and what weight the offspring start with.
+    """Which particles have offspring, and what weight the offspring start with.
 
     Attributes
     ----------
@@ -73,22 +70,22 @@ class Selection(NamedTuple):
     ancestors : ndarray of int or None
         Sorted positions; None where everybody has one.
     resampled : bool or ndarray of bool, shape (*apart,)
-    carried : ndarray or float
-        Log weights that the offspring have already.
-    spent : ndarray or float, shape (*apart,)
+    log_weights : ndarray or float
+        That the offspring have already.
+    log_normaliser : ndarray or float, shape (*apart,)
         Log of what their sum stands for: an increment is the log of the new sum, less this.
     """
 
     particles: int
     ancestors: np.ndarray | None
     resampled: Any
-    carried: Any
-    spent: Any
+    log_weights: Any
+    log_normaliser: Any
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How the arrays of a cloud are laid out.
+    """How the arrays of particles are laid out.
 
     Attributes
     ----------
@@ -108,18 +105,18 @@ class Layout:
 
 
 class Bare(NamedTuple):
-    """What of a mover describes its clouds: it goes with a pickle, and moves none."""
+    """What of a step describes its particles: it goes with a pickle, and moves none."""
 
     slices: Slices
     layout: Layout
 
 
-def even_cloud(t: int, values: dict[str, np.ndarray], layout: Layout) -> Cloud:
-    """Draws of equal weight as a cloud."""
+def evenly_weighted(t: int, values: dict[str, np.ndarray], layout: Layout) -> Particles:
+    """Draws of equal weight."""
     shape = (layout.particles, *layout.lead)
     ones, none = np.ones(shape), np.zeros(layout.lead)
     count = np.full(layout.lead, float(layout.particles))
-    return Cloud(t, values, np.zeros(shape), ones, count, np.log(count), none, count)
+    return Particles(t, values, np.zeros(shape), ones, count, np.log(count), none, count)
 
 
 def along_plates(

@@ -26,12 +26,13 @@ simulation); Lee and Whiteley (2018), Variance estimation in the particle filter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.accuracy import LAST, deviations, unseen
-from bayesmc.engines.particles.cloud import Cloud, Layout
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.errors import LAST, deviations, unseen
+from bayesmc.engines.particles.particles import Particles
 from bayesmc.network import CompiledNode
 from bayesmc.results.shares import is_share
 
@@ -51,41 +52,49 @@ class Sharing:
     ----------
     positions : sequence of ndarray of int
         For each slice, those of trajectories among the particles, shape ``(trajectories, *apart)``.
-    clouds : sequence of Cloud
-        Of the filter.
+    filtered : sequence of Particles
+        Those of the filter.
     steady : bool
         Whether resampling leaves particles the offspring that their weight demands, but for one.
     """
 
     def __init__(
-        self, positions: Sequence[np.ndarray], clouds: Sequence[Cloud], steady: bool
+        self, positions: Sequence[np.ndarray], filtered: Sequence[Particles], steady: bool
     ) -> None:
-        self.count, self.lead = positions[0].shape[0], positions[0].shape[1:]
+        self.count = positions[0].shape[0]
         rows = [index.reshape(self.count, -1).T for index in positions]  # elements first
-        self._groups = [_grouped(own, len(c.weights)) for own, c in zip(rows, clouds, strict=True)]
+        self._groups = [
+            _grouped(own, len(c.weights)) for own, c in zip(rows, filtered, strict=True)
+        ]
         #: particles that trajectories are worth in each slice, shape (time, elements)
         self.even = np.stack([g.even for g in self._groups])
         self._links: list[_Links | None] = [None]
-        for k in range(1, len(clouds)):
-            linked = not np.any(clouds[k].rejuvenated) and (steady or clouds[k].ancestors is None)
+        for k in range(1, len(filtered)):
+            linked = not np.any(filtered[k].rejuvenated) and (
+                steady or filtered[k].ancestors is None
+            )
             pair = self._groups[k - 1], self._groups[k]
-            self._links.append(_linked(*pair, clouds[k]) if linked else None)
+            self._links.append(_linked(*pair, filtered[k]) if linked else None)
 
     @property
-    def worth(self) -> Any:
-        """Independent draws that a slice's trajectories are worth, at most, shape (time, *apart)."""
-        return np.minimum(self.even, self.count).reshape(-1, *self.lead)
+    def worth(self) -> np.ndarray:
+        """Independent draws that a slice's trajectories are worth, at most, shape (time, elements)."""
+        return np.minimum(self.even, self.count)
 
     def variances(self, off: np.ndarray) -> np.ndarray:
-        """Variances of means from which values lie off by ``(time, trajectories, *apart, *rest)``.
+        """Variances of means from which values lie off by so much.
 
-        Shape ``(time, *apart, *rest)``.
+        Parameters
+        ----------
+        off : ndarray, shape (time, elements, numbers, trajectories)
+
+        Returns
+        -------
+        ndarray, shape (time, elements, numbers)
         """
-        rest = off.shape[2 + len(self.lead) :]
         steps, elements = self.even.shape
-        rows = off.reshape(steps, self.count, elements, -1).swapaxes(1, 2).astype(float)
-        squares = np.square(rows).sum(axis=2) / self.count**2
-        columns = rows.reshape(steps, elements * self.count, -1)
+        squares = np.square(off, dtype=float).sum(axis=-1) / self.count**2
+        columns = off.swapaxes(2, 3).reshape(steps, elements * self.count, -1).astype(float)
         # parts of slices before and after, by how far off they are
         parts = np.zeros((2, len(_OFFSETS), *squares.shape))
         signs = np.array([[-1], [1]])
@@ -94,7 +103,7 @@ class Sharing:
             side, kind = np.nonzero((at >= 0) & (at < steps) & ((_OFFSETS > 0) | (signs < 0)))
             found = self._part(s, columns[at[side, kind]])
             parts[side, kind, at[side, kind]] = found / self.count**2
-        return self._total(squares, parts).reshape(steps, *self.lead, *rest)
+        return self._total(squares, parts)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -143,53 +152,36 @@ class Sharing:
         return np.where(squares > 0, total, 0.0)
 
 
-def node_errors(
-    sharing: Sharing,
-    layout: Layout,
-    clouds: Sequence[Cloud],
-    node: CompiledNode,
-    centre: tuple[np.ndarray, np.ndarray | None],
-) -> np.ndarray:
+def node_errors(sharing: Sharing, block: Block, node: CompiledNode) -> np.ndarray:
     """Errors of a node's smoothed means, or of its states' probabilities where they have labels, time first.
 
     Parameters
     ----------
     sharing : Sharing
-    layout : Layout
-    clouds : sequence of Cloud
-        Trajectories.
+    block : Block
+        Trajectories, in all slices.
     node : CompiledNode
-    centre : tuple
-        Means and variances, or tables and None, time first.
     """
-    shape = (sharing.count, *node.value_shape)
-    values = np.stack([np.broadcast_to(c.values[node.name], shape) for c in clouds])
-    off, count, step = deviations(node, values, centre)
-    if any(p not in node.plates for p in layout.apart):  # it hangs on nothing that was drawn
-        return np.zeros((len(off), *off.shape[2:]))
-    at = [2 + node.plates.index(p) for p in layout.apart]
-    found = sharing.variances(np.moveaxis(off, at, range(2, 2 + len(at))))
-    found = np.moveaxis(found, range(1, 1 + len(at)), [a - 1 for a in at])
-    if count is not None:
-        worth = np.moveaxis(sharing.worth, range(1, 1 + len(at)), np.argsort(np.argsort(at)) + 1)
-        wide = [
-            n if p in layout.apart else 1
-            for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        worth = worth.reshape(-1, *wide, *(1,) * (np.ndim(count) - 1 - len(wide)))
-        found = np.maximum(found, step**2 * unseen(count, worth))
-    return np.sqrt(found)
+    labelled = node.domain is not None and node.domain.labels is not None
+    more: tuple[int, ...] = (node.domain.size,) if labelled and node.domain is not None else ()
+    if any(p not in node.plates for p in block.layout.apart):  # it hangs on nothing that was drawn
+        return np.zeros((len(block.slices), *node.value_shape, *more))
+    off, shares, step = deviations(block, node)
+    found = sharing.variances(off)
+    if shares is not None:
+        found = np.maximum(found, step**2 * unseen(shares, sharing.worth[..., None]))
+    return block.unturned(np.sqrt(found), node, more)
 
 
-def function_errors(sharing: Sharing, values: np.ndarray, means: np.ndarray) -> np.ndarray:
+def function_errors(sharing: Sharing, values: np.ndarray) -> np.ndarray:
     """The same of what a function says of each trajectory, ``(time, trajectories, *apart, *rest)``."""
-    found = sharing.variances(values - means[:, None])
+    means, (steps, elements) = values.mean(axis=1), sharing.even.shape
+    off = values - means[:, None]
+    found = sharing.variances(off.reshape(steps, sharing.count, elements, -1).transpose(0, 2, 3, 1))
     if is_share(values):
-        worth = sharing.worth.reshape(
-            sharing.worth.shape + (1,) * (means.ndim - sharing.worth.ndim)
-        )
-        found = np.maximum(found, unseen(means, worth))
-    return np.sqrt(found)
+        flat = means.reshape(steps, elements, -1)
+        found = np.maximum(found, unseen(flat, sharing.worth[..., None]))
+    return np.sqrt(found).reshape(means.shape)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -254,13 +246,13 @@ def _grouped(own: np.ndarray, particles: int) -> _Groups:
     return _Groups(order, starts, firsts, group, keys, even)
 
 
-def _linked(before: _Groups, now: _Groups, cloud: Cloud) -> _Links:
-    n = len(cloud.weights)
+def _linked(before: _Groups, now: _Groups, particles: Particles) -> _Links:
+    n = len(particles.weights)
     element, particle = now.keys // n, now.keys % n
-    if cloud.ancestors is None:
+    if particles.ancestors is None:
         parents, children = now.keys, np.ones(len(before.keys))
     else:
-        ancestors = cloud.ancestors.reshape(n, -1).T  # sorted, elements first
+        ancestors = particles.ancestors.reshape(n, -1).T  # sorted, elements first
         parents = ancestors[element, particle] + n * element
         flat = (ancestors + n * np.arange(len(ancestors))[:, None]).reshape(-1)
         ends = (np.searchsorted(flat, before.keys, side) for side in ("right", "left"))

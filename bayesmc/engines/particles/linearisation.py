@@ -25,7 +25,7 @@ import numpy as np
 
 from bayesmc.distributions import WrappedNormal
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.particles.curved import corrected
+from bayesmc.engines.particles.laplace import corrected
 from bayesmc.engines.particles.looking import (
     NUMBERS,
     by_moments,

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, SeriesProblem
-from bayesmc.engines.particles.cloud import Cloud, along_plates
+from bayesmc.engines.particles.particles import Particles, along_plates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Observed
@@ -24,7 +24,7 @@ from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
 from bayesmc.results.predictive import UNLIKELY, Predictive
 
-#: draws from a belief that is no cloud: so many values of each node that the next slice reads, first axis
+#: draws from a belief without particles: so many values of each node that the next slice reads, first axis
 Draws = Callable[[np.random.Generator, int], Mapping[str, np.ndarray]]
 
 #: rows drawn in a slice, and particles that say how likely they are
@@ -80,8 +80,8 @@ class Replicates:
         """Whether the k-th row is looked at."""
         return (k in self._looked or k <= self._until) and not (self._cannot or self._broken)
 
-    def look(self, k: int, before: Cloud | Draws | None, row: Row) -> None:
-        """Compare the k-th row, whose slice follows that of a cloud, or of a belief that draws."""
+    def look(self, k: int, before: Particles | Draws | None, row: Row) -> None:
+        """Compare the k-th row, whose slice follows that of particles, or of a belief that draws."""
         if not self.wanted(k) or not row.seen:
             return
         try:
@@ -107,13 +107,13 @@ class Replicates:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _taken(self, before: Cloud | Draws | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    def _taken(self, before: Particles | Draws | None) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """Values of the slice before, of the particles that draw rows and of those that judge them."""
         if before is None:
             return {}
-        cloud = before if isinstance(before, Cloud) else None
-        drawn = before.values if isinstance(before, Cloud) else before(self.rng, ROWS + JUDGES)
-        chosen = None if cloud is None else self._ancestors(cloud, ROWS + JUDGES)
+        held = before if isinstance(before, Particles) else None
+        drawn = before.values if isinstance(before, Particles) else before(self.rng, ROWS + JUDGES)
+        chosen = None if held is None else self._ancestors(held, ROWS + JUDGES)
         found = {}
         for name in self.slices.interface:
             value = drawn[name]
@@ -131,14 +131,14 @@ class Replicates:
             found[name + PREVIOUS] = taken[:ROWS], judges
         return found
 
-    def _ancestors(self, cloud: Cloud, count: int) -> np.ndarray:
+    def _ancestors(self, held: Particles, count: int) -> np.ndarray:
         """Particles drawn in proportion to their weights, shape (count, *lead)."""
         if not self.lead:
-            sums = cloud.weights.cumsum()
+            sums = held.weights.cumsum()
             return sums.searchsorted(self.rng.random(count) * sums[-1], side="right").clip(
                 max=len(sums) - 1
             )
-        weights = cloud.weights.reshape(len(cloud.weights), -1)
+        weights = held.weights.reshape(len(held.weights), -1)
         found = np.empty((count, weights.shape[1]), dtype=np.intp)
         for k, column in enumerate(weights.T):
             sums = column.cumsum()

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import Row
-from bayesmc.engines.particles.cases import ByCase, look_ahead
-from bayesmc.engines.particles.lookahead import LookAhead
+from bayesmc.engines.particles.linearisation import LookAhead
 from bayesmc.engines.particles.looking import why_not_looked_at
+from bayesmc.engines.particles.mixtures import ByCase, look_ahead
 from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import ModelError, UnknownNodeError

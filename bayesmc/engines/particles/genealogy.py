@@ -1,0 +1,405 @@
+"""Families: who descends from whom, and what that says of the error of a particle filter's evidence.
+
+The particles of an earlier slice, its *origin*, are cut into a few groups of neighbours. Ancestors are
+sorted, so the descendants of a group are neighbours, too, in every later slice: a family is two positions,
+and to follow it costs a search. Families hardly meet (resampling lets a family have about as many particles
+as its weight demands), so each is nearly a filter of its own, and what their shares of the weight differ by
+says how far the sum of all is off: batch means, over a genealogy.
+
+An origin must be old enough for its errors to have shown, and young enough for many families to be left. So
+there are two, and what happens between them is settled by the families of both when the older one is given
+up: all that has happened since the older origin, less what has happened since the younger one.
+
+Families tell only what the particles have met. Where a slice rests on a particle or two, where one family is
+all that is left, or where families differ by far more than the slices' own weights explain (the particles
+that later rows ask for lay at the edge of the now, rows before), the error cannot be told: it is infinite.
+
+References
+----------
+Chan and Lai (2013), A general theory of particle filters in hidden Markov models, Ann. Statist. 41; Lee and
+Whiteley (2018), Variance estimation in the particle filter, Biometrika 105; Olsson and Douc (2019),
+Numerically stable online estimation of variance in particle filters, Bernoulli 25. Their families have one
+founder, which is right for multinomial resampling; other schemes leave a group its share, so here groups
+found families.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.engines.particles.drift import SEEMS, Drift
+from bayesmc.engines.particles.forgetting import Lost, Sight
+from bayesmc.engines.particles.particles import Particles
+from bayesmc.engines.particles.rare_states import Scouts
+
+#: families of an origin, and founders of each, at least, where there are particles enough
+GROUPS, LEAST = 32, 4
+#: slices after which the younger origin takes over, at the latest and at the soonest
+LONGEST, SHORTEST = 50, 6
+#: slices from one look at the families to the next
+STRIDE = 3
+#: share of the families that must be left to an origin, by their evenness; below it is given up sooner
+LEFT = 0.5
+#: equally weighted particles on which a slice must rest for its error to be told
+RESTS = 4.0
+#: variance of the log evidence between two looks above which it matters where it comes from, at the least and
+#: at the most; between, that of so many slices whose weights are worth a single particle
+MATTERS, UNEVEN = (0.05, 0.15), 80.0
+#: times the variance that the slices' weights explain by themselves, above which the rest came from the edge
+EDGE = 4.0
+#: families that make up such differences below which these are an accident of one or two
+SOME = 2.0
+#: share of the particles below which the worth of a slice's has its weights looked at for a tail, and the
+#: mean log of the largest of them over the next from which on they have one (Hill's estimate)
+FEW, TAIL = 0.05, 0.7
+#: variance above which slices with a tail explain nothing
+LONG = 0.2
+#: variance between two origins beyond which the families that are left are too few to tell
+MOST = 1.0
+
+#: share of the belief in states without particles, over that of all particles, up to which it is an error
+LEFT_OUT = 0.1
+
+OLD, YOUNG = 0, 1
+
+
+class Families(NamedTuple):
+    """Families of an old and a young origin, as they stand in the present slice.
+
+    Attributes
+    ----------
+    bounds : ndarray of int, shape (2, groups + 1, *apart)
+        Positions between which each family's particles lie.
+    shares : ndarray, shape (2, groups, *apart)
+        Their shares of the weight at the origin.
+    kept : ndarray, shape (2, groups, *apart)
+        Logs of what a family's weight is worth: where resampling gave it more particles than its weight
+        demands, it counts for less.
+    explained : ndarray, shape (2, 2, *apart)
+        Variance of the log evidence that the weights of the slices since would make by themselves: of all
+        slices, and of those whose weights have no tail.
+    born : ndarray of int, shape (2, *apart)
+        Slices of the origins.
+    settled : ndarray, shape (*apart,)
+        Variance of the log evidence up to the old origin.
+    lost : Lost or None
+        What the filter has lost sight of.
+    scouts : Scouts or None
+        Where states have no particle: what the rows make of these.
+    drift : Drift or None
+        Whether rows pull the particles the same way; None where particles are not drawn from the model.
+    doubted : int or ndarray of int, shape (*apart)
+        The last slice in which families differed by more than weights explain, if many did.
+    """
+
+    bounds: np.ndarray
+    shares: np.ndarray
+    kept: np.ndarray
+    explained: np.ndarray
+    born: np.ndarray
+    settled: Any
+    lost: Lost | None = None
+    scouts: Scouts | None = None
+    drift: Drift | None = None
+    doubted: Any = -LONGEST
+
+
+def begun(now: Particles, sight: Sight) -> Families:
+    """Families of the particles of the first slice, which were drawn independently."""
+    n, lead = sight.layout.particles, sight.layout.lead
+    groups = min(GROUPS, max(n // LEAST, 2), n)
+    bounds, shares = _even(len(now.weights), groups, len(lead))
+    rested = np.asarray(now.ess) >= min(RESTS, 0.9 * len(now.weights))
+    return Families(
+        np.array(np.broadcast_to(bounds, (2, groups + 1, *lead))),
+        np.array(np.broadcast_to(shares, (2, groups, *lead))),
+        np.zeros((2, groups, *lead)),
+        np.zeros((2, 2, *lead)),
+        np.full((2, *lead), now.t),
+        np.where(rested, 0.0, np.inf),
+        sight.after(None, ~rested, now),
+    )
+
+
+def followed(
+    families: Families, earlier: Particles, now: Particles, steady: bool, sight: Sight
+) -> Families:
+    """The families one slice later.
+
+    Parameters
+    ----------
+    families : Families
+        In the slice before.
+    earlier, now : Particles
+        Of the slice before, and of this one.
+    steady : bool
+        Whether resampling leaves neighbours together the particles that their weight demands, but for one.
+    sight : Sight
+    """
+    found = families
+    gained: Any = 0.0
+    if now.ancestors is not None:
+        found = _moved(families, earlier, now, steady)
+        if now.t % STRIDE == 0 and np.any(now.resampled):
+            found, gained = _looked_at(found, now)
+    poor: Any = now.ess < min(RESTS, 0.9 * len(now.weights))
+    if poor if isinstance(poor, bool) else poor.any():
+        gained = np.where(poor, np.inf, gained)
+    if now.rejuvenated is not False:
+        found, more = _renewed(found, earlier, now)
+        gained = gained + more
+    if isinstance(gained, float) and found.lost is None:
+        return found
+    lost = sight.after(families.lost, np.isinf(gained), now)
+    return found._replace(settled=families.settled + gained, lost=lost)
+
+
+def drifted(families: Families, drift: Drift | None, now: Particles, sight: Sight) -> Families:
+    """The families, where particles are missing if rows go on pulling the same way."""
+    families = families._replace(drift=drift)
+    if drift is None or not drift.largest > SEEMS:
+        return families
+    doubted = families.doubted > now.t - LONGEST
+    missing = (drift.worst > drift.limit) | ((drift.worst > SEEMS) & doubted)
+    if not np.any(missing):
+        return families
+    lost = sight.after(families.lost, missing, now, here=True)
+    return families._replace(settled=np.where(missing, np.inf, families.settled), lost=lost)
+
+
+def scouted(families: Families, scouts: Scouts | None, now: Particles, sight: Sight) -> Families:
+    """The families, where scouts have been to states that no particle has.
+
+    What the particles leave out is lost where it is no longer small.
+    """
+    if scouts is None and families.scouts is None:
+        return families
+    families = families._replace(scouts=scouts)
+    if scouts is None or scouts.share <= LEFT_OUT:
+        return families
+    lost = sight.after(families.lost, True, now, here=True)
+    return families._replace(settled=np.asarray(np.inf), lost=lost)
+
+
+def evidence_error(families: Families, now: Particles) -> Any:
+    """Root mean square error of the log evidence, with its bias of minus half its variance."""
+    off = _off(families, _weights(families, now))
+    variance = _variance(families, off)
+    explained = families.explained + _explained(now)
+    at_edge = _at_edge(families, variance, off, explained, now)
+    total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
+    if families.scouts is not None:
+        total = total + families.scouts.share**2
+    found = np.sqrt(total + 0.25 * total**2)
+    return found if np.ndim(found) else float(found)
+
+
+def family_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """Sums of values over the particles of each family.
+
+    Parameters
+    ----------
+    values : ndarray, shape (rows, numbers, particles)
+    bounds : ndarray of int, shape (rows, groups + 1)
+
+    Returns
+    -------
+    ndarray, shape (rows, numbers, groups)
+    """
+    rows, numbers, n = values.shape
+    starts = bounds[:, None, :-1] + n * np.arange(rows * numbers).reshape(rows, numbers, 1)
+    some, flat = bounds[:, 1:] > bounds[:, :-1], values.reshape(-1)
+    if some.all():
+        return np.add.reduceat(flat, starts.reshape(-1)).reshape(starts.shape)
+    found, some = np.zeros(starts.shape), some[:, None].repeat(numbers, axis=1)
+    found[some] = np.add.reduceat(flat, starts[some])
+    return found
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=64)
+def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Groups of about as many particles: where they begin and end, and their shares."""
+    bounds = np.arange(groups + 1) * n // groups
+    tail = (1,) * axes
+    found = bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
+    for array in found:
+        array.flags.writeable = False
+    return found
+
+
+def _moved(families: Families, earlier: Particles, now: Particles, steady: bool) -> Families:
+    """The families after resampling."""
+    assert now.ancestors is not None
+    bounds = _searched(now.ancestors, families.bounds)
+    explained = families.explained
+    if bounds.ndim > 2:
+        explained = explained + np.where(now.resampled, _explained(earlier), 0.0)
+    elif now.resampled:
+        explained = explained + _explained(earlier)
+    if steady:
+        return families._replace(bounds=bounds, explained=explained)
+    sums = _sums(families, earlier)
+    ratio = np.diff(bounds, axis=1) / len(now.ancestors) / (sums / earlier.total)
+    extra = np.where((ratio > 0) & np.isfinite(ratio) & now.resampled, np.log(ratio), 0.0)
+    return families._replace(bounds=bounds, explained=explained, kept=families.kept - extra)
+
+
+def _searched(ancestors: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """How many ancestors lie below each bound."""
+    if ancestors.ndim == 1:
+        return ancestors.searchsorted(bounds)
+    n, many = len(ancestors), int(np.prod(ancestors.shape[1:]))
+    step = (max(n, int(bounds.max())) + 1) * np.arange(many)
+    flat = (ancestors.reshape(n, many) + step).T.reshape(-1)
+    found = flat.searchsorted(bounds.reshape(-1, many) + step) - n * np.arange(many)
+    return found.reshape(bounds.shape)
+
+
+def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
+    """Just after resampling: give up the older origin where few of its families are left, or it is old.
+
+    And the variance that is settled by that.
+    """
+    resampled = np.asarray(now.resampled)
+    counts = (families.bounds[:, 1:] - families.bounds[:, :-1]) / len(now.weights)
+    kept = families.kept.any()
+    if not kept and not _matters(families, now, counts):
+        return families, 0.0
+    off = _off(families, counts * np.exp(families.kept)) if kept else counts - families.shares
+    variance = _variance(families, off)
+    edge = np.zeros(resampled.shape, dtype=bool)
+    if variance.max() > _level(len(now.weights)):
+        edge = resampled & _at_edge(families, variance, off, families.explained, now)
+        suspect = families._replace(drift=None)
+        doubted = resampled & _at_edge(suspect, variance, off, families.explained, now)
+        families = families._replace(doubted=np.where(doubted, now.t, families.doubted))
+    age = now.t - families.born[YOUNG]
+    left = (families.shares[OLD] ** 2).sum(axis=0) / (counts[OLD] ** 2).sum(axis=0)
+    due = resampled & ~edge & ((age > LONGEST) | ((age > SHORTEST) & (left < LEFT)))
+    if edge.any():  # what has happened is told once
+        families = _begun_again(families, now, edge, True)
+    if not due.any():
+        return families, np.where(edge, np.inf, 0.0) if edge.any() else 0.0
+    lost = np.isinf(variance).any(axis=0)
+    gained = np.where(lost, np.inf, variance[OLD] - np.where(lost, 0.0, variance[YOUNG]))
+    gained = np.where(edge, np.inf, np.where(due, gained, 0.0))
+    return _begun_again(families, now, due, False), gained
+
+
+def _matters(families: Families, now: Particles, counts: np.ndarray) -> bool:
+    """Whether anything can be due: the older origin has drifted far, or the younger one is old."""
+    spread = ((counts - families.shares) ** 2).sum(axis=1).max()
+    groups = counts.shape[1]
+    bound = min(_level(len(now.weights)), (1.0 / LEFT - 1.0) / groups)
+    return bool(spread > 0.9 * bound or (now.t - families.born[YOUNG]).max() > LONGEST)
+
+
+def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Families, Any]:
+    """Where all particles were drawn anew: all that has happened is settled, and how much that is."""
+    anew = np.broadcast_to(now.rejuvenated, now.weights.shape[1:])
+    gained = _variance(families, _off(families, _weights(families, earlier)))[OLD]
+    return _begun_again(families, now, anew, True), np.where(anew, gained, 0.0)
+
+
+def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bool) -> Families:
+    """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
+    groups = families.shares.shape[1]
+    even = _even(len(now.weights), groups, now.weights.ndim - 1)
+    fresh: tuple[Any, ...] = (*even, 0.0, 0.0, now.t)
+    found = []
+    for value, new in zip(families[:5], fresh, strict=True):
+        begun = np.empty_like(value)
+        begun[OLD], begun[YOUNG] = new if both else value[YOUNG], new
+        found.append(begun if where.ndim == 0 else np.where(where, begun, value))
+    bounds, shares, kept, explained, born = found
+    return families._replace(
+        bounds=bounds, shares=shares, kept=kept, explained=explained, born=born
+    )
+
+
+def _weights(families: Families, now: Particles) -> np.ndarray:
+    """The families' weights."""
+    return _sums(families, now) * np.exp(families.kept)
+
+
+def _sums(families: Families, now: Particles) -> np.ndarray:
+    """Sums of the weights of the particles of each family."""
+    shape = families.bounds.shape
+    n, elements = len(now.weights), math.prod(shape[2:])
+    weights = np.tile(now.weights.reshape(n, elements).T, (2, 1))[:, None]
+    bounds = families.bounds.reshape(*shape[:2], elements).swapaxes(1, 2).reshape(-1, shape[1])
+    found = family_sums(weights, bounds).reshape(2, elements, -1).swapaxes(1, 2)
+    return found.reshape(2, shape[1] - 1, *shape[2:])
+
+
+def _off(families: Families, weights: np.ndarray) -> np.ndarray:
+    """By how much the families' shares of the weight have changed."""
+    found: np.ndarray = weights / weights.sum(axis=1)[:, None] - families.shares
+    return found
+
+
+def _variance(families: Families, off: np.ndarray) -> np.ndarray:
+    """Variance of the log evidence by what has happened since each origin, shape (2, *apart).
+
+    Shares drift apart like those of families in a population: it is minus the log of what is left of their
+    evenness, and infinite where a single family is left.
+    """
+    even = 1.0 - (families.shares**2).sum(axis=1)
+    left = 1.0 - (off**2).sum(axis=1) / np.where(even > 0, even, np.nan)
+    return np.where(left > 1e-9, -np.log(np.maximum(left, 1e-9)), np.inf)
+
+
+def _explained(now: Particles) -> Any:
+    """Variance of the log of the mean weight of a slice, and again, as 0 where they have a tail."""
+    n = len(now.weights)
+    if isinstance(now.ess, float) and now.ess >= FEW * n:
+        return 1.0 / now.ess - 1.0 / n  # an array of two would cost more than it says
+    ess = np.asarray(now.ess)
+    variance = 1.0 / ess - 1.0 / n
+    few = ess < FEW * n
+    if not few.any():
+        return np.stack([variance, variance])
+    weights = now.weights.reshape(n, -1)
+    bounded = np.array(variance, ndmin=1).reshape(-1)
+    for at in np.flatnonzero(few):
+        count = max(int(ess.reshape(-1)[at]), 5)
+        top = np.partition(weights[:, at], max(n - count - 1, 0))[-count - 1 :]
+        least = np.maximum(top.min(), 1e-300)  # fewer have any weight
+        if np.log(np.maximum(top, least) / least).sum() > TAIL * count:
+            bounded[at] = 0.0
+    return np.stack([variance, bounded.reshape(variance.shape)])
+
+
+def _at_edge(
+    families: Families, variance: np.ndarray, off: np.ndarray, explained: np.ndarray, now: Particles
+) -> np.ndarray:
+    """Whether families differ by far more than the slices' weights explain.
+
+    Many of them must where rows do not pull the same way: a few are an accident.
+    """
+    squares = off**2
+    by = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
+    some: Any = math.inf
+    if families.drift is not None:
+        some = np.where(families.drift.worst < SEEMS, SOME, np.inf)
+    return np.any(_beyond(variance, explained, by, some, len(now.weights)), axis=0)
+
+
+def _beyond(variance: Any, explained: Any, by: Any, some: Any, n: int) -> Any:
+    """The same by origin, given how many families make up the differences, and how many must not."""
+    every, bounded = explained[:, 0], explained[:, 1]
+    odd = (variance > _level(n)) & (variance > EDGE * every)
+    odd |= (variance > LONG) & (variance > EDGE * bounded)
+    return (odd & (by < some)) | (variance > MOST)
+
+
+def _level(n: int) -> float:
+    """Variance between two looks above which it matters where it comes from."""
+    return min(max(UNEVEN / n, MATTERS[0]), MATTERS[1])

@@ -1,0 +1,293 @@
+"""One step of sequential Monte Carlo: first-stage weights, resampling, propagation, weighting.
+
+Every filter of the house takes it: one of a template (``filter_step``), filters of all chains of a particle
+Markov chain sampler in one array (``pmcmc.filters``), elements of plates that never meet side by side.
+
+References
+----------
+Gordon, Salmond and Smith (1993), IEE Proceedings F 140; Pitt and Shephard (1999), JASA 94 (first-stage
+weights); Chopin and Papaspiliopoulos (2020), An introduction to sequential Monte Carlo, ch. 10.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS
+from bayesmc.engines.particles.particles import Layout, Particles, Selection, along_plates
+from bayesmc.network import CompiledNode
+from bayesmc.network.forward import Pass, Step
+
+
+class SMCStep:
+    """Makes the particles of a slice from those of the slice before.
+
+    A family of filters says which steps pass a row's slice, and what is known in it (``steps``, ``known``).
+
+    Parameters
+    ----------
+    layout : Layout
+        Particles come in blocks, whose temporaries stay in cache.
+    nodes : mapping
+        Name -> compiled node, of all nodes of a slice.
+    interface : sequence of str
+        Nodes that the next slice reads.
+    kept : sequence of str
+        Nodes whose values particles hold, besides these.
+    resample : callable
+        ``(weights, draws, rng) -> indices``.
+    threshold : float
+        Share of the particles below which their effective number has them resampled.
+    chains : int, optional
+        Independent filters side by side, as if they were a plate: the first of the layout's.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        nodes: Mapping[str, CompiledNode],
+        interface: Sequence[str],
+        kept: Sequence[str],
+        resample: Callable[..., np.ndarray],
+        threshold: float,
+        chains: int | None = None,
+    ) -> None:
+        self.layout, self.resample, self.threshold = layout, resample, threshold
+        self.batch = () if chains is None else (chains,)
+        own = layout.apart[: len(self.batch)]
+        self.kept = tuple(dict.fromkeys((*interface, *kept)))
+        self.before = tuple((n, n + PREVIOUS) for n in interface)
+        self.ranks = {n: 1 + len(self.batch) + len(node.value_shape) for n, node in nodes.items()}
+        self.plates = {n: (*own, *node.plates) for n, node in nodes.items()}
+        for name, previous in self.before:
+            self.ranks[previous], self.plates[previous] = self.ranks[name], self.plates[name]
+        self._log_particles = math.log(layout.particles)
+        self._even = np.ones((layout.particles, *layout.lead))
+        self._even.flags.writeable = False
+        self._spare = _Spare()
+
+    def __call__(self, earlier: Particles | None, row: Any, rng: np.random.Generator) -> Particles:
+        """The particles of a row's slice, given those of the slice before; None before the first."""
+        before, selection = self.chosen(earlier, row, rng)
+        values, log = self.propagated(self.steps(row), row, before, selection, rng)
+        return self.weighted(row, values, log, selection)
+
+    def steps(self, row: Any) -> Sequence[Step]:
+        """The steps of a row's slice."""
+        raise NotImplementedError
+
+    def known(self, row: Any) -> dict[str, np.ndarray]:
+        """Values in place before a slice is passed, but for the slice before."""
+        raise NotImplementedError
+
+    def log_first_stage(
+        self, before: Mapping[str, np.ndarray], row: Any, rng: np.random.Generator
+    ) -> np.ndarray | None:
+        """Log factors by which particles are chosen for their future, from their values and the row."""
+        return None
+
+    def stored(self, row: Any, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What is held of a slice."""
+        return {name: values[name] for name in self.kept}
+
+    def recycle(self, particles: Particles) -> None:
+        """Take back the large arrays of particles that nobody will look at again."""
+        if len(particles.weights) > self.layout.block:
+            self._spare.put(particles.weights, particles.log_weights, *particles.values.values())
+
+    def chosen(
+        self, earlier: Particles | None, row: Any, rng: np.random.Generator
+    ) -> tuple[dict[str, np.ndarray], Selection]:
+        """The values of the slice before, and which of them have offspring."""
+        if earlier is None:
+            n, never = self.layout.particles, False
+            resampled = np.zeros(self.layout.lead, dtype=bool) if self.layout.lead else never
+            return {}, Selection(n, None, resampled, 0.0, self._log_particles)
+        values = earlier.values
+        before = {previous: values[n] for n, previous in self.before if n in values}
+        return before, self.selected(earlier, before, row, rng)
+
+    def selected(
+        self,
+        earlier: Particles,
+        before: Mapping[str, np.ndarray],
+        row: Any,
+        rng: np.random.Generator,
+    ) -> Selection:
+        """Resample where weights are uneven; with a first stage, by what the next row makes of them."""
+        n, total = len(earlier.weights), earlier.log_total
+        weights, ess, gained = earlier.weights, earlier.ess, 0.0
+        factor = self.log_first_stage(before, row, rng)
+        if factor is not None:
+            log = earlier.log_weights + factor
+            level = _top(log)
+            weights = np.exp(log - level)
+            chosen_from = weights.sum(axis=0)
+            ess = chosen_from**2 / _squares(weights)
+            gained = level + np.log(chosen_from) - total
+        poor = ess < self.threshold * n
+        some, every = (poor.any(), poor.all()) if self.layout.lead else (poor, poor)
+        if not some:
+            return Selection(n, None, poor, earlier.log_weights, total)
+        chosen = self.resample(weights, n, rng)
+        carried: Any = 0.0
+        if factor is not None:
+            carried = -np.take_along_axis(factor, chosen, 0)
+        if every:
+            return Selection(n, chosen, poor, carried, self._log_particles - gained)
+        own = np.arange(n).reshape((-1,) + (1,) * poor.ndim)
+        return Selection(
+            n,
+            np.where(poor, chosen, own),
+            poor,
+            np.where(poor, carried, earlier.log_weights),
+            np.where(poor, self._log_particles - gained, total),
+        )
+
+    def propagated(
+        self,
+        steps: Sequence[Step],
+        row: Any,
+        before: Mapping[str, np.ndarray],
+        selection: Selection,
+        rng: np.random.Generator,
+    ) -> tuple[dict[str, np.ndarray], Any]:
+        """One forward pass over a slice, in blocks of particles: stored values and log weights."""
+        n, ancestors, known = selection.particles, selection.ancestors, self.known(row)
+        if n <= self.layout.block:
+            for name, value in before.items():
+                known[name] = self.taken(name, value, ancestors)
+            state = Pass(rng, (n, *self.batch), known)
+            for step in steps:
+                step(state)
+            return self.stored(row, state.values), state.log_weight
+        values: dict[str, np.ndarray] = {}
+        log: Any = 0.0
+        for low in range(0, n, self.layout.block):
+            high = min(low + self.layout.block, n)
+            part = slice(low, high)
+            chosen = part if ancestors is None else ancestors[part]
+            taken = {k: self.taken(k, v, chosen) for k, v in before.items()}
+            state = Pass(rng, (high - low, *self.batch), {**known, **taken})
+            for step in steps:
+                step(state)
+            for name, value in self.stored(row, state.values).items():
+                if value.ndim < self.ranks[name]:
+                    values[name] = value  # the same for all particles
+                    continue
+                if low == 0:
+                    values[name] = self._spare.get((n, *value.shape[1:]), value.dtype)
+                values[name][part] = value
+            weight = np.asarray(state.log_weight)
+            if weight.ndim <= len(self.layout.lead):
+                log = weight  # nothing was seen, or nothing that depends on the particles
+                continue
+            if low == 0:
+                log = self._spare.get((n, *self.layout.lead), np.dtype(float))
+            log[part] = weight
+        return values, log
+
+    def taken(
+        self, name: str, value: np.ndarray, ancestors: np.ndarray | slice | None
+    ) -> np.ndarray:
+        """A node's values in the slice before, of the ancestors; read-only."""
+        if ancestors is None or value.ndim < self.ranks[name]:
+            return value
+        if isinstance(ancestors, slice):
+            found = value[ancestors]
+        elif not self.layout.apart:
+            found = value.take(ancestors, axis=0, mode="clip")  # they lie within
+        else:
+            found = along_plates(value, ancestors, self.plates[name], self.layout.apart)
+        found.flags.writeable = False
+        return found
+
+    def weighted(
+        self, row: Any, values: dict[str, np.ndarray], log: Any, selection: Selection
+    ) -> Particles:
+        """The particles of a slice; their ``total`` is not positive where no weight is left."""
+        n, lead = selection.particles, self.layout.lead
+        carried, spent = selection.log_weights, selection.log_normaliser
+        log = carried + log if isinstance(carried, np.ndarray) else np.asarray(log)
+        if log.ndim <= len(lead) and np.all(log == 0.0):
+            even = np.full(lead, float(n)) if lead else float(n)
+            log_total = np.log(even)
+            return Particles(
+                row.t, values, np.broadcast_to(0.0, (n, *lead)), self._even[:n], even, log_total,
+                log_total - spent, even, selection.ancestors, selection.resampled,
+            )  # fmt: skip
+        if log.shape != (n, *lead):
+            log = np.broadcast_to(log, (n, *lead))
+        level = _top(log)
+        weights, total, squares = self._exponentials(log, level)
+        if lead:
+            log_total, ess = level + np.log(total), total * total / squares
+        else:
+            log_total = level + (math.log(total) if total > 0.0 else -math.inf)
+            ess = total * total / squares if squares else math.nan
+        return Particles(
+            row.t, values, log, weights, total, log_total, log_total - spent, ess,
+            selection.ancestors, selection.resampled,
+        )  # fmt: skip
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
+        """Weights relative to a level, block by block, their sums and the sums of their squares."""
+        if len(log) <= self.layout.block:
+            weights = log - level
+            np.exp(weights, out=weights)
+            return weights, self._sum(weights), _squares(weights)
+        weights = self._spare.get(log.shape, np.dtype(float))
+        total: Any = 0.0
+        squares: Any = 0.0
+        for low in range(0, len(log), self.layout.block):
+            part = weights[low : low + self.layout.block]
+            np.subtract(log[low : low + self.layout.block], level, out=part)
+            np.exp(part, out=part)
+            total = total + self._sum(part)
+            squares = squares + _squares(part)
+        return weights, total, squares
+
+    def _sum(self, weights: np.ndarray) -> Any:
+        if weights.ndim == 1:
+            return float(weights.dot(self._even[: len(weights)]))
+        return np.add.reduce(weights)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Spare:
+    """Large arrays that are used again: fresh ones cost the machine a page at a time."""
+
+    def __init__(self) -> None:
+        self._free: dict[tuple[Any, ...], list[np.ndarray]] = {}
+
+    def get(self, shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+        free = self._free.get((shape, dtype))
+        return free.pop() if free else np.empty(shape, dtype)
+
+    def put(self, *arrays: np.ndarray) -> None:
+        for array in arrays:
+            if array.flags.owndata and array.flags.writeable:
+                self._free.setdefault((array.shape, array.dtype), []).append(array)
+
+
+def _top(log: np.ndarray) -> Any:
+    """The largest log weight; 0 where all are minus infinity."""
+    if log.ndim == 1:
+        level = log.item(log.argmax())  # several times faster than a reduction, for short arrays
+        return level if level > -math.inf else 0.0
+    level = np.maximum.reduce(log)
+    return np.where(level > -np.inf, level, 0.0)
+
+
+def _squares(weights: np.ndarray) -> Any:
+    if weights.ndim == 1:
+        return float(weights.dot(weights))
+    return np.einsum("i...,i...->...", weights, weights)
