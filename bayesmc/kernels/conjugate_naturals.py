@@ -1,0 +1,410 @@
+"""Natural parameters of a full conditional: the prior's and what every child adds, as one program."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import (
+    Dirichlet,
+    Distribution,
+    InverseWishart,
+    MvNormal,
+    Truncated,
+    Uniform,
+)
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Expression,
+    Family,
+    Program,
+    TracedArray,
+    as_expression,
+    broadcast,
+    elementwise,
+    pick,
+    reshape,
+)
+from bayesmc.kernels.conjugate_families import (
+    Bounds,
+    Conditional,
+    DirichletConditional,
+    InverseWishartConditional,
+    MvNormalConditional,
+    Naturals,
+    family_of_features,
+)
+from bayesmc.kernels.conjugate_terms import (
+    Added,
+    Moving,
+    family_read,
+    features_of,
+    known_values,
+    moving,
+    parameters_read,
+    shares_sum_to_one,
+)
+from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
+from bayesmc.kernels.conjugate_words import why_not
+from bayesmc.network.expressions import Opaque, stored_leaf
+from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.passes.features import LOG, Feature
+from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Term, Values
+
+
+class Form:
+    """The full conditional of a class of elements.
+
+    Parameters
+    ----------
+    family : Conditional
+    words : str
+        The prior and the children that it rests on.
+    naturals : sequence of Expression
+        With the node's plates in front, or the members of the class.
+    bounds : sequence of Expression
+        Of the support, none or two.
+    """
+
+    def __init__(
+        self, family: Conditional, words: str, naturals: list[Expression], bounds: list[Expression]
+    ) -> None:
+        self.family, self.words = family, words
+        roots = [*naturals, *bounds]
+        self._program = Program(roots)
+        self._count = len(naturals)
+        self._ndims = [len(r.shape) for r in roots]
+        self._kept: tuple[Naturals, Bounds | None] | None = None
+        if not any(r.leaves for r in roots):
+            self._kept = self({})
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> tuple[Naturals, Bounds | None]:
+        """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
+        if self._kept is not None:
+            return self._kept
+        found = [
+            a if a.ndim > n else a[None]
+            for a, n in zip(self._program(values), self._ndims, strict=True)
+        ]
+        k = self._count
+        return tuple(found[:k]), (found[k], found[k + 1]) if len(found) > k else None
+
+
+def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
+    """The full conditional of some elements of a node, or in words why it has no closed form."""
+    try:
+        prior = _prior(blanket)
+    except TraceError as error:
+        return str(error)
+    if prior.base.make is Dirichlet:
+        return _of_events(blanket, members, prior, DirichletConditional())
+    if prior.base.make is MvNormal:
+        return _of_events(blanket, members, prior, MvNormalConditional())
+    if prior.base.make is InverseWishart:
+        return _of_events(blanket, members, prior, InverseWishartConditional())
+    return _of_numbers(blanket, members, prior)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Prior:
+    """A prior without its bounds.
+
+    Attributes
+    ----------
+    low, high : Expression
+    is_bounded : bool
+        Whether they cut off some of the base.
+    """
+
+    base: Family
+    words: str
+    low: Expression
+    high: Expression
+    is_bounded: bool
+
+    def ends(self, blanket: Blanket) -> tuple[float, float]:
+        """The least and the largest value that it allows, as far as this is seen."""
+        states = blanket.target.states
+        if states is None:
+            return -np.inf, np.inf
+        low, high = Program([self.low, self.high])(states)
+        return float(np.min(low)), float(np.max(high))
+
+
+def _prior(blanket: Blanket) -> _Prior:
+    assert blanket.own is not None
+    read = blanket.own.read
+    if isinstance(read, Opaque):
+        raise TraceError(f"its prior cannot be followed ({read.reason})")
+    family = _as_family(read.result)
+    low: Any = as_expression(-np.inf)
+    high: Any = as_expression(np.inf)
+    words, bounded = getattr(family.make, "__name__", str(family.make)), False
+    if family.make is Truncated and isinstance(family.parameters["base"], Family | Distribution):
+        low, high = (_known(blanket, family.parameters[k]) for k in ("low", "high"))
+        family = _as_family(family.parameters["base"])
+        words, bounded = f"truncated {family.make.__name__}", True
+    if family.make is Uniform:
+        ends = [_known(blanket, family.parameters[k]) for k in ("low", "high")]
+        low, high = elementwise(np.maximum, low, ends[0]), elementwise(np.minimum, high, ends[1])
+        words, bounded = "Uniform", True
+    return _Prior(family, words, low, high, bounded)
+
+
+def _as_family(result: Any) -> Family:
+    if isinstance(result, Family):
+        return result
+    if isinstance(result, InverseWishart):
+        kept = {k: as_expression(getattr(result, k)) for k in ("df", "scale")}
+        return Family(InverseWishart, kept)
+    try:
+        return family_of(result)
+    except TraceError:
+        raise TraceError(f"a {type(result).__name__} prior has no conjugate pair") from None
+
+
+def _known(blanket: Blanket, value: Any) -> Expression:
+    return known_values(blanket.target, as_expression(value))
+
+
+def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> Form | str:
+    """Of numbers, by the features of prior and children."""
+    if blanket.event_shape:
+        return f"a {prior.words} prior has no conjugate pair"
+    of = moving(blanket, members)
+    try:
+        own = _own_features(blanket, prior, of)
+    except TraceError:
+        return f"a {prior.words} prior has no conjugate pair"
+    children: dict[str, Added] = {}
+    matched: list[str] = []
+    for term in _terms(blanket):
+        added = _added(blanket, term, of, prior.words)
+        if isinstance(added, str):
+            return added
+        if added.coefficients:
+            children[term.name] = added
+            matched.append(_pair(term, of, added.is_picked and 2.0 not in added.coefficients))
+    if not children:
+        return "no child varies with it"
+    everything = [own, *(c.coefficients for c in children.values())]
+    found = dict.fromkeys(f for some in everything for f in some)
+    low, high = prior.ends(blanket)
+    least, most = _SUPPORTS.get(prior.base.make.__name__, (0.0, np.inf))
+    low, high = max(low, least), min(high, most)
+    family = family_of_features(found, low, high)
+    if family is None:
+        return _unlike(blanket, own, children, prior, low, high)
+    naturals = []
+    for feature in family.features:
+        whole: Expression = ZERO
+        for some in everything:
+            whole = add(whole, some.get(feature, ZERO))
+        naturals.append(_placed(broadcast(whole, (of.count,)), blanket, members))
+    form = Form(family, _words(prior, matched), naturals, _bounds(blanket, members, prior, family))
+    if any(c.is_picked for c in children.values()) and not _is_closed(form, blanket):
+        unlike = next(t for t in _terms(blanket) if t.name in children and children[t.name].is_picked)
+        return why_not(blanket, unlike, prior.words)
+    return form
+
+
+#: support of a prior, where that is not all positive numbers
+_SUPPORTS = {"Normal": (-np.inf, np.inf), "Uniform": (-np.inf, np.inf), "Beta": (0.0, 1.0)}
+
+
+def _own_features(blanket: Blanket, prior: _Prior, of: Moving) -> dict[Feature, Expression]:
+    """Features of the prior itself."""
+    if prior.base.make is Uniform:
+        return {}
+    model = blanket.target.model
+    density = log_density(prior.base, stored_leaf(model, model[blanket.name]))
+    density = broadcast(_known(blanket, density), blanket.node.plate_shape)
+    return dict(features_of(density, of, None, True).coefficients)
+
+
+def _terms(blanket: Blanket) -> list[Term]:
+    return [c.term for c in blanket.children]
+
+
+def _added(blanket: Blanket, term: Term, of: Moving, prior: str) -> Added | str:
+    """What a child adds, or why it makes no pair."""
+    if term.is_potential:
+        return f"it enters the potential {term.name!r}"
+    if term.expression is None:
+        return why_not(blanket, term, prior)
+    try:
+        return features_of(known_values(blanket.target, term.expression), of, term.mask)
+    except TraceError:
+        return why_not(blanket, term, prior)
+
+
+def _pair(term: Term, of: Moving, is_picked: bool) -> str:
+    family = family_read(term)
+    words = f"{family.make.__name__} {' and '.join(parameters_read(family, of.name))}"
+    return f"{words} where it is picked" if is_picked else words
+
+
+def _words(prior: _Prior, matched: list[str]) -> str:
+    return f"{prior.words} with {', '.join(dict.fromkeys(matched))}"
+
+
+def _unlike(
+    blanket: Blanket,
+    own: dict[Feature, Expression],
+    children: dict[str, Added],
+    prior: _Prior,
+    low: float,
+    high: float,
+) -> str:
+    """Why prior and children are of no one family."""
+    if family_of_features({**own, **_union(children)}, 0.0, 1.0) is not None:
+        return "its flat prior reaches beyond what the parameter allows"
+    power, whose = _power(own), f"a {prior.words} prior"
+    for name, child in children.items():
+        term = blanket.target.terms[name]
+        wanted = _power(child.coefficients)
+        if wanted is None:
+            return why_not(blanket, term, prior.words)
+        if power is not None and wanted != power:
+            return (
+                f"the density of child {name!r} has the power {wanted:g} of it in its exponential, and "
+                f"{whose} the power {power:g}: no conjugate pair"
+            )
+        power, whose = wanted, "another child"
+    return why_not(blanket, blanket.target.terms[next(iter(children))], prior.words)
+
+
+def _union(children: dict[str, Added]) -> dict[Feature, Expression]:
+    return {f: c for child in children.values() for f, c in child.coefficients.items()}
+
+
+def _power(found: Mapping[Feature, Any]) -> float | None:
+    """The only power that occurs."""
+    powers = [f for f in found if not isinstance(f, str)]
+    return powers[0] if len(powers) == 1 and LOG in found else None
+
+
+def _of_events(
+    blanket: Blanket, members: np.ndarray | None, prior: _Prior, family: Conditional
+) -> Form | str:
+    """Of vectors, shares and covariances."""
+    if prior.is_bounded:
+        return f"a {prior.words} prior has no conjugate pair"
+    of = moving(blanket, members, isinstance(family, DirichletConditional))
+    naturals = _naturals_of(blanket, prior.base)
+    matched = []
+    for term in _terms(blanket):
+        if term.is_potential:
+            return f"it enters the potential {term.name!r}"
+        if term.expression is None and not _is_family(term):
+            return why_not(blanket, term, prior.words)
+        try:
+            added = _event_added(blanket, term, of, family)
+        except TraceError:
+            return why_not(blanket, term, prior.words)
+        if added is not None:
+            naturals = [add(a, reshape(b, a.shape)) for a, b in zip(naturals, added, strict=True)]
+            matched.append(_pair(term, of, False))
+    if not matched:
+        return "no child varies with it"
+    placed = [_placed(a, blanket, members) for a in naturals]
+    return Form(family, _words(prior, matched), placed, [])
+
+
+def _is_family(term: Term) -> bool:
+    return isinstance(getattr(term.read, "result", None), Family)
+
+
+def _event_added(
+    blanket: Blanket, term: Term, of: Moving, family: Conditional
+) -> tuple[Expression, ...] | None:
+    if not parameters_read(family_read(term), of.name):
+        return None
+    if isinstance(family, MvNormalConditional):
+        return mean_added(term, of)
+    if isinstance(family, InverseWishartConditional):
+        return covariance_added(term, of)
+    if term.expression is None:
+        raise TraceError("it has no closed log density")
+    density = shares_sum_to_one(known_values(blanket.target, term.expression), blanket)
+    found = features_of(density, of, term.mask, True).coefficients
+    if set(found) - {LOG}:
+        raise TraceError("it has other features")
+    return (found.get(LOG, broadcast(ZERO, (of.count,))),)
+
+
+def _naturals_of(blanket: Blanket, base: Family) -> list[Expression]:
+    """Natural parameters of the prior, one block for each element."""
+    count = blanket.size
+    parameters: dict[str, Any] = {
+        k: _by_element(_known(blanket, v), blanket, 2 if k in ("cov", "scale", "scale_tril") else 1)
+        for k, v in base.parameters.items()
+        if isinstance(v, Expression) and k != "df"
+    }
+    if base.make is Dirichlet:
+        return [add(parameters["concentration"].expression, -1.0)]
+    if base.make is InverseWishart:
+        df = broadcast(_known(blanket, base.parameters["df"]), blanket.node.plate_shape)
+        return [reshape(df, (count,)), parameters["scale"].expression]
+    if "scale_diag" in parameters:
+        d = blanket.event_shape[-1]
+        precision = parameters["scale_diag"][..., None] ** -2.0 * np.eye(d)
+    else:
+        factor = parameters.get("scale_tril")
+        factor = np.linalg.cholesky(parameters["cov"]) if factor is None else factor
+        inverse = np.linalg.inv(factor)
+        precision = np.matmul(np.matrix_transpose(inverse), inverse)
+    linear = np.matvec(precision, parameters["loc"])
+    return [a.expression if isinstance(a, TracedArray) else as_expression(a) for a in (precision, linear)]
+
+
+def _by_element(value: Expression, blanket: Blanket, event_ndim: int) -> Any:
+    """A parameter for each element: ``(count, *event)``."""
+    d = blanket.event_shape[-1]
+    event = (d,) * event_ndim
+    whole = broadcast(value, (*blanket.node.plate_shape, *event))
+    return TracedArray(reshape(whole, (blanket.size, *event)))
+
+
+def _placed(natural: Expression, blanket: Blanket, members: np.ndarray | None) -> Expression:
+    """Of all elements as the node's plates, or of those of a class."""
+    shape = blanket.node.plate_shape
+    block = natural.shape[1:]
+    if natural.shape[0] != blanket.size:  # number by number
+        block = blanket.event_shape
+        natural = reshape(natural, (blanket.size, *block))
+    if members is None:
+        return reshape(natural, (*shape, *block))
+    at = np.arange(natural.size).reshape(natural.shape)
+    return pick([natural], at[members])
+
+
+def _bounds(
+    blanket: Blanket, members: np.ndarray | None, prior: _Prior, family: Conditional
+) -> list[Expression]:
+    """The ends of the support, where they cut off some of the family's."""
+    low, high = prior.low, prior.high
+    least, most = _SUPPORTS.get(prior.base.make.__name__, (0.0, np.inf))
+    if not prior.is_bounded and least <= family.low and most >= family.high:
+        return []
+    low, high = elementwise(np.maximum, low, least), elementwise(np.minimum, high, most)
+    shape, size = blanket.node.plate_shape, blanket.size
+    ends = [reshape(broadcast(e, shape), (size,)) for e in (low, high)]
+    return [_placed(e, blanket, members) for e in ends]
+
+
+def _is_closed(form: Form, blanket: Blanket) -> bool:
+    """Whether there is a closed form at some states."""
+    states: Values | None = blanket.target.states
+    if states is None:
+        return False
+    naturals, _ = form(states)
+    return all(bool(np.isfinite(n).all()) for n in naturals)

@@ -1,0 +1,167 @@
+"""What a term adds to the natural parameters of a node, as expressions of the state of a chain.
+
+Values that are known are constants here, so that what does not change from sweep to sweep is worked out
+once, when the expressions are made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Constant,
+    Expression,
+    Family,
+    Leaf,
+    Reduction,
+    as_expression,
+    broadcast,
+    ordered,
+    replaced,
+    substituted,
+)
+from bayesmc.passes.arithmetic import ONE, ZERO, add, multiply
+from bayesmc.passes.features import Feature, statistics
+from bayesmc.passes.reads import element_read, same_along
+from bayesmc.passes.sinking import reads, sunk
+from bayesmc.passes.totals import parts_of, total
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target, Term
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """The elements of a node that move together, all others given.
+
+    Attributes
+    ----------
+    numbers : ndarray of int, shape of the node's value
+        The element that each number belongs to; -1 for those that do not move.
+    count : int
+        Elements of the node, or of its numbers where these are elements.
+    """
+
+    blanket: Blanket
+    numbers: np.ndarray
+    count: int
+
+    @property
+    def name(self) -> str:
+        return self.blanket.name
+
+
+@dataclass(frozen=True, eq=False)
+class Added:
+    """Coefficients of features, summed for every element.
+
+    Attributes
+    ----------
+    coefficients : dict
+        Feature -> expression of shape ``(count,)``.
+    is_picked : bool
+        Whether it hangs on other nodes which entries read an element.
+    """
+
+    coefficients: Mapping[Feature, Expression] = field(default_factory=dict)
+    is_picked: bool = False
+
+
+def moving(blanket: Blanket, members: np.ndarray | None, by_number: bool = False) -> Moving:
+    """The elements of a class of a node; with ``by_number``, their numbers one by one."""
+    elements = np.arange(blanket.size)
+    if len(blanket.classes) > 1 and members is not None:
+        elements = np.full(blanket.size, -1)
+        elements[members] = members
+    event = int(np.prod(blanket.event_shape, dtype=int))
+    if by_number:
+        inner = elements[:, None] * event + np.arange(event)
+        numbers = np.where(elements[:, None] < 0, -1, inner)
+        return Moving(blanket, numbers.reshape(blanket.node.value_shape), blanket.size * event)
+    numbers = np.repeat(elements, event).reshape(blanket.node.value_shape)
+    return Moving(blanket, numbers, blanket.size)
+
+
+def known_values(target: Target, expression: Expression) -> Expression:
+    """An expression with constants in the place of what is known."""
+    values = {}
+    for node in ordered(expression):
+        if isinstance(node, Leaf) and target.is_known(node.name):
+            value = np.asarray(target.known[node.name])
+            if value.shape == node.shape:
+                values[node.name] = as_expression(value)
+    return substituted(expression, values) if values else expression
+
+
+def features_of(expression: Expression, of: Moving, mask: Any = None, strict: bool = False) -> Added:
+    """The features of a log density, summed over all entries for every element.
+
+    Parameters
+    ----------
+    strict : bool
+        Whether every entry must have them for all values of other nodes.
+
+    Raises
+    ------
+    TraceError
+        It is no sum of features.
+    """
+    found: dict[Feature, Expression] = {}
+    picked = False
+    for part in parts_of(expression, of.name, mask):
+        some = statistics(part.expression, of.name, of.numbers, strict)
+        picked = picked or some.is_picked or part.is_picked
+        for feature, coefficient in some.coefficients.items():
+            whole = multiply(coefficient, broadcast(part.factor, coefficient.shape))
+            sums = total(whole, some.at, of.count, part.mask)
+            found[feature] = add(found.get(feature, ZERO), sums)
+    return Added(found, picked)
+
+
+def shares_sum_to_one(expression: Expression, blanket: Blanket) -> Expression:
+    """An expression in which the sum of all of a node's shares is 1."""
+    size = blanket.event_shape[-1]
+    name = blanket.name
+    flat = np.arange(blanket.size * size).reshape(blanket.node.value_shape)
+    whole = sunk(expression, name)
+    instead: dict[Expression, Expression] = {}
+    pure = set(reads(whole, name))
+    for node in ordered(whole):
+        if isinstance(node, Reduction) and node.ufunc is np.add and node.operands[0] in pure:
+            (axis, *more), operand = node.axes, node.operands[0]
+            rows = element_read(operand, name, flat // size)
+            places = element_read(operand, name, flat % size)
+            if more or same_along(rows, [axis]) is None or not isinstance(places, Constant):
+                continue
+            every = np.sort(np.moveaxis(places.value, axis, -1), axis=-1)
+            if every.shape[-1] == size and (every == np.arange(size)).all():
+                instead[node] = broadcast(ONE, node.shape)
+    return replaced(whole, instead) if instead else whole
+
+
+def parameters_read(family: Family, name: str) -> list[str]:
+    """The parameters of a family in which a node occurs."""
+    return [k for k, v in family.parameters.items() if name in leaves_of(v)]
+
+
+def leaves_of(value: Any) -> frozenset[str]:
+    """The leaves of a parameter."""
+    if isinstance(value, Expression):
+        return value.leaves
+    if isinstance(value, Family):
+        value = list(value.parameters.values())
+    if isinstance(value, (list, tuple)):
+        return frozenset().union(*map(leaves_of, value))
+    return frozenset()
+
+
+def family_read(term: Term) -> Family:
+    """The family of a term whose function was followed."""
+    result = getattr(term.read, "result", None)
+    if not isinstance(result, Family):
+        raise TraceError("it is no distribution that can be followed")
+    return result
