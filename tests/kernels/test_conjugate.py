@@ -12,7 +12,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.expression import elementwise
 from bayesmc.kernels import conjugate_naturals
