@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network import BayesNet
 from bayesmc.network.forward import Pass, Step, refuse_unsampled, step_for
-from bayesmc.network.node import Declaration
+from bayesmc.network.node import Declaration, Numbered
 
 
 def unroll(template: Template, steps: int, inputs: Mapping[str, Any] | None) -> BayesNet:
@@ -108,21 +108,9 @@ def _at(template: Template, declaration: Declaration, t: int) -> Declaration:
     function = declaration.function
     if places:
         assert function is not None
-        function = _with_time(function, tuple(places), t)
+        function = Numbered(function, tuple(places), t)
     name = indexed(declaration.name, t)
     return replace(declaration, name=name, parents=tuple(parents), function=function)
-
-
-def _with_time(function: Callable[..., Any], places: tuple[int, ...], t: int) -> Callable[..., Any]:
-    """A function with the index of the slice put in: functions of two slices differ in this number alone."""
-
-    def call(*values: Any) -> Any:
-        arguments = list(values)
-        for place in places:
-            arguments.insert(place, t)
-        return function(*arguments)
-
-    return call
 
 
 def _steps(slices: Slices, t: int) -> Sequence[Step]:

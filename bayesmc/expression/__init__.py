@@ -26,7 +26,7 @@ from bayesmc.expression.graph import (
     reshape,
     substituted,
 )
-from bayesmc.expression.trace import Family, expressions_of, rebuilt, trace
+from bayesmc.expression.trace import Family, expressions_of, mapped, rebuilt, trace
 
 __all__ = [
     "Call",
@@ -51,6 +51,7 @@ __all__ = [
     "expressions_of",
     "gather",
     "leaf",
+    "mapped",
     "ordered",
     "pick",
     "rebuilt",

@@ -104,6 +104,17 @@ def rebuilt(traced: Any, values: Iterator[Any]) -> Any:
     return traced
 
 
+def mapped(traced: Any, change: Callable[[Expression], Expression]) -> Any:
+    """What was traced, with every expression changed."""
+    if isinstance(traced, Expression):
+        return change(traced)
+    if isinstance(traced, Family):
+        return Family(traced.make, {k: mapped(v, change) for k, v in traced.parameters.items()})
+    if isinstance(traced, (list, tuple)):
+        return type(traced)(mapped(v, change) for v in traced)
+    return traced
+
+
 def same(first: Any, second: Any) -> bool:
     """Whether two traced results are equal."""
     if isinstance(first, Expression) or isinstance(second, Expression):

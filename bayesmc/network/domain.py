@@ -7,6 +7,7 @@ and results speak *user values*: the support value itself, a numeric state, or a
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,6 +41,12 @@ class Domain:
     def dtype(self) -> np.dtype:
         """Smallest unsigned integer type that holds the positions."""
         return np.min_scalar_type(max(self.size - 1, 0))
+
+    @property
+    def key(self) -> Hashable:
+        """Equal for sets of the same values."""
+        values = None if self.values is None else (self.values.dtype.str, self.values.tobytes())
+        return self.size, self.low, values, self.labels
 
     @property
     def states(self) -> tuple[Any, ...]:

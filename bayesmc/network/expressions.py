@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from itertools import count
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Density, Distribution, as_distribution
+from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import (
+    Constant,
     Expression,
     Family,
     Program,
     TracedArray,
-    TracedStates,
     broadcast,
     call,
     constant,
@@ -24,20 +26,20 @@ from bayesmc.expression import (
     expressions_of,
     gather,
     leaf,
+    mapped,
     rebuilt,
-    trace,
+    replaced,
 )
-from bayesmc.network.align import Aligner
-from bayesmc.network.domain import Domain
-from bayesmc.network.model import CompiledNode, Model
+from bayesmc.network.align import Aligner, RowAligner
+from bayesmc.network.model import CompiledNode, Model, potential_shape
+from bayesmc.network.node import Numbered
+from bayesmc.network.readings import Argument, Reading, numbers_of, read_function, read_table
 from bayesmc.passes.log_density import family_of, log_density
-from bayesmc.passes.templates import template
-from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
 
 #: how far an expression may be off what the function gives, relative to the largest entry
 _RTOL = 1e-11
-#: nodes with one function, such as slices of a template, that are checked
+#: readings of one shape, and uses of one reading, that are checked at all probe points
 _CHECKED = 3
 
 
@@ -47,17 +49,57 @@ class Followed:
 
     Attributes
     ----------
-    result : Family, Expression or Distribution
-        A density, the value of a deterministic node or a log factor, of the stored values of stochastic
-        nodes and inputs; a distribution that depends on none.
+    reading : Reading
+        What the function computes of its arguments; nodes that share a function share it.
+    parents : tuple of str
+        The nodes that the function receives.
+    arguments : tuple of Argument
+        How it receives them.
+    numbers : tuple of ndarray
+        What stands for the reading's ``number 0``, ...
     """
 
-    result: Any
+    model: Model
+    reading: Reading
+    parents: tuple[str, ...] = ()
+    arguments: tuple[Argument, ...] = ()
+    numbers: tuple[np.ndarray, ...] = ()
 
-    @property
+    @cached_property
+    def result(self) -> Any:
+        """A Family or Distribution, the value of a deterministic node, or a log factor.
+
+        Of the stored values of stochastic nodes and inputs: deterministic nodes are substituted.
+        """
+        instead: dict[Expression, Expression] = dict(self.inside)
+        for parent, argument in zip(self.parents, self.arguments, strict=True):
+            node = self.model[parent]
+            if argument.known is not None:
+                continue
+            instead.setdefault(argument.leaf, _stored_value(self.model, parent))
+            if node.kind == "deterministic" and node.domain and node.domain.labels is None:
+                instead[numbers_of(argument.leaf, node.domain)] = value_of(self.model, parent)
+        return mapped(self.reading.result, lambda e: replaced(e, instead))
+
+    @cached_property
+    def inside(self) -> dict[Expression, Expression]:
+        """The numbers in the function, by their leaves in the reading."""
+        return {
+            leaf(f"number {k}", n.shape, n.dtype): constant(n) for k, n in enumerate(self.numbers)
+        }
+
+    @cached_property
     def leaves(self) -> frozenset[str]:
         """Names of the nodes that it depends on."""
         return frozenset().union(*(e.leaves for e in expressions_of(self.result)))
+
+    def local(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Stored values by the names of the reading's leaves."""
+        found = {
+            f"argument {a.place}": values[p]
+            for p, a in zip(self.parents, self.arguments, strict=True)
+        }
+        return {**found, **{f"number {k}": n for k, n in enumerate(self.numbers)}}
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +118,25 @@ class Opaque:
 
 
 def density(model: Model, name: str) -> Followed | Opaque:
-    """What a node's function computes; it is read, and checked, once for each model."""
+    """What a node's function, or a potential's, computes; it is read, and checked, once for each model.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network.expressions import density
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Normal(0.0, 1.0))
+    >>> net.add("b", lambda a: 2 * a)
+    >>> net.add("y", lambda b: bmc.Normal(b, 1.0))
+    >>> density(net.model({}, {}), "y").result.parameters["loc"]
+    <Elementwise multiply ()>
+    """
     known = model.cache.setdefault("expressions", {})
     if name not in known:
+        for above in _deterministic_above(model, name, known):
+            known[above] = found = _read(model, above)
+            if isinstance(found, Followed):
+                _ = found.result  # one after the other, however many follow from each other
         known[name] = _read(model, name)
     return known[name]
 
@@ -103,19 +161,18 @@ def log_density_of(model: Model, name: str) -> Expression:
     return broadcast(log_density(family, value), node.plate_shape)
 
 
-def argument(model: Model, parent: str, link: Aligner) -> Any:
-    """The stand-in that a function receives for a parent."""
-    node = model[parent]
-    if node.kind == "deterministic":
-        value: Any = TracedArray(value_of(model, parent))
-        labels = None if node.domain is None else node.domain.labels
-        value = value if labels is None else TracedStates(value, labels)
-    else:
-        value = _decoded(TracedArray(stored_leaf(model, node)), link)
-    placed = link.place(value)
-    if link.foreign:
-        return PlateArray(placed, link.foreign, link.own, link.event_ndim)
-    return placed
+def log_factor_of(model: Model, name: str) -> Expression:
+    """A potential's log factors, shape its plates or the rows of its index.
+
+    Raises
+    ------
+    TraceError
+        Its function cannot be followed.
+    """
+    found = density(model, name)
+    if isinstance(found, Opaque):
+        raise TraceError(f"potential {name!r}: {found.reason}")
+    return broadcast(found.result, potential_shape(model.sizes, model.potentials[name][0]))
 
 
 def value_of(model: Model, name: str) -> Expression:
@@ -125,14 +182,11 @@ def value_of(model: Model, name: str) -> Expression:
     if isinstance(found, Followed):
         return broadcast(found.result, node.value_shape)
     parents = tuple(dict.fromkeys(node.parents))
-    operands = [
-        _stored_value(model, p)
-        if model[p].kind == "deterministic"
-        else stored_leaf(model, model[p])
-        for p in parents
-    ]
+    operands = [_stored_value(model, p) for p in parents]
     stored = call(_NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
-    return stored if node.domain is None else _decoded_values(stored, node)
+    if node.domain is None or node.domain.labels is not None:
+        return stored
+    return numbers_of(stored, node.domain)
 
 
 def stored_leaf(model: Model, node: CompiledNode) -> Expression:
@@ -174,33 +228,11 @@ def _dtype(model: Model, node: CompiledNode) -> Any:
     return int if node.is_discrete or node.domain is not None else float
 
 
-def _decoded(stored: TracedArray, link: Aligner) -> Any:
-    """User values of stored ones, as a link hands them on."""
-    domain = link.domain
-    if domain is None:
-        return stored
-    if domain.labels is not None:
-        return TracedStates(stored, domain.labels)
-    return TracedArray(_numbers(stored.expression, domain))
-
-
-def _numbers(stored: Expression, domain: Domain) -> Expression:
-    """Numeric user values of positions."""
-    if domain.values is not None:
-        return gather(constant(domain.values), stored)
-    return elementwise(np.add, stored, domain.low) if domain.low else stored
-
-
-def _decoded_values(stored: Expression, node: CompiledNode) -> Expression:
-    assert node.domain is not None
-    if node.domain.labels is not None:
-        return stored
-    return _numbers(stored, node.domain)
-
-
 def _stored_value(model: Model, name: str) -> Expression:
-    """The stored value of a deterministic node."""
+    """A node's stored value; that of a deterministic one follows from others."""
     node = model[name]
+    if node.kind != "deterministic":
+        return stored_leaf(model, node)
     value = value_of(model, name)
     if node.domain is None or node.domain.labels is not None:
         return value
@@ -211,132 +243,220 @@ def _stored_value(model: Model, name: str) -> Expression:
     return gather(constant(order), found.expression)
 
 
-def _read(model: Model, name: str) -> Followed | Opaque:
-    node = model[name]
-    try:
-        result = _traced(model, node)
-        if node.is_stochastic and not isinstance(result, (Family, Distribution)):
-            raise TraceError(f"it returns {type(result).__name__}")
-        if isinstance(result, Density) and node.links:
-            raise TraceError("its Density may read parents where that cannot be seen")
-        found = Followed(result)
-        if not _is_known(model, node, found):
-            _check(model, node, found)
-        return found
-    except TraceError as error:
-        return Opaque(str(error), _leaves_above(model, name))
-
-
-def _leaves_above(model: Model, name: str) -> frozenset[str]:
-    found: frozenset[str] = frozenset()
-    for parent in model[name].parents:
-        above = _leaves_above(model, parent) if model[parent].kind == "deterministic" else {parent}
-        found = found | above
-    return found
-
-
-def _traced(model: Model, node: CompiledNode) -> Any:
-    declaration = node.declaration
-    if declaration.value is not None:
-        return constant(declaration.value)
-    if declaration.probs is not None:
-        return _of_table(model, node)
-    if declaration.vectorize:
-        raise TraceError("it is called element by element (vectorize=True)")
-    assert declaration.function is not None
-    arguments = [argument(model, parent, link) for parent, link in node.links]
-    return trace(declaration.function, arguments)
-
-
-def _of_table(model: Model, node: CompiledNode) -> Family:
-    probs = node.declaration.probs
-    assert probs is not None
-    rows: Any = 0
-    for card, (parent, link) in zip(probs.shape[:-1], node.links, strict=True):
-        parent_node = model[parent]
-        if parent_node.kind == "deterministic":
-            stored = _stored_value(model, parent)
-        else:
-            stored = stored_leaf(model, parent_node)
-        placed: Any = TracedArray(stored)
-        rows = rows * card + link.place(placed)
-    table = constant(probs.reshape(-1, probs.shape[-1]))
-    rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
-    return Family(Categorical, {"probs": gather(table, rows), "logits": None})
-
-
-def _is_known(model: Model, node: CompiledNode, found: Followed) -> bool:
-    """Whether the same function has been read in the same way, but for constants, a few times before."""
-    code = getattr(node.declaration.function, "__code__", None)
-    if code is None:
-        return False
-    keys = tuple(template(e).key for e in expressions_of(found.result))
-    times = model.cache.setdefault("expressions checked", {})
-    times[code, keys] = times.get((code, keys), 0) + 1
-    return times[code, keys] > _CHECKED
-
-
-def _check(model: Model, node: CompiledNode, found: Followed) -> None:
-    """Refuse a reading that gives something else than the function at probe points."""
-    program = Program(list(expressions_of(found.result)))
-    for values in _probes(model, node, found.leaves):
-        with marking_invalid(), np.errstate(all="ignore"):
-            try:
-                whole = dict(values)
-                for name in _between(model, node):
-                    whole[name] = model.evaluate(name, whole)[0]
-                expected, batch = model.evaluate(node.name, whole)
-            except BayesmcError:
-                continue  # the function's own fault, or out of range: nothing to compare
-            try:
-                made = rebuilt(found.result, iter(program(values)))
-                if node.is_stochastic and not isinstance(made, Distribution):
-                    made = as_distribution(made)
-            except (BayesmcError, ValueError, TypeError, IndexError) as error:
-                raise TraceError(f"what was read of it fails: {error}") from error
-            if not _agree(node, expected, made, batch + node.plate_shape):
-                raise TraceError("what was read of it gives other values than the function")
-
-
-def _between(model: Model, node: CompiledNode) -> list[str]:
-    """Deterministic nodes above one, those first on which others depend."""
+def _deterministic_above(model: Model, name: str, known: Mapping[str, Any]) -> list[str]:
+    """Deterministic nodes above one that are not known, those first on which others depend."""
     found: dict[str, None] = {}
-
-    def visit(name: str) -> None:
-        for parent in model[name].parents:
-            if model[parent].kind == "deterministic" and parent not in found:
-                visit(parent)
-                found[parent] = None
-
-    visit(node.name)
+    todo = [(name, False)]
+    while todo:
+        above, is_done = todo.pop()
+        if is_done:
+            found[above] = None
+            continue
+        if above != name:
+            todo.append((above, True))
+        parents = (
+            model[above].parents if above in model.nodes else model.potentials[above][0].parents
+        )
+        todo += [
+            (p, False)
+            for p in parents
+            if model[p].kind == "deterministic" and p not in known and p not in found
+        ]
     return list(found)
 
 
-def _probes(
-    model: Model, node: CompiledNode, leaves: frozenset[str]
-) -> Iterator[Mapping[str, np.ndarray]]:
-    """Stored values of unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks."""
-    above = leaves | _leaves_above(model, node.name)
-    whole = {n: model.probe[n] for n in above}
-    yield whole
-    if not whole or not model.probe_shape:
-        return
-    ranks = {n: v.ndim - len(model[n].value_shape) for n, v in whole.items()}
-    yield {n: v[-1] if ranks[n] == 2 else v for n, v in whole.items()}
-    yield {n: v[(0,) * ranks[n]] for n, v in whole.items()}
-    yield {
-        n: (v, v[0], v[:, :1], v[0, 0])[k % 4] if ranks[n] == 2 else v
-        for k, (n, v) in enumerate(sorted(whole.items()))
-    }
+def _read(model: Model, name: str) -> Followed | Opaque:
+    ways = (True, False) if isinstance(_function(model, name), Numbered) else (False,)
+    reason = ""
+    for for_all_numbers in ways:
+        try:
+            found = _shared(model, name, for_all_numbers)
+            _check(model, name, found)
+            return found
+        except TraceError as error:
+            reason = str(error)
+    return Opaque(reason, _leaves_above(model, name))
 
 
-def _agree(node: CompiledNode, expected: Any, made: Any, shape: Shape) -> bool:
+def _function(model: Model, name: str) -> Any:
+    if name in model.nodes:
+        return model[name].declaration.function
+    return model.potentials[name][0].function
+
+
+def _leaves_above(model: Model, name: str) -> frozenset[str]:
+    found, seen = set(), set()
+    todo = [name]
+    while todo:
+        above = todo.pop()
+        parents = (
+            model[above].parents if above in model.nodes else model.potentials[above][0].parents
+        )
+        for parent in parents:
+            if parent not in seen:
+                seen.add(parent)
+                if model[parent].kind == "deterministic":
+                    todo.append(parent)
+                else:
+                    found.add(parent)
+    return frozenset(found)
+
+
+def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:
+    """What is read of a function, which nodes that have it in the same way share."""
+    function, table = _function(model, name), None
+    if name in model.nodes:
+        node = model[name]
+        declaration, links, plates = node.declaration, node.links, node.plates
+        if declaration.value is not None:
+            return Followed(model, Reading(constant(declaration.value)))
+        if declaration.vectorize:
+            raise TraceError("it is called element by element (vectorize=True)")
+        table = declaration.probs
+    else:
+        potential, links = model.potentials[name]
+        plates = potential.plates
+    parents = tuple(parent for parent, _ in links)
+    arguments = _arguments(model, links)
+    what: Hashable = id(function)
+    if table is not None:
+        what = table.shape, table.tobytes()
+    elif isinstance(function, Numbered):
+        what = id(function.func), function.places, None if for_all_numbers else function.number
+    known = model.cache.setdefault("readings", {})
+    key = what, plates, arguments
+    if key not in known:
+        try:
+            if table is not None:
+                known[key] = read_table(table, arguments, links)
+            else:
+                known[key] = read_function(function, arguments, links, for_all_numbers)
+        except TraceError as error:
+            known[key] = error
+    reading = known[key]
+    if isinstance(reading, TraceError):
+        raise reading
+    stochastic = name in model.nodes and model[name].is_stochastic
+    if stochastic != isinstance(reading.result, (Family, Distribution)):
+        raise TraceError(f"it returns {type(reading.result).__name__}")
+    numbers = (np.asarray(function.number),) if for_all_numbers else ()
+    return Followed(model, reading, parents, arguments, numbers)
+
+
+def _arguments(model: Model, links: Sequence[tuple[str, Aligner]]) -> tuple[Argument, ...]:
+    first: dict[str, int] = {}
+    return tuple(
+        _argument(model, first.setdefault(parent, k), parent, link)
+        for k, (parent, link) in enumerate(links)
+    )
+
+
+def _argument(model: Model, place: int, parent: str, link: Aligner) -> Argument:
+    node = model[parent]
+    domain = node.domain
+    known, dtype = None, np.dtype(_dtype(model, node))
+    if node.kind == "deterministic" and domain is None:
+        value = value_of(model, parent)
+        known, dtype = value if isinstance(value, Constant) else None, value.dtype
+    states = None if domain is None else domain.size
+    rows = link.flat.tobytes() if isinstance(link, RowAligner) else None
+    how = node.plates, node.event_shape, link.domain is None, domain and domain.key, rows
+    return Argument(place, node.value_shape, dtype.str, states, how, known)
+
+
+# ---- the check ----------------------------------------------------------------------------------
+
+
+def _check(model: Model, name: str, found: Followed) -> None:
+    """Refuse a reading that gives something else than the function at probe points.
+
+    A function of its own is checked whatever it is like, a shared one a few times.
+    """
+    times = model.cache.setdefault("expressions checked", {})
+    alike = next(times.setdefault(found.reading.key, count()))
+    uses = next(times.setdefault(id(found.reading), count()))
+    if alike < _CHECKED:
+        through = any(model[p].kind == "deterministic" for p in found.parents)
+        for variant in range(len(_VARIANTS)):
+            values = _Probe.of(model, variant)
+            _compare(model, name, found, values)
+            if through:
+                _compare(model, name, found, values, whole=True)
+    elif found.numbers or not uses & (uses - 1):  # another number, or function; else now and then
+        _compare(model, name, found, _Probe.of(model, len(_VARIANTS) - 1))
+
+
+def _compare(model: Model, name: str, found: Followed, values: _Probe, whole: bool = False) -> None:
+    """Hold what was read against what the function gives, at one of the probes."""
+    is_node = name in model.nodes
+    with marking_invalid(), np.errstate(all="ignore"):
+        try:
+            if is_node:
+                expected, batch = model.evaluate(name, values)
+                shape = batch + model[name].plate_shape
+            else:
+                expected = model.potential(name, values, total=False)
+                shape = expected.shape
+            given = values if whole else found.local(values)
+        except BayesmcError:
+            return  # the function's own fault, or out of range: nothing to compare
+        result = found.result if whole else found.reading.result
+        program = Program(list(expressions_of(result))) if whole else found.reading.program
+        try:
+            made = rebuilt(result, iter(program(given)))
+            if is_node and model[name].is_stochastic and not isinstance(made, Distribution):
+                made = as_distribution(made)
+        except (BayesmcError, ValueError, TypeError, IndexError) as error:
+            raise TraceError(f"what was read of it fails: {error}") from error
+        if not _agree(model.nodes.get(name), expected, made, shape):
+            raise TraceError("what was read of it gives other values than the function")
+
+
+class _Probe(dict[str, np.ndarray]):
+    """Stored values of all nodes at probe points; of deterministic ones as they are asked for."""
+
+    def __init__(self, model: Model, variant: int) -> None:
+        super().__init__()
+        self.model, self.variant = model, variant
+        self._place = {n: k for k, n in enumerate(model.nodes)}
+
+    @classmethod
+    def of(cls, model: Model, variant: int) -> _Probe:
+        known = model.cache.setdefault("expression probes", {})
+        if variant not in known:
+            known[variant] = cls(model, variant)
+        return known[variant]
+
+    def __missing__(self, name: str) -> np.ndarray:
+        node = self.model[name]
+        if node.kind == "deterministic":
+            for above in _deterministic_above(self.model, name, self):
+                self[above] = self.model.evaluate(above, self)[0]
+            value = self.model.evaluate(name, self)[0]
+        else:
+            value = self.model.probe[name]
+            rank = value.ndim - len(node.value_shape)
+            value = _VARIANTS[self.variant](value, rank, self._place[name])
+        self[name] = value
+        return value
+
+
+#: unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks
+_VARIANTS: tuple[Callable[[np.ndarray, int, int], np.ndarray], ...] = (
+    lambda v, rank, _: v,
+    lambda v, rank, _: v[-1] if rank == 2 else v,
+    lambda v, rank, _: v[(0,) * rank],
+    lambda v, rank, k: (v, v[0], v[:, :1], v[0, 0])[k % 4] if rank == 2 else v,
+)
+
+
+def _agree(node: CompiledNode | None, expected: Any, made: Any, shape: Shape) -> bool:
     if isinstance(expected, Distribution) != isinstance(made, Distribution):
         return False
     if not isinstance(expected, Distribution):
-        full = shape + node.event_shape
+        full = shape if node is None else shape + node.event_shape
         stored = np.asarray(expected)
-        value = node.decode(stored) if node.domain is not None else stored
+        value = node.decode(stored) if node is not None and node.domain is not None else stored
         return _near(np.asarray(value), np.broadcast_to(np.asarray(made), full))
     if type(expected) is not type(made):
         return False

@@ -240,7 +240,9 @@ class Model:
         """What a potential's function returns, checked, shape ``(*batch, *plates or rows)``."""
         name = potential.name
         plates = potential_shape(self.sizes, potential)
-        what = Declaration(f"potential {name}", "function", function=potential.function)
+        what = Declaration(
+            f"potential {name}", "function", plates=potential.plates, function=potential.function
+        )
         raw = np.asarray(call(what, arguments, batch + plates, links, wants_array=True))
         if raw.dtype.kind == "b":
             raise ModelError(

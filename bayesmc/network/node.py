@@ -44,6 +44,33 @@ class Node:
 
 
 @dataclass(frozen=True, eq=False)
+class Numbered:
+    """A function with a number in the place of some arguments: that of a template, in one slice.
+
+    Attributes
+    ----------
+    func : callable
+    places : tuple of int
+        Where the number stands among the arguments, in ascending order.
+    number : int
+    """
+
+    func: Callable[..., Any]
+    places: tuple[int, ...]
+    number: int
+
+    def filled(self, values: Sequence[Any], number: Any) -> list[Any]:
+        """All arguments, from the others."""
+        arguments = list(values)
+        for place in self.places:
+            arguments.insert(place, number)
+        return arguments
+
+    def __call__(self, *values: Any) -> Any:
+        return self.func(*self.filled(values, self.number))
+
+
+@dataclass(frozen=True, eq=False)
 class Declaration:
     """What was declared under one name.
 

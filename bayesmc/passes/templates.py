@@ -35,21 +35,27 @@ class Stacked:
 
     Attributes
     ----------
-    root : Expression
-        Its leaves are those of the first, and ``constant 0``, ``constant 1``, ... for constants that differ.
+    roots : tuple of Expression
+        Of the leaves of the first, and ``constant 0``, ``constant 1``, ... for constants that differ.
     constants : dict
         Leaf -> the constants of all of them, shape ``(count, *shape)``.
     leaves : tuple of tuple of str
         For each the names that stand for the first one's leaves.
     """
 
-    root: Expression
+    roots: tuple[Expression, ...]
     constants: dict[str, np.ndarray]
     leaves: tuple[tuple[str, ...], ...]
 
+    @property
+    def root(self) -> Expression:
+        """The only one."""
+        (root,) = self.roots
+        return root
 
-def template(root: Expression) -> Template:
-    """What an expression is, apart from its constants and the names of its leaves.
+
+def template(*roots: Expression) -> Template:
+    """What expressions are, together, apart from their constants and the names of their leaves.
 
     Examples
     --------
@@ -65,7 +71,7 @@ def template(root: Expression) -> Template:
     key: list[Hashable] = []
     constants: list[np.ndarray] = []
     leaves: dict[str, int] = {}
-    for node in ordered(root):
+    for node in ordered(*roots):
         number[node] = len(number)
         if isinstance(node, Constant) and node.dtype.kind in "fi":
             constants.append(node.value)
@@ -76,23 +82,37 @@ def template(root: Expression) -> Template:
         else:
             own = tuple(number[a] for a in node.operands)
             key.append((type(node).__name__, own, node.content, node.shape))
+    key.append(tuple(number[r] for r in roots))
     return Template(tuple(key), tuple(constants), tuple(leaves))
 
 
 def stacked(roots: Sequence[Expression]) -> Stacked | None:
     """One expression for all, or None where they are not alike."""
-    found = [template(r) for r in roots]
+    return stacked_rows([(r,) for r in roots])
+
+
+def stacked_rows(
+    rows: Sequence[Sequence[Expression]], templates: Sequence[Template] | None = None
+) -> Stacked | None:
+    """One row of expressions for many, as the parameters of a distribution; None where they are not alike.
+
+    Parameters
+    ----------
+    templates : sequence of Template, optional
+        Of the rows, where they are known.
+    """
+    found = [template(*r) for r in rows] if templates is None else templates
     if len({t.key for t in found}) != 1:
         return None
-    columns = list(zip(*(t.constants for t in found), strict=True))
-    first = [n for n in ordered(roots[0]) if isinstance(n, Constant) and n.dtype.kind in "fi"]
+    columns = zip(*(t.constants for t in found), strict=True)
+    first = [n for n in ordered(*rows[0]) if isinstance(n, Constant) and n.dtype.kind in "fi"]
     values: dict[str, np.ndarray] = {}
     instead: dict[Expression, Expression] = {}
     for node, column in zip(first, columns, strict=True):
-        if all(np.array_equal(c, column[0], equal_nan=True) for c in column):
+        if all(c is column[0] or np.array_equal(c, column[0], equal_nan=True) for c in column):
             continue
         name = f"constant {len(values)}"
         values[name] = np.stack(column)
         instead[node] = leaf(name, node.shape, node.dtype)
-    root = replaced(roots[0], instead) if instead else roots[0]
-    return Stacked(root, values, tuple(t.leaves for t in found))
+    roots = tuple(replaced(r, instead) if instead else r for r in rows[0])
+    return Stacked(roots, values, tuple(t.leaves for t in found))

@@ -19,7 +19,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, DensityError, TraceError
 from bayesmc.expression import Expression
 from bayesmc.network import Model, Observed, Problem
-from bayesmc.network.expressions import Followed, Opaque, density, log_density_of
+from bayesmc.network.expressions import Followed, Opaque, density, log_density_of, log_factor_of
 from bayesmc.network.model import invalid_error
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
@@ -61,13 +61,11 @@ class Term:
     @cached_property
     def read(self) -> Followed | Opaque:
         """What its function computes of stochastic nodes and inputs."""
-        if self.is_potential:
-            return Opaque("it is a potential", frozenset(self.parents))
         return density(self.model, self.name)
 
     @cached_property
     def expression(self) -> Expression | None:
-        """Its log density, shape its plates, of stored values of stochastic nodes and inputs.
+        """Its log factors, shape its plates, of stored values of stochastic nodes and inputs.
 
         None where the function could not be followed, or the family has no closed form. Its mask is left
         to those who sum.
@@ -75,6 +73,8 @@ class Term:
         if isinstance(self.read, Opaque):
             return None
         try:
+            if self.is_potential:
+                return log_factor_of(self.model, self.name)
             return log_density_of(self.model, self.name)
         except TraceError:
             return None

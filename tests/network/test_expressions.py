@@ -112,3 +112,67 @@ def test_a_wrong_reading_is_never_taken(monkeypatch):
     net.add("a", bmc.Normal(0.0, 1.0))
     net.add("y", lambda a: bmc.Normal(a, 1.0))
     assert isinstance(read(net)["y"], Opaque)
+
+
+def growth(steps, drift):
+    dbn = bmc.DynamicBayesNet()
+
+    @dbn.node(initial=bmc.Normal(0.0, 1.0))
+    def x(x_prev, t):
+        return bmc.Normal(drift(x_prev, t), 1.0)
+
+    model = dbn.unroll(steps).model({}, {})
+    return model, [density(model, f"x[{t}]") for t in range(1, steps)]
+
+
+def test_slices_share_a_reading():
+    """Of the index of the slice, too, where the function can be followed for all of them at once."""
+    for drift, shared in (
+        (lambda x, t: 0.5 * x + np.cos(1.2 * t), True),
+        (lambda x, t: x if t % 2 else -x, False),
+        (lambda x, t: x + 10**t % 7, False),  # other numbers as integers of 64 bits
+    ):
+        model, found = growth(30, drift)
+        assert all(isinstance(f, Followed) for f in found)
+        assert (len({id(f.reading) for f in found}) == 1) == shared
+        values = {f"x[{t}]": np.array([0.3, -2.0]) for t in range(30)}
+        for t, f in enumerate(found, 1):
+            (loc, _) = Program(f.result.parameters.values())(values)
+            np.testing.assert_allclose(loc, drift(values["x[0]"], t), rtol=1e-15)
+
+
+def test_a_number_at_which_the_reading_is_wrong_is_noticed():
+    """Negative control: t = 19 alone differs, which no stand-in for numbers shows."""
+
+    def lying(x, t):
+        return x + (100.0 if isinstance(x, np.ndarray) and np.all(t == 19) else 0.0)
+
+    _, found = growth(24, lying)
+    assert [t for t, f in enumerate(found, 1) if isinstance(f, Opaque)] == [19]
+
+
+def test_potentials_are_followed():
+    graph = bmc.FactorGraph(plates={"site": 6})
+    graph.variable("s", (-1, 1), plates="site")
+    graph.variable("f", "real")
+    graph.factor(lambda a, b: 0.4 * a * b, scope=("s", "s"), index=(np.arange(5), np.arange(1, 6)))
+    graph.factor(lambda f: -(f**2), scope="f")
+    graph.factor(lambda s, f: s * f, scope=("s", "f"))
+    model = graph.model({}, {})
+    values = {"s": np.array([[0, 1, 1, 0, 1, 0], [1, 1, 1, 0, 0, 0]]), "f": np.array([0.5, -1.0])}
+    for name in model.potentials:
+        (found,) = Program([expressions.log_factor_of(model, name)])(values)
+        np.testing.assert_allclose(found, model.potential(name, values, total=False), rtol=1e-15)
+
+
+def test_deterministic_nodes_may_follow_from_each_other_a_thousand_times():
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("s[0]", lambda x: x)
+    step = lambda s, x: 0.5 * s + x  # noqa: E731
+    for t in range(1, 1000):
+        net.add(f"s[{t}]", step, parents=[f"s[{t - 1}]", "x"])
+    net.add("y", lambda s: bmc.Normal(s, 1.0), parents=["s[999]"])
+    found = density(net.model({}, {}), "y")
+    (loc, _) = Program(found.result.parameters.values())({"x": np.array([1.0, 3.0])})
+    np.testing.assert_allclose(loc, [2.0, 6.0])

@@ -1,0 +1,196 @@
+"""What functions compute of their arguments: each is read once, for all nodes that share it.
+
+A reading speaks of leaves ``argument 0``, ``argument 1``, ... for what a node's parents store, and of
+``number 0``, ... for numbers that were put into the function, as the index of a slice is. The slices of an
+unrolled template have one reading, and so do nodes that were given one function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Categorical, Density, Distribution
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Constant,
+    Expression,
+    Family,
+    Leaf,
+    Program,
+    TracedArray,
+    TracedStates,
+    constant,
+    elementwise,
+    expressions_of,
+    gather,
+    leaf,
+    trace,
+)
+from bayesmc.network.align import Aligner, RowAligner
+from bayesmc.network.domain import Domain
+from bayesmc.network.node import Numbered
+from bayesmc.passes.templates import Template, template
+from bayesmc.plates import PlateArray
+from bayesmc.shapes import Shape
+
+
+@dataclass(frozen=True, eq=False)
+class Reading:
+    """What a function computes.
+
+    Attributes
+    ----------
+    result : Family, Expression or Distribution
+        Of leaves ``argument k`` and ``number k``; a distribution that depends on none.
+    """
+
+    result: Any
+
+    @cached_property
+    def roots(self) -> tuple[Expression, ...]:
+        return tuple(expressions_of(self.result))
+
+    @cached_property
+    def template(self) -> Template:
+        """What it is, apart from its constants."""
+        return template(*self.roots)
+
+    @cached_property
+    def key(self) -> Hashable:
+        """Equal for readings that differ in constants only."""
+        return frame(self.result), self.template.key
+
+    @cached_property
+    def program(self) -> Program:
+        return Program(self.roots)
+
+
+@dataclass(frozen=True)
+class Argument:
+    """What a function receives for a parent, apart from the parent's name.
+
+    Attributes
+    ----------
+    place : int
+        Of the first argument that is the same node.
+    shape, dtype, states : tuple of int, str, int or None
+        Of what the parent stores.
+    how : hashable
+        How it is decoded and aligned.
+    known : Constant or None
+        Its value, where that never changes.
+    """
+
+    place: int
+    shape: Shape
+    dtype: str
+    states: int | None
+    how: Hashable
+    known: Constant | None = None
+
+    @property
+    def leaf(self) -> Leaf:
+        return leaf(f"argument {self.place}", self.shape, self.dtype, self.states)
+
+    @property
+    def stored(self) -> Expression:
+        """What the parent stores."""
+        return self.leaf if self.known is None else self.known
+
+
+def read_function(
+    function: Any,
+    arguments: Sequence[Argument],
+    links: Sequence[tuple[str, Aligner]],
+    open_number: bool = False,
+) -> Reading:
+    """The reading of a function; of a ``Numbered`` one for all numbers, if asked for.
+
+    Raises
+    ------
+    TraceError
+        It cannot be followed.
+    """
+    given = [_argument(a, link) for a, (_, link) in zip(arguments, links, strict=True)]
+    if isinstance(function, Numbered):
+        number: Any = TracedArray(leaf("number 0", (), int)) if open_number else function.number
+        function, given = function.func, function.filled(given, number)
+    found = trace(function, given)
+    if isinstance(found, Density) and links:
+        raise TraceError("its Density may read parents where that cannot be seen")
+    return Reading(found)
+
+
+def read_table(
+    probs: np.ndarray, arguments: Sequence[Argument], links: Sequence[tuple[str, Aligner]]
+) -> Reading:
+    """The reading of a conditional probability table."""
+    rows: Any = 0
+    for card, argument, (_, link) in zip(probs.shape[:-1], arguments, links, strict=True):
+        placed: Any = TracedArray(argument.stored)
+        rows = rows * card + link.place(placed)
+    table = constant(probs.reshape(-1, probs.shape[-1]))
+    rows = rows.expression if isinstance(rows, TracedArray) else constant(rows)
+    return Reading(Family(Categorical, {"probs": gather(table, rows), "logits": None}))
+
+
+def numbers_of(stored: Expression, domain: Domain) -> Expression:
+    """Numeric user values of positions."""
+    if domain.values is not None:
+        return gather(constant(domain.values), stored)
+    return elementwise(np.add, stored, domain.low) if domain.low else stored
+
+
+def frame(traced: Any) -> Hashable:
+    """What is around the expressions of something traced; equal where these are used alike."""
+    if isinstance(traced, Expression):
+        return "expression"
+    if isinstance(traced, Family):
+        return traced.make, tuple((k, frame(v)) for k, v in traced.parameters.items())
+    if isinstance(traced, (list, tuple)):
+        return type(traced), tuple(map(frame, traced))
+    if traced is None or isinstance(traced, (bool, str)):
+        return type(traced), traced
+    return _content(traced)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _argument(argument: Argument, link: Aligner) -> Any:
+    """The stand-in that a function receives."""
+    placed = link.place(_decoded(argument.stored, link.domain))
+    if isinstance(link, RowAligner):  # one element for all rows broadcasts
+        event = placed.shape[placed.ndim - link.event_ndim :]
+        return np.broadcast_to(placed, (len(link.flat), *event))
+    if link.foreign:
+        return PlateArray(placed, link.foreign, link.own, link.event_ndim)
+    return placed
+
+
+def _decoded(stored: Expression, domain: Domain | None) -> Any:
+    """User values of stored ones."""
+    if domain is None:
+        return TracedArray(stored)
+    if domain.labels is not None:
+        return TracedStates(stored, domain.labels)
+    return TracedArray(numbers_of(stored, domain))
+
+
+def _content(value: Any) -> Hashable:
+    """A value by what it holds, where that can be told; otherwise it is like itself alone."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biufSU":
+        return "array", value.shape, value.dtype.str, value.tobytes()
+    if isinstance(value, Distribution) and type(value).__module__.startswith(
+        "bayesmc.distributions"
+    ):
+        inside = sorted(vars(value).items())
+        return type(value), tuple((k, _content(v)) for k, v in inside)
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return type(value), value
+    return "object", id(value)
