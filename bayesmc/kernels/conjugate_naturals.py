@@ -28,6 +28,7 @@ from bayesmc.expression import (
     pick,
     reshape,
 )
+from bayesmc.kernels.conjugate_children import Child, children_of, with_known
 from bayesmc.kernels.conjugate_families import (
     Bounds,
     Conditional,
@@ -37,16 +38,7 @@ from bayesmc.kernels.conjugate_families import (
     Naturals,
     family_of_features,
 )
-from bayesmc.kernels.conjugate_terms import (
-    Added,
-    Moving,
-    family_read,
-    features_of,
-    known_values,
-    moving,
-    parameters_read,
-    shares_sum_to_one,
-)
+from bayesmc.kernels.conjugate_terms import Added, Moving, features_of, moving, shares_sum_to_one
 from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
 from bayesmc.kernels.conjugate_words import why_not
 from bayesmc.network.expressions import Opaque, stored_leaf
@@ -172,7 +164,7 @@ def _as_family(result: Any) -> Family:
 
 
 def _known(blanket: Blanket, value: Any) -> Expression:
-    return known_values(blanket.target, as_expression(value))
+    return with_known(blanket.target, as_expression(value))
 
 
 def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> Form | str:
@@ -184,15 +176,19 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> 
         own = _own_features(blanket, prior, of)
     except TraceError:
         return f"a {prior.words} prior has no conjugate pair"
-    children: dict[str, Added] = {}
+    found_children = children_of(blanket)
+    if not isinstance(found_children, list):
+        return why_not(blanket, found_children, prior.words)
+    children: dict[Term, Added] = {}
     matched: list[str] = []
-    for term in _terms(blanket):
-        added = _added(blanket, term, of, prior.words)
-        if isinstance(added, str):
-            return added
+    for child in found_children:
+        try:
+            added = features_of(child.density, of, child.mask)
+        except TraceError:
+            return why_not(blanket, child.terms[0], prior.words)
         if added.coefficients:
-            children[term.name] = added
-            matched.append(_pair(term, of, added.is_picked and 2.0 not in added.coefficients))
+            children[child.terms[0]] = added
+            matched.append(_pair(child, of, added.is_picked and 2.0 not in added.coefficients))
     if not children:
         return "no child varies with it"
     everything = [own, *(c.coefficients for c in children.values())]
@@ -211,7 +207,7 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> 
         naturals.append(_placed(broadcast(whole, (of.count,)), blanket, members))
     form = Form(family, _words(prior, matched), naturals, _bounds(blanket, members, prior, family))
     if any(c.is_picked for c in children.values()) and not _is_closed(form, blanket):
-        unlike = next(t for t in _terms(blanket) if t.name in children and children[t.name].is_picked)
+        unlike = next(t for t, c in children.items() if c.is_picked)
         return why_not(blanket, unlike, prior.words)
     return form
 
@@ -230,25 +226,8 @@ def _own_features(blanket: Blanket, prior: _Prior, of: Moving) -> dict[Feature, 
     return dict(features_of(density, of, None, True).coefficients)
 
 
-def _terms(blanket: Blanket) -> list[Term]:
-    return [c.term for c in blanket.children]
-
-
-def _added(blanket: Blanket, term: Term, of: Moving, prior: str) -> Added | str:
-    """What a child adds, or why it makes no pair."""
-    if term.is_potential:
-        return f"it enters the potential {term.name!r}"
-    if term.expression is None:
-        return why_not(blanket, term, prior)
-    try:
-        return features_of(known_values(blanket.target, term.expression), of, term.mask)
-    except TraceError:
-        return why_not(blanket, term, prior)
-
-
-def _pair(term: Term, of: Moving, is_picked: bool) -> str:
-    family = family_read(term)
-    words = f"{family.make.__name__} {' and '.join(parameters_read(family, of.name))}"
+def _pair(child: Child, of: Moving, is_picked: bool) -> str:
+    words = f"{child.word} {' and '.join(child.read(of.name))}"
     return f"{words} where it is picked" if is_picked else words
 
 
@@ -259,7 +238,7 @@ def _words(prior: _Prior, matched: list[str]) -> str:
 def _unlike(
     blanket: Blanket,
     own: dict[Feature, Expression],
-    children: dict[str, Added],
+    children: dict[Term, Added],
     prior: _Prior,
     low: float,
     high: float,
@@ -268,21 +247,20 @@ def _unlike(
     if family_of_features({**own, **_union(children)}, 0.0, 1.0) is not None:
         return "its flat prior reaches beyond what the parameter allows"
     power, whose = _power(own), f"a {prior.words} prior"
-    for name, child in children.items():
-        term = blanket.target.terms[name]
+    for term, child in children.items():
         wanted = _power(child.coefficients)
         if wanted is None:
             return why_not(blanket, term, prior.words)
         if power is not None and wanted != power:
             return (
-                f"the density of child {name!r} has the power {wanted:g} of it in its exponential, and "
+                f"the density of child {term.name!r} has the power {wanted:g} of it in its exponential, and "
                 f"{whose} the power {power:g}: no conjugate pair"
             )
         power, whose = wanted, "another child"
-    return why_not(blanket, blanket.target.terms[next(iter(children))], prior.words)
+    return why_not(blanket, next(iter(children)), prior.words)
 
 
-def _union(children: dict[str, Added]) -> dict[Feature, Expression]:
+def _union(children: dict[Term, Added]) -> dict[Feature, Expression]:
     return {f: c for child in children.values() for f, c in child.coefficients.items()}
 
 
@@ -300,42 +278,31 @@ def _of_events(
         return f"a {prior.words} prior has no conjugate pair"
     of = moving(blanket, members, isinstance(family, DirichletConditional))
     naturals = _naturals_of(blanket, prior.base)
-    matched = []
-    for term in _terms(blanket):
-        if term.is_potential:
-            return f"it enters the potential {term.name!r}"
-        if term.expression is None and not _is_family(term):
-            return why_not(blanket, term, prior.words)
+    found = children_of(blanket)
+    if not isinstance(found, list):
+        return why_not(blanket, found, prior.words)
+    for child in found:
         try:
-            added = _event_added(blanket, term, of, family)
+            added = _event_added(blanket, child, of, family)
         except TraceError:
-            return why_not(blanket, term, prior.words)
-        if added is not None:
-            naturals = [add(a, reshape(b, a.shape)) for a, b in zip(naturals, added, strict=True)]
-            matched.append(_pair(term, of, False))
+            return why_not(blanket, child.terms[0], prior.words)
+        naturals = [add(a, reshape(b, a.shape)) for a, b in zip(naturals, added, strict=True)]
+    matched = [_pair(child, of, False) for child in found]
     if not matched:
         return "no child varies with it"
     placed = [_placed(a, blanket, members) for a in naturals]
     return Form(family, _words(prior, matched), placed, [])
 
 
-def _is_family(term: Term) -> bool:
-    return isinstance(getattr(term.read, "result", None), Family)
-
-
 def _event_added(
-    blanket: Blanket, term: Term, of: Moving, family: Conditional
-) -> tuple[Expression, ...] | None:
-    if not parameters_read(family_read(term), of.name):
-        return None
+    blanket: Blanket, child: Child, of: Moving, family: Conditional
+) -> tuple[Expression, ...]:
     if isinstance(family, MvNormalConditional):
-        return mean_added(term, of)
+        return mean_added(child, of)
     if isinstance(family, InverseWishartConditional):
-        return covariance_added(term, of)
-    if term.expression is None:
-        raise TraceError("it has no closed log density")
-    density = shares_sum_to_one(known_values(blanket.target, term.expression), blanket)
-    found = features_of(density, of, term.mask, True).coefficients
+        return covariance_added(child, of)
+    density = shares_sum_to_one(child.density, blanket)
+    found = features_of(density, of, child.mask, True).coefficients
     if set(found) - {LOG}:
         raise TraceError("it has other features")
     return (found.get(LOG, broadcast(ZERO, (of.count,))),)

@@ -12,18 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Constant,
     Expression,
-    Family,
-    Leaf,
     Reduction,
-    as_expression,
     broadcast,
     ordered,
     replaced,
-    substituted,
 )
 from bayesmc.passes.arithmetic import ONE, ZERO, add, multiply
 from bayesmc.passes.features import Feature, statistics
@@ -31,7 +26,6 @@ from bayesmc.passes.reads import element_read, same_along
 from bayesmc.passes.sinking import reads, sunk
 from bayesmc.passes.totals import parts_of, total
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Target, Term
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,17 +80,6 @@ def moving(blanket: Blanket, members: np.ndarray | None, by_number: bool = False
     return Moving(blanket, numbers, blanket.size)
 
 
-def known_values(target: Target, expression: Expression) -> Expression:
-    """An expression with constants in the place of what is known."""
-    values = {}
-    for node in ordered(expression):
-        if isinstance(node, Leaf) and target.is_known(node.name):
-            value = np.asarray(target.known[node.name])
-            if value.shape == node.shape:
-                values[node.name] = as_expression(value)
-    return substituted(expression, values) if values else expression
-
-
 def features_of(expression: Expression, of: Moving, mask: Any = None, strict: bool = False) -> Added:
     """The features of a log density, summed over all entries for every element.
 
@@ -141,27 +124,3 @@ def shares_sum_to_one(expression: Expression, blanket: Blanket) -> Expression:
             if every.shape[-1] == size and (every == np.arange(size)).all():
                 instead[node] = broadcast(ONE, node.shape)
     return replaced(whole, instead) if instead else whole
-
-
-def parameters_read(family: Family, name: str) -> list[str]:
-    """The parameters of a family in which a node occurs."""
-    return [k for k, v in family.parameters.items() if name in leaves_of(v)]
-
-
-def leaves_of(value: Any) -> frozenset[str]:
-    """The leaves of a parameter."""
-    if isinstance(value, Expression):
-        return value.leaves
-    if isinstance(value, Family):
-        value = list(value.parameters.values())
-    if isinstance(value, (list, tuple)):
-        return frozenset().union(*map(leaves_of, value))
-    return frozenset()
-
-
-def family_read(term: Term) -> Family:
-    """The family of a term whose function was followed."""
-    result = getattr(term.read, "result", None)
-    if not isinstance(result, Family):
-        raise TraceError("it is no distribution that can be followed")
-    return result

@@ -31,13 +31,8 @@ from bayesmc.expression import (
     reshape,
     substituted,
 )
-from bayesmc.kernels.conjugate_terms import (
-    Moving,
-    family_read,
-    known_values,
-    parameters_read,
-)
-from bayesmc.network.expressions import stored_leaf
+from bayesmc.kernels.conjugate_children import Child
+from bayesmc.kernels.conjugate_terms import Moving
 from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import ONE, divide, subtract
 from bayesmc.passes.derivatives import tangent
@@ -45,10 +40,9 @@ from bayesmc.passes.features import alone, statistics
 from bayesmc.passes.reads import element_read, same_along
 from bayesmc.passes.totals import total
 from bayesmc.shapes import Shape
-from bayesmc.structure.target import Term
 
 
-def mean_added(term: Term, of: Moving) -> tuple[Expression, Expression]:
+def mean_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
     """Precision ``(count, d, d)`` and linear term ``(count, d)`` of a vector that enters a mean.
 
     Raises
@@ -56,12 +50,15 @@ def mean_added(term: Term, of: Moving) -> tuple[Expression, Expression]:
     TraceError
         It enters something else, or not affinely.
     """
-    parameters, value = _known(term, of)
-    family = family_read(term)
-    if family.make not in (Normal, LogNormal, MvNormal) or parameters_read(family, of.name) != ["loc"]:
+    family, value = child.family, child.value
+    parameters = family.parameters
+    if family.make not in (Normal, LogNormal, MvNormal) or child.read(of.name) != ["loc"]:
         raise TraceError("it enters no mean")
+    if family.make is LogNormal:
+        value = elementwise(np.log, value)
     is_vector = family.make is MvNormal
-    shape = term.shape + (value.shape[-1:] if is_vector else (1,))
+    shape = child.shape + (value.shape[-1:] if is_vector else (1,))
+    value = broadcast(value, shape if is_vector else child.shape)
     loc, own = alone(broadcast(parameters["loc"], value.shape), of.name, of.numbers)
     if own is None:
         raise TraceError("it enters no mean")
@@ -75,13 +72,13 @@ def mean_added(term: Term, of: Moving) -> tuple[Expression, Expression]:
     zero = as_expression(np.zeros(own.shape))
     off = subtract(reshape(value, shape), substituted(mean, {own.name: zero}))
     if not is_vector:
-        weight = divide(1.0, elementwise(np.square, broadcast(parameters["scale"], term.shape)))
-        return _of_numbers(slope, off, weight, _Entries(at, of.count, term.mask))
+        weight = divide(1.0, elementwise(np.square, broadcast(parameters["scale"], child.shape)))
+        return _of_numbers(slope, off, weight, _Entries(at, of.count, child.mask))
     root = _inverse_root(parameters, shape)
-    return _of_vectors(slope, off, root, _Entries(at, of.count, term.mask))
+    return _of_vectors(slope, off, root, _Entries(at, of.count, child.mask))
 
 
-def covariance_added(term: Term, of: Moving) -> tuple[Expression, Expression]:
+def covariance_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
     """Degrees of freedom ``(count,)`` and scale ``(count, d, d)`` of a covariance.
 
     Raises
@@ -89,12 +86,11 @@ def covariance_added(term: Term, of: Moving) -> tuple[Expression, Expression]:
     TraceError
         It enters something else, or not as a multiple of itself.
     """
-    parameters, value = _known(term, of)
-    family = family_read(term)
-    if family.make is not MvNormal or parameters_read(family, of.name) != ["cov"]:
+    parameters, value = child.family.parameters, child.value
+    if child.family.make is not MvNormal or child.read(of.name) != ["cov"]:
         raise TraceError("it enters no covariance")
     d = value.shape[-1]
-    cov = broadcast(parameters["cov"], (*term.shape, d, d))
+    cov = broadcast(parameters["cov"], (*child.shape, d, d))
     size = of.numbers.size
     flat = np.arange(size).reshape(of.numbers.shape)
     found = statistics(cov, of.name, flat)
@@ -108,10 +104,10 @@ def covariance_added(term: Term, of: Moving) -> tuple[Expression, Expression]:
     in_place = np.broadcast_to(np.arange(d * d).reshape(d, d), place.shape)
     if times is None or at is None or place is not as_expression(in_place):
         raise TraceError("it is no multiple")
-    entries = _Entries(at, of.count, term.mask)
+    entries = _Entries(at, of.count, child.mask)
     off = subtract(value, broadcast(parameters["loc"], value.shape))
-    scaled = divide(off, reshape(elementwise(np.sqrt, times), (*term.shape, 1)))
-    return entries.total(broadcast(ONE, term.shape)), entries.outer(scaled, scaled)
+    scaled = divide(off, reshape(elementwise(np.sqrt, times), (*child.shape, 1)))
+    return entries.total(broadcast(ONE, child.shape)), entries.outer(scaled, scaled)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -172,20 +168,6 @@ class _Outer:
             for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)
         ]
         return np.stack(np.broadcast_arrays(*parts), axis=-3)
-
-
-def _known(term: Term, of: Moving) -> tuple[dict[str, Any], Expression]:
-    """Parameters and value of a term with constants in the place of what is known."""
-    target, model = of.blanket.target, term.model
-    family = family_read(term)
-    parameters = {
-        k: known_values(target, v) if isinstance(v, Expression) else v
-        for k, v in family.parameters.items()
-    }
-    value = known_values(target, stored_leaf(model, model[term.name]))
-    if family.make is LogNormal:
-        value = elementwise(np.log, value)
-    return parameters, value
 
 
 def _stacked(parts: list[Expression]) -> Expression:

@@ -6,8 +6,7 @@ from typing import Any
 
 from bayesmc.distributions import Categorical, Multinomial, MvNormal
 from bayesmc.errors import TraceError
-from bayesmc.expression import Family, leaf
-from bayesmc.kernels.conjugate_terms import parameters_read
+from bayesmc.expression import Family, expressions_of, leaf
 from bayesmc.network.expressions import Opaque
 from bayesmc.passes.affine import affine
 from bayesmc.passes.features import LOG1M, statistics
@@ -26,13 +25,16 @@ _OF_VECTORS = {
 def why_not(blanket: Blanket, term: Term, prior: str) -> str:
     """Why a child makes no conjugate pair with a node under a prior."""
     name, child = blanket.name, term.name
+    if term.is_potential:
+        return f"it enters the potential {child!r}"
     if isinstance(term.read, Opaque):
         return f"child {child!r} cannot be followed ({term.read.reason})"
     family = term.read.result
     if not isinstance(family, Family):
         return f"child {child!r} is no distribution that can be followed"
     word = getattr(family.make, "__name__", str(family.make))
-    read = parameters_read(family, name)
+    parameters = family.parameters.items()
+    read = [k for k, v in parameters if any(name in e.leaves for e in expressions_of(v))]
     forms = {k: form for k in family.parameters if (form := _form(family, k, read)) is not None}
     if not forms:
         return f"child {child!r} is {word}, which makes no conjugate pair"

@@ -20,7 +20,6 @@ from scipy import special
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Call,
-    Constant,
     Elementwise,
     Expression,
     Gather,
