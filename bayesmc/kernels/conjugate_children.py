@@ -96,6 +96,11 @@ def children_of(blanket: Blanket) -> list[Child] | Term:
     return [c for terms in groups.values() for c in _made(blanket, terms)]
 
 
+def apart(blanket: Blanket, child: Child) -> list[Child]:
+    """Many like children one by one; nothing of one."""
+    return [_alone(blanket, t) for t in child.terms] if len(child.terms) > 1 else []
+
+
 def with_known(target: Target, expression: Expression) -> Expression:
     """An expression with constants in the place of what is known."""
     values = {}
@@ -137,8 +142,12 @@ def _made(blanket: Blanket, terms: Sequence[Term]) -> Iterator[Child]:
         yield found
         return
     for term in terms:
-        roots = [with_known(blanket.target, r) for r in _roots(term)]
-        yield _child((term,), roots, term.shape, term.mask)
+        yield _alone(blanket, term)
+
+
+def _alone(blanket: Blanket, term: Term) -> Child:
+    roots = [with_known(blanket.target, r) for r in _roots(term)]
+    return _child((term,), roots, term.shape, term.mask)
 
 
 def _joined(blanket: Blanket, terms: Sequence[Term]) -> Child | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,7 +16,7 @@ from bayesmc.distributions import (
     Truncated,
     Uniform,
 )
-from bayesmc.errors import TraceError
+from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import (
     Expression,
     Family,
@@ -28,7 +28,7 @@ from bayesmc.expression import (
     pick,
     reshape,
 )
-from bayesmc.kernels.conjugate_children import Child, children_of, with_known
+from bayesmc.kernels.conjugate_children import Child, apart, children_of, with_known
 from bayesmc.kernels.conjugate_families import (
     Bounds,
     Conditional,
@@ -38,6 +38,7 @@ from bayesmc.kernels.conjugate_families import (
     Naturals,
     family_of_features,
 )
+from bayesmc.kernels.conjugate_range import least_values, refuse
 from bayesmc.kernels.conjugate_terms import Added, Moving, features_of, moving, shares_sum_to_one
 from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
 from bayesmc.kernels.conjugate_words import why_not
@@ -46,7 +47,7 @@ from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.features import LOG, Feature
 from bayesmc.passes.log_density import family_of, log_density
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Term, Values
+from bayesmc.structure.target import Values
 
 
 class Form:
@@ -61,21 +62,29 @@ class Form:
         With the node's plates in front, or the members of the class.
     bounds : sequence of Expression
         Of the support, none or two.
+    positive : sequence of tuple
+        What must be positive, and the child that it is a parameter of.
     """
 
     def __init__(
-        self, family: Conditional, words: str, naturals: list[Expression], bounds: list[Expression]
+        self,
+        family: Conditional,
+        words: str,
+        naturals: list[Expression],
+        bounds: list[Expression],
+        positive: list[tuple[Expression, Child]],
     ) -> None:
         self.family, self.words = family, words
-        roots = [*naturals, *bounds]
+        self._positive = [child for _, child in positive]
+        roots = [*naturals, *bounds, *(e for e, _ in positive)]
         self._program = Program(roots)
-        self._count = len(naturals)
+        self._count, self._ends = len(naturals), len(naturals) + len(bounds)
         self._ndims = [len(r.shape) for r in roots]
         self._kept: tuple[Naturals, Bounds | None] | None = None
         if not any(r.leaves for r in roots):
             self._kept = self({})
 
-    def __call__(self, values: Mapping[str, np.ndarray]) -> tuple[Naturals, Bounds | None]:
+    def __call__(self, values: Values) -> tuple[Naturals, Bounds | None]:
         """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
         if self._kept is not None:
             return self._kept
@@ -83,8 +92,11 @@ class Form:
             a if a.ndim > n else a[None]
             for a, n in zip(self._program(values), self._ndims, strict=True)
         ]
-        k = self._count
-        return tuple(found[:k]), (found[k], found[k + 1]) if len(found) > k else None
+        k, end = self._count, self._ends
+        for least, child in zip(found[end:], self._positive, strict=True):
+            if (least <= 0.0).any():
+                refuse(child, values)
+        return tuple(found[:k]), (found[k], found[k + 1]) if end > k else None
 
 
 def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
@@ -176,26 +188,22 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> 
         own = _own_features(blanket, prior, of)
     except TraceError:
         return f"a {prior.words} prior has no conjugate pair"
+    low, high = prior.ends(blanket)
+    least, most = _SUPPORTS.get(prior.base.make.__name__, (0.0, np.inf))
+    low, high = max(low, least), min(high, most)
     found_children = children_of(blanket)
     if not isinstance(found_children, list):
         return why_not(blanket, found_children, prior.words)
-    children: dict[Term, Added] = {}
-    matched: list[str] = []
+    children: dict[Child, Added] = {}
     for child in found_children:
         try:
-            added = features_of(child.density, of, child.mask)
+            children |= _added(blanket, child, of, low >= 0.0 and high <= 1.0)
         except TraceError:
             return why_not(blanket, child.terms[0], prior.words)
-        if added.coefficients:
-            children[child.terms[0]] = added
-            matched.append(_pair(child, of, added.is_picked and 2.0 not in added.coefficients))
     if not children:
         return "no child varies with it"
     everything = [own, *(c.coefficients for c in children.values())]
     found = dict.fromkeys(f for some in everything for f in some)
-    low, high = prior.ends(blanket)
-    least, most = _SUPPORTS.get(prior.base.make.__name__, (0.0, np.inf))
-    low, high = max(low, least), min(high, most)
     family = family_of_features(found, low, high)
     if family is None:
         return _unlike(blanket, own, children, prior, low, high)
@@ -205,10 +213,15 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> 
         for some in everything:
             whole = add(whole, some.get(feature, ZERO))
         naturals.append(_placed(broadcast(whole, (of.count,)), blanket, members))
-    form = Form(family, _words(prior, matched), naturals, _bounds(blanket, members, prior, family))
+    words = _words(
+        prior,
+        [_pair(c, of, a.is_picked and 2.0 not in a.coefficients) for c, a in children.items()],
+    )
+    positive = _positive(blanket, children)
+    form = Form(family, words, naturals, _bounds(blanket, members, prior, family), positive)
     if any(c.is_picked for c in children.values()) and not _is_closed(form, blanket):
-        unlike = next(t for t, c in children.items() if c.is_picked)
-        return why_not(blanket, unlike, prior.words)
+        unlike = next(c for c, a in children.items() if a.is_picked)
+        return why_not(blanket, unlike.terms[0], prior.words)
     return form
 
 
@@ -226,6 +239,24 @@ def _own_features(blanket: Blanket, prior: _Prior, of: Moving) -> dict[Feature, 
     return dict(features_of(density, of, None, True).coefficients)
 
 
+def _added(blanket: Blanket, child: Child, of: Moving, is_share: bool) -> dict[Child, Added]:
+    """What a child adds; like ones one by one, where together they are no sum of features."""
+    try:
+        found = {child: features_of(child.density, of, child.mask, False, is_share)}
+    except TraceError:
+        alone = apart(blanket, child)
+        if not alone:
+            raise
+        found = {c: features_of(c.density, of, c.mask, False, is_share) for c in alone}
+    return {c: a for c, a in found.items() if a.coefficients}
+
+
+def _positive(blanket: Blanket, children: Iterable[Child]) -> list[tuple[Expression, Child]]:
+    """What must be positive of the parameters of children."""
+    model = blanket.target.model
+    return [(e, c) for c in children for e in least_values(c, blanket.name, model)]
+
+
 def _pair(child: Child, of: Moving, is_picked: bool) -> str:
     words = f"{child.word} {' and '.join(child.read(of.name))}"
     return f"{words} where it is picked" if is_picked else words
@@ -238,7 +269,7 @@ def _words(prior: _Prior, matched: list[str]) -> str:
 def _unlike(
     blanket: Blanket,
     own: dict[Feature, Expression],
-    children: dict[Term, Added],
+    children: dict[Child, Added],
     prior: _Prior,
     low: float,
     high: float,
@@ -247,8 +278,8 @@ def _unlike(
     if family_of_features({**own, **_union(children)}, 0.0, 1.0) is not None:
         return "its flat prior reaches beyond what the parameter allows"
     power, whose = _power(own), f"a {prior.words} prior"
-    for term, child in children.items():
-        wanted = _power(child.coefficients)
+    for child, added in children.items():
+        term, wanted = child.terms[0], _power(added.coefficients)
         if wanted is None:
             return why_not(blanket, term, prior.words)
         if power is not None and wanted != power:
@@ -257,10 +288,10 @@ def _unlike(
                 f"{whose} the power {power:g}: no conjugate pair"
             )
         power, whose = wanted, "another child"
-    return why_not(blanket, next(iter(children)), prior.words)
+    return why_not(blanket, next(iter(children)).terms[0], prior.words)
 
 
-def _union(children: dict[Term, Added]) -> dict[Feature, Expression]:
+def _union(children: dict[Child, Added]) -> dict[Feature, Expression]:
     return {f: c for child in children.values() for f, c in child.coefficients.items()}
 
 
@@ -281,31 +312,33 @@ def _of_events(
     found = children_of(blanket)
     if not isinstance(found, list):
         return why_not(blanket, found, prior.words)
+    matched = []
     for child in found:
         try:
-            added = _event_added(blanket, child, of, family)
+            added, picked = _event_added(blanket, child, of, family)
         except TraceError:
             return why_not(blanket, child.terms[0], prior.words)
         naturals = [add(a, reshape(b, a.shape)) for a, b in zip(naturals, added, strict=True)]
-    matched = [_pair(child, of, False) for child in found]
+        matched.append(_pair(child, of, picked))
     if not matched:
         return "no child varies with it"
     placed = [_placed(a, blanket, members) for a in naturals]
-    return Form(family, _words(prior, matched), placed, [])
+    return Form(family, _words(prior, matched), placed, [], _positive(blanket, found))
 
 
 def _event_added(
     blanket: Blanket, child: Child, of: Moving, family: Conditional
-) -> tuple[Expression, ...]:
+) -> tuple[tuple[Expression, ...], bool]:
+    """What a child adds to each natural parameter, and whether not all of its entries do."""
     if isinstance(family, MvNormalConditional):
-        return mean_added(child, of)
+        return mean_added(child, of), False
     if isinstance(family, InverseWishartConditional):
-        return covariance_added(child, of)
+        return covariance_added(child, of), False
     density = shares_sum_to_one(child.density, blanket)
-    found = features_of(density, of, child.mask, True).coefficients
-    if set(found) - {LOG}:
+    found = features_of(density, of, child.mask, True)
+    if set(found.coefficients) - {LOG}:
         raise TraceError("it has other features")
-    return (found.get(LOG, broadcast(ZERO, (of.count,))),)
+    return (found.coefficients.get(LOG, broadcast(ZERO, (of.count,))),), found.is_picked
 
 
 def _naturals_of(blanket: Blanket, base: Family) -> list[Expression]:
@@ -373,5 +406,8 @@ def _is_closed(form: Form, blanket: Blanket) -> bool:
     states: Values | None = blanket.target.states
     if states is None:
         return False
-    naturals, _ = form(states)
+    try:
+        naturals, _ = form(states)
+    except BayesmcError:
+        return False
     return all(bool(np.isfinite(n).all()) for n in naturals)

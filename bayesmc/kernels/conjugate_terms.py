@@ -20,7 +20,8 @@ from bayesmc.expression import (
     ordered,
     replaced,
 )
-from bayesmc.passes.arithmetic import ONE, ZERO, add, multiply
+from bayesmc.passes.arithmetic import ONE, ZERO, add, multiply, tidied
+from bayesmc.passes.branches import branches_up
 from bayesmc.passes.features import Feature, statistics
 from bayesmc.passes.reads import element_read, same_along
 from bayesmc.passes.sinking import reads, sunk
@@ -80,13 +81,21 @@ def moving(blanket: Blanket, members: np.ndarray | None, by_number: bool = False
     return Moving(blanket, numbers, blanket.size)
 
 
-def features_of(expression: Expression, of: Moving, mask: Any = None, strict: bool = False) -> Added:
+def features_of(
+    expression: Expression,
+    of: Moving,
+    mask: Any = None,
+    strict: bool = False,
+    is_share: bool = True,
+) -> Added:
     """The features of a log density, summed over all entries for every element.
 
     Parameters
     ----------
     strict : bool
         Whether every entry must have them for all values of other nodes.
+    is_share : bool
+        Whether the node is between 0 and 1.
 
     Raises
     ------
@@ -96,7 +105,7 @@ def features_of(expression: Expression, of: Moving, mask: Any = None, strict: bo
     found: dict[Feature, Expression] = {}
     picked = False
     for part in parts_of(expression, of.name, mask):
-        some = statistics(part.expression, of.name, of.numbers, strict)
+        some = statistics(part.expression, of.name, of.numbers, strict, is_share)
         picked = picked or some.is_picked or part.is_picked
         for feature, coefficient in some.coefficients.items():
             whole = multiply(coefficient, broadcast(part.factor, coefficient.shape))
@@ -110,7 +119,7 @@ def shares_sum_to_one(expression: Expression, blanket: Blanket) -> Expression:
     size = blanket.event_shape[-1]
     name = blanket.name
     flat = np.arange(blanket.size * size).reshape(blanket.node.value_shape)
-    whole = sunk(expression, name)
+    whole = sunk(branches_up(sunk(tidied(expression), name), name), name)
     instead: dict[Expression, Expression] = {}
     pure = set(reads(whole, name))
     for node in ordered(whole):

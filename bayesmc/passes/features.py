@@ -37,7 +37,7 @@ from bayesmc.expression import (
     replaced,
 )
 from bayesmc.expression.graph import CASTS
-from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, subtract, tidy
+from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, subtract, tidied, tidy
 from bayesmc.passes.branches import branches_up
 from bayesmc.passes.reads import NOTHING, element_read
 from bayesmc.passes.sinking import reads, sunk
@@ -68,7 +68,11 @@ class Statistics:
 
 
 def statistics(
-    density: Expression, name: str, numbers: np.ndarray | None = None, strict: bool = True
+    density: Expression,
+    name: str,
+    numbers: np.ndarray | None = None,
+    strict: bool = True,
+    is_share: bool = True,
 ) -> Statistics:
     """The features of a log density in a leaf, entry by entry.
 
@@ -83,6 +87,8 @@ def statistics(
     strict : bool
         Whether to refuse entries that have features for some values of other leaves only. If not,
         coefficients are NaN for all others.
+    is_share : bool
+        Whether it is between 0 and 1, so that one minus it may be meant.
 
     Raises
     ------
@@ -108,7 +114,7 @@ def statistics(
     instead: dict[Expression, Expression] = {
         r: leaf(own.name, r.shape) for r in reads(whole, own.name)
     }
-    reader = _Reader(own.name, strict)
+    reader = _Reader(own.name, strict, is_share)
     found = reader(replaced(whole, instead))
     kept = {
         f: broadcast(c, density.shape) for f, c in found.items() if f != CONSTANT and not is_all(c, 0)
@@ -130,7 +136,7 @@ def alone(
     moving: Expression = element
     if numbers is not None and (numbers < 0).any():
         moving = elementwise(np.where, numbers.reshape(own.shape) >= 0, element, own)
-    whole = sunk(replaced(root, {own: moving}), element.name)
+    whole = sunk(tidied(replaced(root, {own: moving})), element.name)
     return sunk(branches_up(whole, element.name), element.name), element
 
 
@@ -145,8 +151,8 @@ def own_numbers(own: Leaf, numbers: np.ndarray | None) -> np.ndarray:
 class _Reader:
     """Features of expressions in one number."""
 
-    def __init__(self, name: str, strict: bool) -> None:
-        self.name, self.strict = name, strict
+    def __init__(self, name: str, strict: bool, is_share: bool) -> None:
+        self.name, self.strict, self.is_share = name, strict, is_share
         self.is_picked = False
         self._found: dict[Expression, Features] = {}
 
@@ -276,7 +282,7 @@ class _Reader:
             feature: tidy(np.where, mine, made, ZERO),
         }
         closed = mine
-        if of_rest and power == 1.0:
+        if of_rest and self.is_share and power == 1.0:
             rest = elementwise(np.logical_and, varies, elementwise(np.equal, free, multiply(own, -1.0)))
             result[LOG1M] = tidy(np.where, rest, ONE, ZERO)
             closed = elementwise(np.logical_or, mine, rest)
