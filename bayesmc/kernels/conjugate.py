@@ -24,13 +24,11 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_children import Partner
-from bayesmc.kernels.conjugate_components import CountedShares, PlanarStep, quick_step
-from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Naturals, split_prior
+from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Kind, Naturals, split_prior
 from bayesmc.kernels.conjugate_like import partners_of
 from bayesmc.kernels.conjugate_matching import Match, match_of
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.conjugate_picks import is_picked
-from bayesmc.kernels.precisions import keep_precision
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
@@ -78,10 +76,6 @@ class Conjugate(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
-        if self._quick is not None and not self.debug:
-            new = self._quickly(values, rng)
-            if new is not None:
-                return {blanket.name: new}, memory
         state = values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
@@ -107,13 +101,6 @@ class Conjugate(Kernel):
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _quickly(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
-        assert self._quick is not None
-        try:
-            return self._quick.draw(values, rng)
-        except np.linalg.LinAlgError as error:
-            raise self._degenerate(error) from error
-
     def _moved(
         self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
     ) -> np.ndarray:
@@ -121,13 +108,7 @@ class Conjugate(Kernel):
         now = self.blanket.current(values, members)
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
         naturals, bounds = self._naturals(values, part)
-        if isinstance(self.kind, Covariance):
-            drawn: np.ndarray | None
-            drawn, precision = self.kind.with_precision(naturals, rng, shape)
-            if precision is not None and members is None:
-                keep_precision(self.blanket.target, self.blanket.name, drawn, precision)
-        else:
-            drawn = self.kind.draw(naturals, bounds, rng, shape)
+        drawn = self.kind.draw(naturals, bounds, rng, shape)
         if drawn is not None and not self.debug:
             return drawn
         posterior = self.kind.posterior(naturals, bounds, self.power)
@@ -136,16 +117,6 @@ class Conjugate(Kernel):
         if self.debug:
             self._check(values, members, posterior, now, drawn)
         return drawn
-
-    @cached_property
-    def _quick(self) -> PlanarStep | CountedShares | None:
-        """A way round arrays, looked up at the first step."""
-        classes = self.blanket.classes
-        alone = len(self.partners) == 1 and len(classes) == 1 and classes[0] is None
-        if not alone or not self._constant:
-            return None
-        prior, bounds = self._prior({**self.blanket.target.known}, 0, None)
-        return None if bounds is not None else quick_step(self.partners[0], prior)
 
     def _naturals(self, values: Values, part: int) -> tuple[Naturals, Bounds | None]:
         """Natural parameters of the full conditional: the prior's and what children add."""

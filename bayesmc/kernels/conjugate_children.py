@@ -18,13 +18,14 @@ import numpy as np
 from bayesmc.distributions import Categorical, Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements, Groups, counted
-from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, slope_of
+from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements
+from bayesmc.kernels.conjugate_evaluation import Evaluated, slope_of
 from bayesmc.kernels.conjugate_kinds import Kind, Naturals
-from bayesmc.kernels.conjugate_labels import ByLabel, by_label, read_directly
+from bayesmc.kernels.conjugate_labels import ByLabel, by_label, counted
 from bayesmc.kernels.conjugate_matching import Match
 from bayesmc.kernels.conjugate_picks import picked_natural, points_of
 from bayesmc.kernels.conjugate_sums import Collector
+from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Term, Values
@@ -65,7 +66,6 @@ class Partner:
         self._slope: np.ndarray | None = None
         self._fixed: Naturals | None = None
         self._way: ByLabel | None = None
-        self.is_mean_by_label = False
         if settle:
             with marking_invalid(), np.errstate(all="ignore"):
                 self._settle()
@@ -85,10 +85,9 @@ class Partner:
 
     def _natural(self, values: Values, members: np.ndarray | None) -> Naturals:
         if self.counts is not None:
-            count = self.counts.at(values).count
-            return (count.reshape((len(count), -1)),)
-        if self.is_mean_by_label:
-            return self._by_label(values)
+            return (self.counts.sums(values)[..., 0],)
+        if self._way is not None:
+            return self._way(values)
         if self.is_picked:
             e = self._evaluated(values, members, True)
             assert isinstance(e, Evaluated)
@@ -108,7 +107,7 @@ class Partner:
         spread = np.ones(()) if self.is_copy else e.get("cov", 2)[..., 0, 0]
         return e.sum(found), e.data.scatter(e.get("loc", 1), spread, e)
 
-    def _mean(self, e: Evaluated | Looked, slope: np.ndarray) -> Naturals:
+    def _mean(self, e: Evaluated, slope: np.ndarray) -> Naturals:
         """Precision and linear term of a node that enters a mean affinely."""
         rows = self.pair.statistic(e, slope)  # (components, lead, *plates, m)
         residual = self.pair.statistic(e, e.data.deviations(e.get("loc", self._event_ndim)))
@@ -120,17 +119,8 @@ class Partner:
         weighted = _last(rows * np.sqrt(count)[..., None])
         return e.outer(weighted), e.sum(_last(np.vecdot(rows, residual)), 1)
 
-    def _by_label(self, values: Values) -> Naturals:
-        """The same for vectors whose mean is this node itself, element k under label k."""
-        assert self._way is not None
-        precision, data = self._way.precision(values), self._way.groups.at(values)
-        d = precision.matrix.shape[-1]
-        count = data.count.reshape((len(data.count), -1, 1, 1))
-        total = data.total.reshape((len(count), -1, d))
-        return count * precision.matrix, np.matvec(precision.matrix, total)
-
     @cached_property
-    def counts(self) -> Groups | None:
+    def counts(self) -> LabelSums | None:
         """Where the child is itself the label of somebody's sums, how often each of its states came.
 
         Looked up at the first step, when all kernels have been made.
@@ -139,19 +129,13 @@ class Partner:
         if not alone or len(self.terms) > 1 or self.is_picked or self.blanket.node.plates:
             return None
         target = self.blanket.target
-        return None if target.seen(self.term.name) is not None else counted(target, self.term)
+        return None if target.seen(self.term.name) is not None else counted(target, self.term.name)
 
     @property
     def _event_ndim(self) -> int:
         return len(self.node.event_shape)
 
-    def _evaluated(
-        self, values: Values, members: np.ndarray | None, steps: bool
-    ) -> Evaluated | Looked:
-        if self._way is not None:
-            if self._way.direct is not None:
-                return self._way.looked(values)
-            return self._way.evaluated(values, self._moved if steps else self._neutral, steps)
+    def _evaluated(self, values: Values, members: np.ndarray | None, steps: bool) -> Evaluated:
         candidate = self._full(self._moved if steps else self._neutral, members)
         state = self.blanket.placed(values, candidate, members)
         dist, keys = self._valid(state)
@@ -212,7 +196,13 @@ class Partner:
         return values[self.term.name]
 
     def _find_way(self) -> ByLabel | None:
-        return by_label(self.blanket, self.child, self.pair)
+        name = self.blanket.name
+        return by_label(self.blanket.target, self.term, name, self.kind.name, self._exponent)
+
+    @property
+    def _exponent(self) -> float:
+        """The power of the node in the exponential, for a scale."""
+        return self.power * self.pair.exponent
 
     # ---- what never changes -------------------------------------------------------------------
 
@@ -230,30 +220,8 @@ class Partner:
             return
         if members is None and self.pair.by_label and not self.is_picked:
             self._way = self._find_way()
-        if self._way is not None:
-            if self.is_copy or self.pair.form != "multiple":
-                self._read_directly(tuple(above))
-        elif self.kind.name == "mean":
+        if self._way is None and self.kind.name == "mean":
             self._find_slope(tuple(above), members)
-
-    def _read_directly(self, above: tuple[str, ...]) -> None:
-        """Leave out calls of the function where its parameters are plain nodes by label."""
-        assert self._way is not None
-        example = read_directly(self._way, self._neutral, above)
-        if example is not None and self.kind.name == "mean":
-            # the mean varies with this node and the label alone
-            dist, _ = self._way.at_labels(example, self._moved)
-            self._slope = slope_of(dist, len(self.shape), self._steps)
-            self.is_mean_by_label = self._is_itself(self._slope)
-
-    def _is_itself(self, slope: np.ndarray) -> bool:
-        """Whether the mean of vectors is the node's value under each label."""
-        assert self._way is not None
-        if not self.blanket.event_shape or not self.blanket.node.plates or not self._event_ndim:
-            return False
-        unit = np.eye(len(self._steps)).reshape((len(slope), *(1,) * (slope.ndim - 2), -1))
-        at_zero = self._way.parameter("loc", {})
-        return bool((slope == unit).all() and not np.any(at_zero))
 
     def _find_slope(self, above: tuple[str, ...], members: np.ndarray | None) -> None:
         """Slopes are constant where the mean is affine in all that is hidden together."""

@@ -1,43 +1,20 @@
-"""A child evaluated with its node at a neutral value: parameters, data, and how both are summed.
-
-There are two ways to the same answers: from a distribution that the child's function returned, and, for
-mixtures, from parameters that are known to be nodes looked up by label, without calling anything.
-"""
+"""A child evaluated with its node at a neutral value: parameters, data, and how both are summed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from bayesmc.gaussian import solve_lower
-from bayesmc.kernels.conjugate_data import Elements, Grouped
-from bayesmc.kernels.conjugate_sums import ByElement, Collector
+from bayesmc.kernels.conjugate_data import Elements
+from bayesmc.kernels.conjugate_sums import Collector
 
 #: Cholesky factors up to which inverting them one by one is faster than substituting in all at once
 _FEW = 64
 
 
-class _Whitening:
-    """Residuals of vectors divided by a Cholesky factor, which is inverted once where there are few."""
-
-    _inverse: np.ndarray | None = None
-
-    def get(self, parameter: str, event_ndim: int = 0) -> np.ndarray:
-        raise NotImplementedError
-
-    def whitened(self, residual: np.ndarray) -> np.ndarray:
-        if self._inverse is None:
-            tril = self.get("scale_tril", 2)
-            if tril.size > _FEW * tril.shape[-1] ** 2:
-                return solve_lower(tril, residual)
-            # of an upper triangle: back substitution, nothing is pivoted
-            self._inverse = np.linalg.inv(np.matrix_transpose(tril))
-        return np.vecmat(residual, self._inverse)
-
-
-class Evaluated(_Whitening):
+class Evaluated:
     """A child's distribution with the node at its neutral value.
 
     Parameters
@@ -47,18 +24,19 @@ class Evaluated(_Whitening):
         Whether its first axis runs through the neutral value and steps away from it.
     plates : int
         Number of the child's plates.
-    data : Elements or Grouped
+    data : Elements
     collector : Collector
     """
 
     def __init__(
-        self, dist: Any, steps: bool, plates: int, data: Elements | Grouped, collector: Collector
+        self, dist: Any, steps: bool, plates: int, data: Elements, collector: Collector
     ) -> None:
         self.dist, self.steps, self.plates = dist, steps, plates
         self.data, self.collector = data, collector
         self.lost: np.ndarray | None = None
         if dist.invalid is not None:  # where a coefficient overflowed, there is no closed form
             self.lost = padded(dist.invalid, steps + 1 + plates) & (data.count > 0)
+        self._inverse: np.ndarray | None = None
 
     def get(self, parameter: str, event_ndim: int = 0) -> np.ndarray:
         """A parameter with axes for chains and plates."""
@@ -73,6 +51,16 @@ class Evaluated(_Whitening):
             array = np.where(lost, np.nan, array)
         return array
 
+    def whitened(self, residual: np.ndarray) -> np.ndarray:
+        """Residuals of vectors divided by the Cholesky factor, which is inverted once where there are few."""
+        if self._inverse is None:
+            tril = self.get("scale_tril", 2)
+            if tril.size > _FEW * tril.shape[-1] ** 2:
+                return solve_lower(tril, residual)
+            # of an upper triangle: back substitution, nothing is pivoted
+            self._inverse = np.linalg.inv(np.matrix_transpose(tril))
+        return np.vecmat(residual, self._inverse)
+
     def slope(self, steps: np.ndarray) -> np.ndarray:
         """Slopes of the mean in every component, see ``slope_of``."""
         return slope_of(self.dist, self.plates, steps)
@@ -84,40 +72,7 @@ class Evaluated(_Whitening):
         return self.collector.outer(rows)
 
     def tally(self, states: int) -> np.ndarray:
-        assert isinstance(self.data, Elements)
         return self.collector.tally(self.data.value, states, self.data.mask)
-
-
-class Looked(_Whitening):
-    """The same for parameters that are known by label.
-
-    Parameters
-    ----------
-    parameters : dict
-        Name -> values ``(lead, *ones, labels or 1, *event)``.
-    """
-
-    def __init__(
-        self, parameters: Mapping[str, np.ndarray], data: Grouped, collector: Collector | ByElement
-    ) -> None:
-        self.parameters, self.data, self.collector = parameters, data, collector
-
-    def get(self, parameter: str, event_ndim: int = 0) -> np.ndarray:
-        if parameter == "scale_tril" and parameter not in self.parameters:
-            return np.linalg.cholesky(self.parameters["cov"])
-        return self.parameters[parameter]
-
-    def slope(self, steps: np.ndarray) -> np.ndarray:
-        raise NotImplementedError  # known beforehand where parameters are
-
-    def sum(self, array: np.ndarray, event_ndim: int = 0) -> np.ndarray:
-        return self.collector.sum(array, event_ndim)
-
-    def outer(self, rows: np.ndarray) -> np.ndarray:
-        return self.collector.outer(rows)
-
-    def tally(self, states: int) -> np.ndarray:
-        raise NotImplementedError  # categories are never summed by label
 
 
 def slope_of(dist: Any, plates: int, steps: np.ndarray) -> np.ndarray:

@@ -1,299 +1,278 @@
-"""Children that meet their plate through one label only: mixtures, summed by label.
+"""What a child summed by label adds to a conjugate node, read off its expression.
 
-The child's function is called on every label instead of every element, which was found to say the same,
-and data are summed by label. Where tracing shows that its parameters are nothing but nodes looked up by
-the label, times a constant, even that call is left out.
+The child's log density by label is an expression of the sums (``label_sums``); the natural parameters are
+its coefficients of the node's powers and logarithms, and for normal vectors the quadratic form in the
+mean, or the scatter about it.
 """
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Distribution, LogNormal, MvNormal, Normal
-from bayesmc.kernels.conjugate_data import Groups, groups_of
-from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, padded
-from bayesmc.kernels.conjugate_pairs import Pair
-from bayesmc.kernels.conjugate_sums import ByElement, Collector
-from bayesmc.kernels.precisions import Precision, kept_precision, precision_of
-from bayesmc.network.model import arguments_of, call
-from bayesmc.plates import Lookups, PlateArray
-from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.target import Values
-from bayesmc.structure.traced import Untraceable, traced_term
-from bayesmc.tracing import TracedCall, Tracer
+from bayesmc.distributions import MvNormal
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Constant,
+    Expression,
+    as_expression,
+    broadcast,
+    constant,
+    elementwise,
+    pick,
+    reduction,
+    reshape,
+)
+from bayesmc.expression.products import product
+from bayesmc.expression.scalars import SmallProgram
+from bayesmc.kernels.label_sums import LabelSums, label_sums
+from bayesmc.passes.affine import affine
+from bayesmc.passes.arithmetic import add, divide, is_all, multiply, subtract
+from bayesmc.passes.features import LOG, LOG1M, statistics
+from bayesmc.passes.sufficient import precision_of, transposed
+from bayesmc.structure.target import Target, Term, Values
 
 #: elements per label from which on sums by label pay
 _PER_LABEL = 4
-#: families whose parameters may be read off nodes, with the axes of each parameter's event
-_FAMILIES: dict[Any, dict[str, int]] = {
-    Normal: {"loc": 0, "scale": 0},
-    LogNormal: {"loc": 0, "scale": 0},
-    MvNormal: {"loc": 1, "cov": 2},
-}
 
 
 class ByLabel:
-    """A child evaluated label by label.
+    """Natural parameters that a child summed by label adds.
 
-    Attributes
+    Parameters
     ----------
-    groups : Groups
-        Sums of its data.
-    shape : tuple of int
-        Of its plates, with the labels on the last.
-    direct : dict or None
-        Parameters that are nodes looked up by label, where all are.
+    sums : LabelSums
+    naturals : sequence of Expression, shapes (*node's value, ...)
     """
 
-    def __init__(self, blanket: Blanket, child: Child, groups: Groups) -> None:
-        self.blanket, self.child, self.groups = blanket, child, groups
-        self.node = blanket.target.model[child.term.name]
-        self.shape = (1,) * (len(child.term.shape) - 1) + (groups.states,)
-        domain = blanket.target.model[groups.label].domain
-        assert domain is not None
-        self._labels = np.arange(groups.states, dtype=domain.dtype).reshape(self.shape)
-        self.direct: dict[str, _Source] | None = None
+    def __init__(self, sums: LabelSums, naturals: tuple[Expression, ...]) -> None:
+        self.sums, self.naturals = sums, naturals
+        self._program = SmallProgram(naturals)
+        self._ranks = [len(n.shape) for n in naturals]
 
-    def evaluated(self, values: Values, candidate: np.ndarray, steps: bool) -> Evaluated:
-        """The child's function on all labels, with the node at a candidate."""
-        data = self.groups.at(values)
-        dist, keys = self.at_labels(values, candidate)
-        term = self.child.term
-        if dist.invalid is not None and (dist.invalid & (data.count > 0)).any():
-            state = self.blanket.placed(values, candidate)
-            full, batch, _ = self.blanket.distribution(self.child, state)
-            term.refuse_out_of_range(full, batch, values[term.name])
-        collector = Collector(self.child.relation, self.shape, keys, None)
-        return Evaluated(dist, steps, len(self.shape), data, collector)
-
-    def looked(self, values: Values) -> Looked:
-        """The same without a call, where ``direct`` is known."""
-        data = self.groups.at(values)
-        if self.blanket.node.plates:
-            return Looked(self.parameters(values), data, ByElement(self.shape))
-        collector = Collector(self.child.relation, self.shape, (), None)
-        return Looked(self.parameters(values), data, collector)
-
-    def parameters(self, values: Values) -> dict[str, np.ndarray]:
-        """Parameters by label read off the nodes, shape ``(lead, *ones, labels or 1, *event)``."""
-        assert self.direct is not None
-        return {name: self.parameter(name, values) for name in self.direct}
-
-    def parameter(self, name: str, values: Values) -> np.ndarray:
-        """One of them."""
-        assert self.direct is not None
-        source = self.direct[name]
-        if source.node is None:
-            return source.factor
-        value = values[source.node]
-        value = value.reshape(value.shape[: value.ndim - source.trailing] + source.shape)
-        return value if source.is_copy else source.factor * value**source.power
-
-    def precision(self, values: Values) -> Precision:
-        """Of vectors by label, batch ``(lead, labels or 1)``."""
-        assert self.direct is not None
-        source = self.direct["cov"]
-        if source.node is None or not source.is_copy:
-            cov = self.parameter("cov", values)
-            return precision_of(cov.reshape((len(cov), -1, *cov.shape[-2:])))
-        cov = values[source.node]
-        found = kept_precision(self.blanket.target, source.node, cov)
-        if source.trailing == 3:
-            return found
-        return found.reshaped((-1, 1))
-
-    def at_labels(
-        self, values: Values, candidate: np.ndarray
-    ) -> tuple[Distribution, tuple[Any, ...]]:
-        """The child's distribution for every label, and the index by which it looked the node up."""
-        state = self.blanket.placed(values, candidate)
-        state[self.groups.label] = self._labels
-        arguments, batch = arguments_of(self.node.links, state)
-        watched = None
-        for i, (parent, _) in enumerate(self.node.links):
-            if self.child.relation.kind == "lookup" and parent == self.child.relation.source:
-                a = arguments[i]
-                assert isinstance(a, PlateArray)
-                watched = Lookups(a.array, a.plates, a.own, a.event_ndim, parent)
-                arguments[i] = watched
-        dist = call(self.node.declaration, arguments, batch + self.shape, self.node.links)
-        return dist, () if watched is None else watched.keys[0]
+    def __call__(self, values: Values) -> tuple[np.ndarray, ...]:
+        """In a state, shapes ``(chains, *plates, ...)``."""
+        found = self._program({**values, self.sums.leaf.name: self.sums.sums(values)})
+        return tuple(
+            f if f.ndim > rank else f[None] for f, rank in zip(found, self._ranks, strict=True)
+        )
 
 
-@dataclass(frozen=True, eq=False)
-class _Source:
-    """A parameter by label: ``factor * node**power``, or the factor alone.
+def by_label(target: Target, term: Term, node: str, kind: str, power: float) -> ByLabel | None:
+    """The natural parameters that a term's sums by label add to a node, if there is such a label.
 
-    ``trailing`` axes of the node's value become ``shape``.
+    Parameters
+    ----------
+    kind : str
+        Of the full conditional (``conjugate_kinds``).
+    power : float
+        Of the node in a scale's exponential.
     """
-
-    factor: np.ndarray
-    node: str | None = None
-    power: float = 1.0
-    is_copy: bool = False
-    trailing: int = 0
-    shape: tuple[int, ...] = ()
-
-
-def by_label(blanket: Blanket, child: Child, pair: Pair) -> ByLabel | None:
-    """The way by labels, where it is found to be right and worth while."""
-    target, model, term = blanket.target, blanket.target.model, child.term
-    if child.relation.kind not in ("aligned", "lookup") or not target.is_known(term.name):
+    own = [p for p in term.parents if set(term.plates) & set(target.model[p].plates)]
+    if len(own) != 1 or node in own:
         return None
-    own = set(term.plates)
-    if not own or own & set(blanket.node.plates):
+    sums = label_sums(target, term, own[0])
+    if sums is None or sums.states * _PER_LABEL > sums.statistics.shape[1]:
         return None
-    inside = [p for p in term.parents if own & set(model[p].plates)]
-    if len(inside) != 1 or model[inside[0]].plates != term.plates:
+    try:
+        return ByLabel(sums, _naturals(sums, target, node, kind, power))
+    except (TraceError, ValueError):
         return None
-    label = inside[0]
-    domain, size = model[label].domain, math.prod(term.shape)
-    if domain is None or label in blanket.path or domain.size * _PER_LABEL > size:
-        return None
-    if domain.size in term.shape:  # an array of the function's own might fit by chance
-        return None
-    found = ByLabel(blanket, child, groups_of(target, term, label, pair.transform))
-    if not _suffices(found):
-        return None
-    found.groups.used = True
-    found.groups.second = found.groups.second or pair.squares
-    return found
 
 
-def read_directly(way: ByLabel, neutral: np.ndarray, above: tuple[str, ...]) -> Values | None:
-    """Find out whether every parameter is one node looked up by label, and the node enters in order.
-
-    The node is that of the blanket, which may also be the label itself.
-
-    Returns
-    -------
-    dict or None
-        Where that is so, an example of the hidden nodes, ``(1, *plates, *event)``.
-    """
-    target, name = way.blanket.target, way.blanket.name
-    hidden = [n for n in target.chain if n in above and n != way.groups.label]
-    if any(target.model[n].is_discrete for n in hidden):
-        return None
-    state = way.blanket.target.example(above)
-    dist, keys = way.at_labels(state, state[name])
-    wanted = _FAMILIES.get(type(dist))
-    if wanted is None or dist.invalid is not None:
-        return None
-    if name != way.groups.label and not _is_in_order(way, keys):
-        return None
-    entered: dict[str, tuple[str, Tracer]] = {}
-    for node in hidden:
-        found = _entered(way, node)
-        if found is None or not set(found) <= set(wanted) or set(found) & set(entered):
-            return None
-        entered |= {parameter: (node, value) for parameter, value in found.items()}
-    ones = {n: np.ones_like(state[n]) for n in hidden if not target.model[n].event_shape}
-    plain = {**state, **ones}
-    target.refresh(plain, ones)
-    at_one, _ = way.at_labels(plain, neutral)
-    sources: dict[str, _Source] = {}
-    for parameter, event_ndim in wanted.items():
-        factor = padded(getattr(at_one, parameter), 1 + len(way.shape) + event_ndim)
-        source = _source(way, factor, *entered.get(parameter, (name, None)))
-        if source is None:
-            return None
-        sources[parameter] = source
-    way.direct = sources
-    if not _is_right(way, state, dist, {p for p, (n, _) in entered.items() if n == name}):
-        way.direct = None
-        return None
-    return state
+def counted(target: Target, label: str) -> LabelSums | None:
+    """Sums by this very label that count all its elements, if somebody takes any."""
+    for term in target.terms.values():
+        sums = term.summaries.get(label)
+        if sums is not None and sums.ones == 1 and term.mask is None:
+            return sums
+    return None
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _suffices(way: ByLabel) -> bool:
-    """Whether parameters at every label are those of the elements with that label."""
-    target, term = way.blanket.target, way.child.term
-    state = target.example(target.hidden_above(term))
-    states = way.groups.states
-    label = np.random.default_rng(0).permutation(np.arange(math.prod(term.shape)) % states)
-    label = label.reshape(term.shape)
-    domain = target.model[way.groups.label].domain
-    assert domain is not None
-    state[way.groups.label] = label.astype(domain.dtype)
-    candidate = np.asarray(state[way.blanket.name])
-    try:
-        placed = way.blanket.placed(state, candidate)
-        full, _, _ = way.blanket.distribution(way.child, placed)
-        short, _ = way.at_labels(state, candidate)
-    except Exception:  # a function that does not broadcast like this tells so in its own way
-        return False
-    plates = label.ndim
-    return type(full) is type(short) and all(
-        _agrees(padded(a, plates + n), padded(b, plates + n), label, n)
-        for (a, n), (b, _) in zip(full.parameters(), short.parameters(), strict=True)
+def _naturals(
+    sums: LabelSums, target: Target, node: str, kind: str, power: float
+) -> tuple[Expression, ...]:
+    shape = target.model[node].plate_shape
+    if sums.family.make is MvNormal and sums.repeats == 1:
+        if kind == "mean":
+            return _quadratic(sums, node, target.model[node].value_shape, len(shape))
+        if kind == "covariance":
+            return _scatter(sums, node, shape)
+        if kind == "scale":
+            return _spread(sums, node, shape, power)
+    if target.model[node].event_shape:
+        raise TraceError("it is a vector")
+    found = statistics(sums.expression, node)
+    wanted: dict[str, tuple[Any, Any]] = {
+        "mean": (2.0, 1.0), "scale": (LOG, power), "share": (LOG, LOG1M),
+    }  # fmt: skip
+    first, second = wanted[kind]
+    if not set(found.coefficients) <= {first, second}:
+        raise TraceError("it is not of this family")
+    zero = broadcast(as_expression(0.0), sums.expression.shape)
+    a, b = (found.coefficients.get(f, zero) for f in (first, second))
+    if kind == "mean":
+        a = multiply(a, -2.0)
+    elif kind == "scale":
+        b = multiply(b, -1.0)
+    at = _known(found.at)
+    return _collected(a, at, shape, 0), _collected(b, at, shape, 0)
+
+
+def _known(at: Expression) -> np.ndarray:
+    """Positions that do not depend on the state."""
+    if not isinstance(at, Constant):
+        raise TraceError("which element is read varies")
+    return at.value
+
+
+def _collected(
+    parts: Expression, at: np.ndarray, shape: tuple[int, ...], event_ndim: int
+) -> Expression:
+    """Sums of entries ``(*entries, *event)`` over those at each element of a node."""
+    size = int(np.prod(shape, dtype=int))
+    event = parts.shape[len(parts.shape) - event_ndim :]
+    flat = reshape(parts, (at.size, *event))
+    if not np.array_equal(at.ravel(), np.arange(size)):
+        hot = (at.ravel() == np.arange(size)[:, None]).astype(float)
+        wide = constant(hot.reshape(hot.shape + (1,) * event_ndim))
+        flat = reduction(np.add, multiply(wide, flat), (1,))
+    return reshape(flat, (*shape, *event))
+
+
+# ---- normal vectors -----------------------------------------------------------------------------
+
+
+def _moments(sums: LabelSums) -> tuple[Expression, Expression, Expression | None]:
+    """How many, their sum about the centre and the products', by label."""
+    d = len(sums.centre)
+    rows = sums.leaf.shape[1]
+    count, first = sums.column(0, 1), sums.column(1, d)
+    if rows == 1 + d:
+        return count, first, None
+    if rows != 1 + d + d * (d + 1) // 2:
+        raise TraceError("some products have no coefficient")
+    i, j = np.tril_indices(d)
+    place = np.empty((d, d), dtype=np.intp)
+    place[i, j] = place[j, i] = 1 + d + np.arange(len(i))
+    at = np.arange(sums.leaf.size).reshape(sums.leaf.shape)
+    return count, first, pick([sums.leaf], at[:, place])
+
+
+def _quadratic(
+    sums: LabelSums, node: str, value_shape: tuple[int, ...], plates: int
+) -> tuple[Expression, ...]:
+    """Precision and linear term of a node in which the mean is affine."""
+    labels, d = sums.states, len(sums.centre)
+    loc = broadcast(as_expression(sums.family.parameters["loc"]), (*sums.shape, d))
+    form = affine(reshape(loc, (labels, d)), [node])
+    if node in precision_leaves(sums):
+        raise TraceError("it is not in the mean alone")
+    read = form.reads[node]
+    at = _known(read.at)
+    event, shape = value_shape[plates:], value_shape[:plates]
+    own = int(np.prod(event, dtype=int))
+    element = at // own
+    if (element != element[:, :1, :1]).any():
+        raise TraceError("several elements are read")
+    hot = constant((at[..., None] % own == np.arange(own)).astype(float))
+    slope = reduction(np.add, multiply(reshape(read.gain, (*read.gain.shape, 1)), hot), (2,))
+    precision, _ = precision_of(sums.family, sums.shape)
+    precision = reshape(precision, (labels, d, d))
+    count, first, _ = _moments(sums)
+    total = add(first, multiply(count, subtract(sums.centre, form.offset)))
+    linear = product(np.matvec, precision, total)
+    if not (isinstance(slope, Constant) and is_all(subtract(slope, np.eye(d, own)), 0)):
+        linear = product(np.matvec, transposed(slope), linear)
+        precision = product(np.matmul, product(np.matmul, transposed(slope), precision), slope)
+    precision = multiply(reshape(count, (labels, 1, 1)), precision)
+    if not event:
+        precision, linear = reshape(precision, (labels,)), reshape(linear, (labels,))
+    at = element[:, 0, 0]
+    return (
+        _collected(precision, at, shape, 2 * len(event)),
+        _collected(linear, at, shape, len(event)),
     )
 
 
-def _agrees(full: np.ndarray, short: np.ndarray, label: np.ndarray, event_ndim: int) -> bool:
-    """Whether a parameter of every element is that of its label, ``short`` holding one row per label."""
-    end = short.ndim - event_ndim
-    lead, plates = short.shape[: end - label.ndim], short.shape[end - label.ndim : end]
-    if any(n != 1 for n in plates[:-1]):
-        return False
-    if plates[-1] != 1:
-        table = short.reshape((*lead, plates[-1], *short.shape[end:]))
-        short = np.take(table, label, axis=len(lead))
-    return bool(((full == short) | (np.isnan(full) & np.isnan(short))).all())
+def precision_leaves(sums: LabelSums) -> frozenset[str]:
+    """What the covariance depends on."""
+    given = [v for k, v in sums.family.parameters.items() if k != "loc"]
+    return frozenset().union(*(v.leaves for v in given if isinstance(v, Expression)))
 
 
-def _is_in_order(way: ByLabel, keys: tuple[Any, ...]) -> bool:
-    """Whether label k looks up element k of the node (or the node has one element)."""
-    shape = way.blanket.node.plate_shape
-    if not shape:
-        return True
-    if shape != (way.groups.states,) or len(keys) != 1:
-        return False
-    return np.array_equal(np.ravel(np.asarray(keys[0])), np.arange(way.groups.states))
+def _about_loc(sums: LabelSums) -> Expression:
+    """Scatter matrices about the mean, (labels, d, d)."""
+    labels, d = sums.states, len(sums.centre)
+    count, first, second = _moments(sums)
+    if second is None:
+        raise TraceError("the covariance is known")
+    loc = broadcast(as_expression(sums.family.parameters["loc"]), (*sums.shape, d))
+    off = subtract(reshape(loc, (labels, d)), sums.centre)
+    half = subtract(first, multiply(multiply(0.5, count), off))
+    cross = multiply(reshape(off, (labels, d, 1)), reshape(half, (labels, 1, d)))
+    return subtract(second, add(cross, transposed(cross)))
 
 
-def _entered(way: ByLabel, node: str) -> dict[str, Tracer] | None:
-    """The parameters that a node enters; None where that is not known."""
-    try:
-        result = traced_term(way.blanket.target, (node,), way.child.term).result
-    except Untraceable:
-        return None
-    if isinstance(result, Distribution):
-        return {}
-    traced = result.traced if isinstance(result, TracedCall) else {}
-    fine = len(traced) == 1 and all(isinstance(t, Tracer) for t in traced.values())
-    return traced if fine else None
+def _scatter(sums: LabelSums, node: str, shape: tuple[int, ...]) -> tuple[Expression, ...]:
+    """Degrees of freedom and scale of a node of which the covariance is a multiple."""
+    labels, d = sums.states, len(sums.centre)
+    cov = sums.family.parameters.get("cov")
+    if cov is None or node in as_expression(sums.family.parameters["loc"]).leaves:
+        raise TraceError("it is not the covariance alone")
+    form = affine(reshape(broadcast(cov, (*sums.shape, d, d)), (labels, d, d)), [node])
+    read = form.reads[node]
+    at = _known(read.at)
+    block = np.arange(d * d).reshape(d, d)
+    element = at[:, 0, 0, 0] // (d * d)
+    fits = read.gain.shape[-1] == 1 and is_all(form.offset, 0)
+    if not fits or (at[..., 0] != element[:, None, None] * d * d + block).any():
+        raise TraceError("the covariance is no multiple of it")
+    gain = reshape(read.gain, (labels, d, d))
+    scatter = _about_loc(sums)
+    if not is_all(gain, 1):
+        if not isinstance(gain, Constant) or (gain.value != gain.value[:, :1, :1]).any():
+            raise TraceError("the covariance is no multiple of it")
+        scatter = divide(scatter, gain)
+    count = reshape(sums.column(0, 1), (labels,))
+    return _collected(count, element, shape, 0), _collected(scatter, element, shape, 2)
 
 
-def _source(way: ByLabel, factor: np.ndarray, node: str, value: Tracer | None) -> _Source | None:
-    """How a parameter is read off a node; of the node itself, what it is at the neutral value."""
-    if factor.shape[0] != 1:
-        return None
-    if value is None or node == way.blanket.name:
-        return _Source(factor)
-    compiled = way.blanket.target.model[node]
-    if compiled.plate_shape not in ((), (way.groups.states,)) or len(value.sources) != 1:
-        return None
-    labels = compiled.plate_shape or (1,)
-    shape = (*way.shape[:-1], *labels, *compiled.event_shape)
-    trailing = len(compiled.value_shape)
-    if value.is_copy and value.whole_event and factor.ndim == 1 + len(shape):
-        return _Source(factor, node, is_copy=True, trailing=trailing, shape=shape)
-    if value.power is None or compiled.event_shape or factor.ndim != 1 + len(shape):
-        return None
-    return _Source(factor, node, value.power, trailing=trailing, shape=shape)
+def _spread(
+    sums: LabelSums, node: str, shape: tuple[int, ...], power: float
+) -> tuple[Expression, ...]:
+    """Exponent and coefficient of a number whose power multiplies the covariance."""
+    labels, d = sums.states, len(sums.centre)
+    given = sums.family.parameters
+    if node in as_expression(given["loc"]).leaves:
+        raise TraceError("it is in the mean, too")
+    name = next(k for k in ("scale_diag", "scale_tril", "cov") if given.get(k) is not None)
+    twice = 1.0 if name == "cov" else 2.0
+    event = (d,) if name == "scale_diag" else (d, d)
+    whole = reshape(broadcast(given[name], (*sums.shape, *event)), (labels, *event))
+    found = statistics(whole, node)
+    at = _known(found.at).reshape(labels, -1)
+    if len(found.coefficients) != 1 or (at != at[:, :1]).any():
+        raise TraceError("the covariance is no multiple of a power of it")
+    ((p, matrix),) = found.coefficients.items()
+    if not isinstance(p, float) or p * twice != -power:
+        raise TraceError("the covariance is no multiple of this power of it")
+    if name == "scale_diag":
+        root = multiply(reshape(matrix, (labels, d, 1)), np.eye(d))
+        cov = product(np.matmul, root, transposed(root))
+    else:
+        cov = matrix if name == "cov" else product(np.matmul, matrix, transposed(matrix))
+    inverse = _inverse(sums, cov)
+    traces = reduction(np.add, multiply(inverse, _about_loc(sums)), (1, 2))
+    rate = multiply(0.5, elementwise(np.maximum, traces, 0.0))
+    exponent = multiply(reshape(sums.column(0, 1), (labels,)), 0.5 * d * power)
+    return _collected(exponent, at[:, 0], shape, 0), _collected(rate, at[:, 0], shape, 0)
 
 
-def _is_right(way: ByLabel, state: Values, dist: Distribution, own: set[str]) -> bool:
-    """Whether the parameters read off the nodes are the function's."""
-    for parameter, value in way.parameters(state).items():
-        expected = padded(getattr(dist, parameter), value.ndim)
-        if parameter not in own and not np.allclose(value, expected, rtol=1e-12, atol=0.0):
-            return False
-    return True
+def _inverse(sums: LabelSums, cov: Expression) -> Expression:
+    family = type(sums.family)(MvNormal, {"loc": None, "cov": cov})
+    return precision_of(family, cov.shape[:-2])[0]

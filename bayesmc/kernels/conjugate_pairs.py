@@ -35,13 +35,13 @@ from bayesmc.distributions import (
     Normal,
     Poisson,
 )
-from bayesmc.kernels.conjugate_data import Elements, Grouped
+from bayesmc.kernels.conjugate_data import Elements
 
 
 class Evaluation(Protocol):
     """A child with the node at its neutral value."""
 
-    data: Elements | Grouped
+    data: Elements
 
     def get(self, parameter: str, event_ndim: int = 0) -> np.ndarray:
         """A parameter, shape ``(lead, *plates, ...)``."""
@@ -131,7 +131,6 @@ def _scale_about_zero(e: Evaluation) -> tuple[Any, Any]:
 
 
 def _absolute_scale(e: Evaluation) -> tuple[Any, Any]:
-    assert isinstance(e.data, Elements)
     return -e.data.count, np.abs(e.data.deviations(e.get("loc"))) / e.get("scale")
 
 

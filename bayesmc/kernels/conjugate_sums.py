@@ -146,28 +146,3 @@ class Collector:
         ndim = 1 + len(self.shape)
         found = found.reshape((1,) * (ndim - found.ndim) + found.shape)
         return np.broadcast_to(found, (len(found), *self.shape))
-
-
-@dataclass(frozen=True, eq=False)
-class ByElement:
-    """Sums of what comes label by label, where label k is element k of the node: nothing is left to add.
-
-    Attributes
-    ----------
-    shape : tuple of int
-        Of the child's plates: ones, and the labels last.
-    """
-
-    shape: Shape
-
-    def sum(self, array: np.ndarray, event_ndim: int = 0) -> np.ndarray:
-        """``(lead, *ones, labels, *event)`` as ``(lead, labels, *event)``."""
-        end = array.ndim - event_ndim
-        lead, event = array.shape[: end - len(self.shape)], array.shape[end:]
-        if array.shape[end - 1] != self.shape[-1]:
-            array = np.broadcast_to(array, lead + self.shape + event)
-        return array.reshape((*lead, self.shape[-1], *event))
-
-    def outer(self, rows: np.ndarray) -> np.ndarray:
-        """Sums of outer products of ``(lead, *ones, labels, m, d)``: ``(lead, labels, d, d)``."""
-        return self.sum(np.matrix_transpose(rows) @ rows, 2)

@@ -103,11 +103,38 @@ def log_density_of(model: Model, name: str) -> Expression:
     return broadcast(log_density(family, value), node.plate_shape)
 
 
-def argument(model: Model, parent: str, link: Aligner) -> Any:
+def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
+    """What a node's function computes where some parents have other stored values, of any plate sizes.
+
+    So a function of a label is read at every label in place of every element: whether that says the same
+    is the caller's to check, as it is here not.
+
+    Parameters
+    ----------
+    given : mapping
+        Stochastic parent -> whole numbers with its plates' axes.
+
+    Raises
+    ------
+    TraceError
+        The function cannot be followed, or does not broadcast so.
+    """
+    try:
+        found = _traced(model, model[name], given)
+    except (BayesmcError, ValueError, IndexError) as error:
+        raise TraceError(str(error)) from error
+    return family_of(found) if isinstance(found, Distribution) else found
+
+
+def argument(
+    model: Model, parent: str, link: Aligner, given: Mapping[str, np.ndarray] | None = None
+) -> Any:
     """The stand-in that a function receives for a parent."""
     node = model[parent]
-    if node.kind == "deterministic":
-        value: Any = TracedArray(value_of(model, parent))
+    if given and parent in given:
+        value: Any = _decoded(TracedArray(constant(given[parent])), link)
+    elif node.kind == "deterministic":
+        value = TracedArray(value_of(model, parent))
         labels = None if node.domain is None else node.domain.labels
         value = value if labels is None else TracedStates(value, labels)
     else:
@@ -235,26 +262,30 @@ def _leaves_above(model: Model, name: str) -> frozenset[str]:
     return found
 
 
-def _traced(model: Model, node: CompiledNode) -> Any:
+def _traced(
+    model: Model, node: CompiledNode, given: Mapping[str, np.ndarray] | None = None
+) -> Any:
     declaration = node.declaration
     if declaration.value is not None:
         return constant(declaration.value)
     if declaration.probs is not None:
-        return _of_table(model, node)
+        return _of_table(model, node, given or {})
     if declaration.vectorize:
         raise TraceError("it is called element by element (vectorize=True)")
     assert declaration.function is not None
-    arguments = [argument(model, parent, link) for parent, link in node.links]
+    arguments = [argument(model, parent, link, given) for parent, link in node.links]
     return trace(declaration.function, arguments)
 
 
-def _of_table(model: Model, node: CompiledNode) -> Family:
+def _of_table(model: Model, node: CompiledNode, given: Mapping[str, np.ndarray]) -> Family:
     probs = node.declaration.probs
     assert probs is not None
     rows: Any = 0
     for card, (parent, link) in zip(probs.shape[:-1], node.links, strict=True):
         parent_node = model[parent]
-        if parent_node.kind == "deterministic":
+        if parent in given:
+            stored: Expression = constant(given[parent])
+        elif parent_node.kind == "deterministic":
             stored = _stored_value(model, parent)
         else:
             stored = stored_leaf(model, parent_node)

@@ -15,7 +15,6 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.starting import start_states
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel, full_conditional
-from bayesmc.kernels.conjugate_data import Elements, groups_of
 from bayesmc.kernels.conjugate_kinds import KINDS, RootOf
 from bayesmc.kernels.conjugate_pairs import PAIRS
 from bayesmc.network import pose
@@ -529,20 +528,17 @@ def test_a_mixture_is_summed_by_label(states: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("child", "names", "direct"),
+    ("child", "names"),
     [
-        (lambda label, mean, tau, sd: bmc.Normal(mean[label], 2 * tau[label] ** -0.5), "mt", True),
-        (lambda label, mean, tau, sd: bmc.Normal(3 * mean[label], sd**0.5), "ms", True),
-        (lambda label, mean, tau, sd: bmc.Normal(3 - 2 * mean[label], sd**0.5), "m", True),
-        (lambda label, mean, tau, sd: bmc.Normal(3 - 2 * mean[label], sd**0.5), "s", False),
-        (lambda label, mean, tau, sd: bmc.Normal(mean[label] + sd, tau[label] ** -0.5), "mt", False),
-        (lambda label, mean, tau, sd: bmc.Normal(mean[2 - label], tau[label] ** -0.5), "mt", False),
-        (lambda label, mean, tau, sd: bmc.Normal(mean[label], np.exp(tau)[label]), "m", False),
+        (lambda label, mean, tau, sd: bmc.Normal(mean[label], 2 * tau[label] ** -0.5), "mt"),
+        (lambda label, mean, tau, sd: bmc.Normal(3 * mean[label], sd**0.5), "ms"),
+        (lambda label, mean, tau, sd: bmc.Normal(3 - 2 * mean[label], sd**0.5), "ms"),
+        (lambda label, mean, tau, sd: bmc.Normal(mean[label] + sd, tau[label] ** -0.5), "mt"),
+        (lambda label, mean, tau, sd: bmc.Normal(mean[2 - label], tau[label] ** -0.5), "mt"),
+        (lambda label, mean, tau, sd: bmc.Normal(mean[label], np.exp(tau)[label]), "m"),
     ],
 )  # fmt: skip
-def test_parameters_that_are_nodes_by_label_are_read_without_a_call(
-    child: Callable[..., Any], names: str, direct: bool
-) -> None:
+def test_numbers_in_two_plates_are_summed_by_label(child: Callable[..., Any], names: str) -> None:
     """Points in two plates; numbers, not vectors; nodes shared by all labels."""
     net = bmc.BayesNet(plates={"cluster": 3, "i": 6, "j": 5})
     net.add("mean", bmc.Normal(0.0, 3.0), plates="cluster")
@@ -555,39 +551,43 @@ def test_parameters_that_are_nodes_by_label_are_read_without_a_call(
         name = {"m": "mean", "t": "tau", "s": "sd"}[letter]
         kernel = _assert_right(net, evidence, name)
         assert kernel.partners[0]._way is not None
-        assert (kernel.partners[0]._way.direct is not None) == direct
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        lambda spread: spread[..., None, None] * np.array([[2.0, 0.5], [0.5, 1.0]]),
+        lambda spread: np.eye(2) / spread[..., None, None],
+    ],
+)
+def test_a_number_in_the_covariances_is_summed_by_label(covariance: Callable[..., Any]) -> None:
+    net, evidence = _mixture(120)
+    net.add("spread", bmc.Gamma(2.0, 1.0), plates="cluster")
+    if covariance(np.ones(3))[0, 0, 1]:
+        net.add("spread", bmc.InverseGamma(2.0, 1.0), plates="cluster", replace=True)
+    net.add(
+        "x",
+        lambda label, mean, spread: bmc.MvNormal(mean[label], covariance(spread[label])),
+        plates="point",
+        replace=True,
+    )
+    for name in ("spread", "mean"):
+        kernel = _assert_right(net, evidence, name)
+        assert kernel.partners[0]._way is not None
 
 
 def test_the_kernels_of_a_mixture_go_once_through_the_data() -> None:
     net, evidence = _mixture(120)
     target, values = _started(net, evidence)
     kernels = [conjugate_kernel(Blanket(target, n)) for n in ("mean", "covariance")]
-    groups = [k.partners[0]._way.groups for k in kernels]
-    assert groups[0] is groups[1]
-    first = groups[0].at(values)
-    assert groups[0].at({**values, "mean": values["mean"] + 1}) is first
-    again = groups[0].at({**values, "label": values["label"].copy()})
+    sums = [k.partners[0]._way.sums for k in kernels]
+    assert sums[0] is sums[1]
+    first = sums[0].sums(values)
+    kept = {**values, **sums[0].kept(values["label"], first)}
+    assert sums[0].sums({**kept, "mean": values["mean"] + 1}) is first
+    again = sums[0].sums({**kept, "label": values["label"].copy()})
     assert again is not first
-    assert (again.total == first.total).all()
-
-
-def test_sums_by_label_are_those_of_the_elements() -> None:
-    net, evidence = _mixture(120)
-    target, values = _started(net, evidence)
-    groups = groups_of(target, target.terms["x"], "label", "value")
-    groups.second = True
-    grouped = groups.at(values)
-    loc, tril = np.array([99.0, 101.0]), np.linalg.cholesky(COV)
-    one = Elements(evidence["x"][None], None, 1)
-    hot = values["label"][:, None] == np.arange(3)[:, None]
-    assert (grouped.count == hot.sum(-1)).all()
-    for found, each in (
-        (grouped.total, one.total),
-        (grouped.deviations(loc), one.deviations(loc)),
-        (grouped.mahalanobis(loc, tril), one.mahalanobis(loc, tril)),
-    ):
-        wide = hot.reshape(hot.shape + (1,) * (each.ndim - 2))
-        np.testing.assert_allclose(found, (wide * each[:, None]).sum(2), rtol=1e-10)
+    assert (again == first).all()
 
 
 def test_a_function_with_arrays_of_its_own_is_not_summed_by_label() -> None:
@@ -746,7 +746,7 @@ def _wrong_table(words: str, statistic: Any) -> list[Any]:
     ],
 )  # fmt: skip
 def test_a_wrong_table_is_caught(name: str, words: str, statistic: Any) -> None:
-    target, values = _started(*_net("label", SIDES[name]))
+    target, values = _started(*_net("index", SIDES[name]))
     right = conjugate_kernel(Blanket(target, "x"), debug=True)
     wrong = conjugate_kernel(Blanket(target, "x"), True, _wrong_table(words, statistic))
     _run(right, values)
@@ -754,6 +754,17 @@ def test_a_wrong_table_is_caught(name: str, words: str, statistic: Any) -> None:
         _run(wrong, values)
     with pytest.raises(AssertionError):
         _assert_conditional(wrong, values)
+
+
+@pytest.mark.parametrize("name", ["poisson", "precision", "bernoulli", "normal", "covariance"])
+def test_wrong_sums_by_label_are_caught(name: str) -> None:
+    target, values = _started(*_net("label", SIDES[name]))
+    kernel = conjugate_kernel(Blanket(target, "x"), debug=True)
+    _run(kernel, values)
+    sums = kernel.partners[0]._way.sums
+    kept = sums.kept(values["label"], 1.1 * sums.sums(values))
+    with pytest.raises(DensityError, match="node 'x'.*log ratio"):
+        _run(kernel, {**values, **kept})
 
 
 class _Given:
