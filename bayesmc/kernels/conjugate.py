@@ -23,11 +23,9 @@ from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_families import (
     Bounds,
-    InverseWishartConditional,
     Naturals,
 )
 from bayesmc.kernels.conjugate_naturals import Form, form_of
-from bayesmc.kernels.precisions import keep_precision
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
@@ -91,13 +89,7 @@ class Conjugate(Kernel):
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
         naturals, bounds = self._naturals(values, part)
         family = self.forms[part].family
-        drawn: np.ndarray | None
-        if isinstance(family, InverseWishartConditional):
-            drawn, precision = family.with_precision(naturals, rng, shape)
-            if precision is not None and members is None:
-                keep_precision(self.blanket.target, self.blanket.name, drawn, precision)
-        else:
-            drawn = family.draw(naturals, bounds, rng, shape)
+        drawn = family.draw(naturals, bounds, rng, shape)
         if drawn is not None and not self.debug:
             return drawn
         posterior = family.posterior(naturals, bounds)

@@ -7,7 +7,7 @@ names: they are one child with the slices as one more axis in front.
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -26,6 +26,8 @@ from bayesmc.expression import (
     pick,
     substituted,
 )
+from bayesmc.kernels.conjugate_labels import by_label
+from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.network.expressions import Opaque, stored_leaf
 from bayesmc.network.readings import frame
 from bayesmc.passes.log_density import log_density
@@ -51,6 +53,8 @@ class Child:
         Of the entries: the plates, and the terms in front where there are many.
     mask : ndarray of bool or None
         Entries that count; broadcasts to the shape.
+    sums : LabelSums or None
+        Its sums by label, of which the density then is.
     """
 
     terms: tuple[Term, ...]
@@ -58,16 +62,19 @@ class Child:
     value: Expression
     shape: Shape
     mask: np.ndarray | None
+    sums: LabelSums | None = None
 
     @cached_property
     def density(self) -> Expression:
-        """Log densities of all entries.
+        """Log densities of all entries, or of all labels.
 
         Raises
         ------
         TraceError
             The family has no closed form.
         """
+        if self.sums is not None:
+            return self.sums.expression
         return broadcast(log_density(self.family, self.value), self.shape)
 
     def read(self, name: str) -> list[str]:
@@ -97,8 +104,10 @@ def children_of(blanket: Blanket) -> list[Child] | Term:
 
 
 def apart(blanket: Blanket, child: Child) -> list[Child]:
-    """Many like children one by one; nothing of one."""
-    return [_alone(blanket, t) for t in child.terms] if len(child.terms) > 1 else []
+    """Many like children one by one, or one entry by entry and not by label; nothing of others."""
+    if child.sums is None and len(child.terms) == 1:
+        return []
+    return [_alone(blanket, t) for t in child.terms]
 
 
 def with_known(target: Target, expression: Expression) -> Expression:
@@ -137,12 +146,16 @@ def _low(term: Term) -> int:
 
 
 def _made(blanket: Blanket, terms: Sequence[Term]) -> Iterator[Child]:
-    found = _joined(blanket, terms) if len(terms) > 1 else None
-    if found is not None:
-        yield found
-        return
+    summed = {t.name: by_label(blanket.target, t, blanket.name) for t in terms}
+    if len(terms) > 1 and not any(summed.values()):
+        found = _joined(blanket, terms)
+        if found is not None:
+            yield found
+            return
     for term in terms:
-        yield _alone(blanket, term)
+        sums = None if len(blanket.classes) > 1 else summed[term.name]
+        child = _alone(blanket, term)
+        yield child if sums is None else replace(child, sums=sums, mask=None)
 
 
 def _alone(blanket: Blanket, term: Term) -> Child:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import cache
 from typing import Any
 
 import numpy as np
@@ -30,8 +29,7 @@ from bayesmc.distributions import (
     Truncated,
 )
 from bayesmc.distributions.support import Support, interval
-from bayesmc.distributions.wishart import bartlett, gram
-from bayesmc.kernels.precisions import Precision, from_root
+from bayesmc.kernels.vector_draws import inverse_wishart_draw, normal_draw
 from bayesmc.passes.features import LOG, LOG1M, Feature
 from bayesmc.shapes import Shape
 
@@ -158,11 +156,7 @@ class MvNormalConditional(Conditional):
     def draw(
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
-        precision, linear = naturals
-        # inverting an upper triangle is back substitution: nothing is pivoted
-        root = np.linalg.inv(np.linalg.cholesky(precision).swapaxes(-1, -2))
-        noise = rng.standard_normal(shape + linear.shape[-1:])
-        draw = np.matvec(root, np.vecmat(linear, root) + noise)
+        draw = normal_draw(rng, *naturals, shape)
         return draw if math.isfinite(draw.sum()) else None
 
 
@@ -175,25 +169,7 @@ class InverseWishartConditional(Conditional):
     def draw(
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
-        return self.with_precision(naturals, rng, shape)[0]
-
-    def with_precision(
-        self, naturals: Naturals, rng: np.random.Generator, shape: Shape
-    ) -> tuple[np.ndarray, Precision | None]:
-        """A draw, and its precision from the same factors (None where rounding spoils these).
-
-        If the scale is ``R R'`` and B is Bartlett's triangle, the draw is ``M M'`` with ``M = R B^-1``,
-        and its precision ``N N'`` with ``N = R'^-1 B'``.
-        """
-        df, scale = naturals
-        d = scale.shape[-1]
-        uppers = np.empty((2, *np.broadcast_shapes(shape, scale.shape[:-2]), d, d))
-        uppers[0] = np.linalg.cholesky(scale).swapaxes(-1, -2)
-        uppers[1] = bartlett(rng, df[..., None] - _falling(d), shape).swapaxes(-1, -2)
-        over_root, over_noise = np.linalg.inv(uppers)
-        factor = (over_noise @ uppers[0]).swapaxes(-1, -2)
-        draw, exact = gram(factor)
-        return draw, from_root(over_root @ uppers[1]) if exact else None
+        return inverse_wishart_draw(rng, *naturals, shape)
 
 
 def family_of_features(found: Mapping[Feature, Any], low: float, high: float) -> Conditional | None:
@@ -261,12 +237,6 @@ class RootOf(Distribution):
 
 def _covers(bounds: Bounds, low: float, high: float) -> bool:
     return bool(np.all(bounds[0] <= low) and np.all(bounds[1] >= high))
-
-
-@cache
-def _falling(d: int) -> np.ndarray:
-    """``d - 1, ..., 0``."""
-    return np.arange(d - 1, -1, -1.0)
 
 
 def _root_of_inverse(precision: np.ndarray) -> np.ndarray:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import (
+    Categorical,
     Dirichlet,
     Distribution,
     InverseWishart,
@@ -28,6 +29,7 @@ from bayesmc.expression import (
     pick,
     reshape,
 )
+from bayesmc.expression.scalars import SmallProgram
 from bayesmc.kernels.conjugate_children import Child, apart, children_of, with_known
 from bayesmc.kernels.conjugate_families import (
     Bounds,
@@ -38,14 +40,17 @@ from bayesmc.kernels.conjugate_families import (
     Naturals,
     family_of_features,
 )
+from bayesmc.kernels.conjugate_labels import Counts, covariance_by_label, mean_by_label
 from bayesmc.kernels.conjugate_range import least_values, refuse
 from bayesmc.kernels.conjugate_terms import Added, Moving, features_of, moving, shares_sum_to_one
 from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
 from bayesmc.kernels.conjugate_words import why_not
+from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.network.expressions import Opaque, stored_leaf
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.features import LOG, Feature
 from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.passes.reads import same_along
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
 
@@ -64,6 +69,8 @@ class Form:
         Of the support, none or two.
     positive : sequence of tuple
         What must be positive, and the child that it is a parameter of.
+    placed : sequence
+        Sums by label that are beside the state.
     """
 
     def __init__(
@@ -73,11 +80,12 @@ class Form:
         naturals: list[Expression],
         bounds: list[Expression],
         positive: list[tuple[Expression, Child]],
+        placed: list[LabelSums | Counts],
     ) -> None:
-        self.family, self.words = family, words
+        self.family, self.words, self._placed = family, words, placed
         self._positive = [child for _, child in positive]
         roots = [*naturals, *bounds, *(e for e, _ in positive)]
-        self._program = Program(roots)
+        self._program = SmallProgram(roots)
         self._count, self._ends = len(naturals), len(naturals) + len(bounds)
         self._ndims = [len(r.shape) for r in roots]
         self._kept: tuple[Naturals, Bounds | None] | None = None
@@ -88,6 +96,8 @@ class Form:
         """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
         if self._kept is not None:
             return self._kept
+        for sums in self._placed:
+            values = sums.placed(values)
         found = [
             a if a.ndim > n else a[None]
             for a, n in zip(self._program(values), self._ndims, strict=True)
@@ -218,7 +228,10 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> 
         [_pair(c, of, a.is_picked and 2.0 not in a.coefficients) for c, a in children.items()],
     )
     positive = _positive(blanket, children)
-    form = Form(family, words, naturals, _bounds(blanket, members, prior, family), positive)
+    sums = [c.sums for c in children if c.sums is not None]
+    form = Form(
+        family, words, naturals, _bounds(blanket, members, prior, family), positive, list(sums)
+    )
     if any(c.is_picked for c in children.values()) and not _is_closed(form, blanket):
         unlike = next(c for c, a in children.items() if a.is_picked)
         return why_not(blanket, unlike.terms[0], prior.words)
@@ -313,32 +326,59 @@ def _of_events(
     if not isinstance(found, list):
         return why_not(blanket, found, prior.words)
     matched = []
+    beside: list[LabelSums | Counts] = []
     for child in found:
         try:
-            added, picked = _event_added(blanket, child, of, family)
+            added, picked, sums = _event_added(blanket, child, of, family)
         except TraceError:
             return why_not(blanket, child.terms[0], prior.words)
+        beside += sums
         naturals = [add(a, reshape(b, a.shape)) for a, b in zip(naturals, added, strict=True)]
         matched.append(_pair(child, of, picked))
     if not matched:
         return "no child varies with it"
     placed = [_placed(a, blanket, members) for a in naturals]
-    return Form(family, _words(prior, matched), placed, [], _positive(blanket, found))
+    return Form(family, _words(prior, matched), placed, [], _positive(blanket, found), beside)
 
 
 def _event_added(
     blanket: Blanket, child: Child, of: Moving, family: Conditional
-) -> tuple[tuple[Expression, ...], bool]:
-    """What a child adds to each natural parameter, and whether not all of its entries do."""
-    if isinstance(family, MvNormalConditional):
-        return mean_added(child, of), False
-    if isinstance(family, InverseWishartConditional):
-        return covariance_added(child, of), False
-    density = shares_sum_to_one(child.density, blanket)
-    found = features_of(density, of, child.mask, True)
-    if set(found.coefficients) - {LOG}:
-        raise TraceError("it has other features")
-    return (found.coefficients.get(LOG, broadcast(ZERO, (of.count,))),), found.is_picked
+) -> tuple[tuple[Expression, ...], bool, list[LabelSums | Counts]]:
+    """What a child adds, whether not all of its entries do, and the sums by label that it needs."""
+    if isinstance(family, DirichletConditional):
+        counts = _counts(blanket, child)
+        if counts is not None:
+            return (counts.leaf,), False, [counts]
+        (child,) = apart(blanket, child) if child.sums is not None else (child,)
+        density = shares_sum_to_one(child.density, blanket)
+        found = features_of(density, of, child.mask, True)
+        if set(found.coefficients) - {LOG}:
+            raise TraceError("it has other features")
+        return (found.coefficients.get(LOG, broadcast(ZERO, (of.count,))),), found.is_picked, []
+    is_mean = isinstance(family, MvNormalConditional)
+    if child.sums is not None:
+        try:
+            short = mean_by_label if is_mean else covariance_by_label
+            return short(child.sums, blanket), False, [child.sums]
+        except TraceError:
+            (child,) = apart(blanket, child)
+    whole = mean_added if is_mean else covariance_added
+    return whole(child, of), False, []
+
+
+def _counts(blanket: Blanket, child: Child) -> Counts | None:
+    """How often each state of a child came, where the node is its row and nothing else."""
+    target, (term, *more) = blanket.target, child.terms
+    if more or child.family.make is not Categorical or blanket.node.plates or not term.shape:
+        return None
+    if term.name not in target.chain or target.seen(term.name) is not None:
+        return None
+    row = as_expression(child.family.parameters["probs"])
+    row = broadcast(row, (*term.shape, *row.shape[-1:]))
+    own = stored_leaf(target.model, blanket.node)
+    if same_along(row, range(len(term.shape))) is not own:
+        return None
+    return Counts(target, term.name)
 
 
 def _naturals_of(blanket: Blanket, base: Family) -> list[Expression]:

@@ -13,31 +13,21 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 22; Diebolt and Rober
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Sequence
-from operator import mul
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical
-from bayesmc.errors import BayesmcError, ZeroProbabilityError
+from bayesmc.errors import BayesmcError, TraceError, ZeroProbabilityError
+from bayesmc.expression.scalars import SmallProgram
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conjugate_data import Groups
-from bayesmc.kernels.conjugate_planar import FEW
 from bayesmc.kernels.enumerate import Enumerate
-from bayesmc.kernels.label_terms import (
-    IMPOSSIBLE,
-    LabelTerm,
-    LostParameters,
-    example_of,
-    label_term,
-)
+from bayesmc.kernels.label_sums import IMPOSSIBLE, LabelSums, label_sums
 from bayesmc.kernels.verify import check_ratio
+from bayesmc.network.expressions import Opaque, density_at
+from bayesmc.passes.sufficient import log_probabilities
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Values
-from bayesmc.structure.traced import Untraceable, traced_term
-from bayesmc.tracing import TracedCall, Tracer
+from bayesmc.structure.target import Target, Values
 
 #: sum of the sizes of the products in a log density, from which on rounding could reach 1e-9 of it
 _LARGEST = 2.0**19
@@ -48,13 +38,17 @@ _CHUNK, _NARROW = 1 << 14, 512
 _ZERO = 0.1 * IMPOSSIBLE
 
 
+class LostParameters(Exception):
+    """Parameters that overflowed or are out of range: the model's own density says what follows."""
+
+
 class Labels(Kernel):
     """Draws a finite plated node whose children's log densities are features times coefficients.
 
     Parameters
     ----------
     blanket : Blanket
-    terms : sequence of LabelTerm
+    terms : sequence of LabelSums
         Its children.
     debug : bool
         Check log densities against the model's in every step.
@@ -62,7 +56,7 @@ class Labels(Kernel):
 
     label = "enumerate"
 
-    def __init__(self, blanket: Blanket, terms: Sequence[LabelTerm], debug: bool = False) -> None:
+    def __init__(self, blanket: Blanket, terms: Sequence[LabelSums], debug: bool = False) -> None:
         self.blanket, self.terms, self.debug = blanket, tuple(terms), debug
         self.names = (blanket.name,)
         domain = blanket.node.domain
@@ -88,16 +82,17 @@ class Labels(Kernel):
         by_element = self._prior.by_element(values)
         if self.debug:
             self._check(values, table, by_element)
-        groups = self._fed()
         label = np.empty((chains, self._features.shape[1]), dtype=self.dtype)
-        sums = self._draw(table, by_element, rng, label, groups is not None)
+        sums = self._draw(table, by_element, rng, label)
         shape = values[name].shape
         if self.members is None:
             label = label.reshape(shape)
-        new = self.blanket.moved(values, label, self.members)
-        if groups is not None:
-            groups.feed(new, sums)
-        return {name: new}, memory
+        new = {name: self.blanket.moved(values, label, self.members)}
+        if self._is_asked:
+            for at, term in zip(self._at, self.terms, strict=True):
+                part = sums[..., at : at + len(term.statistics)]
+                new |= term.kept(new[name], part)
+        return new, memory
 
     # ---- log densities -------------------------------------------------------------------------
 
@@ -114,13 +109,13 @@ class Labels(Kernel):
         return log if by_element is None else log + by_element
 
     def _layout(self) -> None:
-        """Stack the features of all children; find the row of ones that the prior multiplies."""
+        """Stack the statistics of all children; find the row of ones that the prior multiplies."""
         parts, self._at = [], []
         start = 0
         for term in self.terms:
-            parts.append(term.features)
+            parts.append(term.statistics)
             self._at.append(start)
-            start += len(term.features)
+            start += len(term.statistics)
         whole = (a for a, t in zip(self._at, self.terms, strict=True) if t.term.mask is None)
         self._one = next(whole, start)
         if self._one == start:
@@ -131,25 +126,21 @@ class Labels(Kernel):
         may_vanish = np.zeros(len(self._features), dtype=bool)
         may_vanish[self._one] = True
         for at, term in zip(self._at, self.terms, strict=True):
-            may_vanish[at + term.ones : at + len(term.features)] = term.indicators
+            may_vanish[at + term.ones : at + len(term.statistics)] = term.indicators
         self._may_vanish = may_vanish
-        self._most_floats = self._most.tolist()
+        self._coefficients = SmallProgram([t.coefficients for t in self.terms])
+        own = self.blanket.own
+        weighed = own is not None and bool(self.blanket.target.hidden_above(own))
+        #: whether somebody needs sums by label
+        self._is_asked = self.members is None and (weighed or any(t.is_asked for t in self.terms))
 
     def _table(self, values: Values, chains: int) -> _Table:
         """The coefficients of a state; raises ``LostParameters`` where products would cancel."""
-        if chains * self.states <= FEW:
-            quick = self._planar(values, chains)
-            if quick is not None:
-                return quick
         table = np.zeros((self.states, chains, len(self._features)))
-        for at, term in zip(self._at, self.terms, strict=True):
-            c = term.coefficients(values)
-            constant = c.constant
-            if term.ones == 1 and constant.shape[-1] != 1:
-                constant = constant.sum(axis=-1, keepdims=True)
-            middle = at + term.ones
-            table[:, :, at:middle] = constant.swapaxes(0, 1)
-            table[:, :, middle : middle + c.rows.shape[-1]] = c.rows.swapaxes(0, 1)
+        for at, found in zip(self._at, self._coefficients(values), strict=True):
+            if found.ndim == 2:
+                found = found[None]
+            table[:, :, at : at + found.shape[-1]] = found.swapaxes(0, 1)
         common = self._prior.common(values)
         if common is not None:
             table[:, :, self._one] += common
@@ -160,21 +151,6 @@ class Labels(Kernel):
             raise LostParameters
         return _Table(np.maximum(table, 3 * IMPOSSIBLE), True)
 
-    def _planar(self, values: Values, chains: int) -> _Table | None:
-        """The same in floats for few components in the plane, or None."""
-        logs = self._prior.floats(values, chains)
-        rows = None if logs is None else self.terms[0].planar(values, chains)
-        if rows is None:
-            return None
-        for row, log in zip(rows, logs, strict=True):  # type: ignore[arg-type]
-            row[0] += log
-            if not sum(map(mul, map(abs, row), self._most_floats)) < _LARGEST:
-                return None
-        table = np.array(rows)
-        if chains == 1:
-            return _Table(table[:, None], False)
-        return _Table(table.reshape(chains, self.states, -1).swapaxes(0, 1).copy(), False)
-
     # ---- draws ---------------------------------------------------------------------------------
 
     def _draw(
@@ -183,7 +159,6 @@ class Labels(Kernel):
         by_element: np.ndarray | None,
         rng: np.random.Generator,
         label: np.ndarray,
-        summing: bool,
     ) -> np.ndarray:
         """Fill in labels ``(chains, elements)``; the features' sums ``(chains, states, features)``."""
         chains, total = len(label), None
@@ -197,7 +172,7 @@ class Labels(Kernel):
                     )
             drawn = label[:, part]
             buffers.draw(rng, drawn)
-            if summing:
+            if self._is_asked:
                 sums = buffers.summed(drawn, self._codes, features)
                 total = sums if total is None else total + sums
         if total is None:
@@ -223,14 +198,6 @@ class Labels(Kernel):
                 ]
             }
         return self._parts[chains]
-
-    def _fed(self) -> Groups | None:
-        """The sums that conjugate kernels ask for, if they are of these features."""
-        if len(self.terms) > 1 or self.members is not None:
-            return None
-        groups = self.terms[0].groups
-        fits = groups is not None and groups.used and groups.rows == len(self._features)
-        return groups if fits else None
 
     def _check(self, values: Values, table: _Table, by_element: np.ndarray | None) -> None:
         """Refuse log densities that are not the model's."""
@@ -332,23 +299,35 @@ class _Prior:
 
     def __init__(self, blanket: Blanket, members: np.ndarray | None) -> None:
         self.blanket, self.members = blanket, members
-        own = blanket.own
+        own, target = blanket.own, blanket.target
         domain = blanket.node.domain
-        assert domain is not None
+        assert domain is not None and target.states is not None
         axes = len(blanket.node.plates)
         self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape(
             (-1,) + (1,) * (1 + axes)
         )
         self.steep = False
-        self._weights = _weights_of(blanket)
         self._kept: np.ndarray | None = None
-        target = blanket.target
-        log = self._evaluated(example_of(target))
+        log = self._evaluated(_first_of(target))
         self._is_common = log.shape[2:] == (1,) * axes
+        self._program = self._read() if self._is_common else None
         above = () if own is None else target.hidden_above(own)
         if not above:
             self._kept = self._shaped(self._evaluated({**target.known}))
             self.steep = bool((self._kept < _ZERO).any())
+
+    def _read(self) -> SmallProgram | None:
+        """The common ones as an expression, where the label's function is followed."""
+        own, domain = self.blanket.own, self.blanket.node.domain
+        if own is None or domain is None or isinstance(own.read, Opaque):
+            return None
+        values = domain.to_support(np.arange(domain.size))
+        try:
+            family = density_at(own.model, own.name, {})
+            logs = log_probabilities(family, values)
+        except TraceError:
+            return None
+        return SmallProgram([logs]) if logs.size == domain.size else None
 
     def common(self, values: Values) -> np.ndarray | None:
         """Shape (states, chains or 1), or None where elements differ."""
@@ -356,18 +335,10 @@ class _Prior:
             return None
         if self._kept is not None:
             return self._kept
-        if self._weights is not None:
-            return np.maximum(np.log(values[self._weights].T), IMPOSSIBLE)
+        if self._program is not None:
+            (found,) = self._program(values)
+            return found.reshape(-1, len(self._candidate)).T
         return self._shaped(self._evaluated(values))
-
-    def floats(self, values: Values, chains: int) -> list[float] | None:
-        """The common ones of every chain and state, where they are the logarithms of a node's value."""
-        if not self._is_common or self._weights is None:
-            return None
-        try:
-            return list(map(math.log, values[self._weights].ravel().tolist()))
-        except ValueError:  # of zero
-            return None
 
     def by_element(self, values: Values) -> np.ndarray | None:
         """Shape (states, chains or 1, elements), or None where they are alike."""
@@ -430,11 +401,13 @@ def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
         return None
     if blanket.path or len(blanket.classes) != 1 or not blanket.children:
         return None
+    if blanket.target.states is None:
+        return None
     found = []
     with np.errstate(all="ignore"):
         for child in blanket.children:
-            term = label_term(blanket, child)
-            if term is None:
+            term = label_sums(blanket.target, child.term, blanket.name)
+            if term is None or child.relation.kind != "aligned":
                 return None
             found.append(term)
         kernel = Labels(blanket, found, debug)
@@ -444,28 +417,9 @@ def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _weights_of(blanket: Blanket) -> str | None:
-    """The node that holds the probabilities themselves, one row for all elements."""
-    own, target = blanket.own, blanket.target
-    above = () if own is None else target.hidden_above(own)
-    if own is None or len(above) != 1 or target.model[above[0]].plates:
-        return None
-    if target.model[above[0]].event_shape != (blanket.node.domain.size,):  # type: ignore[union-attr]
-        return None
-    try:
-        result = traced_term(target, (above[0],), own).result
-    except Untraceable:
-        return None
-    if not isinstance(result, TracedCall) or result.function is not Categorical:
-        return None
-    value = result.traced.get("probs")
-    alone = len(result.traced) == 1 and isinstance(value, Tracer) and value.is_copy
-    return above[0] if alone and value.whole_event else None  # type: ignore[union-attr]
-
-
 def _is_right(kernel: Labels) -> bool:
     """Whether log densities at a reachable state are the model's."""
-    state = example_of(kernel.blanket.target)
+    state = _first_of(kernel.blanket.target)
     try:
         table = kernel._table(state, 1)
         kernel._check(state, table, kernel._prior.by_element(state))
@@ -474,3 +428,9 @@ def _is_right(kernel: Labels) -> bool:
     except BayesmcError:
         return False
     return True
+
+
+def _first_of(target: Target) -> Values:
+    """One reachable state, ``(1, *plates, *event)``."""
+    assert target.states is not None
+    return {n: v if target.is_known(n) else v[:1] for n, v in target.states.items()}

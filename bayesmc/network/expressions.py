@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
 from typing import Any
@@ -159,6 +159,42 @@ def log_density_of(model: Model, name: str) -> Expression:
     if node.domain is not None and node.domain.low:
         value = elementwise(np.add, value, node.domain.low)
     return broadcast(log_density(family, value), node.plate_shape)
+
+
+def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
+    """What a node's function computes where some parents have other stored values, of any plate sizes.
+
+    So a function of a label is read at every label in place of every element: whether that says the same
+    is the caller's to check, as it is here not.
+
+    Parameters
+    ----------
+    given : mapping
+        Stochastic parent -> whole numbers with its plates' axes.
+
+    Raises
+    ------
+    TraceError
+        The function cannot be followed, or does not broadcast so.
+    """
+    node = model[name]
+    declaration, links = node.declaration, node.links
+    if declaration.vectorize or declaration.value is not None:
+        raise TraceError("it is called element by element, or not at all")
+    parents = tuple(parent for parent, _ in links)
+    arguments = tuple(
+        replace(a, known=constant(given[parent])) if parent in given else a
+        for a, parent in zip(_arguments(model, links), parents, strict=True)
+    )
+    try:
+        if declaration.probs is not None:
+            reading = read_table(declaration.probs, arguments, links)
+        else:
+            reading = read_function(declaration.function, arguments, links)
+        found = Followed(model, reading, parents, arguments).result
+    except (BayesmcError, ValueError, IndexError) as error:
+        raise TraceError(str(error)) from error
+    return family_of(found) if isinstance(found, Distribution) else found
 
 
 def log_factor_of(model: Model, name: str) -> Expression:

@@ -37,9 +37,19 @@ from bayesmc.expression import (
     replaced,
 )
 from bayesmc.expression.graph import CASTS
-from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, subtract, tidied, tidy
+from bayesmc.passes.arithmetic import (
+    ONE,
+    ZERO,
+    add,
+    divide,
+    is_all,
+    multiply,
+    subtract,
+    tidied,
+    tidy,
+)
 from bayesmc.passes.branches import branches_up
-from bayesmc.passes.reads import NOTHING, element_read
+from bayesmc.passes.reads import NOTHING, element_read, matrix_function
 from bayesmc.passes.sinking import reads, sunk
 
 #: powers p of ``x**p``, and the two logarithms
@@ -297,13 +307,14 @@ class _Reader:
 
     def matrices(self, node: Call) -> Features:
         """Functions of matrices that are a power of it times a matrix."""
-        ways = {"cholesky": 0.5, "inv": -1.0}
-        if node.detail in ways:
+        ways = {"cholesky": 0.5, "inv": -1.0, "upper_inverse": -1.0}
+        word = matrix_function(node)
+        if word in ways:
             (operand,) = node.operands
             ((power, c),) = _single(_powers(self(operand))).items()
             made = node.with_operands([broadcast(c, operand.shape)])
-            return {power * ways[node.detail]: made}  # type: ignore[operator]
-        if node.detail == "solve":
+            return {power * ways[word]: made}  # type: ignore[operator]
+        if word == "solve":
             matrix, right = node.operands
             ((power, c),) = _single(_powers(self(matrix))).items()
             whole = broadcast(c, matrix.shape)

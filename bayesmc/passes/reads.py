@@ -30,7 +30,7 @@ from bayesmc.expression import (
 )
 
 #: functions of whole matrices: their batch axes are all but the last two
-_OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det"))
+_OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det", "upper_inverse"))
 #: what an entry reads that reads no element
 NOTHING = as_expression(-1)
 
@@ -94,6 +94,12 @@ def same_along(expression: Expression, axes: Sequence[int]) -> Expression | None
     return first if broadcast(reshape(first, kept), shape) is expression else None
 
 
+def matrix_function(node: Call) -> str:
+    """What the function of a call is called."""
+    function = getattr(node.call, "function", node.call)
+    return getattr(function, "__name__", "")
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -117,7 +123,7 @@ def _read(node: Expression, inner: list[Expression | None]) -> Expression:
         return _along(inner[0], node.axes)
     assert isinstance(node, Call)
     lead = min(2, *(len(a.shape) for a in node.operands))
-    if node.detail not in _OF_MATRICES:
+    if matrix_function(node) not in _OF_MATRICES:
         lead = max(len(a.shape) for a in node.operands)
     parts = []
     for at in inner:

@@ -1,0 +1,236 @@
+"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as thirty.
+
+Every element becomes a variable, equal ones once. What Python refuses (a logarithm of zero, a division
+by it, the root of a negative number) and what has no rule here is evaluated as arrays, which say in NumPy's
+way what follows.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from bayesmc.expression.evaluate import Program
+from bayesmc.expression.graph import (
+    Call,
+    Constant,
+    Elementwise,
+    Expression,
+    Leaf,
+    Pick,
+    Reduction,
+    as_float,
+    ordered,
+)
+from bayesmc.shapes import Shape
+
+#: operations of one call of NumPy's time
+_PER_CALL = 25
+#: elements of a graph up to which code is made
+_MOST = 5000
+
+
+class SmallProgram:
+    """Expressions made ready to be evaluated often, for few elements at a time.
+
+    As ``Program``, with results that may differ from its by rounding.
+
+    Parameters
+    ----------
+    roots : sequence of Expression
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import elementwise, leaf
+    >>> from bayesmc.expression.scalars import SmallProgram
+    >>> x = leaf("x", (2,))
+    >>> program = SmallProgram([elementwise(np.multiply, x, [1.0, 10.0])])
+    >>> program({"x": np.array([[1.0, 2.0], [3.0, 4.0]])})
+    [array([[ 1., 20.],
+           [ 3., 40.]])]
+    """
+
+    def __init__(self, roots: Sequence[Expression]) -> None:
+        self._roots = tuple(roots)
+        nodes = ordered(*roots)
+        self._leaves = [(n.name, n.shape) for n in nodes if isinstance(n, Leaf)]
+        self._calls = sum(bool(n.operands) for n in nodes)
+        self._size = sum(n.size for n in nodes)
+        self._shapes = [(r.shape, r.size) for r in roots]
+
+    @cached_property
+    def _arrays(self) -> Program:
+        return Program(self._roots)
+
+    @cached_property
+    def _code(self) -> tuple[Callable[..., Any], int] | None:
+        """The function, and the largest batch that it pays for."""
+        if self._size > _MOST or not self._leaves:
+            return None
+        try:
+            function, count = _compiled(self._roots, self._leaves)
+        except NotImplementedError:
+            return None
+        return function, self._calls * _PER_CALL // max(count, 1)
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        code = self._code
+        if code is None:
+            return self._arrays(values)
+        function, most = code
+        batch: Shape = ()
+        given = []
+        for name, shape in self._leaves:
+            value = values[name]
+            lead = value.shape[: value.ndim - len(shape)]
+            count = math.prod(lead)
+            if count > most or (lead and batch and lead != batch):
+                return self._arrays(values)
+            batch = lead or batch
+            given.append(value.reshape(count, -1).tolist())
+        count = math.prod(batch)
+        given = [rows if len(rows) == count else rows * count for rows in given]
+        try:
+            rows = [function(*row) for row in zip(*given, strict=True)]
+        except (ArithmeticError, ValueError):
+            return self._arrays(values)
+        if len(self._shapes) == 1:
+            return [np.array(rows).reshape(batch + self._shapes[0][0])]
+        flat, found, start = np.array(rows), [], 0
+        for shape, size in self._shapes:
+            found.append(flat[:, start : start + size].reshape(batch + shape))
+            start += size
+        return found
+
+
+def upper_inverse(matrix: np.ndarray) -> np.ndarray:
+    """Inverses of upper triangles with positive diagonals: back substitution, nothing is pivoted."""
+    return np.linalg.inv(matrix)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+class _Lines:
+    """Assignments, one for every different right side."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self._names: dict[str, str] = {}
+
+    def __call__(self, right: str) -> str:
+        found = self._names.get(right)
+        if found is None:
+            found = self._names[right] = f"t{len(self.lines)}"
+            self.lines.append(f"{found} = {right}")
+        return found
+
+
+def _compiled(
+    roots: Sequence[Expression], leaves: Sequence[tuple[str, Any]]
+) -> tuple[Callable[..., Any], int]:
+    lines = _Lines()
+    names = {name: f"v{k}" for k, (name, _) in enumerate(leaves)}
+    made: dict[Expression, np.ndarray] = {}
+    for node in ordered(*roots):
+        made[node] = _written(node, [made[a] for a in node.operands], names, lines)
+    body = "\n    ".join(lines.lines) or "pass"
+    result = ", ".join(x for r in roots for x in made[r].ravel())
+    heads = [
+        f"{', '.join(f'{v}_{i}' for i in range(math.prod(shape)))}, = {v}"
+        for (name, shape), v in zip(leaves, names.values(), strict=True)
+        if math.prod(shape)
+    ]
+    text = f"def function({', '.join(names.values())}):\n    "
+    text += "\n    ".join([*heads, body, f"return ({result},)"])
+    scope: dict[str, Any] = {
+        "log": math.log, "log1p": math.log1p, "exp": math.exp, "sqrt": math.sqrt, "pow": math.pow,
+        "lgamma": math.lgamma, "inf": math.inf, "nan": math.nan,
+    }  # fmt: skip
+    exec(text, scope)  # noqa: S102 - nothing of a user's is in the text
+    return scope["function"], len(lines.lines)
+
+
+def _written(
+    node: Expression, operands: list[np.ndarray], names: Mapping[str, str], lines: _Lines
+) -> np.ndarray:
+    """The names of a node's elements."""
+    if isinstance(node, Leaf):
+        return _objects([f"{names[node.name]}_{i}" for i in range(node.size)], node.shape)
+    if isinstance(node, Constant):
+        return _objects([_literal(x) for x in node.value.ravel().tolist()], node.shape)
+    if isinstance(node, Pick):
+        flat = np.concatenate([a.ravel() for a in operands])
+        return flat[node.positions.ravel()].reshape(node.shape)
+    if isinstance(node, Reduction) and node.ufunc is np.add:
+        (a,) = operands
+        moved = np.moveaxis(a, node.axes, range(-len(node.axes), 0))
+        rows = moved.reshape(node.size, -1)
+        return _objects([lines(" + ".join(row)) if len(row) else "0.0" for row in rows], node.shape)
+    if isinstance(node, Elementwise) and node.function in _TEXTS:
+        text = _TEXTS[node.function]
+        wide = [np.broadcast_to(a, node.shape).ravel() for a in operands]
+        return _objects([lines(text.format(*row)) for row in zip(*wide, strict=True)], node.shape)
+    if isinstance(node, Elementwise) and node.function is as_float and node.operands[0].dtype != bool:
+        return operands[0]
+    if isinstance(node, Call) and node.call in _MATRICES and len(node.operands) == 1:
+        (a,) = operands
+        rule, d = _MATRICES[node.call], a.shape[-1]
+        if not a.size:
+            raise NotImplementedError
+        return np.stack([rule(m, lines) for m in a.reshape(-1, d, d)]).reshape(a.shape)
+    raise NotImplementedError
+
+
+def _objects(items: list[str], shape: tuple[int, ...]) -> np.ndarray:
+    found = np.empty(len(items), dtype=object)
+    found[:] = items
+    return found.reshape(shape)
+
+
+def _literal(x: Any) -> str:
+    if isinstance(x, bool):
+        return repr(x)
+    return repr(float(x)) if x >= 0 else f"({float(x)!r})"
+
+
+def _cholesky(a: np.ndarray, lines: _Lines) -> np.ndarray:
+    found = np.full(a.shape, "0.0", dtype=object)
+    for i in range(len(a)):
+        for j in range(i + 1):
+            rest = "".join(f" - {found[i, k]} * {found[j, k]}" for k in range(j))
+            right = f"{a[i, j]}{rest}"
+            found[i, j] = lines(f"sqrt({right})" if i == j else f"({right}) / {found[j, j]}")
+    return found
+
+
+def _upper_inverse(a: np.ndarray, lines: _Lines) -> np.ndarray:
+    found = np.full(a.shape, "0.0", dtype=object)
+    for j in range(len(a)):
+        found[j, j] = lines(f"1.0 / {a[j, j]}")
+        for i in reversed(range(j)):
+            total = " + ".join(f"{a[i, k]} * {found[k, j]}" for k in range(i + 1, j + 1))
+            found[i, j] = lines(f"-({total}) / {a[i, i]}")
+    return found
+
+
+_MATRICES: dict[Any, Callable[[np.ndarray, _Lines], np.ndarray]] = {
+    np.linalg.cholesky: _cholesky,
+    upper_inverse: _upper_inverse,
+}
+#: right sides, and what happens to NaN as in NumPy
+_TEXTS: dict[Any, str] = {
+    np.add: "{} + {}", np.subtract: "{} - {}", np.multiply: "{} * {}", np.divide: "{} / {}",
+    np.negative: "-{}", np.square: "{0} * {0}", np.sqrt: "sqrt({})", np.log: "log({})",
+    np.log1p: "log1p({})", np.exp: "exp({})", np.reciprocal: "1.0 / {}", np.power: "pow({}, {})",
+    np.float_power: "pow({}, {})", np.abs: "abs({})", np.where: "{1} if {0} else {2}",
+    np.maximum: "{0} if {0} >= {1} or {0} != {0} else {1}",
+    np.minimum: "{0} if {0} <= {1} or {0} != {0} else {1}",
+    np.greater: "{} > {}", np.greater_equal: "{} >= {}", np.less: "{} < {}",
+    np.less_equal: "{} <= {}", np.equal: "{} == {}",
+}  # fmt: skip
