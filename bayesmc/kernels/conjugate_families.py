@@ -111,6 +111,19 @@ class GammaConditional(Conditional):
             base = Truncated(base, *(ends if power > 0 else ends[::-1]))
         return RootOf(base, power)
 
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        if bounds is not None and not _covers(bounds, 0.0, np.inf):
+            return None
+        concentration, rate = (naturals[0] + 1.0) / self.power, -naturals[1]
+        if not (concentration.min(initial=1.0) >= 1.0 and rate.min(initial=1.0) > 0.0):  # the family looks after these
+            return None
+        drawn = rng.standard_gamma(concentration, shape) / rate
+        if self.power != 1.0:
+            drawn = 1.0 / drawn if self.power == -1.0 else drawn ** (1.0 / self.power)
+        return drawn if math.isfinite(drawn.sum()) and drawn.min(initial=1.0) > 0.0 else None
+
 
 class BetaConditional(Conditional):
     """``x^a (1 - x)^b``."""
@@ -123,6 +136,16 @@ class BetaConditional(Conditional):
         if bounds is None or _covers(bounds, 0.0, 1.0):
             return base
         return Truncated(base, *bounds)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        if bounds is not None and not _covers(bounds, 0.0, 1.0):
+            return None
+        first, second = naturals[0] + 1.0, naturals[1] + 1.0
+        if not (first.min(initial=1.0) >= 1.0 and second.min(initial=1.0) >= 1.0 and np.isfinite(first + second).all()):
+            return None
+        return rng.beta(first, second, shape)
 
 
 class DirichletConditional(Conditional):
