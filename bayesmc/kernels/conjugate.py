@@ -12,6 +12,7 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 2-3, 11.3; Plummer, J
 
 from __future__ import annotations
 
+import math
 from collections import ChainMap
 from collections.abc import Sequence
 from functools import cached_property
@@ -22,6 +23,7 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
+from bayesmc.expression import as_expression, broadcast
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_children import Partner
 from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Kind, Naturals, split_prior
@@ -30,7 +32,9 @@ from bayesmc.kernels.conjugate_matching import Match, match_of
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.conjugate_picks import is_picked
 from bayesmc.kernels.slice import slice_move
+from bayesmc.kernels.vector_draws import InverseWishartDraw, NormalDraw
 from bayesmc.kernels.verify import check_ratio
+from bayesmc.passes.arithmetic import add
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_children import with_like_children
 from bayesmc.structure.target import Values
@@ -76,6 +80,10 @@ class Conjugate(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
+        if self._whole is not None and not self.debug:
+            new = self._whole_draw(values, rng)
+            if new is not None:
+                return {blanket.name: new}, memory
         state = values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
@@ -100,6 +108,41 @@ class Conjugate(Kernel):
         return self.kind.posterior(naturals, bounds, self.power)
 
     # ---- private -------------------------------------------------------------------------------
+
+    @cached_property
+    def _whole(self) -> NormalDraw | InverseWishartDraw | None:
+        """Natural parameters and draw as one program, where all children are summed by labels or fixed."""
+        make = {"mean": NormalDraw, "covariance": InverseWishartDraw}.get(self.kind.name)
+        classes = self.blanket.classes
+        if make is None or not self._constant or len(classes) > 1 or classes[0] is not None:
+            return None
+        prior, bounds = self._prior({**self.blanket.target.known}, 0, None)
+        if bounds is not None or any(len(a) != 1 for a in prior):
+            return None
+        totals = [as_expression(a[0]) for a in prior]
+        for partner in self.partners:
+            parts = partner.expressions
+            if parts is None:
+                return None
+            totals = [add(a, b) for a, b in zip(totals, parts, strict=True)]
+        shape, ranks = self.blanket.node.plate_shape, self.kind.event_ndims
+        whole = [
+            broadcast(t, shape + t.shape[len(t.shape) - n :])
+            for t, n in zip(totals, ranks, strict=True)
+        ]
+        return make(*whole)
+
+    def _whole_draw(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
+        """A draw; None where it is no number, of which the posterior says more."""
+        assert self._whole is not None
+        for partner in self.partners:
+            if partner.way is not None:
+                values = partner.way.sums.placed(values)
+        try:
+            new = self._whole(values, rng, len(values[self.blanket.name]))
+        except np.linalg.LinAlgError as error:
+            raise self._degenerate(error) from error
+        return new if math.isfinite(np.add.reduce(new, axis=None)) else None
 
     def _moved(
         self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
@@ -260,31 +303,32 @@ def conjugate_kernel(
 ) -> Conjugate | str:
     """The conjugate kernel of a node, or in words why there is none.
 
-    Parameters
-    ----------
-    blanket : Blanket
-    debug : bool
-        Check every draw against the model's densities (slow).
-    pairs : sequence of Pair
-        The conjugate table.
+        Parameters
+        ----------
+        blanket : Blanket
+        debug : bool
+            Check every draw against the model's densities (slow).
+        pairs : sequence of Pair
+            The conjugate table.
 
-    Examples
-    --------
-    >>> import bayesmc as bmc
-    >>> from bayesmc.kernels.conjugate import conjugate_kernel
-    >>> from bayesmc.network import pose
-    >>> from bayesmc.structure.blanket import Blanket
-    >>> from bayesmc.structure.target import target_of
-    >>> net = bmc.BayesNet()
-    >>> net.add("rate", bmc.Gamma(2.0, 1.0))
-    >>> net.add("shape", bmc.Gamma(2.0, 1.0))
-    >>> net.add("count", lambda rate: bmc.Poisson(10 * rate))
-    >>> net.add("time", lambda shape: bmc.Gamma(shape, 1.0))
-    >>> target = target_of(pose(net, {"count": 3, "time": 0.5}))
-    >>> conjugate_kernel(Blanket(target, "rate")).match
-    'Gamma with Poisson rate'
-    >>> conjugate_kernel(Blanket(target, "shape"))
-    "it enters the concentration of Gamma 'time'"
+        Examples
+        --------
+        >>> import bayesmc as bmc
+        >>> from bayesmc.kernels.conjugate import conjugate_kernel
+        >>> from bayesmc.network import pose
+        >>> from bayesmc.passes.arithmetic import add
+    from bayesmc.structure.blanket import Blanket
+        >>> from bayesmc.structure.target import target_of
+        >>> net = bmc.BayesNet()
+        >>> net.add("rate", bmc.Gamma(2.0, 1.0))
+        >>> net.add("shape", bmc.Gamma(2.0, 1.0))
+        >>> net.add("count", lambda rate: bmc.Poisson(10 * rate))
+        >>> net.add("time", lambda shape: bmc.Gamma(shape, 1.0))
+        >>> target = target_of(pose(net, {"count": 3, "time": 0.5}))
+        >>> conjugate_kernel(Blanket(target, "rate")).match
+        'Gamma with Poisson rate'
+        >>> conjugate_kernel(Blanket(target, "shape"))
+        "it enters the concentration of Gamma 'time'"
     """
     if blanket.own is None:
         return "it has no prior density of its own"
@@ -315,38 +359,39 @@ def conjugate_kernel(
 def full_conditional(blanket: Blanket, values: Values, part: int = 0) -> Distribution:
     """The full conditional of a conjugate node in a state.
 
-    Parameters
-    ----------
-    values : dict
-        Stored values of all nodes, hidden ones ``(chains, *plates, *event)``.
-    part : int
-        Which of ``blanket.classes``.
+        Parameters
+        ----------
+        values : dict
+            Stored values of all nodes, hidden ones ``(chains, *plates, *event)``.
+        part : int
+            Which of ``blanket.classes``.
 
-    Returns
-    -------
-    Distribution
-        Batch broadcasts to ``(chains, *plates)``, or to ``(chains, members)`` of a class of elements.
+        Returns
+        -------
+        Distribution
+            Batch broadcasts to ``(chains, *plates)``, or to ``(chains, members)`` of a class of elements.
 
-    Raises
-    ------
-    UnsupportedError
-        The node is not conjugate; the message says why.
+        Raises
+        ------
+        UnsupportedError
+            The node is not conjugate; the message says why.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import bayesmc as bmc
-    >>> from bayesmc.kernels.conjugate import full_conditional
-    >>> from bayesmc.network import pose
-    >>> from bayesmc.structure.blanket import Blanket
-    >>> from bayesmc.structure.target import target_of
-    >>> net = bmc.BayesNet(plates={"toss": 4})
-    >>> net.add("p", bmc.Beta(1.0, 1.0))
-    >>> net.add("heads", lambda p: bmc.Bernoulli(p), plates="toss")
-    >>> target = target_of(pose(net, {"heads": [1, 0, 1, 1]}))
-    >>> found = full_conditional(Blanket(target, "p"), {**target.known, "p": np.array([0.5])})
-    >>> found.concentration1.tolist(), found.concentration0.tolist()
-    ([4.0], [2.0])
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import bayesmc as bmc
+        >>> from bayesmc.kernels.conjugate import full_conditional
+        >>> from bayesmc.network import pose
+        >>> from bayesmc.passes.arithmetic import add
+    from bayesmc.structure.blanket import Blanket
+        >>> from bayesmc.structure.target import target_of
+        >>> net = bmc.BayesNet(plates={"toss": 4})
+        >>> net.add("p", bmc.Beta(1.0, 1.0))
+        >>> net.add("heads", lambda p: bmc.Bernoulli(p), plates="toss")
+        >>> target = target_of(pose(net, {"heads": [1, 0, 1, 1]}))
+        >>> found = full_conditional(Blanket(target, "p"), {**target.known, "p": np.array([0.5])})
+        >>> found.concentration1.tolist(), found.concentration0.tolist()
+        ([4.0], [2.0])
     """
     kernel = conjugate_kernel(blanket)
     if isinstance(kernel, str):

@@ -18,6 +18,7 @@ import numpy as np
 from bayesmc.distributions import Categorical, Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
+from bayesmc.expression import Expression, as_expression
 from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements
 from bayesmc.kernels.conjugate_evaluation import Evaluated, slope_of
 from bayesmc.kernels.conjugate_kinds import Kind, Naturals
@@ -80,6 +81,15 @@ class Partner:
     def way(self) -> ByLabel | None:
         """How it is summed by label, if it is."""
         return self._way
+
+    @property
+    def expressions(self) -> tuple[Expression, ...] | None:
+        """What it adds as expressions of the state, where it is summed by label or fixed."""
+        if self._way is not None:
+            return self._way.naturals
+        if self._fixed is None or any(len(a) != 1 for a in self._fixed):
+            return None
+        return tuple(as_expression(a[0]) for a in self._fixed)
 
     # ---- evaluating ---------------------------------------------------------------------------
 

@@ -26,7 +26,7 @@ from bayesmc.distributions import (
     Uniform,
 )
 from bayesmc.distributions.support import Support, interval
-from bayesmc.kernels.vector_draws import inverse_wishart_draw, normal_draw
+from bayesmc.kernels.vector_draws import gammas, inverse_wishart_draw, normal_draw
 from bayesmc.shapes import Shape
 
 Naturals = tuple[np.ndarray, ...]
@@ -232,10 +232,10 @@ class Shares(Kind):
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
         counts = naturals[0]
-        if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
-            return None
-        draw = rng.standard_gamma(counts, shape + counts.shape[-1:])
-        draw /= draw.sum(axis=-1, keepdims=True)
+        if not np.minimum.reduce(counts, axis=None, initial=1.0) >= 1.0:
+            return None  # small ones underflow, which the family looks after
+        draw = gammas(rng, counts, shape + counts.shape[-1:])
+        draw /= np.add.reduce(draw, axis=-1, keepdims=True)
         return draw
 
 

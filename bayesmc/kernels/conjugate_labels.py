@@ -53,7 +53,7 @@ class ByLabel:
 
     def __call__(self, values: Values) -> tuple[np.ndarray, ...]:
         """In a state, shapes ``(chains, *plates, ...)``."""
-        found = self._program({**values, self.sums.leaf.name: self.sums.sums(values)})
+        found = self._program(self.sums.placed(values))
         return tuple(
             f if f.ndim > rank else f[None] for f, rank in zip(found, self._ranks, strict=True)
         )

@@ -262,9 +262,7 @@ def _leaves_above(model: Model, name: str) -> frozenset[str]:
     return found
 
 
-def _traced(
-    model: Model, node: CompiledNode, given: Mapping[str, np.ndarray] | None = None
-) -> Any:
+def _traced(model: Model, node: CompiledNode, given: Mapping[str, np.ndarray] | None = None) -> Any:
     declaration = node.declaration
     if declaration.value is not None:
         return constant(declaration.value)
