@@ -7,6 +7,7 @@ way what follows.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -58,10 +59,14 @@ class SmallProgram:
     def __init__(self, roots: Sequence[Expression]) -> None:
         self._roots = tuple(roots)
         nodes = ordered(*roots)
-        self._leaves = [(n.name, n.shape) for n in nodes if isinstance(n, Leaf)]
+        self._leaves = [(n.name, len(n.shape), n.size) for n in nodes if isinstance(n, Leaf)]
         self._calls = sum(bool(n.operands) for n in nodes)
         self._size = sum(n.size for n in nodes)
-        self._shapes = [(r.shape, r.size) for r in roots]
+        ends = np.cumsum([0, *(r.size for r in roots)]).tolist()
+        self._parts = [
+            (slice(a, b), r.shape)
+            for r, (a, b) in zip(roots, itertools.pairwise(ends), strict=True)
+        ]
 
     @cached_property
     def _arrays(self) -> Program:
@@ -84,28 +89,34 @@ class SmallProgram:
             return self._arrays(values)
         function, most = code
         batch: Shape = ()
+        count = 1
         given = []
-        for name, shape in self._leaves:
+        for name, rank, size in self._leaves:
             value = values[name]
-            lead = value.shape[: value.ndim - len(shape)]
-            count = math.prod(lead)
-            if count > most or (lead and batch and lead != batch):
+            if value.ndim == rank:
+                given.append([value.ravel().tolist()])
+                continue
+            lead = value.shape[: value.ndim - rank]
+            if batch and lead != batch:
                 return self._arrays(values)
-            batch = lead or batch
-            given.append(value.reshape(count, -1).tolist())
-        count = math.prod(batch)
-        given = [rows if len(rows) == count else rows * count for rows in given]
+            batch, count = lead, math.prod(lead)
+            if count > most:
+                return self._arrays(values)
+            given.append(value.reshape(count, size).tolist())
         try:
-            rows = [function(*row) for row in zip(*given, strict=True)]
+            if count == 1:
+                rows = function(*[v[0] for v in given])
+            else:
+                given = [v if len(v) == count else v * count for v in given]
+                rows = [function(*row) for row in zip(*given, strict=True)]
         except (ArithmeticError, ValueError):
             return self._arrays(values)
-        if len(self._shapes) == 1:
-            return [np.array(rows).reshape(batch + self._shapes[0][0])]
-        flat, found, start = np.array(rows), [], 0
-        for shape, size in self._shapes:
-            found.append(flat[:, start : start + size].reshape(batch + shape))
-            start += size
-        return found
+        flat = np.array(rows)
+        if len(self._roots) == 1:
+            return [flat.reshape(batch + self._roots[0].shape)]
+        if count == 1:
+            return [flat[part].reshape(batch + shape) for part, shape in self._parts]
+        return [flat[:, part].reshape(batch + shape) for part, shape in self._parts]
 
 
 def upper_inverse(matrix: np.ndarray) -> np.ndarray:
@@ -132,19 +143,19 @@ class _Lines:
 
 
 def _compiled(
-    roots: Sequence[Expression], leaves: Sequence[tuple[str, Any]]
+    roots: Sequence[Expression], leaves: Sequence[tuple[str, int, int]]
 ) -> tuple[Callable[..., Any], int]:
     lines = _Lines()
-    names = {name: f"v{k}" for k, (name, _) in enumerate(leaves)}
+    names = {name: f"v{k}" for k, (name, _, _) in enumerate(leaves)}
     made: dict[Expression, np.ndarray] = {}
     for node in ordered(*roots):
         made[node] = _written(node, [made[a] for a in node.operands], names, lines)
     body = "\n    ".join(lines.lines) or "pass"
     result = ", ".join(x for r in roots for x in made[r].ravel())
     heads = [
-        f"{', '.join(f'{v}_{i}' for i in range(math.prod(shape)))}, = {v}"
-        for (name, shape), v in zip(leaves, names.values(), strict=True)
-        if math.prod(shape)
+        f"{', '.join(f'{v}_{i}' for i in range(size))}, = {v}"
+        for (_, _, size), v in zip(leaves, names.values(), strict=True)
+        if size
     ]
     text = f"def function({', '.join(names.values())}):\n    "
     text += "\n    ".join([*heads, body, f"return ({result},)"])
@@ -176,7 +187,11 @@ def _written(
         text = _TEXTS[node.function]
         wide = [np.broadcast_to(a, node.shape).ravel() for a in operands]
         return _objects([lines(text.format(*row)) for row in zip(*wide, strict=True)], node.shape)
-    if isinstance(node, Elementwise) and node.function is as_float and node.operands[0].dtype != bool:
+    if (
+        isinstance(node, Elementwise)
+        and node.function is as_float
+        and node.operands[0].dtype != bool
+    ):
         return operands[0]
     if isinstance(node, Call) and node.call in _MATRICES and len(node.operands) == 1:
         (a,) = operands

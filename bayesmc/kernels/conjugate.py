@@ -59,14 +59,15 @@ class Conjugate(Kernel):
         state = values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
-                state = dict(state)
                 blanket.target.refresh(state, self.names)
             try:
                 new = self._moved(state, part, members, rng)
             except np.linalg.LinAlgError as error:
                 raise self._degenerate(error) from error
-            state = {**state, blanket.name: blanket.moved(state, new, members)}
-        return {blanket.name: state[blanket.name]}, memory
+            new = blanket.moved(state, new, members)
+            if part + 1 < len(blanket.classes):
+                state = {**state, blanket.name: new}
+        return {blanket.name: new}, memory
 
     def full_conditional(self, values: Values, part: int = 0) -> Distribution:
         """The distribution of a class's elements given all others.
@@ -85,6 +86,10 @@ class Conjugate(Kernel):
         self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
     ) -> np.ndarray:
         """New values of one class of elements."""
+        if not self.debug:
+            quick = self.forms[part].drawn(values, rng, len(values[self.blanket.name]))
+            if quick is not None:
+                return quick
         now = self.blanket.current(values, members)
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
         naturals, bounds = self._naturals(values, part)

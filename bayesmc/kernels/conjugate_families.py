@@ -29,7 +29,7 @@ from bayesmc.distributions import (
     Truncated,
 )
 from bayesmc.distributions.support import Support, interval
-from bayesmc.kernels.vector_draws import inverse_wishart_draw, normal_draw
+from bayesmc.kernels.vector_draws import gammas, inverse_wishart_draw, normal_draw
 from bayesmc.passes.features import LOG, LOG1M, Feature
 from bayesmc.shapes import Shape
 
@@ -117,8 +117,8 @@ class GammaConditional(Conditional):
         if bounds is not None and not _covers(bounds, 0.0, np.inf):
             return None
         concentration, rate = (naturals[0] + 1.0) / self.power, -naturals[1]
-        if not (concentration.min(initial=1.0) >= 1.0 and rate.min(initial=1.0) > 0.0):  # the family looks after these
-            return None
+        if not (concentration.min(initial=1.0) >= 1.0 and rate.min(initial=1.0) > 0.0):
+            return None  # the family looks after what underflows
         drawn = rng.standard_gamma(concentration, shape) / rate
         if self.power != 1.0:
             drawn = 1.0 / drawn if self.power == -1.0 else drawn ** (1.0 / self.power)
@@ -143,7 +143,8 @@ class BetaConditional(Conditional):
         if bounds is not None and not _covers(bounds, 0.0, 1.0):
             return None
         first, second = naturals[0] + 1.0, naturals[1] + 1.0
-        if not (first.min(initial=1.0) >= 1.0 and second.min(initial=1.0) >= 1.0 and np.isfinite(first + second).all()):
+        least = min(first.min(initial=1.0), second.min(initial=1.0))
+        if not (least >= 1.0 and np.isfinite(first + second).all()):
             return None
         return rng.beta(first, second, shape)
 
@@ -162,7 +163,8 @@ class DirichletConditional(Conditional):
         counts = naturals[0] + 1.0
         if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
             return None
-        draw = rng.standard_gamma(counts, shape + counts.shape[-1:])
+        shape = shape + counts.shape[-1:]
+        draw = gammas(rng, counts if counts.shape == shape else np.broadcast_to(counts, shape), shape)
         draw /= draw.sum(axis=-1, keepdims=True)
         return draw
 

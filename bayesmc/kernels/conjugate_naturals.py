@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -38,6 +39,7 @@ from bayesmc.kernels.conjugate_families import (
     InverseWishartConditional,
     MvNormalConditional,
     Naturals,
+    NormalConditional,
     family_of_features,
 )
 from bayesmc.kernels.conjugate_labels import Counts, covariance_by_label, mean_by_label
@@ -46,8 +48,9 @@ from bayesmc.kernels.conjugate_terms import Added, Moving, features_of, moving, 
 from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
 from bayesmc.kernels.conjugate_words import why_not
 from bayesmc.kernels.label_sums import LabelSums
+from bayesmc.kernels.vector_draws import InverseWishartDraw, NormalDraw
 from bayesmc.network.expressions import Opaque, stored_leaf
-from bayesmc.passes.arithmetic import ZERO, add
+from bayesmc.passes.arithmetic import ZERO, add, multiply
 from bayesmc.passes.features import LOG, Feature
 from bayesmc.passes.log_density import family_of, log_density
 from bayesmc.passes.reads import same_along
@@ -89,6 +92,7 @@ class Form:
         self._count, self._ends = len(naturals), len(naturals) + len(bounds)
         self._ndims = [len(r.shape) for r in roots]
         self._kept: tuple[Naturals, Bounds | None] | None = None
+        self._draw = None if bounds or positive else _one_program(family, naturals)
         if not any(r.leaves for r in roots):
             self._kept = self({})
 
@@ -96,8 +100,7 @@ class Form:
         """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
         if self._kept is not None:
             return self._kept
-        for sums in self._placed:
-            values = sums.placed(values)
+        values = self._with_sums(values)
         found = [
             a if a.ndim > n else a[None]
             for a, n in zip(self._program(values), self._ndims, strict=True)
@@ -107,6 +110,24 @@ class Form:
             if (least <= 0.0).any():
                 refuse(child, values)
         return tuple(found[:k]), (found[k], found[k + 1]) if end > k else None
+
+    def drawn(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray | None:
+        """A draw by one program, where there is one and it is a number; else None.
+
+        Raises
+        ------
+        LinAlgError
+            A matrix is not positive definite to rounding.
+        """
+        if self._draw is None:
+            return None
+        found = self._draw(self._with_sums(values), rng, chains)
+        return found if math.isfinite(np.add.reduce(found, axis=None)) else None
+
+    def _with_sums(self, values: Values) -> Values:
+        for sums in self._placed:
+            values = sums.placed(values)
+        return values
 
 
 def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
@@ -125,6 +146,18 @@ def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _one_program(
+    family: Conditional, naturals: list[Expression]
+) -> NormalDraw | InverseWishartDraw | None:
+    """Natural parameters and draw as one."""
+    if isinstance(family, NormalConditional):
+        linear, square = naturals
+        return NormalDraw(multiply(square, -2.0), linear)
+    if isinstance(family, MvNormalConditional):
+        return NormalDraw(*naturals)
+    return InverseWishartDraw(*naturals) if isinstance(family, InverseWishartConditional) else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,6 +51,8 @@ class LabelSums:
     ----------
     term : Term
     label : str
+    key : str
+        Name of the sums in the state, and of ``leaf``.
     states : int
     repeats : int
         Elements of the term for each of the label.
@@ -74,6 +76,8 @@ class LabelSums:
     def __init__(self, target: Target, term: Term, label: str) -> None:
         model = target.model
         self.target, self.term, self.label = target, term, label
+        self.key = f"sums of {term.name} by {label}"
+        self._of = f"labels that {self.key} belong to"
         self.node, domain = model[term.name], model[label].domain
         assert domain is not None
         self.states = domain.size
@@ -97,7 +101,6 @@ class LabelSums:
         self.statistics = self._measured(form, mask)
         self._express(form)
         self._program = SmallProgram([self.coefficients])
-        self.key = f"sums of {term.name} by {label}"
         self._check()
 
     def table(self, values: Values) -> np.ndarray:
@@ -108,17 +111,19 @@ class LabelSums:
     def sums(self, values: Values) -> np.ndarray:
         """Sums of the statistics by label in a state, shape ``(chains, labels, rows)``."""
         label = values[self.label]
-        if values.get(self.key + ", of") is label:
+        if values.get(self._of) is label:
             return values[self.key]
         return sums_by_label(label.reshape(len(label), -1), self.statistics, self.states)
 
-    def placed(self, values: Values) -> Values:
-        """A state with the sums beside it."""
-        return {**values, self.leaf.name: self.sums(values)}
-
     def kept(self, label: np.ndarray, sums: np.ndarray) -> Values:
         """What goes into the state with labels, from whoever has their sums at hand."""
-        return {self.key: sums, self.key + ", of": label}
+        return {self.key: sums, self._of: label}
+
+    def placed(self, values: Values) -> Values:
+        """The state with the sums in the place of ``leaf``."""
+        if values.get(self._of) is values[self.label]:
+            return values
+        return {**values, self.key: self.sums(values)}
 
     @property
     def is_asked(self) -> bool:
@@ -195,7 +200,7 @@ class LabelSums:
             for start, width in zip(starts, widths, strict=True)
         ]
         self.coefficients = pick(columns, np.concatenate(at, axis=1))
-        self.leaf = leaf(f"sums of {self.term.name} by {self.label}", self.coefficients.shape)
+        self.leaf = leaf(self.key, self.coefficients.shape)
         total: Expression = as_expression(0.0)
         for part, start, width in zip(parts, starts, widths, strict=True):
             total = add(total, multiply(part, self.column(int(start), width)))

@@ -13,18 +13,29 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 22; Diebolt and Rober
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import BayesmcError, TraceError, ZeroProbabilityError
+from bayesmc.expression import (
+    Expression,
+    as_expression,
+    broadcast,
+    elementwise,
+    pick,
+    reduction,
+    reshape,
+)
 from bayesmc.expression.scalars import SmallProgram
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.label_sums import IMPOSSIBLE, LabelSums, label_sums
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.network.expressions import Opaque, density_at
+from bayesmc.passes.arithmetic import add, multiply, subtract
 from bayesmc.passes.sufficient import log_probabilities
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
@@ -65,8 +76,8 @@ class Labels(Kernel):
         self.match = f"{domain.size} states, as one matrix product"
         self.members = blanket.classes[0]
         self._plain = Enumerate(blanket)
-        self._layout()
         self._prior = _Prior(blanket, self.members)
+        self._layout()
         self._parts: dict[int, list[tuple[slice, np.ndarray, _Buffers]]] = {}
         self._codes = np.arange(self.states, dtype=self.dtype)[:, None, None]
 
@@ -128,28 +139,57 @@ class Labels(Kernel):
         for at, term in zip(self._at, self.terms, strict=True):
             may_vanish[at + term.ones : at + len(term.statistics)] = term.indicators
         self._may_vanish = may_vanish
-        self._coefficients = SmallProgram([t.coefficients for t in self.terms])
+        self._plan()
         own = self.blanket.own
         weighed = own is not None and bool(self.blanket.target.hidden_above(own))
         #: whether somebody needs sums by label
         self._is_asked = self.members is None and (weighed or any(t.is_asked for t in self.terms))
 
+    def _plan(self) -> None:
+        """Programs: log odds' coefficients and the size that products can have; coefficients of states."""
+        width = len(self._most)
+        columns = [
+            pick([t.coefficients], _column(t.coefficients, i))
+            for t in self.terms
+            for i in range(t.coefficients.shape[1])
+        ]
+        if len(columns) < width:
+            columns.append(broadcast(as_expression(0.0), (self.states,)))
+        prior = self._prior.expression
+        if prior is not None:
+            columns[self._one] = add(columns[self._one], prior)
+        rows = pick(columns, np.arange(self.states * width).reshape(width, self.states).T)
+        at = np.arange(rows.size).reshape(rows.shape)
+        odds = subtract(pick([rows], at[1:]), pick([rows], at[:1]))
+        sizes = reduction(np.add, multiply(elementwise(np.abs, rows), self._most), (1,))
+        most = pick([sizes], 0)
+        for k in range(1, self.states):
+            most = elementwise(np.maximum, most, pick([sizes], k))
+        self._odds, self._rows = SmallProgram([odds, most]), SmallProgram([rows])
+
     def _table(self, values: Values, chains: int) -> _Table:
         """The coefficients of a state; raises ``LostParameters`` where products would cancel."""
-        table = np.zeros((self.states, chains, len(self._features)))
-        for at, found in zip(self._at, self._coefficients(values), strict=True):
-            if found.ndim == 2:
-                found = found[None]
-            table[:, :, at : at + found.shape[-1]] = found.swapaxes(0, 1)
-        common = self._prior.common(values)
-        if common is not None:
-            table[:, :, self._one] += common
-        if (np.abs(table) @ self._most).max() < _LARGEST:
-            return _Table(table, self._prior.steep)
+        more = self._prior.common(values)
+        if more is None:
+            odds, most = self._odds(values)
+            if np.maximum.reduce(most, axis=None) < _LARGEST:
+                return _Table(odds, lambda: self._by_state(values, chains), self._prior.steep)
+        table = self._by_state(values, chains)
+        if more is not None:
+            table[:, :, self._one] += more
         finite = np.where(self._may_vanish & (table < _ZERO), 0.0, table)
         if not (np.abs(finite) @ self._most).max() < _LARGEST:
             raise LostParameters
-        return _Table(np.maximum(table, 3 * IMPOSSIBLE), True)
+        table = np.maximum(table, 3 * IMPOSSIBLE)
+        odds = (table[1:] - table[:1]).swapaxes(0, 1)
+        lost = bool((self._may_vanish & (table < _ZERO)).any())
+        return _Table(odds, lambda: table, lost or self._prior.steep)
+
+    def _by_state(self, values: Values, chains: int) -> np.ndarray:
+        """Coefficients, shape (states, chains, rows)."""
+        (rows,) = self._rows(values)
+        full = (chains, self.states, len(self._most))
+        return np.array(np.broadcast_to(rows, full).swapaxes(0, 1))
 
     # ---- draws ---------------------------------------------------------------------------------
 
@@ -220,18 +260,30 @@ class Labels(Kernel):
 
 
 class _Table:
-    """Coefficients of every state: ``rows`` (states, chains, features), and their differences to the first.
+    """Coefficients of every state, as differences to the first or, where these may overflow, as such.
 
-    Attributes
+    Parameters
     ----------
+    odds : ndarray, shape ([chains,] states - 1, features)
+    rows : callable
+        Gives the coefficients, shape (states, chains, features).
     steep : bool
         Whether any state may be impossible.
     """
 
-    def __init__(self, rows: np.ndarray, steep: bool) -> None:
-        self.rows, self.steep = rows, steep
-        self.flat = rows.reshape(-1, rows.shape[-1])
-        self.odds = (rows[1:] - rows[0]).reshape(-1, rows.shape[-1])
+    def __init__(self, odds: np.ndarray, rows: Callable[[], np.ndarray], steep: bool) -> None:
+        self._rows, self.steep = rows, steep
+        if odds.ndim == 3:
+            odds = odds[0] if len(odds) == 1 else odds.swapaxes(0, 1).reshape(-1, odds.shape[-1])
+        self.odds = odds
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        return self._rows()
+
+    @property
+    def flat(self) -> np.ndarray:
+        return self.rows.reshape(-1, self.rows.shape[-1])
 
 
 class _Buffers:
@@ -254,7 +306,7 @@ class _Buffers:
         np.dot(table, features, out=self.flat_odds)
         if own is not None:
             log_odds += own[1:] - own[0]
-        if not log_odds.max() < _STEEP:
+        if not np.maximum.reduce(log_odds, axis=None) < _STEEP:
             return False
         np.exp(log_odds, out=log_odds)
         self.log[0] = 1.0
@@ -310,13 +362,18 @@ class _Prior:
         self._kept: np.ndarray | None = None
         log = self._evaluated(_first_of(target))
         self._is_common = log.shape[2:] == (1,) * axes
-        self._program = self._read() if self._is_common else None
+        #: the common ones, shape (states,), where they are known or followed
+        self.expression: Expression | None = None
         above = () if own is None else target.hidden_above(own)
         if not above:
             self._kept = self._shaped(self._evaluated({**target.known}))
             self.steep = bool((self._kept < _ZERO).any())
+            if self._is_common:
+                self.expression = as_expression(self._kept[:, 0])
+        elif self._is_common:
+            self.expression = self._read()
 
-    def _read(self) -> SmallProgram | None:
+    def _read(self) -> Expression | None:
         """The common ones as an expression, where the label's function is followed."""
         own, domain = self.blanket.own, self.blanket.node.domain
         if own is None or domain is None or isinstance(own.read, Opaque):
@@ -327,17 +384,12 @@ class _Prior:
             logs = log_probabilities(family, values)
         except TraceError:
             return None
-        return SmallProgram([logs]) if logs.size == domain.size else None
+        return reshape(logs, (domain.size,)) if logs.size == domain.size else None
 
     def common(self, values: Values) -> np.ndarray | None:
-        """Shape (states, chains or 1), or None where elements differ."""
-        if not self._is_common:
+        """Shape (states, chains or 1), or None where elements differ or it is an expression."""
+        if not self._is_common or self.expression is not None:
             return None
-        if self._kept is not None:
-            return self._kept
-        if self._program is not None:
-            (found,) = self._program(values)
-            return found.reshape(-1, len(self._candidate)).T
         return self._shaped(self._evaluated(values))
 
     def by_element(self, values: Values) -> np.ndarray | None:
@@ -428,6 +480,11 @@ def _is_right(kernel: Labels) -> bool:
     except BayesmcError:
         return False
     return True
+
+
+def _column(node: Expression, at: int) -> np.ndarray:
+    """Positions of a column."""
+    return np.arange(node.size).reshape(node.shape)[:, at]
 
 
 def _first_of(target: Target) -> Values:

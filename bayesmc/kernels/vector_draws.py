@@ -1,4 +1,12 @@
-"""Draws of vectors and covariances from natural parameters, few of them on Python's floats."""
+"""Draws of normals and covariances from natural parameters, few of them on Python's floats.
+
+Natural parameters are arrays, or expressions of a state, which makes parameters and draw one program.
+
+References
+----------
+Rue and Held (2005), Gaussian Markov Random Fields, algorithm 2.5; Smith and Hocking (1972), Wishart
+variate generator, Applied Statistics 21.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +14,30 @@ from functools import cache
 
 import numpy as np
 
-from bayesmc.distributions.wishart import bartlett, gram
-from bayesmc.expression import call, constant, elementwise, leaf, pick
+from bayesmc.distributions.wishart import gram
+from bayesmc.expression import (
+    Expression,
+    broadcast,
+    call,
+    constant,
+    elementwise,
+    leaf,
+    pick,
+    reshape,
+)
 from bayesmc.expression.products import product
 from bayesmc.expression.scalars import SmallProgram, upper_inverse
-from bayesmc.passes.arithmetic import add, divide, multiply
+from bayesmc.passes.arithmetic import add, divide, multiply, subtract
 from bayesmc.passes.sufficient import transposed
 from bayesmc.shapes import Shape
+from bayesmc.structure.target import Values
 
 #: squared sine of an angle between rows, below which a product may be singular to rounding
 _CLOSE = 1e-6
+#: numbers that are drawn one by one
+_FEW = 24
+#: chi-square variates of few degrees of freedom underflow; squares must not
+_LEAST = 1e-280
 
 
 def normal_draw(
@@ -92,31 +114,145 @@ def inverse_wishart_draw(
     [[1.0, 0.0], [0.0, 1.0]]
     """
     d = scale.shape[-1]
-    noise = bartlett(rng, df[..., None] - np.arange(d - 1, -1, -1.0), shape)
+    half = 0.5 * df[..., None] - _halves(d)
+    values = {
+        "normal": rng.standard_normal((*shape, d * (d - 1) // 2)),
+        "gamma": gammas(rng, half, (*shape, d)),
+        "scale": scale,
+    }
     if scale.shape[:-2] != shape:
-        scale = np.broadcast_to(scale, (*shape, d, d))
-    draw, factor, angles = _inverse_wishart(d)({"scale": scale, "noise": noise})
-    return draw if angles.min(initial=1.0) >= _CLOSE else gram(factor)[0]
+        values["scale"] = np.broadcast_to(scale, (*shape, d, d))
+    draw, angle, factor = _inverse_wishart(d)(values)
+    return draw if _least_of(angle) >= _CLOSE else gram(factor)[0]
+
+
+class NormalDraw:
+    """Draws of all elements of a node whose natural parameters are expressions of the state.
+
+    Parameters
+    ----------
+    precision, linear : Expression, shapes (*plates, d, d) and (*plates, d), or both (*plates)
+    """
+
+    def __init__(self, precision: Expression, linear: Expression) -> None:
+        self.shape = linear.shape
+        noise = leaf("noise", self.shape)
+        if precision.shape == self.shape:
+            spread = elementwise(np.sqrt, precision)
+            draw = add(divide(linear, precision), divide(noise, spread))
+        else:
+            draw = _normal_of(precision, linear, noise)
+        self._program = SmallProgram([draw])
+
+    def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray:
+        noise = rng.standard_normal((chains, *self.shape))
+        return self._program({**values, "noise": noise})[0]
+
+
+class InverseWishartDraw:
+    """The same for covariances.
+
+    Parameters
+    ----------
+    df, scale : Expression, shapes (*plates) and (*plates, d, d)
+    """
+
+    def __init__(self, df: Expression, scale: Expression) -> None:
+        d = scale.shape[-1]
+        self.shape = scale.shape[:-1]
+        half = subtract(multiply(0.5, reshape(df, (*df.shape, 1))), _halves(d))
+        self._half = SmallProgram([broadcast(half, self.shape)])
+        self._normals = (*scale.shape[:-2], d * (d - 1) // 2)
+        gamma, normal = leaf("gamma", self.shape), leaf("normal", self._normals)
+        draw, angle, factor = _inverse_wishart_of(scale, gamma, normal)
+        self._program, self._factor = SmallProgram([draw, angle]), SmallProgram([factor])
+
+    def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray:
+        (half,) = self._half(values)
+        normal = rng.standard_normal((chains, *self._normals))
+        gamma = gammas(rng, half, (chains, *self.shape))
+        values = {**values, "gamma": gamma, "normal": normal}
+        draw, angle = self._program(values)
+        return draw if _least_of(angle) >= _CLOSE else gram(self._factor(values)[0])[0]
+
+
+def gammas(rng: np.random.Generator, concentration: np.ndarray, shape: Shape) -> np.ndarray:
+    """Standard gamma numbers as ``rng.standard_gamma`` draws them, which checks few slowly.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.vector_draws import gammas
+    >>> gammas(np.random.default_rng(0), np.array([2.0, 3.0]), (2,))
+    array([1.80926428, 1.5945369 ])
+    >>> np.random.default_rng(0).standard_gamma([2.0, 3.0])
+    array([1.80926428, 1.5945369 ])
+    """
+    if concentration.size > _FEW or concentration.shape != shape:
+        return rng.standard_gamma(concentration, shape)
+    draw = rng.standard_gamma
+    return np.array([draw(a) for a in concentration.ravel().tolist()]).reshape(shape)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _least_of(array: np.ndarray) -> float:
+    return np.minimum.reduce(array, axis=None, initial=1.0)
+
+
+@cache
+def _halves(d: int) -> np.ndarray:
+    """Half of ``d - 1, ..., 0``."""
+    return 0.5 * np.arange(d - 1, -1, -1.0)
+
+
 @cache
 def _normal(d: int) -> SmallProgram:
-    precision, linear, noise = leaf("precision", (d, d)), leaf("linear", (d,)), leaf("noise", (d,))
-    root = call(upper_inverse, [transposed(call(np.linalg.cholesky, [precision]))])
-    white = add(product(np.vecmat, linear, root), noise)
-    return SmallProgram([product(np.matvec, root, white)])
+    leaves = leaf("precision", (d, d)), leaf("linear", (d,)), leaf("noise", (d,))
+    return SmallProgram([_normal_of(*leaves)])
 
 
 @cache
 def _inverse_wishart(d: int) -> SmallProgram:
-    scale, noise = leaf("scale", (d, d)), leaf("noise", (d, d))
-    over = transposed(call(upper_inverse, [transposed(noise)]))
+    normal = leaf("normal", (d * (d - 1) // 2,))
+    return SmallProgram(_inverse_wishart_of(leaf("scale", (d, d)), leaf("gamma", (d,)), normal))
+
+
+def _normal_of(precision: Expression, linear: Expression, noise: Expression) -> Expression:
+    root = call(upper_inverse, [transposed(call(np.linalg.cholesky, [precision]))])
+    white = add(product(np.vecmat, linear, root), noise)
+    return product(np.matvec, root, white)
+
+
+def _inverse_wishart_of(
+    scale: Expression, gamma: Expression, normal: Expression
+) -> tuple[Expression, Expression, Expression]:
+    """A draw, the least square of the sine of an angle between its factor's rows, and the factor."""
+    d = scale.shape[-1]
+    batch = gamma.shape[:-1]
+    least = elementwise(np.maximum, multiply(2.0, gamma), _LEAST)
+    parts = [elementwise(np.sqrt, least), normal, broadcast(constant(0.0), (*batch, 1))]
+    # the triangle, transposed an upper one: from its diagonal, what is beside it, and zero
+    at, start = np.empty((*batch, d, d), dtype=np.intp), 0
+    row, column = np.tril_indices(d, -1)
+    places = [(np.arange(d), np.arange(d)), (column, row), (row, column)]
+    for part, (i, j) in zip(parts, places, strict=True):
+        own = start + np.arange(part.size).reshape(part.shape)
+        at[..., i, j] = own
+        start += part.size
+    over = transposed(call(upper_inverse, [pick(parts, at)]))
     lower = constant(np.tril(np.ones((d, d))))
     factor = product(np.matmul, multiply(call(np.linalg.cholesky, [scale]), lower), over)
     draw = product(np.matmul, factor, transposed(factor))
-    diagonal = np.arange(d) * (d + 1)
-    pivots = elementwise(np.square, pick([factor], diagonal))
-    return SmallProgram([draw, factor, divide(pivots, pick([draw], diagonal))])
+    sines = divide(elementwise(np.square, _diagonal(factor)), _diagonal(draw))
+    sines = reshape(sines, (sines.size,))
+    least = pick([sines], 0)
+    for k in range(1, sines.size):
+        least = elementwise(np.minimum, least, pick([sines], k))
+    return draw, least, factor
+
+
+def _diagonal(matrix: Expression) -> Expression:
+    at = np.arange(matrix.size).reshape(matrix.shape)
+    return pick([matrix], at.diagonal(axis1=-2, axis2=-1))

@@ -226,7 +226,9 @@ class _Reader:
                 return self(node.operands[0])
         if node.leaves == {VALUE} and not node.shape and not isinstance(node, Call):
             return {node: ONE}
-        raise TraceError(f"{node.detail or type(node).__name__} keeps value and parameters together")
+        raise TraceError(
+            f"{node.detail or type(node).__name__} keeps value and parameters together"
+        )
 
     def add(self, node: Elementwise) -> Form:
         first, second = map(self, node.operands)
@@ -338,9 +340,7 @@ def precision_of(family: Family, batch: Shape) -> tuple[Expression, Expression]:
     tuple of Expression, shapes (*batch, d, d) and (*batch)
     """
     root = _root(family)
-    diagonal = pick(
-        [root], np.arange(root.size).reshape(root.shape).diagonal(axis1=-2, axis2=-1)
-    )
+    diagonal = pick([root], np.arange(root.size).reshape(root.shape).diagonal(axis1=-2, axis2=-1))
     half = reduction(np.add, elementwise(np.log, diagonal), (-1,))
     precision = product(np.matmul, root, transposed(root))
     return broadcast(precision, batch + precision.shape[-2:]), broadcast(half, batch)
@@ -380,9 +380,7 @@ def _of_vectors(family: Family, centre: np.ndarray) -> NaturalForm:
         statistics.append(elementwise(np.multiply, ys[i], ys[j]))
         coefficients.append(multiply(_component(precision, (i, j)), -0.5 if i == j else -1.0))
     kept = [k for k, c in enumerate(coefficients) if not k or not _is_uniform(c)]
-    return NaturalForm(
-        tuple(statistics[k] for k in kept), tuple(coefficients[k] for k in kept)
-    )
+    return NaturalForm(tuple(statistics[k] for k in kept), tuple(coefficients[k] for k in kept))
 
 
 def _component(node: Expression, at: tuple[int, ...]) -> Expression:
