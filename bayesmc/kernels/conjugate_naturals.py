@@ -240,7 +240,7 @@ def _of_numbers(blanket: Blanket, members: np.ndarray | None, prior: _Prior) -> 
     children: dict[Child, Added] = {}
     for child in found_children:
         try:
-            children |= _added(blanket, child, of, low >= 0.0 and high <= 1.0)
+            children |= _added(blanket, child, of, own, (low, high))
         except TraceError:
             return why_not(blanket, child.terms[0], prior.words)
     if not children:
@@ -285,12 +285,22 @@ def _own_features(blanket: Blanket, prior: _Prior, of: Moving) -> dict[Feature, 
     return dict(features_of(density, of, None, True).coefficients)
 
 
-def _added(blanket: Blanket, child: Child, of: Moving, is_share: bool) -> dict[Child, Added]:
+def _added(
+    blanket: Blanket,
+    child: Child,
+    of: Moving,
+    own: dict[Feature, Expression],
+    ends: tuple[float, float],
+) -> dict[Child, Added]:
     """What a child adds; like ones one by one, where together they are no sum of features."""
+    is_share = ends[0] >= 0.0 and ends[1] <= 1.0
+    alone = apart(blanket, child)
     try:
         found = {child: features_of(child.density, of, child.mask, False, is_share)}
+        both = {**own, **found[child].coefficients}
+        if alone and family_of_features(both, *ends) is None:
+            raise TraceError("together they have other features")
     except TraceError:
-        alone = apart(blanket, child)
         if not alone:
             raise
         found = {c: features_of(c.density, of, c.mask, False, is_share) for c in alone}

@@ -104,7 +104,7 @@ def features_of(
     """
     found: dict[Feature, Expression] = {}
     picked = False
-    for part in parts_of(expression, of.name, mask):
+    for part in parts_of(sunk(tidied(expression), of.name), of.name, mask):
         some = statistics(part.expression, of.name, of.numbers, strict, is_share)
         picked = picked or some.is_picked or part.is_picked
         for feature, coefficient in some.coefficients.items():

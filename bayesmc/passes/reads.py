@@ -213,8 +213,24 @@ def _along(at: Expression, axes: Sequence[int]) -> Expression:
         if ((at.value >= 0) & (at.value != wide)).any():
             raise _several()
         return as_expression(most)
+    if isinstance(at, Pick):
+        found = _along_picked(at, axes)
+        if found is not None:
+            return found
     if not _is_alone(at):
         raise _several()
     shape = tuple(n for k, n in enumerate(at.shape) if k not in set(axes))
     only = max(_tables(at) or {-1})
     return broadcast(as_expression(only), shape)
+
+
+def _along_picked(at: Pick, axes: Sequence[int]) -> Expression | None:
+    """The same where along the axes some numbers are of what reads nothing, and all others one number."""
+    idle = [isinstance(a, Constant) and bool((a.value < 0).all()) for a in at.operands]
+    ends = np.cumsum([a.size for a in at.operands])
+    reads = ~np.array(idle)[np.searchsorted(ends, at.positions, side="right")]
+    most = np.where(reads, at.positions, -1).max(axis=tuple(axes), keepdims=True)
+    if (reads & (at.positions != most)).any():
+        return None
+    any_of = np.where(most < 0, at.positions.min(axis=tuple(axes), keepdims=True), most)
+    return pick(at.operands, np.squeeze(any_of, tuple(axes)))

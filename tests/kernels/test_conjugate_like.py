@@ -22,6 +22,7 @@ from bayesmc.kernels.gaussian_block import GaussianBlock
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values, target_of
+from tests.kernels.wrong_naturals import with_naturals
 from tests.structure.test_stacked import CHAINS, a_state
 
 DATA = np.random.default_rng(31)
@@ -453,16 +454,9 @@ def test_transitions_that_count_half_show() -> None:
     """The negative control: each of the group adds half of its share to the precision's shape."""
 
     def half_a_shape(kernel: Conjugate) -> None:
-        (right,) = kernel.forms
-        if kernel.names != ("tau",):
-            return
-
-        def wrong(values: Values) -> Any:
-            (exponent, rate), bounds = right(values)
-            return (2.0 + 0.5 * (exponent - 2.0), rate), bounds  # the prior is Gamma(3, 1)
-
-        wrong.family = right.family  # type: ignore[attr-defined]
-        kernel.forms = (wrong,)  # type: ignore[assignment]
+        if kernel.names == ("tau",):  # the prior is Gamma(3, 1)
+            wrong = with_naturals(kernel, lambda a, b: (2.0 + 0.5 * (a - 2.0), b))
+            kernel.forms = wrong.forms
 
     found = scores(half_a_shape)
     assert max(map(abs, found.values())) > LIMIT, found

@@ -470,5 +470,6 @@ def test_sums_of_labels_that_somebody_else_moved_are_taken_anew() -> None:
 
 def test_small_concentrations_are_left_to_the_family() -> None:
     _, kernels, _ = sweep(3, 1)
-    small = np.array([[0.5, 1.0, 8.0]])
-    assert kernels[2].kind.draw((small,), None, np.random.default_rng(0), (1,)) is None
+    small = np.array([[0.5, 1.0, 8.0]]) - 1.0
+    (form,) = kernels[2].forms
+    assert form.family.draw((small,), None, np.random.default_rng(0), (1,)) is None
