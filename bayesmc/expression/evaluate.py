@@ -100,7 +100,21 @@ def _step(node: Expression) -> Step:
     return node.call
 
 
+#: powers that have a function of their own, which ``x ** 2`` of an array takes, too
+_POWERS: dict[float, Callable[..., np.ndarray]] = {
+    2.0: np.square,
+    0.5: np.sqrt,
+    -1.0: np.reciprocal,
+}
+
+
 def _elementwise(node: Elementwise) -> Step:
+    if node.function is np.power:
+        base, exponent = node.operands
+        if isinstance(exponent, Constant) and not exponent.shape and base.dtype.kind == "f":
+            power = _POWERS.get(float(exponent.value))
+            if power is not None:
+                return lambda x, _: power(x)
     ndim = len(node.shape)
     pads = [ndim - len(a.shape) if a.leaves else 0 for a in node.operands]
     function = node.function

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Distribution, as_distribution
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError, TraceError
+from bayesmc.distributions import Distribution
+from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Constant,
     Expression,
@@ -27,18 +26,15 @@ from bayesmc.expression import (
     gather,
     leaf,
     mapped,
-    rebuilt,
     replaced,
 )
+from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered
 from bayesmc.network.readings import Argument, Reading, numbers_of, read_function, read_table
 from bayesmc.passes.log_density import family_of, log_density
-from bayesmc.shapes import Shape
 
-#: how far an expression may be off what the function gives, relative to the largest entry
-_RTOL = 1e-11
 #: readings of one shape, and uses of one reading, that are checked at all probe points
 _CHECKED = 3
 
@@ -133,7 +129,7 @@ def density(model: Model, name: str) -> Followed | Opaque:
     """
     known = model.cache.setdefault("expressions", {})
     if name not in known:
-        for above in _deterministic_above(model, name, known):
+        for above in deterministic_above(model, name, known):
             known[above] = found = _read(model, above)
             if isinstance(found, Followed):
                 _ = found.result  # one after the other, however many follow from each other
@@ -279,28 +275,6 @@ def _stored_value(model: Model, name: str) -> Expression:
     return gather(constant(order), found.expression)
 
 
-def _deterministic_above(model: Model, name: str, known: Mapping[str, Any]) -> list[str]:
-    """Deterministic nodes above one that are not known, those first on which others depend."""
-    found: dict[str, None] = {}
-    todo = [(name, False)]
-    while todo:
-        above, is_done = todo.pop()
-        if is_done:
-            found[above] = None
-            continue
-        if above != name:
-            todo.append((above, True))
-        parents = (
-            model[above].parents if above in model.nodes else model.potentials[above][0].parents
-        )
-        todo += [
-            (p, False)
-            for p in parents
-            if model[p].kind == "deterministic" and p not in known and p not in found
-        ]
-    return list(found)
-
-
 def _read(model: Model, name: str) -> Followed | Opaque:
     ways = (True, False) if isinstance(_function(model, name), Numbered) else (False,)
     reason = ""
@@ -400,121 +374,21 @@ def _argument(model: Model, place: int, parent: str, link: Aligner) -> Argument:
     return Argument(place, node.value_shape, dtype.str, states, how, known)
 
 
-# ---- the check ----------------------------------------------------------------------------------
-
-
 def _check(model: Model, name: str, found: Followed) -> None:
     """Refuse a reading that gives something else than the function at probe points.
 
     A function of its own is checked whatever it is like, a shared one a few times.
     """
     times = model.cache.setdefault("expressions checked", {})
-    alike = next(times.setdefault(found.reading.key, count()))
-    uses = next(times.setdefault(id(found.reading), count()))
+    reading = found.reading
+    alike = next(times.setdefault(reading.key, count()))
+    uses = next(times.setdefault(id(reading), count()))
     if alike < _CHECKED:
         through = any(model[p].kind == "deterministic" for p in found.parents)
-        for variant in range(len(_VARIANTS)):
-            values = _Probe.of(model, variant)
-            _compare(model, name, found, values)
+        for variant in range(len(VARIANTS)):
+            hold_against(model, name, reading.result, reading.program, found.local, variant)
             if through:
-                _compare(model, name, found, values, whole=True)
+                whole = Program(list(expressions_of(found.result)))
+                hold_against(model, name, found.result, whole, lambda values: values, variant)
     elif found.numbers or not uses & (uses - 1):  # another number, or function; else now and then
-        _compare(model, name, found, _Probe.of(model, len(_VARIANTS) - 1))
-
-
-def _compare(model: Model, name: str, found: Followed, values: _Probe, whole: bool = False) -> None:
-    """Hold what was read against what the function gives, at one of the probes."""
-    is_node = name in model.nodes
-    with marking_invalid(), np.errstate(all="ignore"):
-        try:
-            if is_node:
-                expected, batch = model.evaluate(name, values)
-                shape = batch + model[name].plate_shape
-            else:
-                expected = model.potential(name, values, total=False)
-                shape = expected.shape
-            given = values if whole else found.local(values)
-        except BayesmcError:
-            return  # the function's own fault, or out of range: nothing to compare
-        result = found.result if whole else found.reading.result
-        program = Program(list(expressions_of(result))) if whole else found.reading.program
-        try:
-            made = rebuilt(result, iter(program(given)))
-            if is_node and model[name].is_stochastic and not isinstance(made, Distribution):
-                made = as_distribution(made)
-        except (BayesmcError, ValueError, TypeError, IndexError) as error:
-            raise TraceError(f"what was read of it fails: {error}") from error
-        if not _agree(model.nodes.get(name), expected, made, shape):
-            raise TraceError("what was read of it gives other values than the function")
-
-
-class _Probe(dict[str, np.ndarray]):
-    """Stored values of all nodes at probe points; of deterministic ones as they are asked for."""
-
-    def __init__(self, model: Model, variant: int) -> None:
-        super().__init__()
-        self.model, self.variant = model, variant
-        self._place = {n: k for k, n in enumerate(model.nodes)}
-
-    @classmethod
-    def of(cls, model: Model, variant: int) -> _Probe:
-        known = model.cache.setdefault("expression probes", {})
-        if variant not in known:
-            known[variant] = cls(model, variant)
-        return known[variant]
-
-    def __missing__(self, name: str) -> np.ndarray:
-        node = self.model[name]
-        if node.kind == "deterministic":
-            for above in _deterministic_above(self.model, name, self):
-                self[above] = self.model.evaluate(above, self)[0]
-            value = self.model.evaluate(name, self)[0]
-        else:
-            value = self.model.probe[name]
-            rank = value.ndim - len(node.value_shape)
-            value = _VARIANTS[self.variant](value, rank, self._place[name])
-        self[name] = value
-        return value
-
-
-#: unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks
-_VARIANTS: tuple[Callable[[np.ndarray, int, int], np.ndarray], ...] = (
-    lambda v, rank, _: v,
-    lambda v, rank, _: v[-1] if rank == 2 else v,
-    lambda v, rank, _: v[(0,) * rank],
-    lambda v, rank, k: (v, v[0], v[:, :1], v[0, 0])[k % 4] if rank == 2 else v,
-)
-
-
-def _agree(node: CompiledNode | None, expected: Any, made: Any, shape: Shape) -> bool:
-    if isinstance(expected, Distribution) != isinstance(made, Distribution):
-        return False
-    if not isinstance(expected, Distribution):
-        full = shape if node is None else shape + node.event_shape
-        stored = np.asarray(expected)
-        value = node.decode(stored) if node is not None and node.domain is not None else stored
-        return _near(np.asarray(value), np.broadcast_to(np.asarray(made), full))
-    if type(expected) is not type(made):
-        return False
-    pairs = zip(expected.parameters(), made.parameters(), strict=True)
-    for (a, n), (b, m) in pairs:
-        if n != m:
-            return False
-        first = np.broadcast_to(a, shape + a.shape[a.ndim - n :] if n else shape)
-        second = np.broadcast_to(b, shape + b.shape[b.ndim - n :] if n else shape)
-        if not _near(first, second):
-            return False
-    return True
-
-
-def _near(a: np.ndarray, b: np.ndarray) -> bool:
-    if a.shape != b.shape:
-        return False
-    a, b = np.asarray(a), np.asarray(b)
-    if a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
-        return bool(np.array_equal(a, b))
-    a, b = a.astype(float), b.astype(float)
-    scale = np.maximum(np.abs(a), np.abs(b))
-    largest = np.max(np.where(np.isfinite(scale), scale, 0.0), initial=0.0)
-    near = np.abs(a - b) <= _RTOL * (np.where(np.isfinite(scale), scale, 0.0) + 1e-3 * largest)
-    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
+        hold_against(model, name, reading.result, reading.program, found.local, len(VARIANTS) - 1)

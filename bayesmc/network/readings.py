@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Density, Distribution
+from bayesmc.distributions import Affine, Categorical, Density, Distribution, Mixture, Truncated
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Constant,
@@ -29,11 +29,13 @@ from bayesmc.expression import (
     expressions_of,
     gather,
     leaf,
+    reshape,
     trace,
 )
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.domain import Domain
 from bayesmc.network.node import Numbered
+from bayesmc.passes.log_density import family_of
 from bayesmc.passes.templates import Template, template
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
@@ -52,22 +54,44 @@ class Reading:
     result: Any
 
     @cached_property
+    def open(self) -> Any:
+        """The result with the parameters of a known distribution as constants, where it has a family."""
+        if not isinstance(self.result, Distribution):
+            return self.result
+        try:
+            return family_of(self.result)
+        except TraceError:
+            return self.result
+
+    @cached_property
     def roots(self) -> tuple[Expression, ...]:
-        return tuple(expressions_of(self.result))
+        """The expressions of ``open``."""
+        return tuple(expressions_of(self.open))
 
     @cached_property
     def template(self) -> Template:
-        """What it is, apart from its constants."""
+        """What the roots are, apart from their constants."""
         return template(*self.roots)
 
     @cached_property
     def key(self) -> Hashable:
-        """Equal for readings that differ in constants only."""
-        return frame(self.result), self.template.key
+        """Equal for readings that differ in constants only, if these may differ."""
+        exact = () if self.may_differ else tuple(map(_content, self.template.constants))
+        return frame(self.open), self.template.key, self.template.leaves, exact
+
+    @cached_property
+    def may_differ(self) -> bool:
+        """Whether constants of several such functions can be put in one: ``with_axes`` knows the family."""
+        try:
+            with_axes(self.open, 0)
+        except TraceError:
+            return False
+        return True
 
     @cached_property
     def program(self) -> Program:
-        return Program(self.roots)
+        """Values of the expressions of the result."""
+        return Program(list(expressions_of(self.result)))
 
 
 @dataclass(frozen=True)
@@ -159,6 +183,30 @@ def frame(traced: Any) -> Hashable:
     return _content(traced)
 
 
+def with_axes(traced: Any, rank: int) -> Any:
+    """What was traced with an axis for every plate in all parameters, before those of one value.
+
+    A batch in front of a constant parameter is else taken for plates of the others.
+
+    Raises
+    ------
+    TraceError
+        It is not known how many axes one value of a parameter has.
+    """
+    if isinstance(traced, Expression):
+        missing = rank - len(traced.shape)
+        return traced if missing <= 0 else reshape(traced, (1,) * missing + traced.shape)
+    if isinstance(traced, Family):
+        ranks = _ranks(traced)
+        return Family(
+            traced.make,
+            {k: with_axes(v, rank + ranks.get(k, 0)) for k, v in traced.parameters.items()},
+        )
+    if isinstance(traced, (list, tuple)):
+        return type(traced)(with_axes(v, rank) for v in traced)
+    return traced
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -194,3 +242,22 @@ def _content(value: Any) -> Hashable:
     if value is None or isinstance(value, (bool, int, float, str)):
         return type(value), value
     return "object", id(value)
+
+
+def _ranks(family: Family) -> dict[str, int]:
+    """Axes of one value of each parameter, of parts of a mixture one for the part."""
+    make, parameters = family.make, family.parameters
+    if make in (Affine, Truncated) and _is_scalar(parameters["base"]):
+        return {}
+    if make is Mixture:
+        return {"weights": 1, "components": int(isinstance(parameters["components"], Family))}
+    known = getattr(make, "parameter_ndim", None)
+    if not known:
+        raise TraceError("the axes of its parameters are not known")
+    return {**known, "logits": known.get("probs", 0), "scale_tril": 2, "scale_diag": 1}
+
+
+def _is_scalar(base: Any) -> bool:
+    if isinstance(base, Distribution):
+        return not base.event_shape
+    return isinstance(base, Family) and not any(_ranks(base).get(k, 0) for k in base.parameters)

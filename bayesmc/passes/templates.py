@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from itertools import count
+from typing import TypeGuard
 
 import numpy as np
 
-from bayesmc.expression import Constant, Expression, Leaf, leaf, ordered, replaced
+from bayesmc.expression import Call, Constant, Expression, Leaf, leaf, ordered
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,7 +21,7 @@ class Template:
     key : hashable
         Equal for those that are alike.
     constants : tuple of ndarray
-        Real and whole ones, in the order in which they occur.
+        Real and whole ones, in the order in which they occur; equal ones as often as they do.
     leaves : tuple of str
         Names, in the order in which they occur first.
     """
@@ -71,18 +73,25 @@ def template(*roots: Expression) -> Template:
     key: list[Hashable] = []
     constants: list[np.ndarray] = []
     leaves: dict[str, int] = {}
+
+    def place(operand: Expression) -> Hashable:
+        if not _is_number(operand):
+            return number[operand]
+        constants.append(operand.value)
+        return operand.shape, operand.dtype.str
+
     for node in ordered(*roots):
+        if _is_number(node):
+            continue
         number[node] = len(number)
-        if isinstance(node, Constant) and node.dtype.kind in "fi":
-            constants.append(node.value)
-            key.append(("constant", node.shape, node.dtype.str))
-        elif isinstance(node, Leaf):
-            place = leaves.setdefault(node.name, len(leaves))
-            key.append(("leaf", place, node.shape, node.dtype.str, node.states))
+        if isinstance(node, Leaf):
+            at = leaves.setdefault(node.name, len(leaves))
+            key.append(("leaf", at, node.shape, node.dtype.str, node.states))
         else:
-            own = tuple(number[a] for a in node.operands)
+            at_call = isinstance(node, Call)  # its function may take one array for all
+            own = tuple(a.content if at_call and _is_number(a) else place(a) for a in node.operands)
             key.append((type(node).__name__, own, node.content, node.shape))
-    key.append(tuple(number[r] for r in roots))
+    key.append(tuple(map(place, roots)))
     return Template(tuple(key), tuple(constants), tuple(leaves))
 
 
@@ -104,15 +113,41 @@ def stacked_rows(
     found = [template(*r) for r in rows] if templates is None else templates
     if len({t.key for t in found}) != 1:
         return None
-    columns = zip(*(t.constants for t in found), strict=True)
-    first = [n for n in ordered(*rows[0]) if isinstance(n, Constant) and n.dtype.kind in "fi"]
     values: dict[str, np.ndarray] = {}
-    instead: dict[Expression, Expression] = {}
-    for node, column in zip(first, columns, strict=True):
-        if all(c is column[0] or np.array_equal(c, column[0], equal_nan=True) for c in column):
+    instead: dict[int, Expression] = {}
+    for k, column in enumerate(zip(*(t.constants for t in found), strict=True)):
+        first = column[0]
+        if all(c is first for c in column):
             continue
-        name = f"constant {len(values)}"
-        values[name] = np.stack(column)
-        instead[node] = leaf(name, node.shape, node.dtype)
-    roots = tuple(replaced(r, instead) if instead else r for r in rows[0])
-    return Stacked(roots, values, tuple(t.leaves for t in found))
+        stack = np.stack(column)
+        if not np.array_equal(stack, np.broadcast_to(first, stack.shape), equal_nan=True):
+            name = f"constant {len(values)}"
+            values[name] = stack
+            instead[k] = leaf(name, first.shape, first.dtype)
+    return Stacked(_with_leaves(rows[0], instead), values, tuple(t.leaves for t in found))
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _is_number(node: Expression) -> TypeGuard[Constant]:
+    return isinstance(node, Constant) and node.dtype.kind in "fi"
+
+
+def _with_leaves(
+    roots: Sequence[Expression], instead: dict[int, Expression]
+) -> tuple[Expression, ...]:
+    """The expressions with leaves in place of some constants, by their places in the template."""
+    found: dict[Expression, Expression] = {}
+    occurs = count()
+
+    def place(operand: Expression) -> Expression:
+        return instead.get(next(occurs), operand) if _is_number(operand) else found[operand]
+
+    for node in ordered(*roots):
+        if not _is_number(node):
+            at_call = isinstance(node, Call)
+            operands = [a if at_call and _is_number(a) else place(a) for a in node.operands]
+            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
+            found[node] = node if same else node.with_operands(operands)
+    return tuple(map(place, roots))

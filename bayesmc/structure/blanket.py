@@ -14,6 +14,7 @@ from bayesmc.network.model import arguments_of, call, fit
 from bayesmc.plates import Lookups, PlateArray
 from bayesmc.shapes import Shape
 from bayesmc.structure.colouring import colours
+from bayesmc.structure.like_terms import StackedTerm
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
 
@@ -170,6 +171,8 @@ class Blanket:
     def distribution_looked_up(
         self, child: Child, state: Mapping[str, np.ndarray]
     ) -> tuple[Distribution, Shape, tuple[Any, ...]]:
+        if isinstance(child.term, StackedTerm):
+            return (*child.term.distribution(state), child.term.keys(child.relation, state))
         node = self.target.model[child.term.name]
         arguments, batch, watched = self._watched(child, node.links, state)
         dist = call(node.declaration, arguments, batch + node.plate_shape, node.links)
@@ -179,6 +182,8 @@ class Blanket:
     def potential_looked_up(
         self, child: Child, state: Mapping[str, np.ndarray]
     ) -> tuple[np.ndarray, tuple[Any, ...]]:
+        if isinstance(child.term, StackedTerm):
+            return child.term.log(state), child.term.keys(child.relation, state)
         potential, links = self.target.model.potentials[child.term.name]
         arguments, batch, watched = self._watched(child, links, state)
         log = np.asarray(potential.function(*arguments), dtype=float)

@@ -6,23 +6,18 @@ it tries. Here the children get a group axis, as if they were one child in one m
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.network import Model
 from bayesmc.structure.blanket import Blanket, Child
-from bayesmc.structure.like_functions import GROUP, in_model
-from bayesmc.structure.like_terms import FEWEST, LikeTerms, like_terms, repeated
-from bayesmc.structure.target import Values
+from bayesmc.structure.like_terms import FEWEST, LikeTerms, StackedTerm, like_terms, repeated
 
-#: relative error that sums of many terms may have
-_ROUNDING = 1e-9
+#: the plate that stands for a group
+GROUP = "\0group"
 
 
 class GroupedBlanket(Blanket):
@@ -33,8 +28,6 @@ class GroupedBlanket(Blanket):
         self.groups = tuple(groups)
         taken = {n for terms, _ in groups for n in terms.names}
         self.alone = tuple(c for c in self.children if c.term.name not in taken)
-        #: for each group a blanket that knows its functions
-        self._asked = [in_model_of(blanket, terms.model) for terms, _ in groups]
 
     def log_density(
         self,
@@ -59,15 +52,15 @@ class GroupedBlanket(Blanket):
         self, k: int, state: Mapping[str, np.ndarray], members: np.ndarray | None
     ) -> np.ndarray:
         """The log factors of a group, summed for every element of the node."""
-        (terms, child), asked = self.groups[k], self._asked[k]
+        terms, child = self.groups[k]
         gathered = terms.gathered(state)
         keys: tuple[Any, ...] = ()
         if child.relation.kind != "lookup":
             log = terms.term.log(gathered)
         elif terms.term.is_potential:
-            log, keys = asked.potential_looked_up(child, gathered)
+            log, keys = self.potential_looked_up(child, gathered)
         else:
-            dist, batch, keys = asked.distribution_looked_up(child, gathered)
+            dist, batch, keys = self.distribution_looked_up(child, gathered)
             log = terms.term.log_of(dist, batch, gathered[terms.term.name])
         return child.relation.collect(terms.full(log), terms.shape, keys, members)
 
@@ -98,17 +91,8 @@ def with_like_children(blanket: Blanket) -> Blanket:
     ... )
     True
     """
-    found = like_children(blanket, blanket.children)
-    if not found:
-        return blanket
-    states = blanket.target.states
-    if states is None:
-        return blanket
-    groups = []
-    for children in found:
-        group = _grouped(blanket, children, states)
-        if group is not None:
-            groups.append(group)
+    found = [as_one_child(blanket, c) for c in like_children(blanket, blanket.children)]
+    groups = [group for group in found if group is not None]
     return GroupedBlanket(blanket, groups) if groups else blanket
 
 
@@ -143,63 +127,17 @@ def like_children(
     return [g for g in groups.values() if len(g) >= FEWEST]
 
 
-def as_one_child(
-    blanket: Blanket, children: Sequence[Child], states: Values
-) -> tuple[LikeTerms, Child] | None:
-    """Like children as one, whose relation has the group as one more plate; None where they cannot be.
-
-    Whether the one says what they say is for the caller to check.
-    """
-    terms = like_terms(blanket.target, [c.term for c in children], states)
-    if terms is None:
-        return None
+def as_one_child(blanket: Blanket, children: Sequence[Child]) -> tuple[LikeTerms, Child] | None:
+    """Like children as one, whose relation has the group as one more plate; None where they cannot be."""
+    terms = like_terms(blanket.target, [c.term for c in children])
     first = children[0].relation
     rows = tuple(np.concatenate(r) for r in zip(*(c.relation.rows for c in children), strict=True))
     relation = replace(first, term_plates=(GROUP, *first.term_plates), rows=rows, _kept={})
-    return terms, Child(terms.term, relation)
-
-
-def in_model_of(blanket: Blanket, model: Model) -> Blanket:
-    """The blanket, asking a model in which a function has the numbers of a group."""
-    asked = copy.copy(blanket)
-    asked.target = in_model(blanket.target, model, blanket.target.terms)
-    return asked
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _grouped(
-    blanket: Blanket, children: Sequence[Child], states: Values
-) -> tuple[LikeTerms, Child] | None:
-    """Like children as one; None where that would not say what they say."""
-    try:
-        group = as_one_child(blanket, children, states)
-        if group is None:
+    term = terms.term
+    if relation.kind == "lookup" and isinstance(term, StackedTerm):
+        assert term.function is not None and relation.source is not None
+        elements = term.function.elements(relation.source, blanket.target, term.shape)
+        if elements is None:
             return None
-        return group if _agrees(blanket, children, group, states) else None
-    except BayesmcError:  # at some state, perhaps one that is impossible
-        return None
-
-
-def _agrees(
-    blanket: Blanket, children: Sequence[Child], group: tuple[LikeTerms, Child], states: Values
-) -> bool:
-    """Whether the group says of some states what the children say one by one."""
-    only = GroupedBlanket(blanket, [group])
-    members = blanket.classes[0]
-    now = blanket.current(states, members)
-    with marking_invalid(), np.errstate(all="ignore"):
-        candidate = np.stack([now, np.roll(now, 1, axis=0)])
-        state = blanket.placed(states, candidate, members)
-        alone: Any = 0.0
-        size: Any = 0.0
-        for child in children:
-            log = blanket.child_log(child, state, members)
-            alone, size = alone + log, size + np.abs(log)
-        together = only._group_log(0, state, members)
-    shape = candidate.shape[: candidate.ndim - len(blanket.event_shape)]
-    alone, together, size = (np.broadcast_to(v, shape) for v in (alone, together, size))
-    with np.errstate(invalid="ignore"):
-        near = np.abs(alone - together) <= _ROUNDING * (1.0 + size)
-    return bool((near | (alone == together)).all())
+        terms.term = term = replace(term, elements=elements)
+    return terms, Child(term, relation)

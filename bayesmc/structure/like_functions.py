@@ -1,40 +1,46 @@
-"""Several like functions called as one: the group becomes a batch axis, before the plates.
+"""Several like functions evaluated as one: the group becomes a batch axis, before the plates.
 
-Terms and deterministic nodes are alike where their functions are, up to numbers, and what they read has the
-same shapes. The first of them then stands for all: its parents' names stand for arrays in which the parents
-of all are stacked. Numbers by which the functions differ (``t=t``) are stacked, too, but functions need not
-broadcast over those as they do over parents. So it is tried in several ways, and what does not give what the
-functions give one by one is not used.
+Terms and deterministic nodes are alike where what was read of their functions is equal up to constants
+(slices of a template, nodes that a loop declared), and what they read has the same shapes. The first of them
+then stands for all: its parents' names stand for arrays in which the parents of all are stacked. Where no
+constant differs its function is called as it is; constants that differ are stacked, too, in the expressions
+that were read.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from operator import is_, itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError
-from bayesmc.network import CompiledNode, Model
-from bayesmc.network.align import Aligner
-from bayesmc.network.domain import Domain
-from bayesmc.shapes import Shape
-from bayesmc.structure.likeness import Skeleton, same_number, skeleton, with_numbers
+from bayesmc.errors import ModelError
+from bayesmc.expression import (
+    Expression,
+    Program,
+    broadcast,
+    constant,
+    expressions_of,
+    leaf,
+    mapped,
+    ordered,
+    pick,
+    rebuilt,
+    replaced,
+)
+from bayesmc.network import CompiledNode
+from bayesmc.network.expressions import Followed, density
+from bayesmc.network.node import Numbered
+from bayesmc.network.readings import Reading, with_axes
+from bayesmc.passes.sinking import reads, sunk
+from bayesmc.passes.templates import stacked_rows
+from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to
 
 if TYPE_CHECKING:  # a target recomputes like links as one
-    from bayesmc.structure.target import Target, Term, Values
-
-#: stands for a parent that only lengthens the batch
-GROUP = "\0group"
-#: relative error that rounding may make
-_EXACT = 1e-12
-#: event axes that numbers may meet
-_EVENT_NDIM = 3
+    from bayesmc.structure.target import Target, Values
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,16 +50,19 @@ class Signature:
     Attributes
     ----------
     key : hashable
-        Equal where functions are, up to numbers, and values have the same shapes and states.
-    skeleton : Skeleton
-        Of its function.
+        Equal where functions are, up to constants, and values have the same shapes and states.
     scope : tuple of str
         What it reads: parents in the order of arguments, and itself.
+    rank : int
+        Axes of what its function computes, of a density those of the plates.
+    read : Followed or None
+        What its function computes; None where that cannot be followed.
     """
 
     key: Hashable
-    skeleton: Skeleton
     scope: tuple[str, ...]
+    rank: int
+    read: Followed | None
 
 
 class Signatures:
@@ -62,6 +71,7 @@ class Signatures:
     def __init__(self, target: Target) -> None:
         self.target = target
         self._found: dict[str, Signature | None] = {}
+        self._values: dict[str, Hashable] = {}
 
     def of(self, name: str) -> Signature | None:
         """The signature; None for what is called element by element or over the rows of an index."""
@@ -71,26 +81,39 @@ class Signatures:
 
     def _read(self, name: str) -> Signature | None:
         model = self.target.model
-        term = self.target.terms.get(name)
-        what: Hashable
-        if term is not None and term.is_potential:
-            potential, _ = model.potentials[name]
-            if potential.index is not None:
-                return None
-            found, scope = skeleton(potential.function), potential.parents
-            what = ("potential", potential.plates, potential.is_table)
-        else:
+        table: Hashable = None
+        if name in model.nodes:
             node = model[name]
             declaration = node.declaration
             if declaration.vectorize:
                 return None
-            found, scope = skeleton(declaration.function), (*node.parents, name)
-            what = tuple(
-                None if t is None else (t.shape, t.dtype.str, t.tobytes())
-                for t in (declaration.probs, node.table)
-            )
-        read = tuple(value_key(model[n]) for n in scope)
-        return Signature((found.key, what, read), found, scope)
+            function, scope = declaration.function, (*node.parents, name)
+            rank = len(node.plate_shape if node.is_stochastic else node.value_shape)
+            if node.table is not None:  # of a deterministic node: its positions
+                table = node.table.shape, node.table.tobytes()
+        else:
+            potential, _ = model.potentials[name]
+            if potential.index is not None:
+                return None
+            function, scope = potential.function, potential.parents
+            table, rank = potential.plates, len(potential.plates)
+        found = density(model, name)
+        what: Hashable
+        if isinstance(found, Followed):
+            open_numbers = found.reading.may_differ
+            what = found.reading.key, () if open_numbers else tuple(map(int, found.numbers))
+        elif isinstance(function, Numbered):
+            what = id(function.func), function.places, function.number
+        else:
+            what = id(function)
+        read = tuple(self._value(n) for n in scope)
+        followed = found if isinstance(found, Followed) else None
+        return Signature((what, table, read), scope, rank, followed)
+
+    def _value(self, name: str) -> Hashable:
+        if name not in self._values:
+            self._values[name] = value_key(self.target.model[name])
+        return self._values[name]
 
 
 class Slots:
@@ -107,7 +130,6 @@ class Slots:
     def __init__(self, target: Target, sources: Mapping[str, Sequence[str]], count: int) -> None:
         self.sources = {name: _once(these) for name, these in sources.items()}
         self.count = count
-        self._group = np.zeros(count)
         self._trailing = {name: len(target.model[name].value_shape) for name in self.sources}
         known = target.known
         self._taken = {name: _taking(these) for name, these in self.sources.items()}
@@ -122,7 +144,7 @@ class Slots:
 
     def gathered(self, values: Mapping[str, np.ndarray]) -> Values:
         """Values by these names, ``(*lead, group, *plates, *event)``; the group is 1 for a shared one."""
-        found: Values = {GROUP: self._group}
+        found: Values = {}
         for name, taken in self._taken.items():
             arrays = taken(values)
             known = self._known.get(name)
@@ -134,96 +156,96 @@ class Slots:
 
 
 @dataclass(frozen=True, eq=False)
-class LikeFunctions:
-    """Terms or deterministic nodes whose functions differ in numbers at most.
+class StackedFunction:
+    """Functions that differ in constants as one.
 
     Attributes
     ----------
-    names : tuple of str
-        The group; the first stands for all.
-    signatures : tuple of Signature
-        Theirs, with equal keys.
+    result : Family or Expression
+        Of leaves by the names of the first one's parents, and of the constants.
+    constants : dict
+        Leaf -> the constants of all, shape ``(group, *shape)``.
+    shapes : dict
+        Parent of the first -> shape of one value.
+    count : int
+        Size of the group.
     """
 
-    names: tuple[str, ...]
-    signatures: tuple[Signature, ...]
+    result: Any
+    constants: dict[str, np.ndarray]
+    shapes: dict[str, Shape]
+    count: int
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> tuple[Any, Shape]:
+        """What the functions compute of values ``(*lead, group, *plates, *event)``, and the batch shape."""
+        return rebuilt(self.result, iter(self._evaluated(self._program, values))), self.batch(
+            values
+        )
+
+    def batch(self, values: Mapping[str, np.ndarray]) -> Shape:
+        """The batch shape of the parents, the group last."""
+        leads = (values[n].shape[: values[n].ndim - len(s)] for n, s in self.shapes.items())
+        return broadcast_shapes((self.count,), *leads)
+
+    def elements(self, source: str, target: Target, shape: Shape) -> Program | None:
+        """A program for the flat element of a parent that each element of a term looks up, if it is one."""
+        node = target.model[source]
+        own = [e for e in expressions_of(self.result) if source in e.leaves]
+        numbers = np.arange(int(np.prod(node.plate_shape, dtype=int)))
+        whole = broadcast(
+            constant(numbers.reshape(node.plate_shape + (1,) * len(node.event_shape))),
+            node.value_shape,
+        )
+        found = set()
+        for root in (sunk(e, source) for e in own):
+            for read in reads(root, source):
+                at = replaced(read, {_leaf(read, source): whole})
+                if not broadcasts_to(at.shape, shape):  # an event, all of one element
+                    rank = len(at.shape) - len(node.event_shape)
+                    one: Any = (..., *(0,) * len(node.event_shape))
+                    first = np.arange(at.size).reshape(at.shape)[one]
+                    at = pick([at], first)
+                    if rank < 0 or not broadcasts_to(at.shape, shape):
+                        return None
+                found.add(broadcast(at, shape))
+        return Program(list(found)) if len(found) == 1 else None
+
+    def looked_up(self, elements: Program, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Flat elements ``(*lead, group, *plates)``."""
+        (found,) = self._evaluated(elements, values)
+        return found
 
     @cached_property
-    def varying(self) -> dict[int, tuple[Any, ...]]:
-        """The numbers by which the functions differ, by their places in the skeletons."""
-        columns = enumerate(zip(*(s.skeleton.numbers for s in self.signatures), strict=True))
-        return {
-            k: these
-            for k, these in columns
-            if not all(same_number(these[0], other) for other in these)
-        }
+    def _program(self) -> Program:
+        return Program(list(expressions_of(self.result)))
 
-    def mask(self, target: Target) -> np.ndarray | None:
-        """The elements that count, of terms ``(group, *plates)``; None where all do."""
-        terms = [target.terms[n] for n in self.names]
-        if all(t.mask is None for t in terms):
-            return None
-        return np.stack([np.ones(t.shape, bool) if t.mask is None else t.mask for t in terms])
+    def _evaluated(self, program: Program, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        try:
+            full = {n: _full(values[n], shape) for n, shape in self.shapes.items()}
+            return program({**self.constants, **full})
+        except IndexError as error:
+            raise ModelError(str(error)) from error
 
-    def as_one(
-        self, target: Target, model: Model, gathered: Values, states: Values
-    ) -> Model | None:
-        """A model in which the first function has the numbers of all; None where none agrees with them.
 
-        Parameters
-        ----------
-        model : Model
-            The target's, or one in which others have been replaced.
-        gathered, states : dict
-            Values by the names of the first, the group before the plates; and by everybody's own names.
-        """
-        alone = [_evaluated(target, target.model, n, states) for n in self.names]
-        for scalars, after_plates in itertools.product(range(_EVENT_NDIM), (True, False)):
-            try:
-                tried = self._replaced(target, model, scalars, after_plates)
-                together = _evaluated(target, tried, self.names[0], gathered)
-                shape = np.broadcast_shapes(*(a[:, None].shape for a in alone))
-                full = np.broadcast_to(together, (shape[0], len(alone), *shape[2:]))
-            except (BayesmcError, ValueError):
-                continue  # the numbers do not broadcast in this way
-            rows = [np.broadcast_to(a, full[:, 0].shape) for a in alone]
-            if all(close(full[:, i], row) for i, row in enumerate(rows)):
-                return tried
+def as_one(signatures: Sequence[Signature]) -> StackedFunction | None:
+    """Functions of equal signatures as one; None where they do not differ: the first is that of all."""
+    read = [s.read for s in signatures if s.read is not None]
+    if len(read) < len(signatures):
         return None
-
-    def _replaced(self, target: Target, model: Model, scalars: int, after_plates: bool) -> Model:
-        """The model with the numbers of all in the first function.
-
-        Parameters
-        ----------
-        scalars : int
-            How many event axes scalars are to meet.
-        after_plates : bool
-            Whether the axes of arrays come after the plates, as those of an unplated parent's event do.
-        """
-        name = self.names[0]
-        term = target.terms.get(name)
-        plates = len(model[name].plate_shape if term is None else term.shape)
-        numbers = list(self.signatures[0].skeleton.numbers)
-        for k, these in self.varying.items():
-            own = np.ndim(these[0])
-            if not own:
-                axes = plates + scalars
-            else:
-                axes = plates + own if after_plates else max(plates, own)
-            numbers[k] = _column(these, axes)
-        link = (GROUP, Aligner((), (), 0, None))
-        if term is not None and term.is_potential:
-            potential, links = model.potentials[name]
-            function = _longer(with_numbers(potential.function, numbers))
-            made = replace(potential, function=function), (*links, link)
-            return replace(model, potentials={**model.potentials, name: made}, cache={})
-        node = model[name]
-        assert node.declaration.function is not None
-        function = _longer(with_numbers(node.declaration.function, numbers))
-        declaration = replace(node.declaration, function=function)
-        node = replace(node, declaration=declaration, links=(*node.links, link))
-        return replace(model, nodes={**model.nodes, name: node}, cache={})
+    first = read[0]
+    reading, constants = _of_all([r.reading for r in read])
+    for k, numbers in enumerate(zip(*(r.numbers for r in read), strict=True)):
+        constants[f"number {k}"] = np.stack(numbers)
+    if all(_is_one(c) for c in constants.values()):
+        return None
+    instead: dict[Expression, Expression] = {
+        a.leaf: leaf(parent, a.shape, a.dtype, a.states)
+        for parent, a in zip(first.parents, first.arguments, strict=True)
+    }
+    rank = signatures[0].rank
+    result = with_axes(mapped(reading.open, lambda e: replaced(e, instead)), rank)
+    shapes = {p: a.shape for p, a in zip(first.parents, first.arguments, strict=True)}
+    return StackedFunction(*_computed_once(result, constants), shapes, len(signatures))
 
 
 def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:
@@ -239,24 +261,9 @@ def stack_arrays(arrays: Sequence[np.ndarray], trailing: int) -> np.ndarray:
     return rows.swapaxes(0, 1) if lead == 1 else np.moveaxis(rows, 0, lead)
 
 
-def in_model(target: Target, model: Model, terms: Mapping[str, Term]) -> Target:
-    """The target with other functions."""
-    problem = replace(target.problem, model=model, cache={})
-    own = {name: replace(term, model=model) for name, term in terms.items()}
-    return replace(target, problem=problem, terms=own, _below={})
-
-
-def close(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal up to rounding; infinities in the same places."""
-    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
-    with np.errstate(invalid="ignore"):
-        near = np.abs(a - b) <= _EXACT * (1.0 + np.abs(b))
-    return bool((near | (a == b)).all())
-
-
 def value_key(node: CompiledNode) -> Hashable:
     """What a node's values are: equal where shapes and states are."""
-    return node.plates, node.event_shape, node.is_discrete, _domain_key(node.domain)
+    return node.plates, node.event_shape, node.is_discrete, node.domain and node.domain.key
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -300,34 +307,45 @@ def _once(names: Sequence[str]) -> tuple[str, ...]:
     return (names[0],) if len(set(names)) == 1 else tuple(names)
 
 
-def _domain_key(domain: Domain | None) -> Hashable:
-    if domain is None:
-        return None
-    values = None if domain.values is None else (domain.values.dtype.str, domain.values.tobytes())
-    return domain.size, domain.low, values, domain.labels
+def _of_all(readings: Sequence[Reading]) -> tuple[Reading, dict[str, np.ndarray]]:
+    """Readings that are alike as one, and the constants by which they differ."""
+    first = readings[0]
+    if all(r is first for r in readings):
+        return first, {}
+    one = stacked_rows([r.roots for r in readings], [r.template for r in readings])
+    assert one is not None
+    roots = iter(one.roots)
+    return Reading(mapped(first.open, lambda _: next(roots))), one.constants
 
 
-def _evaluated(target: Target, model: Model, name: str, values: Values) -> np.ndarray:
-    """A deterministic node's value or a term's log factors, as part of a model."""
-    term = target.terms.get(name)
-    with marking_invalid(), np.errstate(all="ignore"):
-        if term is None:
-            return model.evaluate(name, values)[0]
-        return np.asarray(replace(term, model=model, mask=None).log(values))
+def _computed_once(
+    result: Any, constants: dict[str, np.ndarray]
+) -> tuple[Any, dict[str, np.ndarray]]:
+    """The same with what follows from the constants alone as constants."""
+    roots = tuple(expressions_of(result))
+    fixed = {n for n in ordered(*roots) if n.leaves and n.leaves <= constants.keys()}
+    used = [a for n in ordered(*roots) if n not in fixed for a in n.operands]
+    needed = [n for n in dict.fromkeys([*used, *roots]) if n in fixed]
+    names = [f"constant {k}" for k in range(len(needed))]
+    instead: dict[Expression, Expression] = {
+        n: leaf(name, n.shape, n.dtype) for n, name in zip(needed, names, strict=True)
+    }
+    values = dict(zip(names, Program(needed)(constants), strict=True))
+    return mapped(result, lambda e: replaced(e, instead)), values
 
 
-def _longer(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with one more argument, which only lengthens the batch."""
-
-    def call(*values: Any) -> Any:
-        return function(*values[:-1])
-
-    return call
+def _is_one(stack: np.ndarray) -> bool:
+    return bool((stack == stack[:1]).all())
 
 
-def _column(numbers: Sequence[Any], axes: int) -> np.ndarray:
-    """Numbers of a group ``(group, *shape)``, as arrays with that many axes after the group's."""
-    rows = np.stack([np.asarray(n) for n in numbers])
-    rows = rows.reshape(len(rows), *(1,) * (axes - rows.ndim + 1), *rows.shape[1:])
-    rows.flags.writeable = False
-    return rows
+def _full(value: np.ndarray, shape: Shape) -> np.ndarray:
+    """A value with all its elements, where candidates have one for all of a plate."""
+    lead = value.shape[: value.ndim - len(shape)]
+    return value if value.shape == lead + shape else np.broadcast_to(value, lead + shape)
+
+
+def _leaf(read: Expression, name: str) -> Expression:
+    """The leaf of a name that elements are chosen from."""
+    while read.operands:
+        read = next(a for a in read.operands if name in a.leaves)
+    return read

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.structure.like_functions import LikeFunctions, Signature, Signatures, Slots, close
+from bayesmc.shapes import Shape
+from bayesmc.structure.like_functions import Signature, Slots, as_one
 
 if TYPE_CHECKING:  # a target recomputes its links with this
     from bayesmc.structure.target import Target, Values
@@ -93,41 +93,29 @@ class LikeLinks:
     ) -> None:
         self.target = target
         self.names = tuple(names)
-        self.alike = LikeFunctions(self.names, tuple(signatures))
+        self.function = as_one(signatures)
         scopes = [s.scope[:-1] for s in signatures]  # the last is the link itself
         sources = {name: tuple(s[i] for s in scopes) for i, name in enumerate(scopes[0])}
         self.slots = Slots(target, sources, len(names))
-        self.model = target.model
 
     def computed(self, values: Values) -> Values:
         """Values of all, each with the batch of the parents of all."""
         try:
-            found, batch = self.model.evaluate(self.names[0], self.slots.gathered(values))
+            found, batch = self._evaluated(self.slots.gathered(values))
         except BayesmcError:
             for name in self.names:  # the group knows the first one's name only
                 self.target.model.evaluate(name, values)
             raise
-        shape = self.model[self.names[0]].value_shape
+        shape = self.target.model[self.names[0]].value_shape
         full = np.broadcast_to(found, (*batch[:-1], len(self.names), *shape))
         rows = np.ascontiguousarray(np.moveaxis(full, len(batch) - 1, 0))
         rows.flags.writeable = False
         return dict(zip(self.names, rows, strict=True))
 
-    def settle(self, states: Values) -> bool:
-        """Take the numbers of all into one function; false where it does not say what all say."""
-        try:
-            if self.alike.varying:
-                model = self.alike.as_one(
-                    self.target, self.model, self.slots.gathered(states), states
-                )
-                if model is None:
-                    return False
-                self.model = model
-            with marking_invalid(), np.errstate(all="ignore"):
-                together = self.computed(states)
-        except BayesmcError:  # at some state, perhaps one that is impossible
-            return False
-        return all(close(v, np.broadcast_to(states[name], v.shape)) for name, v in together.items())
+    def _evaluated(self, values: Values) -> tuple[np.ndarray, Shape]:
+        if self.function is not None:
+            return self.function(values)
+        return self.target.model.evaluate(self.names[0], values)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -156,14 +144,11 @@ def _steps(
             groups.append([])
         groups[at].append(link)
         place[link] = at
-    return [step for group in groups for step in _as_one(target, group, signatures)]
+    return [step for group in groups for step in _as_one(target, group)]
 
 
-def _as_one(
-    target: Target, names: Sequence[str], signatures: Signatures
-) -> Sequence[str | LikeLinks]:
-    if len(names) < FEWEST or target.states is None:
+def _as_one(target: Target, names: Sequence[str]) -> Sequence[str | LikeLinks]:
+    if len(names) < FEWEST:
         return names
-    found = [signatures.of(n) for n in names]
-    group = LikeLinks(target, names, [s for s in found if s is not None])
-    return [group] if group.settle(target.states) else names
+    found = [target.signatures.of(n) for n in names]
+    return [LikeLinks(target, names, [s for s in found if s is not None])]

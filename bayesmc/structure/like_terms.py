@@ -3,24 +3,59 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError
-from bayesmc.network import Model
-from bayesmc.shapes import broadcast_shapes
-from bayesmc.structure.like_functions import (
-    LikeFunctions,
-    Slots,
-    close,
-)
+from bayesmc.distributions import Distribution, as_distribution
+from bayesmc.errors import BayesmcError, DensityError
+from bayesmc.expression import Program
+from bayesmc.shapes import Shape, broadcast_shapes
+from bayesmc.structure.like_functions import Signature, Slots, StackedFunction, as_one
+from bayesmc.structure.relation import Relation
 from bayesmc.structure.target import Target, Term, Values
 
 #: terms that are worth a group
 FEWEST = 4
+
+
+@dataclass(frozen=True, eq=False)
+class StackedTerm(Term):
+    """The first of some like terms whose functions differ in constants, for all of them.
+
+    It takes values ``(*lead, group, *plates, *event)`` by the names that the first one reads.
+    """
+
+    function: StackedFunction | None = None
+    #: which element of a parent in plates of its own each of its elements looks up
+    elements: Program | None = None
+
+    def distribution(self, values: Mapping[str, np.ndarray]) -> tuple[Distribution, Shape]:
+        """The distribution of all given their parents, and the batch shape of those."""
+        assert self.function is not None
+        made, batch = self.function(values)
+        dist = as_distribution(made)
+        assert dist is not None
+        return dist, batch
+
+    def keys(self, relation: Relation, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
+        """The indices along foreign plates by which a parent is looked up."""
+        assert self.function is not None and self.elements is not None
+        at = self.function.looked_up(self.elements, values)
+        along = np.unravel_index(at, relation.shape) if len(relation.shape) > 1 else (at,)
+        return tuple(along[relation.plates.index(p)] for p in relation.foreign)
+
+    def log(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Log factors of every element of all, shape ``(*lead, group, *plates)``."""
+        if not self.is_potential:
+            return super().log(values)
+        assert self.function is not None
+        found, batch = self.function(values)
+        log = np.asarray(found, dtype=float)
+        if not (log < np.inf).all():
+            raise DensityError(f"potential {self.name!r} is NaN or plus infinity")
+        return np.broadcast_to(log, batch + self.shape)
 
 
 class LikeTerms:
@@ -31,7 +66,7 @@ class LikeTerms:
     names : tuple of str
         The terms; the first stands for all.
     term : Term
-        The first, in ``model``; it reads what ``gathered`` returns.
+        The first, for all; it reads what ``gathered`` returns.
     shape : tuple of int
         Of the log factors: the group, then the plates.
     """
@@ -41,10 +76,6 @@ class LikeTerms:
         self.names = tuple(names)
         self.slots = slots
         self.shape = (len(names), *term.shape)
-
-    @property
-    def model(self) -> Model:
-        return self.term.model
 
     def gathered(self, values: Mapping[str, np.ndarray]) -> Values:
         """Values by the names that the first term reads, the group before the plates."""
@@ -62,29 +93,30 @@ class LikeTerms:
 class TermSum:
     """The sum of some terms, like ones evaluated as one.
 
-    Parameters
-    ----------
-    target : Target
-    terms : iterable of Term
+        Parameters
+        ----------
+        target : Target
+        terms : iterable of Term
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import bayesmc as bmc
-    >>> from bayesmc.network import pose
-    >>> from bayesmc.structure.like_terms import TermSum
-    >>> from bayesmc.structure.target import target_of
-    >>> net = bmc.BayesNet()
-    >>> net.add("rate", bmc.LogNormal(0.0, 1.0))
-    >>> for t in range(8):
-    ...     net.add(f"y[{t}]", lambda rate, t=t: bmc.Poisson(rate * (1 + t)))
-    >>> target = target_of(pose(net, {f"y[{t}]": t for t in range(8)}))
-    >>> total = TermSum(target, target.terms.values())
-    >>> [g.names[0] for g in total.groups], [t.name for t in total.alone]
-    (['y[0]'], ['rate'])
-    >>> values = {**target.known, "rate": np.array([0.5, 2.0])}
-    >>> np.allclose(total.log_density(values), target.log_density(values))
-    True
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import bayesmc as bmc
+        >>> from bayesmc.network import pose
+        >>> from bayesmc.structure.like_terms import TermSum
+        >>> from bayesmc.structure.relation import Relation
+    from bayesmc.structure.target import target_of
+        >>> net = bmc.BayesNet()
+        >>> net.add("rate", bmc.LogNormal(0.0, 1.0))
+        >>> for t in range(8):
+        ...     net.add(f"y[{t}]", lambda rate, t=t: bmc.Poisson(rate * (1 + t)))
+        >>> target = target_of(pose(net, {f"y[{t}]": t for t in range(8)}))
+        >>> total = TermSum(target, target.terms.values())
+        >>> [g.names[0] for g in total.groups], [t.name for t in total.alone]
+        (['y[0]'], ['rate'])
+        >>> values = {**target.known, "rate": np.array([0.5, 2.0])}
+        >>> np.allclose(total.log_density(values), target.log_density(values))
+        True
     """
 
     def __init__(self, target: Target, terms: Iterable[Term]) -> None:
@@ -106,21 +138,28 @@ class TermSum:
         return total
 
 
-def like_terms(target: Target, terms: Sequence[Term], states: Values) -> LikeTerms | None:
-    """Terms of equal signatures as one; None where their numbers do not broadcast."""
-    signatures = target.signatures
-    found = [signatures.of(t.name) for t in terms]
-    alike = LikeFunctions(tuple(t.name for t in terms), tuple(s for s in found if s is not None))
-    scopes = [s.scope for s in alike.signatures]
+def like_terms(target: Target, terms: Sequence[Term]) -> LikeTerms:
+    """Terms of equal signatures as one."""
+    found = [target.signatures.of(t.name) for t in terms]
+    signatures = [s for s in found if s is not None]
+    scopes = [s.scope for s in signatures]
     sources = {name: tuple(s[i] for s in scopes) for i, name in enumerate(scopes[0])}
     slots = Slots(target, sources, len(terms))
-    term = replace(terms[0], mask=alike.mask(target))
-    if alike.varying:
-        model = alike.as_one(target, target.model, slots.gathered(states), states)
-        if model is None:
-            return None
-        term = replace(term, model=model)
-    return LikeTerms(term, alike.names, slots)
+    return LikeTerms(one_term(terms, signatures), [t.name for t in terms], slots)
+
+
+def one_term(terms: Sequence[Term], signatures: Sequence[Signature]) -> Term:
+    """The first of some like terms, for all of them."""
+    first, mask = terms[0], None
+    if any(t.mask is not None for t in terms):
+        mask = np.stack([np.ones(t.shape, bool) if t.mask is None else t.mask for t in terms])
+    function = as_one(signatures)
+    if function is None:
+        return first if mask is None else replace(first, mask=mask)
+    return StackedTerm(
+        first.model, first.name, first.plates, first.shape, first.parents, first.is_potential,
+        mask, function,
+    )  # fmt: skip
 
 
 def like_groups(
@@ -140,36 +179,9 @@ def like_groups(
         if signature is not None:
             key = signature.key, repeated(signature.scope), None if also is None else also(term)
             alike.setdefault(key, []).append(term)
-    many = [g for g in alike.values() if len(g) >= FEWEST]
-    states = target.states if many else None
-    if states is None:
-        return []
-    found = []
-    for group in many:
-        made = like_terms(target, group, states)
-        if made is not None and _agrees(made, group, states):
-            found.append(made)
-    return found
+    return [like_terms(target, group) for group in alike.values() if len(group) >= FEWEST]
 
 
 def repeated(scope: Sequence[str]) -> tuple[int, ...]:
     """Which places of a scope hold the same name: those of a group must do so alike."""
     return tuple(scope.index(n) for n in scope)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _agrees(made: LikeTerms, terms: Sequence[Term], states: Values) -> bool:
-    """Whether terms as one say of some states what they say one by one."""
-    try:
-        with marking_invalid(), np.errstate(all="ignore"):
-            together = made.log(states)
-            alone = [t.log(states) for t in terms]
-    except BayesmcError:  # at some state, perhaps one that is impossible
-        return False
-    axis = together.ndim - len(made.shape)
-    rows = np.moveaxis(together, axis, 0)
-    return all(
-        close(row, np.broadcast_to(a, row.shape)) for row, a in zip(rows, alone, strict=True)
-    )

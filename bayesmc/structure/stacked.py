@@ -5,38 +5,33 @@ blanket of one of them then serves all: its neighbours' names stand for arrays i
 of them are stacked, with the group as one more batch axis, after the chains. Functions broadcast over batch
 axes, so nothing else has to know.
 
-Numbers by which the functions of a group differ (``t=t``) are stacked as well, but a function need not
-broadcast over those; the stacked blanket is compared with the single ones on a few states, and what does not
-agree is left alone.
+Constants by which the functions of a group differ (``t=t``) are stacked as well (``like_functions``).
 """
 
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_functions import (
-    LikeFunctions,
     Signature,
     Slots,
-    close,
-    in_model,
+    StackedFunction,
+    as_one,
     stack_arrays,
     value_key,
 )
+from bayesmc.structure.like_terms import one_term
 from bayesmc.structure.target import Target, Values
 
 #: nodes that are worth a group
 FEWEST = 4
-#: values of finite nodes that are tried, to compare a stack with its members
-_TRIED = 6
 
 
 class StackedBlanket:
@@ -89,7 +84,10 @@ class StackedBlanket:
 
 
 def stacks(
-    target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]
+    target: Target,
+    blankets: Mapping[str, Blanket],
+    names: Sequence[str],
+    forms: Forms | None = None,
 ) -> tuple[list[StackedBlanket], list[str]]:
     """Groups of like nodes that may be updated as one, and the nodes that are left.
 
@@ -99,6 +97,8 @@ def stacks(
         Of every chain node (or of ``names`` at least).
     names : sequence of str
         Chain nodes to be grouped.
+    forms : Forms, optional
+        Of the target, where they are known.
 
     Returns
     -------
@@ -128,8 +128,8 @@ def stacks(
     """
     if len(names) < FEWEST:
         return [], list(names)
-    forms = _Forms(target)
-    alike: dict[Hashable, list[_Form]] = {}
+    forms = Forms(target) if forms is None else forms
+    alike: dict[Hashable, list[Form]] = {}
     for name in names:
         form = forms.of(blankets[name])
         if form is not None:
@@ -137,23 +137,14 @@ def stacks(
     found: list[StackedBlanket] = []
     for group in alike.values():
         for members in _apart(group):
-            if len(members) < FEWEST:
-                continue
-            states = target.states
-            if states is None:
-                return [], list(names)
-            stack = _stacked(target, members, states)
-            if stack is not None:
-                found.append(stack)
+            if len(members) >= FEWEST:
+                found.append(_stacked(target, members))
     taken = {n for stack in found for n in stack.names}
     return found, [n for n in names if n not in taken]
 
 
-# ---- private ------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
-class _Form:
+class Form:
     """A blanket in a way that can be compared.
 
     Attributes
@@ -172,17 +163,38 @@ class _Form:
     signatures: tuple[Signature, ...]
     others: tuple[str, ...]
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All nodes around, like ones in like places."""
+        return (self.blanket.name, *self.parts, *self.others)
 
-class _Forms:
-    """Reads blankets; signatures get numbers, so that parts can be brought into one order."""
+    def said_of(self, like: Form, words: str) -> str:
+        """What is said of this node as it is of one that is like it."""
+        names = dict(zip(self.names, like.names, strict=True))
+        return re.sub(r"'([^']*)'", lambda m: f"'{names.get(m[1], m[1])}'", words)
+
+
+class Forms:
+    """The forms of a target's nodes, each found once; parts are brought into one order."""
 
     def __init__(self, target: Target) -> None:
         self.target = target
         self._signatures = target.signatures
         self._numbers: dict[Hashable, int] = {}
+        self._found: dict[str, Form | None] = {}
 
-    def of(self, blanket: Blanket) -> _Form | None:
+    def of(self, blanket: Blanket) -> Form | None:
         """The form of a blanket; None where its node is updated in turns, or in other ways."""
+        if blanket.name not in self._found:
+            self._found[blanket.name] = self._read(blanket)
+        return self._found[blanket.name]
+
+    def key(self, blanket: Blanket) -> Hashable | None:
+        """Equal for nodes around which functions, and what is known, are alike; None of no form."""
+        form = self.of(blanket)
+        return form and (form.key, tuple(map(self.target.is_known, form.names)))
+
+    def _read(self, blanket: Blanket) -> Form | None:
         node = blanket.node
         if blanket.classes != (None,) or self.target.seen(blanket.name) is not None:
             return None
@@ -204,7 +216,7 @@ class _Forms:
         pattern = tuple(tuple(place[n] for n in scope) for scope in read)
         shape = (len(blanket.path), len(own))
         key = (value_key(node), node.support, shape, numbers, pattern)
-        return _Form(key, blanket, parts, signatures, others)
+        return Form(key, blanket, parts, signatures, others)
 
     def _number(self, name: str, roles: Mapping[str, Hashable]) -> int:
         """A number for what a part is, and where it reads the node and what is on its path."""
@@ -215,7 +227,10 @@ class _Forms:
         return self._numbers.setdefault(key, len(self._numbers))
 
 
-def _apart(group: Sequence[_Form]) -> Iterator[list[_Form]]:
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _apart(group: Sequence[Form]) -> Iterator[list[Form]]:
     """Like nodes by colour: those of one share no term."""
     if len(group) < FEWEST:
         return
@@ -229,65 +244,33 @@ def _apart(group: Sequence[_Form]) -> Iterator[list[_Form]]:
         yield [group[i] for i in members]
 
 
-def _stacked(target: Target, forms: Sequence[_Form], states: Values) -> StackedBlanket | None:
-    """The stack of some nodes that are alike and apart; None where it would not say what they say."""
-    try:
-        one = _representative(target, forms, states)
-        if one is None:
-            return None
-        slots = Slots(target, _sources(forms), len(forms))
-        stack = StackedBlanket(one, [f.blanket for f in forms], slots)
-        return stack if _agrees(stack, states) else None
-    except BayesmcError:  # at some state, perhaps one that is impossible
-        return None
+def _stacked(target: Target, forms: Sequence[Form]) -> StackedBlanket:
+    """The stack of some nodes that are alike and apart."""
+    slots = Slots(target, _sources(forms), len(forms))
+    return StackedBlanket(_representative(target, forms), [f.blanket for f in forms], slots)
 
 
-def _sources(forms: Sequence[_Form], with_path: bool = False) -> dict[str, tuple[str, ...]]:
+def _sources(forms: Sequence[Form]) -> dict[str, tuple[str, ...]]:
     """What each name around the first node stands for."""
     first = forms[0]
     found = {first.blanket.name: tuple(f.blanket.name for f in forms)}
     for at, name in enumerate(first.others):
         found[name] = tuple(f.others[at] for f in forms)
-    for at, name in enumerate(first.blanket.path if with_path else ()):
-        found[name] = tuple(f.parts[at] for f in forms)
     return found
 
 
-def _representative(target: Target, forms: Sequence[_Form], states: Values) -> Blanket | None:
-    """The first node's blanket, where need be in a model whose functions have the numbers of all."""
+def _representative(target: Target, forms: Sequence[Form]) -> Blanket:
+    """The first node's blanket, where need be with functions that have the constants of all."""
     first = forms[0]
-    gathered = Slots(target, _sources(forms, with_path=True), len(forms)).gathered(states)
-    model, terms = target.model, dict(target.terms)
+    terms, links = dict(target.terms), dict[str, StackedFunction]()
     for at, name in enumerate(first.parts):
-        alike = LikeFunctions(
-            tuple(f.parts[at] for f in forms), tuple(f.signatures[at] for f in forms)
-        )
+        signatures = [f.signatures[at] for f in forms]
         if name in terms:
-            terms[name] = replace(terms[name], mask=alike.mask(target))
-        if alike.varying:
-            made = alike.as_one(target, model, gathered, states)
-            if made is None:
-                return None
-            model = made
-    if model is target.model and all(terms[n].mask is t.mask for n, t in target.terms.items()):
+            terms[name] = one_term([target.terms[f.parts[at]] for f in forms], signatures)
+            continue
+        function = as_one(signatures)
+        if function is not None:
+            links[name] = function
+    if not links and all(terms[n] is t for n, t in target.terms.items()):
         return first.blanket
-    return Blanket(in_model(target, model, terms), first.blanket.name)
-
-
-def _agrees(stack: StackedBlanket, states: Values) -> bool:
-    """Whether the stack says of some states, with values in other states' places, what its members say."""
-    now = stack.current(states)
-    if stack.one.node.domain is not None:
-        size = stack.one.node.domain.size
-        tried = [(now + k) % size for k in range(min(size, _TRIED))]
-    else:
-        tried = [now, np.roll(now, 1, axis=0), np.roll(now, 1, axis=1)]
-    candidate = np.stack(tried).astype(now.dtype)
-    shape = candidate.shape[: candidate.ndim - len(stack.one.event_shape)]
-    with marking_invalid(), np.errstate(all="ignore"):
-        together = np.broadcast_to(stack.log_density(states, candidate), shape)
-        for i, blanket in enumerate(stack.blankets):
-            alone = blanket.log_density(states, candidate[:, :, i])
-            if not close(together[:, :, i], np.broadcast_to(alone, shape[:2] + shape[3:])):
-                return False
-    return True
+    return Blanket(replace(target, terms=terms, stacked_links=links, _below={}), first.blanket.name)

@@ -23,7 +23,7 @@ from bayesmc.network.expressions import Followed, Opaque, density, log_density_o
 from bayesmc.network.model import invalid_error
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
-from bayesmc.structure.like_functions import Signatures
+from bayesmc.structure.like_functions import Signatures, StackedFunction
 from bayesmc.structure.like_links import FEWEST, LinkSteps
 
 Values = dict[str, np.ndarray]
@@ -173,6 +173,8 @@ class Target:
     terms: dict[str, Term]
     #: deterministic nodes between the chain and the terms, parents first
     links: tuple[str, ...]
+    #: deterministic nodes that stand for like ones, with other constants than the model's
+    stacked_links: Mapping[str, StackedFunction] = field(default_factory=dict, repr=False)
     _below: dict[str, tuple[str, ...]] = field(default_factory=dict, repr=False)
 
     @property
@@ -283,9 +285,11 @@ class Target:
 
     def compute(self, values: Values, links: tuple[str, ...]) -> None:
         """Recompute some deterministic nodes, given parents first; many like ones in one call."""
-        if len(links) < FEWEST:
+        if len(links) < FEWEST or self.stacked_links:
             for link in links:
-                values[link], _ = self.model.evaluate(link, values)
+                stacked = self.stacked_links.get(link)
+                found = self.model.evaluate(link, values) if stacked is None else stacked(values)
+                values[link] = found[0]
             return
         steps = self._link_steps.get(links)
         if steps is None:

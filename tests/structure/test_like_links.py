@@ -176,7 +176,7 @@ def test_the_wrong_neighbours_are_noticed() -> None:
     turned = {**sources, "x[0]": (*sources["x[0]"][1:], "x[0]")}
     for wrong in (
         {"slots": Slots(target, turned, 7)},
-        {"model": target.model},
+        {"function": None},
     ):
         right = dict(vars(group))
         vars(group).update(wrong)
@@ -207,9 +207,10 @@ def test_an_error_names_the_node_at_fault() -> None:
         return np.sqrt(x - least)
 
     net = bmc.BayesNet()
+    above = lambda x: root(x, -1.0)  # noqa: E731
     for t in range(5):
         net.add(f"x[{t}]", bmc.Exponential(1.0))
-        net.add(f"m[{t}]", lambda x: root(x, -1.0), parents=[f"x[{t}]"])
+        net.add(f"m[{t}]", above, parents=[f"x[{t}]"])
     target = target_of(pose(net, seen(net, [f"m[{t}]" for t in range(5)])))
     assert isinstance(LinkSteps(target, target.links).steps[0], LikeLinks)
     values = a_state(target, 0)

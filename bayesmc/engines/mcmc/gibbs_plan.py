@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -34,7 +34,7 @@ from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_children import with_like_children
-from bayesmc.structure.stacked import stacks
+from bayesmc.structure.stacked import Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
 #: components that move together along learnt directions, at most
@@ -171,19 +171,12 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     ]
     blocks += vectors
     joined |= {n for b in vectors for n in b.names}
-    kernels, constraints = _finite(target, blankets, debug)
-    refusals: dict[str, str] = {}
-    numbers = []
-    for name in names:
-        if name in joined or target.model[name].domain is not None:
-            continue
-        kernel = conjugate_kernel(blankets[name], debug)
-        if isinstance(kernel, Kernel):
-            kernels.append(kernel)
-        else:
-            refusals[name] = kernel
-            numbers.append(name)
-    kernels += _numbers(target, blankets, numbers)
+    forms = Forms(target)
+    kernels, constraints = _finite(target, blankets, forms, debug)
+    left = [n for n in names if n not in joined and target.model[n].domain is None]
+    conjugate, refusals = _conjugate(blankets, forms, left, debug)
+    kernels += conjugate
+    kernels += _numbers(target, blankets, forms, list(refusals))
     for block in blocks:
         scales = governing(target, block, blankets)
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
@@ -198,6 +191,31 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 
+def _conjugate(
+    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool
+) -> tuple[list[Kernel], dict[str, str]]:
+    """Kernels of nodes with a closed form, and why others have none: of like nodes one is asked."""
+    kernels: list[Kernel] = []
+    refusals: dict[str, str] = {}
+    asked: dict[Hashable, str] = {}
+    for name in names:
+        key = forms.key(blankets[name])
+        first = None if key is None else asked.get(key)
+        if first is not None:
+            one, other = forms.of(blankets[first]), forms.of(blankets[name])
+            assert one is not None and other is not None
+            refusals[name] = one.said_of(other, refusals[first])
+            continue
+        kernel = conjugate_kernel(blankets[name], debug)
+        if isinstance(kernel, Kernel):
+            kernels.append(kernel)
+        else:
+            refusals[name] = kernel
+            if key is not None:
+                asked[key] = name
+    return kernels, refusals
+
+
 def _is_slice(kernel: Kernel) -> bool:
     return isinstance(
         kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice)
@@ -205,7 +223,7 @@ def _is_slice(kernel: Kernel) -> bool:
 
 
 def _finite(
-    target: Target, blankets: Mapping[str, Blanket], debug: bool
+    target: Target, blankets: Mapping[str, Blanket], forms: Forms, debug: bool
 ) -> tuple[list[Kernel], tuple[str, ...]]:
     """Kernels of the finite nodes that have a blanket, and those that these may leave stuck."""
     names = [n for n in blankets if target.model[n].domain is not None]
@@ -241,14 +259,16 @@ def _finite(
             kernels.append(kernel)
         else:
             alone.append(block[0])
-    groups, alone = stacks(target, blankets, alone)
+    groups, alone = stacks(target, blankets, alone, forms)
     kernels += [Stacked(group, Enumerate) for group in groups]
     kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
     tied = deterministic_constraints(target, [*joined, *blocks], terms)
     return kernels, (*tight, *(n for n in tied if n in blankets))
 
 
-def _numbers(target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]) -> list[Kernel]:
+def _numbers(
+    target: Target, blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str]
+) -> list[Kernel]:
     """Kernels of nodes without a closed form that have too many values to try."""
     kernels: list[Kernel] = []
     left = []
@@ -259,7 +279,7 @@ def _numbers(target: Target, blankets: Mapping[str, Blanket], names: Sequence[st
             kernels.append(Jump(blankets[name]))
         else:
             kernels.append(AdaptiveWalk(blankets[name]))
-    stacked, left = stacks(target, blankets, left)
+    stacked, left = stacks(target, blankets, left, forms)
     kernels += [Stacked(group, Slice) for group in stacked]
     for group in _together(target, blankets, left):
         if len(group) > 1 or target.model[group[0]].event_shape:

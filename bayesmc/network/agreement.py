@@ -1,0 +1,164 @@
+"""Whether what was read of a function gives what the function gives, at probe points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import Distribution, as_distribution
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError, TraceError
+from bayesmc.expression import Program, rebuilt
+from bayesmc.network.model import CompiledNode, Model
+from bayesmc.shapes import Shape
+
+#: how far an expression may be off what the function gives, relative to the largest entry
+_RTOL = 1e-11
+
+
+class Probe(dict[str, np.ndarray]):
+    """Stored values of all nodes at probe points; of deterministic ones as they are asked for."""
+
+    def __init__(self, model: Model, variant: int) -> None:
+        super().__init__()
+        self.model, self.variant = model, variant
+        self._place = {n: k for k, n in enumerate(model.nodes)}
+
+    @classmethod
+    def of(cls, model: Model, variant: int) -> Probe:
+        known = model.cache.setdefault("expression probes", {})
+        if variant not in known:
+            known[variant] = cls(model, variant)
+        return known[variant]
+
+    def __missing__(self, name: str) -> np.ndarray:
+        node = self.model[name]
+        if node.kind == "deterministic":
+            for above in deterministic_above(self.model, name, self):
+                self[above] = self.model.evaluate(above, self)[0]
+            value = self.model.evaluate(name, self)[0]
+        else:
+            value = self.model.probe[name]
+            rank = value.ndim - len(node.value_shape)
+            value = VARIANTS[self.variant](value, rank, self._place[name])
+        self[name] = value
+        return value
+
+
+#: unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks
+VARIANTS: tuple[Callable[[np.ndarray, int, int], np.ndarray], ...] = (
+    lambda v, rank, _: v,
+    lambda v, rank, _: v[-1] if rank == 2 else v,
+    lambda v, rank, _: v[(0,) * rank],
+    lambda v, rank, k: (v, v[0], v[:, :1], v[0, 0])[k % 4] if rank == 2 else v,
+)
+
+
+def deterministic_above(model: Model, name: str, known: Mapping[str, Any]) -> list[str]:
+    """Deterministic nodes above one that are not known, those first on which others depend."""
+    found: dict[str, None] = {}
+    todo = [(name, False)]
+    while todo:
+        above, is_done = todo.pop()
+        if is_done:
+            found[above] = None
+            continue
+        if above != name:
+            todo.append((above, True))
+        parents = (
+            model[above].parents if above in model.nodes else model.potentials[above][0].parents
+        )
+        todo += [
+            (p, False)
+            for p in parents
+            if model[p].kind == "deterministic" and p not in known and p not in found
+        ]
+    return list(found)
+
+
+def hold_against(
+    model: Model,
+    name: str,
+    result: Any,
+    program: Program,
+    given: Callable[[Probe], Mapping[str, np.ndarray]],
+    variant: int,
+) -> None:
+    """Refuse what was read of a node or potential where its function gives something else.
+
+    Parameters
+    ----------
+    result : Family, Expression or Distribution
+    program : Program
+        Of its expressions.
+    given : callable
+        From values of all nodes to those of the program's leaves.
+    variant : int
+        Which of the probes.
+
+    Raises
+    ------
+    TraceError
+    """
+    values = Probe.of(model, variant)
+    is_node = name in model.nodes
+    with marking_invalid(), np.errstate(all="ignore"):
+        try:
+            if is_node:
+                expected, batch = model.evaluate(name, values)
+                shape = batch + model[name].plate_shape
+            else:
+                expected = model.potential(name, values, total=False)
+                shape = expected.shape
+            leaves = given(values)
+        except BayesmcError:
+            return  # the function's own fault, or out of range: nothing to compare
+        try:
+            made = rebuilt(result, iter(program(leaves)))
+            if is_node and model[name].is_stochastic and not isinstance(made, Distribution):
+                made = as_distribution(made)
+        except (BayesmcError, ValueError, TypeError, IndexError) as error:
+            raise TraceError(f"what was read of it fails: {error}") from error
+        if not _agree(model.nodes.get(name), expected, made, shape):
+            raise TraceError("what was read of it gives other values than the function")
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _agree(node: CompiledNode | None, expected: Any, made: Any, shape: Shape) -> bool:
+    if isinstance(expected, Distribution) != isinstance(made, Distribution):
+        return False
+    if not isinstance(expected, Distribution):
+        full = shape if node is None else shape + node.event_shape
+        stored = np.asarray(expected)
+        value = node.decode(stored) if node is not None and node.domain is not None else stored
+        return _near(np.asarray(value), np.broadcast_to(np.asarray(made), full))
+    if type(expected) is not type(made):
+        return False
+    pairs = zip(expected.parameters(), made.parameters(), strict=True)
+    for (a, n), (b, m) in pairs:
+        if n != m:
+            return False
+        first = np.broadcast_to(a, shape + a.shape[a.ndim - n :] if n else shape)
+        second = np.broadcast_to(b, shape + b.shape[b.ndim - n :] if n else shape)
+        if not _near(first, second):
+            return False
+    return True
+
+
+def _near(a: np.ndarray, b: np.ndarray) -> bool:
+    if a.shape != b.shape:
+        return False
+    a, b = np.asarray(a), np.asarray(b)
+    if (a == b).all():
+        return True
+    if a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
+        return False
+    a, b = a.astype(float), b.astype(float)
+    scale = np.maximum(np.abs(a), np.abs(b))
+    largest = np.max(np.where(np.isfinite(scale), scale, 0.0), initial=0.0)
+    near = np.abs(a - b) <= _RTOL * (np.where(np.isfinite(scale), scale, 0.0) + 1e-3 * largest)
+    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
