@@ -112,7 +112,7 @@ class Conjugate(Kernel):
     @cached_property
     def _whole(self) -> NormalDraw | InverseWishartDraw | None:
         """Natural parameters and draw as one program, where all children are summed by labels or fixed."""
-        make = {"mean": NormalDraw, "covariance": InverseWishartDraw}.get(self.kind.name)
+        make: Any = {"mean": NormalDraw, "covariance": InverseWishartDraw}.get(self.kind.name)
         classes = self.blanket.classes
         if make is None or not self._constant or len(classes) > 1 or classes[0] is not None:
             return None

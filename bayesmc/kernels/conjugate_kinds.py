@@ -139,7 +139,8 @@ class MeanVector(Kind):
     def draw(
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
-        draw = normal_draw(rng, *naturals, shape)
+        precision, linear = naturals
+        draw = normal_draw(rng, precision, linear, shape)
         return draw if math.isfinite(draw.sum()) else None
 
 
@@ -258,7 +259,8 @@ class Covariance(Kind):
     def draw(
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
-        return inverse_wishart_draw(rng, *naturals, shape)
+        df, scale = naturals
+        return inverse_wishart_draw(rng, df, scale, shape)
 
 
 #: all kinds, in the order in which they are tried for a flat prior
