@@ -49,20 +49,20 @@ from bayesmc.distributions import (
 )
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact import Exact
-from bayesmc.engines.gibbs import Gibbs
 from bayesmc.engines.grid.filter import GridFilter
-from bayesmc.engines.importance import Importance
 from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
-from bayesmc.engines.metropolis import MetropolisHastings
-from bayesmc.engines.metropolis_proposals import Independence, RandomWalk
+from bayesmc.engines.mcmc.gibbs import Gibbs
+from bayesmc.engines.mcmc.metropolis import MetropolisHastings
+from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
 from bayesmc.engines.particles.counts import KLD
 from bayesmc.engines.particles.filter import ParticleFilter
 from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.rejection import Rejection
-from bayesmc.engines.weighting import LikelihoodWeighting
+from bayesmc.engines.weighted.importance import Importance
+from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
+from bayesmc.engines.weighted.rejection import Rejection
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.engines.chains import ChainEngine
-from bayesmc.engines.gibbs import Gibbs
-from bayesmc.engines.gibbs_plan import Plan
-from bayesmc.engines.metropolis import MetropolisHastings
-from bayesmc.engines.weighting import LikelihoodWeighting
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.gibbs import Gibbs
+from bayesmc.engines.mcmc.gibbs_plan import Plan
+from bayesmc.engines.mcmc.metropolis import MetropolisHastings
+from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.random_walk import AdaptiveWalk

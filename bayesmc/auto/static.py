@@ -12,10 +12,10 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.exact import Exact, readable_bytes
 from bayesmc.engines.exact_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
-from bayesmc.engines.gibbs import Gibbs
-from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import Gibbs
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.engines.unrolled import pose_any
-from bayesmc.engines.weighting import LikelihoodWeighting
+from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import BayesNet, FactorGraph, Problem
 from bayesmc.randomness import seed_sequence

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.unrolled import pose_any, series_of
-from bayesmc.engines.weighted import check_count
+from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import BayesmcError
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled

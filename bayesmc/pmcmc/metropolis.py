@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
-from bayesmc.engines.weighted import treatment
+from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.network import Problem
 from bayesmc.pmcmc.base import ParticleEngine

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.engines.starting import start_states
-from bayesmc.engines.sweep import SweepSampler
+from bayesmc.engines.mcmc.starts import start_states
+from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.errors import ZeroProbabilityError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.densities import instead

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import scipy.special
 
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.adaptation import chance
 from bayesmc.kernels.base import Memory
 from bayesmc.kernels.densities import accepted, instead

@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 import bayesmc as bmc
-from bayesmc.engines import gibbs_plan
+from bayesmc.engines.mcmc import gibbs_plan
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.testing import session
 

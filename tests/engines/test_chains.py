@@ -22,8 +22,8 @@ from arviz_stats.base import array_stats
 import bayesmc as bmc
 from bayesmc import diagnostics
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.chains import ChainEngine
-from bayesmc.engines.convergence import poor_acceptance, poor_mixing
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing
 from bayesmc.errors import ConvergenceWarning, DensityError, InterruptWarning, UnsupportedError
 from bayesmc.network import Problem, pose
 from bayesmc.randomness import Purpose, seed_sequence, stream

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.network import Problem
 from bayesmc.testing import session

@@ -163,7 +163,7 @@ def test_the_same_seed_gives_the_same_draws() -> None:
 
 
 def test_interrupted_chains_keep_what_they_have(monkeypatch: pytest.MonkeyPatch) -> None:
-    from bayesmc.engines.sweep import SweepSampler
+    from bayesmc.engines.mcmc.sweep import SweepSampler
 
     net, evidence = mixture()
     step, calls = SweepSampler.step, []

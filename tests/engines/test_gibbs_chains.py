@@ -16,7 +16,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.diagnostics import chain_statistic
-from bayesmc.engines import gibbs_plan
+from bayesmc.engines.mcmc import gibbs_plan
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.testing import session
 from bayesmc.testing.posteriors.matching import assert_matches

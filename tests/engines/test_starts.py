@@ -11,8 +11,8 @@ from scipy.special import expit
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.gibbs_plan import plan_of
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import (
     EvidenceError,
     ModelError,

@@ -12,7 +12,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel, full_conditional
 from bayesmc.kernels.conjugate_kinds import KINDS, RootOf

@@ -10,8 +10,8 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.gibbs_plan import plan_of
-from bayesmc.engines.sweep import SweepSampler
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel

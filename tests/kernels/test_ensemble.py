@@ -14,7 +14,7 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.adaptation import Steps
 from bayesmc.kernels.densities import Block
 from bayesmc.kernels.ensemble import BlockWalk, parts_of, stragglers

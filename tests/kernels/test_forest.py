@@ -13,7 +13,7 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.errors import ConvergenceWarning, ParameterError, ZeroProbabilityError
 from bayesmc.kernels.forest import Forest
 from bayesmc.kernels.forest_block import ForestBlock

@@ -14,7 +14,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_order
 from bayesmc.kernels.gaussian_band import Band, Blocks, Pattern

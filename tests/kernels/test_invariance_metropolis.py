@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.metropolis_proposals import Independence, read_proposals
+from bayesmc.engines.mcmc.proposals import Independence, read_proposals
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.proposed import Proposed, ProposedBlock

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.gibbs_plan import plan_of
-from bayesmc.engines.sweep import SweepSampler
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.conjugate_pairs import PAIRS

@@ -17,7 +17,7 @@ from scipy import stats
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.adaptation import Steps, best_rate
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.jump import Jump

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines import gibbs_plan
+from bayesmc.engines.mcmc import gibbs_plan
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.rescaled import Rescaled, rescaled_kernels
 from bayesmc.network import pose

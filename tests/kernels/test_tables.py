@@ -10,7 +10,7 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels import tables
 from bayesmc.kernels.conditionals import FiniteTerms, conditional_of

@@ -409,7 +409,7 @@ MUTANTS = [
     ),
     Mutant(
         "a deterministic node is stale",
-        (Edit("bayesmc.engines.sweep:SweepSampler.step",
+        (Edit("bayesmc.engines.mcmc.sweep:SweepSampler.step",
               "self.target.refresh(values, kernel.names)", "pass"),),
         matched(linked, {"y": 2.7}, bmc.Gibbs(draws=10, warmup=30, chains=300)),
         "compare with exact(), 300 chains of 10 draws",

@@ -135,7 +135,7 @@ MUTANTS = [
     ),
     Mutant(
         "the evidence is averaged over one draw too many",
-        (Edit("bayesmc.engines.weighted:WeightedEngine._set_evidence",
+        (Edit("bayesmc.engines.weighted.drawing:WeightedEngine._set_evidence",
               "log_total - float(np.log(draws))", "log_total - float(np.log(draws + 1))"),),
         evidence_of(mixture, SEEN, bmc.LikelihoodWeighting(5), 500),
         "unbiased_evidence_test, 500 runs of 5 draws",
@@ -149,7 +149,7 @@ MUTANTS = [
     ),
     Mutant(
         "rejection by a bound that is too low",
-        (Edit("bayesmc.engines.rejection:Rejection._fill",
+        (Edit("bayesmc.engines.weighted.rejection:Rejection._fill",
               "np.exp(chunk.log_weight)", "np.exp(chunk.log_weight + 1.0)"),),
         matched(mixture, SEEN, bmc.Rejection(3000)),
         "compare with exact(), 3000 draws",

@@ -10,7 +10,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.engines.forward import fast_steps
-from bayesmc.engines.weighted import passes
+from bayesmc.engines.weighted.drawing import passes
 from bayesmc.errors import ParameterError
 from bayesmc.network import pose
 from bayesmc.randomness import seed_sequence

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines import start_faults
+from bayesmc.engines.mcmc import start_faults
 from bayesmc.errors import EvidenceError, ModelError, ParameterError, UnsupportedError
 
 #: runs are short

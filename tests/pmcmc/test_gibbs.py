@@ -18,7 +18,7 @@ import scipy.special
 
 import bayesmc as bmc
 from bayesmc.distributions import marking_invalid
-from bayesmc.engines import starting
+from bayesmc.engines.mcmc import starts as starting
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import ReducibleWarning, UnsupportedError
 from bayesmc.pmcmc import ParticleGibbs

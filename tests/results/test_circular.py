@@ -7,7 +7,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.metropolis_proposals import RandomWalk
+from bayesmc.engines.mcmc.proposals import RandomWalk
 from bayesmc.network import pose
 from bayesmc.results import DrawsPosterior
 from bayesmc.robotics.pose_distributions import AndAngle, PoseNormal

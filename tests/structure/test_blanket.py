@@ -7,7 +7,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours

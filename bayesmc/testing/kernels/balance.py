@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import scipy.special
 
-from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.errors import BudgetError, ShapeError, UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.network import BayesNet, FactorGraph, pose

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.chains import ChainEngine
-from bayesmc.engines.sweep import SweepSampler
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.conjugate import Conjugate

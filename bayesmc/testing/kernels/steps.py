@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.engines.chains import ChainEngine
+from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.errors import BayesmcError, EvidenceError, ModelError
 from bayesmc.kernels.base import Kernel
 from bayesmc.network.evidence import store

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.diagnostics import chain_statistic, weight_ess
-from bayesmc.engines.weighting import LikelihoodWeighting
+from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import DensityError, ShapeError, UnknownNodeError
 from bayesmc.network import Model
 from bayesmc.network.evidence import store

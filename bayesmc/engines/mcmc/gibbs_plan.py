@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from bayesmc.engines.base import Treatment
-from bayesmc.engines.weighted import treatment
+from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conditionals import FiniteTerms
@@ -140,7 +140,7 @@ def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None 
     Examples
     --------
     >>> import bayesmc as bmc
-    >>> from bayesmc.engines.gibbs_plan import plan_of
+    >>> from bayesmc.engines.mcmc.gibbs_plan import plan_of
     >>> from bayesmc.network import pose
     >>> net = bmc.BayesNet()
     >>> net.add("rate", bmc.Gamma(1.0, 1.0))

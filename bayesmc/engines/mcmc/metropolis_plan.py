@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bayesmc.engines.metropolis_proposals import RandomWalk, Read, read_proposals
-from bayesmc.engines.weighted import treatment
+from bayesmc.engines.mcmc.proposals import RandomWalk, Read, read_proposals
+from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk, parts_of
 from bayesmc.kernels.jump import Jump

@@ -36,7 +36,7 @@ def difference(
     Examples
     --------
     >>> import bayesmc as bmc
-    >>> from bayesmc.engines.question import difference
+    >>> from bayesmc.engines.mcmc.question import difference
     >>> from bayesmc.network import pose
     >>> def asked(scale):
     ...     net = bmc.BayesNet()

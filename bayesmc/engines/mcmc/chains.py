@@ -19,13 +19,13 @@ import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
-from bayesmc.engines.convergence import poor_acceptance, poor_mixing
-from bayesmc.engines.funnels import missed_ends
-from bayesmc.engines.never_left import never_left
-from bayesmc.engines.question import difference
-from bayesmc.engines.start_values import frozen_start, read_start
+from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing
+from bayesmc.engines.mcmc.funnels import missed_ends
+from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.start_values import frozen_start, read_start
+from bayesmc.engines.mcmc.unvisited import never_left
 from bayesmc.engines.unrolled import series_of
-from bayesmc.engines.weighted import check_count, no_memory
+from bayesmc.engines.weighted.drawing import check_count, no_memory
 from bayesmc.errors import (
     BayesmcError,
     ConvergenceWarning,

@@ -12,8 +12,8 @@ import math
 import numpy as np
 
 from bayesmc.distributions.transforms import transform_of
-from bayesmc.engines.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
-from bayesmc.engines.start_faults import fault_at, impossible, refuse_impossible
+from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
+from bayesmc.engines.mcmc.start_faults import fault_at, impossible, refuse_impossible
 from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError
 from bayesmc.kernels.enumerate import draw_states
 from bayesmc.network import CompiledNode

@@ -16,7 +16,7 @@ from bayesmc import diagnostics
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.forward import chunk_sizes
-from bayesmc.engines.question import difference
+from bayesmc.engines.mcmc.question import difference
 from bayesmc.errors import BudgetError, LowEssWarning, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem
 from bayesmc.network.forward import Pass, Step, run

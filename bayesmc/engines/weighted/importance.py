@@ -18,7 +18,7 @@ from bayesmc.engines.proposal import (
     check_targets,
 )
 from bayesmc.engines.proposing import proposal_steps
-from bayesmc.engines.weighted import WeightedEngine, check_count, treatment
+from bayesmc.engines.weighted.drawing import WeightedEngine, check_count, treatment
 from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.network import Problem

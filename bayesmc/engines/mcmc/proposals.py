@@ -47,8 +47,8 @@ class RandomWalk:
     Examples
     --------
     >>> import bayesmc as bmc
-    >>> from bayesmc.engines.metropolis import MetropolisHastings
-    >>> from bayesmc.engines.metropolis_proposals import RandomWalk
+    >>> from bayesmc.engines.mcmc.metropolis import MetropolisHastings
+    >>> from bayesmc.engines.mcmc.proposals import RandomWalk
     >>> net = bmc.BayesNet()
     >>> net.add("x", bmc.Normal(0.0, 1.0))
     >>> net.add("y", lambda x: bmc.Normal(x, 1.0))
@@ -108,8 +108,8 @@ class Independence:
     Examples
     --------
     >>> import bayesmc as bmc
-    >>> from bayesmc.engines.metropolis import MetropolisHastings
-    >>> from bayesmc.engines.metropolis_proposals import Independence
+    >>> from bayesmc.engines.mcmc.metropolis import MetropolisHastings
+    >>> from bayesmc.engines.mcmc.proposals import Independence
     >>> net = bmc.BayesNet()
     >>> net.add("x", bmc.Normal(0.0, 1.0))
     >>> net.add("y", lambda x: bmc.Normal(x, 1.0))

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from bayesmc.engines.forward import fast_steps
-from bayesmc.engines.weighted import WeightedEngine, check_count, treatment
+from bayesmc.engines.weighted.drawing import WeightedEngine, check_count, treatment
 from bayesmc.network import Problem
 from bayesmc.network.forward import Step, refuse_noiseless, refuse_unsampled, whole
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.forward import fast_steps
-from bayesmc.engines.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.redrawn import renewals
 from bayesmc.network.forward import Pass, run

@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.engines.chains import ChainEngine
-from bayesmc.engines.metropolis_plan import Plan, plan_of
-from bayesmc.engines.metropolis_proposals import RandomWalk, check_given
-from bayesmc.engines.sweep import SweepSampler, block_name
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.metropolis_plan import Plan, plan_of
+from bayesmc.engines.mcmc.proposals import RandomWalk, check_given
+from bayesmc.engines.mcmc.sweep import SweepSampler, block_name
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.coupling import deterministic_constraints
@@ -88,7 +88,7 @@ class MetropolisHastings(ChainEngine):
     --------
     >>> import numpy as np
     >>> import bayesmc as bmc
-    >>> from bayesmc.engines.metropolis import MetropolisHastings
+    >>> from bayesmc.engines.mcmc.metropolis import MetropolisHastings
     >>> net = bmc.BayesNet()
     >>> net.add("x", bmc.Gamma(2.0, 1.0))
     >>> net.add("y", lambda x: bmc.Poisson(x))

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from bayesmc.engines.base import Treatment
-from bayesmc.engines.chains import ChainEngine
-from bayesmc.engines.gibbs_plan import plan_of
-from bayesmc.engines.sweep import SweepSampler
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts

@@ -1,0 +1,1 @@
+"""Independent draws that are weighted, or accepted: likelihood weighting, importance, rejection."""
