@@ -31,6 +31,7 @@ from bayesmc.kernels.conjugate_like import partners_of
 from bayesmc.kernels.conjugate_matching import Match, match_of
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.conjugate_picks import is_picked
+from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.vector_draws import InverseWishartDraw, NormalDraw
 from bayesmc.kernels.verify import check_ratio
@@ -80,10 +81,16 @@ class Conjugate(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
+        derived: Values = {}
+        for sums in self._sums:
+            placed = sums.placed(values)
+            if placed is not values:  # others read the same
+                derived |= sums.kept(placed[sums.label], placed[sums.key])
+                values = placed
         if self._whole is not None and not self.debug:
             new = self._whole_draw(values, rng)
             if new is not None:
-                return {blanket.name: new}, memory
+                return {blanket.name: new, **derived}, memory
         state = values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
@@ -94,7 +101,7 @@ class Conjugate(Kernel):
             except np.linalg.LinAlgError as error:
                 raise self._degenerate(error) from error
             state = {**state, blanket.name: blanket.moved(state, new, members)}
-        return {blanket.name: state[blanket.name]}, memory
+        return {blanket.name: state[blanket.name], **derived}, memory
 
     def full_conditional(self, values: Values, part: int = 0) -> Distribution:
         """The distribution of a class's elements given all others.
@@ -108,6 +115,12 @@ class Conjugate(Kernel):
         return self.kind.posterior(naturals, bounds, self.power)
 
     # ---- private -------------------------------------------------------------------------------
+
+    @cached_property
+    def _sums(self) -> list[LabelSums]:
+        """Sums by label that the children are known by."""
+        ways = [p.counts if p.way is None else p.way.sums for p in self.partners]
+        return list(dict.fromkeys(w for w in ways if w is not None))
 
     @cached_property
     def _whole(self) -> NormalDraw | InverseWishartDraw | None:
@@ -135,9 +148,6 @@ class Conjugate(Kernel):
     def _whole_draw(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
         """A draw; None where it is no number, of which the posterior says more."""
         assert self._whole is not None
-        for partner in self.partners:
-            if partner.way is not None:
-                values = partner.way.sums.placed(values)
         try:
             new = self._whole(values, rng, len(values[self.blanket.name]))
         except np.linalg.LinAlgError as error:

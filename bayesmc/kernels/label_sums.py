@@ -123,7 +123,7 @@ class LabelSums:
         """The state with the sums in the place of ``leaf``."""
         if values.get(self._of) is values[self.label]:
             return values
-        return {**values, self.key: self.sums(values)}
+        return {**values, **self.kept(values[self.label], self.sums(values))}
 
     @property
     def is_asked(self) -> bool:

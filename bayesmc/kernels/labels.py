@@ -1,7 +1,7 @@
 """Labels of mixtures: the full conditionals of all elements as one matrix product, then a draw of each.
 
 Log densities of every element at every state are features of the data times coefficients of the states
-(``label_terms``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
+(``label_sums``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
 for next come out of the same pass. A sweep whose products would cancel (components narrow beside the
 spread of the data) or whose parameters are lost goes to ``Enumerate``, which works on residuals.
 

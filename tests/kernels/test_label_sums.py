@@ -9,7 +9,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.chains.starting import start_states
+from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.expression import evaluate
 from bayesmc.kernels.conjugate import conjugate_kernel
 from bayesmc.kernels.label_sums import LabelSums, label_sums, sums_by_label
@@ -53,7 +53,8 @@ def _assert_are_log_densities(target: Target, values: Values) -> None:
     for state in (values, other):
         (log,) = evaluate([sums.expression], sums.placed(state))
         found.append(log)
-        full = np.broadcast_to(term.log(state), (2, *term.shape)).reshape(2, N, -1)
+        full = np.broadcast_to(term.log(state), (2, *term.shape))
+        full = full.reshape(2, N, -1) if term.plates[0] == "i" else full.swapaxes(1, 2)
         by_label = np.zeros((2, 3, full.shape[-1]))
         for chain in range(2):
             for i in range(N):
