@@ -25,7 +25,7 @@ from bayesmc.expression import (
     reduction,
 )
 from bayesmc.expression.scalars import SmallProgram
-from bayesmc.network.expressions import density_at
+from bayesmc.network.expressions import Opaque, density_at
 from bayesmc.passes.arithmetic import add, multiply
 from bayesmc.passes.sufficient import VALUE, NaturalForm, natural_form, tabulated
 from bayesmc.structure.target import Target, Term, Values
@@ -310,6 +310,8 @@ def _found(target: Target, term: Term, label: str) -> LabelSums | None:
     if term.is_potential or not own or node.domain is None or not own <= set(term.plates):
         return None
     if not node.is_stochastic or label not in target.chain or not target.is_known(term.name):
+        return None
+    if isinstance(term.read, Opaque):
         return None
     if [p for p in term.parents if own & set(model[p].plates)] != [label]:
         return None

@@ -100,7 +100,7 @@ def natural_form(family: Family, centre: Any = 0.0, log_centre: float = 0.0) -> 
     >>> family = trace(lambda r: bmc.Poisson(r), [TracedArray(leaf("r", ()))])
     >>> form = natural_form(family)
     >>> form.statistics
-    (<Constant 1.>, <Leaf value ()>)
+    (<Constant 1. ()>, <Leaf value ()>)
     >>> [float(c) for c in evaluate(form.coefficients, {"r": 1.0})]  # minus the rate, and its logarithm
     [-1.0, 0.0]
     """
