@@ -89,33 +89,40 @@ class SmallProgram:
             return self._arrays(values)
         function, most = code
         batch: Shape = ()
-        count = 1
+        given = []
+        for name, rank, size in self._leaves:  # one entry, mostly
+            value = values[name]
+            if value.size != size:
+                return self._entries(function, most, values)
+            if value.ndim > rank:
+                batch = value.shape[: value.ndim - rank]
+            given.append(value.ravel().tolist())
+        try:
+            flat = np.array(function(*given))
+        except (ArithmeticError, ValueError):
+            return self._arrays(values)
+        return [flat[part].reshape(batch + shape) for part, shape in self._parts]
+
+    def _entries(
+        self, function: Callable[..., Any], most: int, values: Mapping[str, np.ndarray]
+    ) -> list[np.ndarray]:
+        """The same for several entries, one after the other."""
+        batch: Shape = ()
         given = []
         for name, rank, size in self._leaves:
             value = values[name]
-            if value.ndim == rank:
-                given.append([value.ravel().tolist()])
-                continue
             lead = value.shape[: value.ndim - rank]
-            if batch and lead != batch:
+            if math.prod(lead) > most or (lead and batch and lead != batch):
                 return self._arrays(values)
-            batch, count = lead, math.prod(lead)
-            if count > most:
-                return self._arrays(values)
-            given.append(value.reshape(count, size).tolist())
+            batch = lead or batch
+            given.append(value.reshape(math.prod(lead), size).tolist())
+        count = math.prod(batch)
+        given = [rows if len(rows) == count else rows * count for rows in given]
         try:
-            if count == 1:
-                rows = function(*[v[0] for v in given])
-            else:
-                given = [v if len(v) == count else v * count for v in given]
-                rows = [function(*row) for row in zip(*given, strict=True)]
+            flat = np.array([function(*row) for row in zip(*given, strict=True)])
         except (ArithmeticError, ValueError):
             return self._arrays(values)
-        flat = np.array(rows)
-        if len(self._roots) == 1:
-            return [flat.reshape(batch + self._roots[0].shape)]
-        if count == 1:
-            return [flat[part].reshape(batch + shape) for part, shape in self._parts]
+        flat = flat.reshape(count, -1)
         return [flat[:, part].reshape(batch + shape) for part, shape in self._parts]
 
 

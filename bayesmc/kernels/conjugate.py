@@ -56,7 +56,8 @@ class Conjugate(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
-        state = values
+        derived = self.forms[0].left(values)
+        state = {**values, **derived} if derived else values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
                 blanket.target.refresh(state, self.names)
@@ -67,7 +68,7 @@ class Conjugate(Kernel):
             new = blanket.moved(state, new, members)
             if part + 1 < len(blanket.classes):
                 state = {**state, blanket.name: new}
-        return {blanket.name: new}, memory
+        return {blanket.name: new, **derived}, memory
 
     def full_conditional(self, values: Values, part: int = 0) -> Distribution:
         """The distribution of a class's elements given all others.

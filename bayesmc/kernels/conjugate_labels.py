@@ -53,6 +53,8 @@ class Counts:
     ----------
     leaf : Leaf, shape (states,)
         What stands for them.
+    sums : LabelSums or None
+        That somebody takes by the label.
     """
 
     def __init__(self, target: Target, label: str) -> None:
@@ -63,15 +65,15 @@ class Counts:
 
     def placed(self, values: Values) -> Values:
         """A state with the counts beside it."""
-        if self._sums is not None:
-            return {**values, self.leaf.name: self._sums.sums(values)[..., 0]}
+        if self.sums is not None:
+            return {**values, self.leaf.name: self.sums.sums(values)[..., 0]}
         label = values[self.label]
         ones = np.ones((1, label[0].size))
         found = sums_by_label(label.reshape(len(label), -1), ones, self.leaf.size)
         return {**values, self.leaf.name: found[..., 0]}
 
     @cached_property
-    def _sums(self) -> LabelSums | None:
+    def sums(self) -> LabelSums | None:
         """Looked up at the first step, when all kernels have been made."""
         return _counted(self.target, self.label)
 

@@ -124,6 +124,16 @@ class Form:
         found = self._draw(self._with_sums(values), rng, chains)
         return found if math.isfinite(np.add.reduce(found, axis=None)) else None
 
+    def left(self, values: Values) -> Values:
+        """Sums by label that it reads and that are not in the state yet, for others that read them."""
+        found: Values = {}
+        for placed in self._placed:
+            sums = placed.sums if isinstance(placed, Counts) else placed
+            state = values if sums is None else sums.placed(values)
+            if sums is not None and state is not values:
+                found |= sums.kept(state[sums.label], state[sums.key])
+        return found
+
     def _with_sums(self, values: Values) -> Values:
         for sums in self._placed:
             values = sums.placed(values)

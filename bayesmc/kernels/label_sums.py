@@ -25,7 +25,7 @@ from bayesmc.expression import (
     reduction,
 )
 from bayesmc.expression.scalars import SmallProgram
-from bayesmc.network.expressions import density_at
+from bayesmc.network.expressions import Opaque, density_at
 from bayesmc.passes.arithmetic import add, multiply
 from bayesmc.passes.sufficient import VALUE, NaturalForm, natural_form, tabulated
 from bayesmc.structure.target import Target, Term, Values
@@ -123,7 +123,7 @@ class LabelSums:
         """The state with the sums in the place of ``leaf``."""
         if values.get(self._of) is values[self.label]:
             return values
-        return {**values, self.key: self.sums(values)}
+        return {**values, **self.kept(values[self.label], self.sums(values))}
 
     @property
     def is_asked(self) -> bool:
@@ -172,17 +172,14 @@ class LabelSums:
         """The statistics of every element, zero where it was not seen."""
         value = self._by_element(self._value)
         full = value.shape[:2]
-        measure = Program([*form.statistics[1:], *form.support])
-        found = measure({VALUE: value - self.centre})
-        found = [np.broadcast_to(np.asarray(row, dtype=float), full).T for row in found]
-        rows, inside = found[: len(form.statistics) - 1], found[len(form.statistics) - 1 :]
+        found = Program(form.statistics[1:])({VALUE: value - self.centre})
+        rows = [np.broadcast_to(np.asarray(row, dtype=float), full).T for row in found]
         count = np.ones((1, len(value)))
         if mask is not None:
             count = mask.T.astype(float)
             rows = [np.where(mask.T, row, 0.0) for row in rows]
-            inside = [np.where(mask.T, row, 1.0) for row in inside]
         statistics = np.concatenate([count, *rows])
-        if not (np.isfinite(statistics).all() and all(row.all() for row in inside)):
+        if not np.isfinite(statistics).all():
             raise TraceError("its values are not in the support")
         return statistics
 
@@ -237,13 +234,13 @@ class LabelSums:
                 terms = table * self.statistics.T
                 found.append(terms.sum(axis=-1))
                 sizes.append(np.abs(terms).sum(axis=-1))
-        for log, own, size in zip(logs[1:], found[1:], sizes[1:], strict=True):
+        for log, own, size in zip(logs, found, sizes, strict=True):
             fine = np.isfinite(log) & np.isfinite(logs[0])
-            lost = (log == -np.inf) & np.isfinite(logs[0])
             off = np.abs((log - logs[0]) - (own - found[0]))[fine]
             rounding = _ROUNDING * (1.0 + np.abs(log) + np.abs(logs[0]))
             near = off <= (rounding + _CANCELLING * (size + sizes[0]))[fine]
-            if not (near.all() and (own[lost] < 0.1 * IMPOSSIBLE).all()):
+            # and what is impossible, as values outside of a support are, must be so here, too
+            if not (near.all() and (own[log == -np.inf] < 0.1 * IMPOSSIBLE).all()):
                 raise TraceError("what was read of it gives other values than the function")
 
 
@@ -313,6 +310,8 @@ def _found(target: Target, term: Term, label: str) -> LabelSums | None:
     if term.is_potential or not own or node.domain is None or not own <= set(term.plates):
         return None
     if not node.is_stochastic or label not in target.chain or not target.is_known(term.name):
+        return None
+    if isinstance(term.read, Opaque):
         return None
     if [p for p in term.parents if own & set(model[p].plates)] != [label]:
         return None

@@ -1,7 +1,7 @@
 """Labels of mixtures: the full conditionals of all elements as one matrix product, then a draw of each.
 
 Log densities of every element at every state are features of the data times coefficients of the states
-(``label_terms``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
+(``label_sums``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
 for next come out of the same pass. A sweep whose products would cancel (components narrow beside the
 spread of the data) or whose parameters are lost goes to ``Enumerate``, which works on residuals.
 
@@ -173,6 +173,7 @@ class Labels(Kernel):
         if more is None:
             odds, most = self._odds(values)
             if np.maximum.reduce(most, axis=None) < _LARGEST:
+                odds = np.broadcast_to(odds, (chains, *odds.shape[-2:]))
                 return _Table(odds, lambda: self._by_state(values, chains), self._prior.steep)
         table = self._by_state(values, chains)
         if more is not None:
@@ -264,7 +265,7 @@ class _Table:
 
     Parameters
     ----------
-    odds : ndarray, shape ([chains,] states - 1, features)
+    odds : ndarray, shape (chains, states - 1, features)
     rows : callable
         Gives the coefficients, shape (states, chains, features).
     steep : bool
@@ -273,9 +274,8 @@ class _Table:
 
     def __init__(self, odds: np.ndarray, rows: Callable[[], np.ndarray], steep: bool) -> None:
         self._rows, self.steep = rows, steep
-        if odds.ndim == 3:
-            odds = odds[0] if len(odds) == 1 else odds.swapaxes(0, 1).reshape(-1, odds.shape[-1])
-        self.odds = odds
+        wide = len(odds) > 1
+        self.odds = odds.swapaxes(0, 1).reshape(-1, odds.shape[-1]) if wide else odds[0]
 
     @cached_property
     def rows(self) -> np.ndarray:

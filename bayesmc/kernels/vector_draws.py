@@ -110,8 +110,8 @@ def inverse_wishart_draw(
     >>> from bayesmc.kernels.vector_draws import inverse_wishart_draw
     >>> rng = np.random.default_rng(0)
     >>> draws = inverse_wishart_draw(rng, np.array(12.0), 9.0 * np.eye(2), (10_000,))
-    >>> draws.mean(axis=0).round(1).tolist()  # the scale over df - d - 1
-    [[1.0, 0.0], [0.0, 1.0]]
+    >>> bool(np.abs(draws.mean(axis=0) - np.eye(2)).max() < 0.05)  # the scale over df - d - 1
+    True
     """
     d = scale.shape[-1]
     half = 0.5 * df[..., None] - _halves(d)
@@ -184,9 +184,9 @@ def gammas(rng: np.random.Generator, concentration: np.ndarray, shape: Shape) ->
     >>> import numpy as np
     >>> from bayesmc.kernels.vector_draws import gammas
     >>> gammas(np.random.default_rng(0), np.array([2.0, 3.0]), (2,))
-    array([1.80926428, 1.5945369 ])
+    array([1.83431007, 3.85514353])
     >>> np.random.default_rng(0).standard_gamma([2.0, 3.0])
-    array([1.80926428, 1.5945369 ])
+    array([1.83431007, 3.85514353])
     """
     if concentration.size > _FEW or concentration.shape != shape:
         return rng.standard_gamma(concentration, shape)

@@ -58,7 +58,7 @@ Form = dict[Expression, Expression]
 
 @dataclass(frozen=True, eq=False)
 class NaturalForm:
-    """A log density as a sum of statistics of the value times coefficients.
+    """A log density as a sum of statistics of the value times coefficients, at values in the support.
 
     Attributes
     ----------
@@ -68,14 +68,11 @@ class NaturalForm:
         One for each: the natural parameters; of the first, minus the log normaliser.
     indicators : bool
         Whether every statistic is 0 or 1.
-    support : tuple of Expression, shape ()
-        Conditions on the value; where one fails the density is zero whatever the coefficients.
     """
 
     statistics: tuple[Expression, ...]
     coefficients: tuple[Expression, ...]
     indicators: bool = False
-    support: tuple[Expression, ...] = ()
 
 
 def natural_form(family: Family, centre: Any = 0.0, log_centre: float = 0.0) -> NaturalForm:
@@ -103,15 +100,14 @@ def natural_form(family: Family, centre: Any = 0.0, log_centre: float = 0.0) -> 
     >>> family = trace(lambda r: bmc.Poisson(r), [TracedArray(leaf("r", ()))])
     >>> form = natural_form(family)
     >>> form.statistics
-    (<Constant 1.>, <Leaf value ()>)
+    (<Constant 1. ()>, <Leaf value ()>)
     >>> [float(c) for c in evaluate(form.coefficients, {"r": 1.0})]  # minus the rate, and its logarithm
     [-1.0, 0.0]
     """
     if family.make is MvNormal:
         return _of_vectors(family, np.asarray(centre, dtype=float))
     value = add(leaf(VALUE, ()), centre)
-    reader = _Reader(value, log_centre)
-    return _found(reader(log_density(family, value)), tuple(reader.support))
+    return _found(_Reader(value, log_centre)(log_density(family, value)))
 
 
 def tabulated(family: Family, values: np.ndarray) -> NaturalForm:
@@ -156,11 +152,11 @@ def log_probabilities(family: Family, values: np.ndarray) -> Expression:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _found(form: Form, support: tuple[Expression, ...]) -> NaturalForm:
+def _found(form: Form) -> NaturalForm:
     form = {f: _guarded(c) for f, c in form.items()}
     first = form.pop(ONE, ZERO)
     kept = {f: c for f, c in form.items() if not _is_uniform(c)}
-    return NaturalForm((ONE, *kept), (first, *kept.values()), False, support)
+    return NaturalForm((ONE, *kept), (first, *kept.values()))
 
 
 def _is_uniform(node: Expression) -> bool:
@@ -170,7 +166,7 @@ def _is_uniform(node: Expression) -> bool:
 
 def _guarded(coefficient: Expression) -> Expression:
     """NaN where a concentration is not positive, of which the log of the gamma function does not tell."""
-    instead = {
+    instead: dict[Expression, Expression] = {
         n: elementwise(np.where, elementwise(np.greater, n.operands[0], 0), n, np.nan)
         for n in ordered(coefficient)
         if isinstance(n, Elementwise) and n.function is special.gammaln and n.leaves
@@ -198,7 +194,6 @@ class _Reader:
 
     def __init__(self, value: Expression, log_centre: float) -> None:
         self.value, self.log_centre = value, as_expression(float(log_centre))
-        self.support: dict[Expression, None] = {}
         self._found: dict[Expression, Form] = {}
 
     def __call__(self, node: Expression) -> Form:
@@ -245,6 +240,8 @@ class _Reader:
         first, second = node.operands
         if VALUE not in second.leaves:
             return {f: divide(c, second) for f, c in self(first).items()}
+        if second.leaves == {VALUE} and not second.shape:
+            return _product(self(first), {elementwise(np.divide, 1.0, second): ONE})
         ((f, c),) = _single(self(second)).items()
         return _product(self(first), {elementwise(np.divide, 1.0, f): divide(1.0, c)})
 
@@ -272,8 +269,7 @@ class _Reader:
     def where(self, node: Elementwise) -> Form:
         condition, first, second = node.operands
         if is_all(second, -np.inf) and condition.leaves <= {VALUE}:
-            self.support[condition] = None
-            return self(first)
+            return self(first)  # in the support, that is
         if condition.leaves == {VALUE} and not condition.shape:
             one, other = self(first), self(second)
             found: Form = {}
@@ -376,7 +372,7 @@ def _of_vectors(family: Family, centre: np.ndarray) -> NaturalForm:
     ys = [pick([y], i) for i in range(d)]
     statistics, coefficients = [ONE, *ys], [first]
     coefficients += [_component(linear, (i,)) for i in range(d)]
-    for i, j in zip(*np.tril_indices(d), strict=True):
+    for i, j in np.transpose(np.tril_indices(d)).tolist():
         statistics.append(elementwise(np.multiply, ys[i], ys[j]))
         coefficients.append(multiply(_component(precision, (i, j)), -0.5 if i == j else -1.0))
     kept = [k for k, c in enumerate(coefficients) if not k or not _is_uniform(c)]
@@ -385,5 +381,5 @@ def _of_vectors(family: Family, centre: np.ndarray) -> NaturalForm:
 
 def _component(node: Expression, at: tuple[int, ...]) -> Expression:
     """One element of the last axes."""
-    positions = np.arange(node.size).reshape(node.shape)
-    return pick([node], positions[(Ellipsis, *at)])
+    place: Any = (Ellipsis, *at)
+    return pick([node], np.arange(node.size).reshape(node.shape)[place])

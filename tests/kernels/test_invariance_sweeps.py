@@ -8,7 +8,6 @@ with an error in one kernel.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,7 +18,6 @@ import bayesmc as bmc
 from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.kernels.base import Kernel
-from bayesmc.kernels.conjugate import Conjugate
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.network import pose
 from bayesmc.structure.target import Target

@@ -22,6 +22,9 @@ class WrongForm:
         naturals, bounds = self.form(values)
         return self.change(*naturals), bounds
 
+    def left(self, values: Any) -> Any:
+        return self.form.left(values)
+
     def drawn(self, values: Any, rng: Any, chains: int) -> None:
         return None
 
