@@ -152,7 +152,7 @@ def _pick(node: Pick) -> Step:
 
     def several(*values: np.ndarray) -> np.ndarray:
         first = values[0].shape
-        if alike and first and all([v.shape == first for v in values]):
+        if alike and first and all(v.shape == first for v in values):
             return take(_side_by_side(values, ranks[0], dtype))
         batches = [v.shape[: v.ndim - rank] for v, rank in zip(values, ranks, strict=True)]
         batch = np.broadcast_shapes(*set(batches))

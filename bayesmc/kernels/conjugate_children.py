@@ -183,7 +183,9 @@ def _joined(blanket: Blanket, terms: Sequence[Term]) -> Child | None:
         mask = np.stack([np.broadcast_to(True if t.mask is None else t.mask, shape) for t in terms])
     # of parameters, plates and event may be fewer than the value's: the group stays in front of all
     rank = len(terms[0].shape)
-    roots = [_in_front(r, o, rank, len(v)) for r, o, v in _with_events(terms[0], roots, found.roots)]
+    roots = [
+        _in_front(r, o, rank, len(v)) for r, o, v in _with_events(terms[0], roots, found.roots)
+    ]
     return _child(tuple(terms), roots, (count, *terms[0].shape), mask)
 
 

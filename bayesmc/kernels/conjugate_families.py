@@ -164,7 +164,9 @@ class DirichletConditional(Conditional):
         if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
             return None
         shape = shape + counts.shape[-1:]
-        draw = gammas(rng, counts if counts.shape == shape else np.broadcast_to(counts, shape), shape)
+        draw = gammas(
+            rng, counts if counts.shape == shape else np.broadcast_to(counts, shape), shape
+        )
         draw /= draw.sum(axis=-1, keepdims=True)
         return draw
 
@@ -181,7 +183,8 @@ class MvNormalConditional(Conditional):
     def draw(
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
-        draw = normal_draw(rng, *naturals, shape)
+        precision, linear = naturals
+        draw = normal_draw(rng, precision, linear, shape)
         return draw if math.isfinite(draw.sum()) else None
 
 
@@ -194,7 +197,8 @@ class InverseWishartConditional(Conditional):
     def draw(
         self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
     ) -> np.ndarray | None:
-        return inverse_wishart_draw(rng, *naturals, shape)
+        df, scale = naturals
+        return inverse_wishart_draw(rng, df, scale, shape)
 
 
 def family_of_features(found: Mapping[Feature, Any], low: float, high: float) -> Conditional | None:

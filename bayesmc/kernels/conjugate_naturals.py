@@ -456,7 +456,10 @@ def _naturals_of(blanket: Blanket, base: Family) -> list[Expression]:
         inverse = np.linalg.inv(factor)
         precision = np.matmul(np.matrix_transpose(inverse), inverse)
     linear = np.matvec(precision, parameters["loc"])
-    return [a.expression if isinstance(a, TracedArray) else as_expression(a) for a in (precision, linear)]
+    return [
+        a.expression if isinstance(a, TracedArray) else as_expression(a)
+        for a in (precision, linear)
+    ]
 
 
 def _by_element(value: Expression, blanket: Blanket, event_ndim: int) -> Any:

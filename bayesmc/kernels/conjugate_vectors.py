@@ -243,9 +243,15 @@ def _inverse_root(parameters: dict[str, Any], shape: Shape) -> Expression:
         wide = divide(as_expression(np.eye(m)), reshape(spread, (*spread.shape, 1)))
         return broadcast(wide, (*entries, m, m))
     factor: Any = parameters.get("scale_tril")
-    factor = np.linalg.cholesky(TracedArray(parameters["cov"])) if factor is None else TracedArray(factor)
+    factor = (
+        np.linalg.cholesky(TracedArray(parameters["cov"]))
+        if factor is None
+        else TracedArray(factor)
+    )
     found: Any = np.linalg.inv(factor)
-    return broadcast(found.expression if isinstance(found, TracedArray) else found, (*entries, m, m))
+    return broadcast(
+        found.expression if isinstance(found, TracedArray) else found, (*entries, m, m)
+    )
 
 
 def _product(first: Expression, second: Expression) -> Expression:

@@ -15,7 +15,7 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Term
 
 #: parameters of vectors -> how a node must enter them
-_OF_VECTORS = {
+_OF_VECTORS: dict[tuple[Any, str], str] = {
     (MvNormal, "loc"): "mean", (MvNormal, "cov"): "multiple", (MvNormal, "scale_tril"): "power",
     (MvNormal, "scale_diag"): "power", (Categorical, "probs"): "shares",
     (Multinomial, "probs"): "shares",

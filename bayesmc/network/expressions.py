@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import TraceError
+from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import (
     Constant,
     Expression,

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from bayesmc.expression import (
+    Constant,
     Elementwise,
     Expression,
     Gather,
     Pick,
     Reduction,
-    as_expression,
     broadcast,
     elementwise,
     gather,
@@ -124,8 +124,8 @@ def _cast(node: Expression) -> Any:
 
 def _truth(condition: Expression) -> bool | None:
     """Whether a condition is always true, or never; None where it may be both."""
-    if not condition.leaves:
-        value = getattr(condition, "value", as_expression(0).value)
+    if isinstance(condition, Constant):
+        value = condition.value
         return bool(value.flat[0]) if value.size and (value == value.flat[0]).all() else None
     if isinstance(condition, Pick) and len(condition.operands) == 1:
         return _truth(condition.operands[0])

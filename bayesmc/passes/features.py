@@ -127,7 +127,9 @@ def statistics(
     reader = _Reader(own.name, strict, is_share)
     found = reader(replaced(whole, instead))
     kept = {
-        f: broadcast(c, density.shape) for f, c in found.items() if f != CONSTANT and not is_all(c, 0)
+        f: broadcast(c, density.shape)
+        for f, c in found.items()
+        if f != CONSTANT and not is_all(c, 0)
     }
     return Statistics(kept, at, reader.is_picked)
 
@@ -191,7 +193,10 @@ class _Reader:
             parts = [self(a) for a in node.operands]
             return {
                 f: pick(
-                    [broadcast(p.get(f, ZERO), a.shape) for p, a in zip(parts, node.operands, strict=True)],
+                    [
+                        broadcast(p.get(f, ZERO), a.shape)
+                        for p, a in zip(parts, node.operands, strict=True)
+                    ],
                     node.positions,
                 )
                 for f in dict.fromkeys(f for p in parts for f in p)
@@ -247,7 +252,9 @@ class _Reader:
         inner = _powers(self(base))
         if e == 2.0:
             return _square(inner)
-        return self.each(inner, lambda c: tidy(np.power, c, e), lambda p, c: (p * e, tidy(np.power, c, e)))
+        return self.each(
+            inner, lambda c: tidy(np.power, c, e), lambda p, c: (p * e, tidy(np.power, c, e))
+        )
 
     def root(self, node: Elementwise) -> Features:
         function = node.function
@@ -293,7 +300,9 @@ class _Reader:
         }
         closed = mine
         if of_rest and self.is_share and power == 1.0:
-            rest = elementwise(np.logical_and, varies, elementwise(np.equal, free, multiply(own, -1.0)))
+            rest = elementwise(
+                np.logical_and, varies, elementwise(np.equal, free, multiply(own, -1.0))
+            )
             result[LOG1M] = tidy(np.where, rest, ONE, ZERO)
             closed = elementwise(np.logical_or, mine, rest)
         closed = elementwise(np.logical_or, closed, elementwise(np.logical_not, varies))

@@ -89,7 +89,9 @@ def same_along(expression: Expression, axes: Sequence[int]) -> Expression | None
     shape = expression.shape
     gone = {a % len(shape) for a in axes}
     at = np.arange(expression.size).reshape(shape)
-    first = pick([expression], at[tuple(0 if k in gone else slice(None) for k in range(len(shape)))])
+    first = pick(
+        [expression], at[tuple(0 if k in gone else slice(None) for k in range(len(shape)))]
+    )
     kept = tuple(1 if k in gone else n for k, n in enumerate(shape))
     return first if broadcast(reshape(first, kept), shape) is expression else None
 

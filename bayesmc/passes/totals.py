@@ -64,7 +64,9 @@ def parts_of(root: Expression, name: str, mask: np.ndarray | None = None) -> lis
     return list(_parts(root, name, Part(root, ONE, mask)))
 
 
-def total(coefficient: Expression, at: Expression, count: int, mask: np.ndarray | None = None) -> Expression:
+def total(
+    coefficient: Expression, at: Expression, count: int, mask: np.ndarray | None = None
+) -> Expression:
     """Sums of entries by the element that they read.
 
     Parameters
@@ -95,7 +97,8 @@ def total(coefficient: Expression, at: Expression, count: int, mask: np.ndarray 
     if isinstance(at, Constant):
         return _at_constants(coefficient, at.value, count, mask, block)
     shape = at.shape
-    own, rest = [], [] if mask is None else [_where(mask, coefficient.shape, at.shape)]
+    own: list[tuple[Expression, int]] = []
+    rest = [] if mask is None else [_where(mask, coefficient.shape, at.shape)]
     for factor, power in _factors(coefficient):
         short = _by_rows(factor, at, (count, *block))
         (rest if short is None else own).append((factor if short is None else short, power))
@@ -125,7 +128,9 @@ def _parts(node: Expression, name: str, now: Part) -> Iterator[Part]:
         if found:
             free = [a for a in node.operands[1:] if name not in a.leaves]
             branch = node.function is np.where and len(free) == 1
-            picked = now.is_picked or (branch and not is_all(free[0], 0) and not is_all(free[0], -np.inf))
+            picked = now.is_picked or (
+                branch and not is_all(free[0], 0) and not is_all(free[0], -np.inf)
+            )
             for operand, own in found:
                 whole = broadcast(operand, node.shape)
                 yield from _parts(whole, name, Part(whole, own, mask, picked))
@@ -133,7 +138,9 @@ def _parts(node: Expression, name: str, now: Part) -> Iterator[Part]:
     yield Part(node, factor, mask, now.is_picked)
 
 
-def _split(node: Elementwise, name: str, factor: Expression) -> Iterator[tuple[Expression, Expression]]:
+def _split(
+    node: Elementwise, name: str, factor: Expression
+) -> Iterator[tuple[Expression, Expression]]:
     """Terms of a sum, each with its factor; nothing where it is none."""
     function, operands = node.function, node.operands
     if function is np.negative:

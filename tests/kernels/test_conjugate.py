@@ -531,9 +531,7 @@ def test_a_mixture_is_summed_by_label(states: int) -> None:
         (lambda label, mean, tau, sd: bmc.Normal(mean[label], np.exp(tau)[label]), "m"),
     ],
 )  # fmt: skip
-def test_parameters_by_label(
-    child: Callable[..., Any], names: str
-) -> None:
+def test_parameters_by_label(child: Callable[..., Any], names: str) -> None:
     """Points in two plates; numbers, not vectors; nodes shared by all labels."""
     net = bmc.BayesNet(plates={"cluster": 3, "i": 6, "j": 5})
     net.add("mean", bmc.Normal(0.0, 3.0), plates="cluster")

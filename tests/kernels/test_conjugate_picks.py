@@ -155,7 +155,9 @@ def test_a_wrong_closed_form_is_refused(monkeypatch: pytest.MonkeyPatch) -> None
     def wrong(*arguments: Any) -> Any:
         found = right(*arguments)
         changed = {f: elementwise(np.add, c, 1.0) for f, c in found.coefficients.items()}
-        return dataclasses.replace(found, coefficients=changed if found.is_picked else found.coefficients)
+        return dataclasses.replace(
+            found, coefficients=changed if found.is_picked else found.coefficients
+        )
 
     monkeypatch.setattr(conjugate_naturals, "features_of", wrong)
     net, evidence = chain(SPELT["where"])

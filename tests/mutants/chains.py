@@ -353,7 +353,8 @@ MUTANTS = [
         "counts go to the neighbouring category",
         (Edit("bayesmc.kernels.conjugate_naturals:_placed",
               "natural = reshape(natural, (blanket.size, *block))",
-              "natural = pick([natural], np.roll(np.arange(natural.size), 1).reshape(blanket.size, *block))"),),
+              "natural = pick([natural], np.roll(np.arange(natural.size), 1)"
+              ".reshape(blanket.size, *block))"),),
         ranks(lambda: closed_form, shares, 400),
         "rank_test, 400 replications",
     ),
