@@ -30,7 +30,7 @@ from bayesmc.kernels.conjugate_labels import by_label
 from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.network.expressions import Opaque, stored_leaf
 from bayesmc.network.readings import frame
-from bayesmc.passes.log_density import log_density
+from bayesmc.passes.log_density import has_own_form, log_density
 from bayesmc.passes.templates import stacked_rows, template
 from bayesmc.passes.widening import widened
 from bayesmc.shapes import Shape
@@ -75,6 +75,8 @@ class Child:
         """
         if self.sums is not None:
             return self.sums.expression
+        if has_own_form(self.family) and any(t.expression is None for t in self.terms):
+            raise TraceError("its form gives other values than its log_prob")
         return broadcast(log_density(self.family, self.value), self.shape)
 
     def read(self, name: str) -> list[str]:

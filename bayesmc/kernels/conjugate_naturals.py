@@ -52,7 +52,7 @@ from bayesmc.kernels.vector_draws import InverseWishartDraw, NormalDraw
 from bayesmc.network.expressions import Opaque, stored_leaf
 from bayesmc.passes.arithmetic import ZERO, add, multiply
 from bayesmc.passes.features import LOG, Feature
-from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.passes.log_density import family_of, has_own_form, log_density
 from bayesmc.passes.reads import same_along
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
@@ -289,6 +289,8 @@ def _own_features(blanket: Blanket, prior: _Prior, of: Moving) -> dict[Feature, 
     """Features of the prior itself."""
     if prior.base.make is Uniform:
         return {}
+    if has_own_form(prior.base) and blanket.own is not None and blanket.own.expression is None:
+        raise TraceError("its form gives other values than its log_prob")
     model = blanket.target.model
     density = log_density(prior.base, stored_leaf(model, model[blanket.name]))
     density = broadcast(_known(blanket, density), blanket.node.plate_shape)

@@ -10,7 +10,7 @@ import numpy as np
 from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, TraceError
-from bayesmc.expression import Program, rebuilt
+from bayesmc.expression import Expression, Program, rebuilt
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.shapes import Shape
 
@@ -123,6 +123,24 @@ def hold_against(
             raise TraceError(f"what was read of it fails: {error}") from error
         if not _agree(model.nodes.get(name), expected, made, shape):
             raise TraceError("what was read of it gives other values than the function")
+
+
+def hold_form_against(model: Model, name: str, form: Expression) -> None:
+    """Refuse a family's own form where ``log_prob`` gives something else at probe points.
+
+    Raises
+    ------
+    TraceError
+    """
+    program = Program([form])
+    for variant in range(len(VARIANTS)):
+        values = Probe.of(model, variant)
+        with marking_invalid(), np.errstate(all="ignore"):
+            dist, _ = model.evaluate(name, values)
+            expected = model.log_density(name, dist, values[name])
+            (found,) = program(values)
+        if not _near(*np.broadcast_arrays(expected, found)):
+            raise TraceError("its log_density gives other values than its log_prob")
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -28,12 +28,17 @@ from bayesmc.expression import (
     mapped,
     replaced,
 )
-from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against
+from bayesmc.network.agreement import (
+    VARIANTS,
+    deterministic_above,
+    hold_against,
+    hold_form_against,
+)
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered
 from bayesmc.network.readings import Argument, Reading, numbers_of, read_function, read_table
-from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.passes.log_density import family_of, has_own_form, log_density
 
 #: readings of one shape, and uses of one reading, that are checked at all probe points
 _CHECKED = 3
@@ -154,7 +159,10 @@ def log_density_of(model: Model, name: str) -> Expression:
     value: Expression = stored_leaf(model, node)
     if node.domain is not None and node.domain.low:
         value = elementwise(np.add, value, node.domain.low)
-    return broadcast(log_density(family, value), node.plate_shape)
+    result = broadcast(log_density(family, value), node.plate_shape)
+    if has_own_form(family):
+        hold_form_against(model, name, result)
+    return result
 
 
 def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
