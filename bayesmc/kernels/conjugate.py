@@ -25,7 +25,8 @@ from bayesmc.kernels.conjugate_families import (
     Bounds,
     Naturals,
 )
-from bayesmc.kernels.conjugate_naturals import Form, form_of
+from bayesmc.kernels.conjugate_forms import Form
+from bayesmc.kernels.conjugate_naturals import form_of
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket

@@ -314,7 +314,7 @@ MUTANTS = [
     ),
     Mutant(
         "inverse-Wishart degrees of freedom are off by d",
-        (Edit("bayesmc.kernels.conjugate_naturals:_naturals_of",
+        (Edit("bayesmc.kernels.conjugate_priors:naturals_of",
               "return [reshape(df, (count,)), ", "return [add(reshape(df, (count,)), 2.0), "),),
         ranks(lambda: closed_form, covariance, 700),
         "rank_test, 700 replications",
@@ -351,7 +351,7 @@ MUTANTS = [
     ),
     Mutant(
         "counts go to the neighbouring category",
-        (Edit("bayesmc.kernels.conjugate_naturals:_placed",
+        (Edit("bayesmc.kernels.conjugate_priors:of_members",
               "natural = reshape(natural, (blanket.size, *block))",
               "natural = pick([natural], np.roll(np.arange(natural.size), 1)"
               ".reshape(blanket.size, *block))"),),
