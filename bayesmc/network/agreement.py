@@ -125,8 +125,8 @@ def hold_against(
             raise TraceError("what was read of it gives other values than the function")
 
 
-def hold_form_against(model: Model, name: str, form: Expression) -> None:
-    """Refuse a family's own form where ``log_prob`` gives something else at probe points.
+def hold_form(model: Model, name: str, form: Expression) -> None:
+    """Refuse a family's own log density where ``log_prob`` gives something else.
 
     Raises
     ------

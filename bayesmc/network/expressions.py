@@ -28,16 +28,18 @@ from bayesmc.expression import (
     mapped,
     replaced,
 )
-from bayesmc.network.agreement import (
-    VARIANTS,
-    deterministic_above,
-    hold_against,
-    hold_form_against,
-)
+from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against, hold_form
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered
-from bayesmc.network.readings import Argument, Reading, numbers_of, read_function, read_table
+from bayesmc.network.readings import (
+    Argument,
+    Reading,
+    identity,
+    numbers_of,
+    read_function,
+    read_table,
+)
 from bayesmc.passes.log_density import family_of, has_own_form, log_density
 
 #: readings of one shape, and uses of one reading, that are checked at all probe points
@@ -161,7 +163,7 @@ def log_density_of(model: Model, name: str) -> Expression:
         value = elementwise(np.add, value, node.domain.low)
     result = broadcast(log_density(family, value), node.plate_shape)
     if has_own_form(family):
-        hold_form_against(model, name, result)
+        hold_form(model, name, result)
     return result
 
 
@@ -336,11 +338,13 @@ def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:
         plates = potential.plates
     parents = tuple(parent for parent, _ in links)
     arguments = _arguments(model, links)
-    what: Hashable = id(function)
+    what: Hashable
     if table is not None:
         what = table.shape, table.tobytes()
-    elif isinstance(function, Numbered):
-        what = id(function.func), function.places, None if for_all_numbers else function.number
+    elif for_all_numbers:
+        what = identity(function.func), function.places
+    else:
+        what = identity(function)
     known = model.cache.setdefault("readings", {})
     key = what, plates, arguments
     if key not in known:

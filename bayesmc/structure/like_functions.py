@@ -33,8 +33,7 @@ from bayesmc.expression import (
 )
 from bayesmc.network import CompiledNode
 from bayesmc.network.expressions import Followed, density
-from bayesmc.network.node import Numbered
-from bayesmc.network.readings import Reading, with_axes
+from bayesmc.network.readings import Reading, identity, with_axes
 from bayesmc.passes.sinking import reads, sunk
 from bayesmc.passes.templates import stacked_rows
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to
@@ -102,10 +101,8 @@ class Signatures:
         if isinstance(found, Followed):
             open_numbers = found.reading.may_differ
             what = found.reading.key, () if open_numbers else tuple(map(int, found.numbers))
-        elif isinstance(function, Numbered):
-            what = id(function.func), function.places, function.number
         else:
-            what = id(function)
+            what = identity(function)
         read = tuple(self._value(n) for n in scope)
         followed = found if isinstance(found, Followed) else None
         return Signature((what, table, read), scope, rank, followed)

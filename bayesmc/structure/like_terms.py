@@ -93,30 +93,29 @@ class LikeTerms:
 class TermSum:
     """The sum of some terms, like ones evaluated as one.
 
-        Parameters
-        ----------
-        target : Target
-        terms : iterable of Term
+    Parameters
+    ----------
+    target : Target
+    terms : iterable of Term
 
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import bayesmc as bmc
-        >>> from bayesmc.network import pose
-        >>> from bayesmc.structure.like_terms import TermSum
-        >>> from bayesmc.structure.relation import Relation
-    from bayesmc.structure.target import target_of
-        >>> net = bmc.BayesNet()
-        >>> net.add("rate", bmc.LogNormal(0.0, 1.0))
-        >>> for t in range(8):
-        ...     net.add(f"y[{t}]", lambda rate, t=t: bmc.Poisson(rate * (1 + t)))
-        >>> target = target_of(pose(net, {f"y[{t}]": t for t in range(8)}))
-        >>> total = TermSum(target, target.terms.values())
-        >>> [g.names[0] for g in total.groups], [t.name for t in total.alone]
-        (['y[0]'], ['rate'])
-        >>> values = {**target.known, "rate": np.array([0.5, 2.0])}
-        >>> np.allclose(total.log_density(values), target.log_density(values))
-        True
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.like_terms import TermSum
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.LogNormal(0.0, 1.0))
+    >>> for t in range(8):
+    ...     net.add(f"y[{t}]", lambda rate, t=t: bmc.Poisson(rate * (1 + t)))
+    >>> target = target_of(pose(net, {f"y[{t}]": t for t in range(8)}))
+    >>> total = TermSum(target, target.terms.values())
+    >>> [g.names[0] for g in total.groups], [t.name for t in total.alone]
+    (['y[0]'], ['rate'])
+    >>> values = {**target.known, "rate": np.array([0.5, 2.0])}
+    >>> np.allclose(total.log_density(values), target.log_density(values))
+    True
     """
 
     def __init__(self, target: Target, terms: Iterable[Term]) -> None:

@@ -196,7 +196,9 @@ class Forms:
 
     def _read(self, blanket: Blanket) -> Form | None:
         node = blanket.node
-        if blanket.classes != (None,) or self.target.seen(blanket.name) is not None:
+        if not blanket.classes or blanket.classes[0] is not None:
+            return None
+        if self.target.seen(blanket.name) is not None:
             return None
         if any(c.relation.kind != "aligned" for c in blanket.children):
             return None

@@ -14,8 +14,10 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_functions import Slots
+from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.stacked import StackedBlanket, stacks
 from bayesmc.structure.target import Target, Values, target_of
+from bayesmc.testing import random_dbn
 
 CHAINS = 5
 DATA = np.random.default_rng(11)
@@ -303,6 +305,27 @@ def test_numbers_meet_the_right_axes() -> None:
     assert {n for s in found for n in s.names} == {f"x[{t}]" for t in range(1, 11)}
 
 
+def test_random_templates() -> None:
+    """Slices of random templates of finite nodes: stacks, terms and links as one say what each says alone."""
+    stacked = terms = 0
+    for seed in range(16):
+        case = random_dbn(seed, nodes=(1, 3), steps=(9, 9), zeros=False)
+        net = case.dbn.unroll(case.steps, inputs=case.inputs)
+        evidence = case.dbn.unrolled_evidence(case.observations)
+        target, blankets = posed(net, evidence)
+        found, _ = stacks(target, blankets, target.chain)
+        for stack in found:
+            assert worst_difference(target, stack, 2) < 1e-12, (seed, stack.names)
+        total = TermSum(target, target.terms.values())
+        values = a_state(target, seed)
+        with marking_invalid(), np.errstate(all="ignore"):
+            np.testing.assert_allclose(
+                total.log_density(values), target.log_density(values), rtol=1e-11
+            )
+        stacked, terms = stacked + len(found), terms + len(total.groups)
+    assert stacked > 10 and terms > 20
+
+
 def test_values_are_spread() -> None:
     net, evidence, _ = plated()
     target, blankets = posed(net, evidence)
@@ -392,7 +415,8 @@ def test_what_cannot_be_followed_is_stacked_only_where_it_is_one_function() -> N
         return bmc.Density(lambda y: -np.abs(y - x), support="real")
 
     assert chain_of({}, lambda t: density) == ALL
-    assert not chain_of({}, lambda t: lambda x: density(x))
+    assert chain_of({}, lambda t: lambda x: density(x)) == ALL
+    assert not chain_of({}, lambda t: lambda x, t=t: density(x + 0 * t))
 
 
 @pytest.mark.parametrize(
