@@ -173,7 +173,8 @@ class Labels(Kernel):
         if more is None:
             odds, most = self._odds(values)
             if np.maximum.reduce(most, axis=None) < _LARGEST:
-                odds = np.broadcast_to(odds, (chains, *odds.shape[-2:]))
+                if odds.ndim == 2 or len(odds) < chains:
+                    odds = np.broadcast_to(odds, (chains, *odds.shape[-2:]))
                 return _Table(odds, lambda: self._by_state(values, chains), self._prior.steep)
         table = self._by_state(values, chains)
         if more is not None:

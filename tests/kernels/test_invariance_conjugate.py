@@ -18,9 +18,11 @@ import bayesmc as bmc
 from bayesmc.kernels import gaussian_layout
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
+from bayesmc.kernels.conjugate_labels import ByLabel
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
 from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
 from bayesmc.kernels.slice import Slice
+from bayesmc.passes.arithmetic import multiply
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
 from tests.kernels.invariance import (
@@ -137,24 +139,6 @@ def _wrong(pair: Pair) -> Pair:
     return dataclasses.replace(pair, statistic=faults[pair.kind])
 
 
-def _gross(pair: Pair) -> Pair:
-    """A pair with an error that few rows show."""
-    right = pair.statistic
-
-    def two_shapes(e: Any) -> Any:
-        power, coefficient = right(e)
-        return power + 3.0 * e.data.count * np.sign(pair.exponent), coefficient
-
-    faults = {
-        "mean": lambda e, residual: right(e, residual) + 1.0,
-        "scale": two_shapes,
-        "share": two_shapes,
-        "shares": lambda e: np.roll(right(e), 1, axis=-1),
-        "covariance": lambda e: 6 * right(e),
-    }
-    return dataclasses.replace(pair, statistic=faults[pair.kind])
-
-
 def _kernel(pairs: Any = PAIRS) -> Make:
     def make(target: Target) -> Conjugate:
         kernel = conjugate_kernel(Blanket(target, "x"), pairs=pairs)
@@ -162,6 +146,17 @@ def _kernel(pairs: Any = PAIRS) -> Make:
         return kernel
 
     return make
+
+
+def _gross(target: Target) -> Conjugate:
+    """A kernel with an error in what it reads of sums by label that few rows show."""
+    kernel = _kernel()(target)
+    (partner,) = kernel.partners
+    assert partner._way is not None
+    first, *rest = partner._way.naturals
+    first = first if kernel.kind.name == "mean" else multiply(first, 6.0)
+    partner._way = ByLabel(partner._way.sums, (first, *(multiply(n, 3.0) for n in rest)))
+    return kernel
 
 
 def _key(pair: Pair) -> tuple[str, str, str]:
@@ -207,7 +202,9 @@ KEPT = (
 @pytest.mark.parametrize("key", KEPT, ids="-".join)
 def test_pair_with_what_is_kept_of_the_evidence(key: tuple[str, str, str], fault: str) -> None:
     """Every row has a posed problem of its own; that the sums are right is for ``test_conjugate``."""
-    _case(*SIDES[key], "posed", _gross).check("ranks", fault, replications=60)
+    model, sizes = Model(mixture(*SIDES[key]), ("y",), ("x",)), {"draws": 15, "chains": 240}
+    case = Case(model, _kernel(), {"wrong": _gross}, how="posed", sizes=sizes)
+    case.check("ranks", fault, replications=60)
 
 
 # ---- jointly Normal blocks -------------------------------------------------------------------------
