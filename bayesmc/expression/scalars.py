@@ -185,11 +185,11 @@ def _written(
     if isinstance(node, Pick):
         flat = np.concatenate([a.ravel() for a in operands])
         return flat[node.positions.ravel()].reshape(node.shape)
-    if isinstance(node, Reduction) and node.ufunc is np.add:
+    if isinstance(node, Reduction) and node.ufunc in (np.add, np.maximum, np.minimum):
         (a,) = operands
         moved = np.moveaxis(a, node.axes, range(-len(node.axes), 0))
-        rows = moved.reshape(node.size, -1)
-        return _objects([lines(" + ".join(row)) if len(row) else "0.0" for row in rows], node.shape)
+        rows = moved.reshape(node.size, -1).tolist() if a.size else [[]] * node.size
+        return _objects([_reduced(node.ufunc, row, lines) for row in rows], node.shape)
     if isinstance(node, Elementwise) and node.function in _TEXTS:
         text = _TEXTS[node.function]
         wide = [np.broadcast_to(a, node.shape).ravel() for a in operands]
@@ -207,6 +207,17 @@ def _written(
             raise NotImplementedError
         return np.stack([rule(m, lines) for m in a.reshape(-1, d, d)]).reshape(a.shape)
     raise NotImplementedError
+
+
+def _reduced(ufunc: np.ufunc, row: list[str], lines: _Lines) -> str:
+    if ufunc is np.add:
+        return lines(" + ".join(row)) if row else "0.0"
+    if not row:
+        raise NotImplementedError
+    found = row[0]
+    for x in row[1:]:
+        found = lines(_TEXTS[ufunc].format(found, x))
+    return found
 
 
 def _objects(items: list[str], shape: tuple[int, ...]) -> np.ndarray:

@@ -23,6 +23,7 @@ from bayesmc.expression import (
     elementwise,
     leaf,
     pick,
+    reduction,
     reshape,
 )
 from bayesmc.expression.products import product
@@ -246,10 +247,7 @@ def _inverse_wishart_of(
     factor = product(np.matmul, multiply(call(np.linalg.cholesky, [scale]), lower), over)
     draw = product(np.matmul, factor, transposed(factor))
     sines = divide(elementwise(np.square, _diagonal(factor)), _diagonal(draw))
-    sines = reshape(sines, (sines.size,))
-    least = pick([sines], 0)
-    for k in range(1, sines.size):
-        least = elementwise(np.minimum, least, pick([sines], k))
+    least = reduction(np.minimum, sines, range(len(sines.shape)))
     return draw, least, factor
 
 
