@@ -1,4 +1,4 @@
-"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as thirty.
+"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as seventy.
 
 Every element becomes a variable, equal ones once. What Python refuses (a logarithm of zero, a division
 by it, the root of a negative number) and what has no rule here is evaluated as arrays, which say in NumPy's
@@ -30,9 +30,9 @@ from bayesmc.expression.graph import (
 from bayesmc.shapes import Shape
 
 #: operations of one call of NumPy's time
-_PER_CALL = 25
+_PER_CALL = 70
 #: elements of a graph up to which code is made
-_MOST = 5000
+_MOST = 10_000
 
 
 class SmallProgram:
@@ -185,11 +185,11 @@ def _written(
     if isinstance(node, Pick):
         flat = np.concatenate([a.ravel() for a in operands])
         return flat[node.positions.ravel()].reshape(node.shape)
-    if isinstance(node, Reduction) and node.ufunc is np.add:
+    if isinstance(node, Reduction) and node.ufunc in (np.add, np.maximum, np.minimum):
         (a,) = operands
         moved = np.moveaxis(a, node.axes, range(-len(node.axes), 0))
-        rows = moved.reshape(node.size, -1)
-        return _objects([lines(" + ".join(row)) if len(row) else "0.0" for row in rows], node.shape)
+        rows = moved.reshape(node.size, -1).tolist() if a.size else [[]] * node.size
+        return _objects([_reduced(node.ufunc, row, lines) for row in rows], node.shape)
     if isinstance(node, Elementwise) and node.function in _TEXTS:
         text = _TEXTS[node.function]
         wide = [np.broadcast_to(a, node.shape).ravel() for a in operands]
@@ -206,7 +206,44 @@ def _written(
         if not a.size:
             raise NotImplementedError
         return np.stack([rule(m, lines) for m in a.reshape(-1, d, d)]).reshape(a.shape)
+    if isinstance(node, Call) and node.call in _PRODUCTS:
+        return _multiplied(node, operands, lines)
     raise NotImplementedError
+
+
+def _reduced(ufunc: np.ufunc, row: list[str], lines: _Lines) -> str:
+    if ufunc is np.add:
+        return lines(" + ".join(row)) if row else "0.0"
+    if not row:
+        raise NotImplementedError
+    found = row[0]
+    for x in row[1:]:
+        found = lines(_TEXTS[ufunc].format(found, x))
+    return found
+
+
+def _multiplied(node: Call, operands: list[np.ndarray], lines: _Lines) -> np.ndarray:
+    """A product of matrices or vectors whose batches are equal."""
+    left, right, out = _PRODUCTS[node.call]
+    a, b = operands
+    sizes = dict(zip(left + right, (*a.shape[-len(left) :], *b.shape[-len(right) :]), strict=False))
+    sizes |= dict(zip(right, b.shape[-len(right) :], strict=True))
+    a = a.reshape(-1, *a.shape[-len(left) :])
+    b = b.reshape(-1, *b.shape[-len(right) :])
+    if len(a) != len(b) or not node.size:
+        raise NotImplementedError
+    found = []
+    for one, other in zip(a, b, strict=True):
+        for at in np.ndindex(*(sizes[c] for c in out)):
+            place = dict(zip(out, at, strict=True))
+            terms = []
+            for j in range(sizes["j"]):
+                where = {**place, "j": j}
+                x, y = one[tuple(where[c] for c in left)], other[tuple(where[c] for c in right)]
+                if "0.0" not in (x, y):
+                    terms.append(f"{x} * {y}")
+            found.append(lines(" + ".join(terms)) if terms else "0.0")
+    return _objects(found, node.shape)
 
 
 def _objects(items: list[str], shape: tuple[int, ...]) -> np.ndarray:
@@ -245,6 +282,11 @@ _MATRICES: dict[Any, Callable[[np.ndarray, _Lines], np.ndarray]] = {
     np.linalg.cholesky: _cholesky,
     upper_inverse: _upper_inverse,
 }
+#: axes of both factors, and of the product
+_PRODUCTS: dict[Any, tuple[str, str, str]] = {
+    np.matmul: ("ij", "jk", "ik"), np.matvec: ("ij", "j", "i"),
+    np.vecmat: ("j", "jk", "k"), np.vecdot: ("j", "j", ""),
+}  # fmt: skip
 #: right sides, and what happens to NaN as in NumPy
 _TEXTS: dict[Any, str] = {
     np.add: "{} + {}", np.subtract: "{} - {}", np.multiply: "{} * {}", np.divide: "{} / {}",

@@ -148,23 +148,23 @@ class Labels(Kernel):
     def _plan(self) -> None:
         """Programs: log odds' coefficients and the size that products can have; coefficients of states."""
         width = len(self._most)
-        columns = [
-            pick([t.coefficients], _column(t.coefficients, i))
-            for t in self.terms
-            for i in range(t.coefficients.shape[1])
-        ]
-        if len(columns) < width:
-            columns.append(broadcast(as_expression(0.0), (self.states,)))
+        parts: list[Expression] = [t.coefficients for t in self.terms]
+        if self._one == sum(p.shape[1] for p in parts):
+            parts.append(broadcast(as_expression(0.0), (self.states, 1)))
+        starts = np.cumsum([0, *(p.size for p in parts)])
+        at = np.concatenate(
+            [a + np.arange(p.size).reshape(p.shape) for a, p in zip(starts, parts, strict=False)], 1
+        )
         prior = self._prior.expression
-        if prior is not None:
-            columns[self._one] = add(columns[self._one], prior)
-        rows = pick(columns, np.arange(self.states * width).reshape(width, self.states).T)
+        if prior is not None:  # in the place of the column of what multiplies ones
+            parts.append(add(pick(parts, at[:, self._one]), prior))
+            at[:, self._one] = starts[-1] + np.arange(self.states)
+        rows = pick(parts, at)
+        assert rows.shape == (self.states, width)
         at = np.arange(rows.size).reshape(rows.shape)
         odds = subtract(pick([rows], at[1:]), pick([rows], at[:1]))
         sizes = reduction(np.add, multiply(elementwise(np.abs, rows), self._most), (1,))
-        most = pick([sizes], 0)
-        for k in range(1, self.states):
-            most = elementwise(np.maximum, most, pick([sizes], k))
+        most = reduction(np.maximum, sizes, (0,))
         self._odds, self._rows = SmallProgram([odds, most]), SmallProgram([rows])
 
     def _table(self, values: Values, chains: int) -> _Table:
@@ -173,7 +173,8 @@ class Labels(Kernel):
         if more is None:
             odds, most = self._odds(values)
             if np.maximum.reduce(most, axis=None) < _LARGEST:
-                odds = np.broadcast_to(odds, (chains, *odds.shape[-2:]))
+                if odds.ndim == 2 or len(odds) < chains:
+                    odds = np.broadcast_to(odds, (chains, *odds.shape[-2:]))
                 return _Table(odds, lambda: self._by_state(values, chains), self._prior.steep)
         table = self._by_state(values, chains)
         if more is not None:
@@ -480,11 +481,6 @@ def _is_right(kernel: Labels) -> bool:
     except BayesmcError:
         return False
     return True
-
-
-def _column(node: Expression, at: int) -> np.ndarray:
-    """Positions of a column."""
-    return np.arange(node.size).reshape(node.shape)[:, at]
 
 
 def _first_of(target: Target) -> Values:

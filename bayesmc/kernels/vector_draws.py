@@ -23,6 +23,7 @@ from bayesmc.expression import (
     elementwise,
     leaf,
     pick,
+    reduction,
     reshape,
 )
 from bayesmc.expression.products import product
@@ -221,8 +222,8 @@ def _inverse_wishart(d: int) -> SmallProgram:
 
 def _normal_of(precision: Expression, linear: Expression, noise: Expression) -> Expression:
     root = call(upper_inverse, [transposed(call(np.linalg.cholesky, [precision]))])
-    white = add(product(np.vecmat, linear, root), noise)
-    return product(np.matvec, root, white)
+    white = add(call(np.vecmat, [linear, root]), noise)
+    return call(np.matvec, [root, white])
 
 
 def _inverse_wishart_of(
@@ -243,13 +244,10 @@ def _inverse_wishart_of(
         start += part.size
     over = transposed(call(upper_inverse, [pick(parts, at)]))
     lower = constant(np.tril(np.ones((d, d))))
-    factor = product(np.matmul, multiply(call(np.linalg.cholesky, [scale]), lower), over)
-    draw = product(np.matmul, factor, transposed(factor))
+    factor = call(np.matmul, [multiply(call(np.linalg.cholesky, [scale]), lower), over])
+    draw = product(np.matmul, factor, transposed(factor))  # symmetric to the last bit
     sines = divide(elementwise(np.square, _diagonal(factor)), _diagonal(draw))
-    sines = reshape(sines, (sines.size,))
-    least = pick([sines], 0)
-    for k in range(1, sines.size):
-        least = elementwise(np.minimum, least, pick([sines], k))
+    least = reduction(np.minimum, sines, range(len(sines.shape)))
     return draw, least, factor
 
 

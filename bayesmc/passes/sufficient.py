@@ -42,7 +42,6 @@ from bayesmc.expression import (
     reshape,
 )
 from bayesmc.expression.graph import CASTS
-from bayesmc.expression.products import product
 from bayesmc.expression.scalars import upper_inverse
 from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, subtract
 from bayesmc.passes.log_density import log_density
@@ -338,7 +337,7 @@ def precision_of(family: Family, batch: Shape) -> tuple[Expression, Expression]:
     root = _root(family)
     diagonal = pick([root], np.arange(root.size).reshape(root.shape).diagonal(axis1=-2, axis2=-1))
     half = reduction(np.add, elementwise(np.log, diagonal), (-1,))
-    precision = product(np.matmul, root, transposed(root))
+    precision = call(np.matmul, [root, transposed(root)])
     return broadcast(precision, batch + precision.shape[-2:]), broadcast(half, batch)
 
 
@@ -366,8 +365,9 @@ def _of_vectors(family: Family, centre: np.ndarray) -> NaturalForm:
     root = _root(family)
     batch = np.broadcast_shapes(root.shape[:-2], loc.shape[:-1])
     precision, half = precision_of(family, batch)
-    linear = product(np.matvec, precision, loc)
-    first = subtract(half, multiply(0.5, product(np.vecdot, linear, broadcast(loc, linear.shape))))
+    loc = broadcast(loc, (*batch, d))
+    linear = call(np.matvec, [precision, loc])
+    first = subtract(half, multiply(0.5, call(np.vecdot, [linear, loc])))
     y = leaf(VALUE, (d,))
     ys = [pick([y], i) for i in range(d)]
     statistics, coefficients = [ONE, *ys], [first]

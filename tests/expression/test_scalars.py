@@ -38,6 +38,7 @@ def _both(
 
 def _function(x: Any, s: Any) -> Any:
     z = (x[..., 0] - 2.0) ** 2 / s[..., 1] + np.sqrt(s[..., 0]) * np.log1p(s).sum(axis=-1)
+    z = z + np.max(s, axis=-1) - np.min(x[..., :2], axis=-1)
     return np.where(x[..., 1] > 0.3, z, -np.maximum(x[..., 1], np.exp(-np.abs(x[..., 2]))))
 
 
