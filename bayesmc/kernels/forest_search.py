@@ -109,6 +109,8 @@ def _is_eligible(target: Target, blanket: Blanket) -> bool:
 
 def _families(target: Target, names: Sequence[str]) -> dict[str, tuple[int, int]]:
     """For each node the place of its kind, and how many are of it."""
+    if len(names) == 1:
+        return {names[0]: (0, 1)}
     kinds: dict[Hashable, list[str]] = {}
     for name in names:
         signature = target.signatures.of(name) if name in target.terms else None

@@ -35,7 +35,7 @@ from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours
 from bayesmc.structure.like_children import with_like_children
-from bayesmc.structure.stacked import Forms, stacks
+from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
 #: components that move together along learnt directions, at most
@@ -203,7 +203,7 @@ def _conjugate(
     refusals: dict[str, str] = {}
     asked: dict[Hashable, str] = {}
     for name in names:
-        key = forms.key(blankets[name])
+        key = forms.key(blankets[name]) if len(names) >= FEWEST else None
         first = None if key is None else asked.get(key)
         if first is not None:
             one, other = forms.of(blankets[first]), forms.of(blankets[name])
