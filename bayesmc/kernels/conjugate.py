@@ -326,8 +326,7 @@ def conjugate_kernel(
         >>> import bayesmc as bmc
         >>> from bayesmc.kernels.conjugate import conjugate_kernel
         >>> from bayesmc.network import pose
-        >>> from bayesmc.passes.arithmetic import add
-    from bayesmc.structure.blanket import Blanket
+        >>> from bayesmc.structure.blanket import Blanket
         >>> from bayesmc.structure.target import target_of
         >>> net = bmc.BayesNet()
         >>> net.add("rate", bmc.Gamma(2.0, 1.0))
@@ -392,8 +391,7 @@ def full_conditional(blanket: Blanket, values: Values, part: int = 0) -> Distrib
         >>> import bayesmc as bmc
         >>> from bayesmc.kernels.conjugate import full_conditional
         >>> from bayesmc.network import pose
-        >>> from bayesmc.passes.arithmetic import add
-    from bayesmc.structure.blanket import Blanket
+        >>> from bayesmc.structure.blanket import Blanket
         >>> from bayesmc.structure.target import target_of
         >>> net = bmc.BayesNet(plates={"toss": 4})
         >>> net.add("p", bmc.Beta(1.0, 1.0))
