@@ -7,7 +7,7 @@ PYTHON ?= $(shell for p in python3 python3.14 python3.13 python3.12 python3.11 p
 PY = .venv/bin/python
 PIP_FLAGS = --disable-pip-version-check -q
 
-.PHONY: help demo test test-thorough mutants alarms lint format docs bench peers references clean
+.PHONY: help demo test test-thorough mutants alarms lint format counts docs bench peers references clean
 .NOTPARALLEL:
 
 help:
@@ -18,6 +18,7 @@ help:
 	@echo "make alarms  count the false alarms of the statistical tests (long)"
 	@echo "make lint    ruff, formatting, mypy"
 	@echo "make format  let ruff mend formatting and import order"
+	@echo "make counts  count lines, the modules that a call runs in, and the functions that are followed"
 	@echo "make docs    run every snippet of README, docs and docstrings"
 	@echo "make bench   time bayesmc beside hand-written code (and peers, after 'make peers')"
 	@echo "make peers   install the packages that the benchmarks compare with, in .venv-peers"
@@ -52,6 +53,9 @@ lint: .venv/.extras-dev
 format: .venv/.extras-dev
 	$(PY) -m ruff check --fix-only -q .
 	$(PY) -m ruff format .
+
+counts: .venv/.extras-plot,arviz,robotics,test
+	OPENBLAS_NUM_THREADS=1 $(PY) -m tests.counts
 
 docs: .venv/.extras-plot,arviz,robotics,test
 	$(PY) -m pytest -q tests/test_readme.py tests/test_docs.py tests/test_doctests.py

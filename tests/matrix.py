@@ -26,26 +26,12 @@ from bayesmc.errors import (
     ZeroProbabilityError,
 )
 from bayesmc.network import pose
-from bayesmc.testing import (
-    compare,
-    enumerate_posterior,
-    gaussian_evidence,
-    random_evidence,
-    random_gaussian_net,
-    random_net,
-    session,
-)
+from bayesmc.testing import compare, session
+from bayesmc.testing.posteriors.matrix import KINDS, matrix_case
 
 ALPHA = 1e-3
 SHIFT = session.seed()
 SEEDS = range(SHIFT, SHIFT + session.scaled(30, 4))
-KINDS: dict[str, dict[str, Any]] = {
-    "discrete": {},
-    "plates": {"plates": True},
-    "hybrid": {"hybrid": True},
-    "hybrid plates": {"hybrid": True, "plates": True},
-    "gaussian": {"plates": True, "vectors": True},
-}
 
 Answer = Callable[[bmc.BayesNet, dict[str, Any], int], Any]
 
@@ -176,20 +162,13 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
 
 @functools.cache
 def problem(kind: str, seed: int) -> tuple[bmc.BayesNet, dict[str, Any]]:
-    if kind == "gaussian":
-        net, _ = random_gaussian_net(seed, **KINDS[kind])
-        return net, gaussian_evidence(net, seed, chance=0.25)
-    net = random_net(seed, **KINDS[kind])
-    return net, random_evidence(net, seed)
+    return matrix_case(kind, seed)[:2]
 
 
 @functools.cache
 def exact(kind: str, seed: int, observed: bool = True) -> Any:
-    net, evidence = problem(kind, seed)
-    if kind == "gaussian":
-        _, plain = random_gaussian_net(seed, **KINDS[kind])
-        return plain.posterior(evidence if observed else {})
-    return enumerate_posterior(net, evidence if observed else None)
+    _, evidence, answer = matrix_case(kind, seed)
+    return answer(evidence if observed else None)
 
 
 def rejected(answer: Answer, kind: str, seed: int, draw: int, observed: bool = True) -> str | None:

@@ -26,6 +26,7 @@ from bayesmc.engines.mcmc.gibbs_plan import Plan
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import BayesmcError
+from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.redrawn import Redrawn
@@ -135,7 +136,7 @@ def _is_small(problem: Problem, plan: Plan) -> bool:
     names = {n for kernel in plan.kernels for n in kernel.names}
     slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels)
     finite = {n for n in names if model[n].domain is not None}
-    known = (Slice, FactorSlice, AdaptiveWalk, Redrawn, Rescaled)
+    known = (Slice, FactorSlice, AdaptiveWalk, BlockWalk, Redrawn, Rescaled)
     if not slow or any(
         not isinstance(k, known) and not finite >= set(k.names) for k in plan.kernels
     ):

@@ -7,8 +7,6 @@ log probability the broadcast of the value's and the distribution's batch. A fam
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -17,10 +15,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from bayesmc.distributions import faults
+from bayesmc.distributions.keywords import check_keywords, signature
 from bayesmc.distributions.reading import read_floats
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Transform, transform_of
-from bayesmc.errors import BayesmcError, ParameterError, ShapeError, UnsupportedError
+from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
 from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
 from bayesmc.tracing import TracedCall, is_traced
 
@@ -51,6 +51,9 @@ class Distribution:
 
     event_shape: Shape = ()
     batch_shape: Shape = ()
+    #: a family's log density as a NumPy function of a value and the parameters by name, for engines that read
+    #: its form (conjugate updates, derivatives); ``log_prob`` is it, too, unless ``_log_prob`` is given
+    log_density: ClassVar[Callable[..., Any] | None] = None
     #: batch elements with parameters out of range (only while these are marked), else None
     invalid: np.ndarray | None = None
     problem: ParameterError | None = None
@@ -59,10 +62,12 @@ class Distribution:
 
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """A new distribution; of traced parameters, a record of the call in its place."""
+        if kwargs:
+            check_keywords(cls, kwargs.keys())
         if not _may_be_traced(args) and not (kwargs and _may_be_traced(kwargs.values())):
             return super().__new__(cls)
         if any(map(is_traced, args)) or any(map(is_traced, kwargs.values())):
-            bound = _signature(cls).bind(*args, **kwargs)  # type: ignore[arg-type]
+            bound = signature(cls).bind(*args, **kwargs)  # type: ignore[arg-type]
             bound.apply_defaults()
             return TracedCall(cls, dict(bound.arguments))
         return super().__new__(cls)
@@ -79,7 +84,7 @@ class Distribution:
             shape = as_shape(sample_shape) + self.batch_shape
             return self._sample(np.random.default_rng(rng), shape)
         except (TypeError, ValueError) as error:
-            self._explain_sample(sample_shape, error)
+            faults.explain_sample(self, sample_shape, error)
             raise
 
     def sample_to(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
@@ -102,7 +107,7 @@ class Distribution:
             with np.errstate(all="ignore"):
                 return self._log_prob(np.asarray(x))
         except (TypeError, ValueError, IndexError) as error:
-            self._explain_log_prob(x, error)
+            faults.explain_log_prob(self, x, error)
             raise
 
     def log_prob_unchecked(self, x: np.ndarray) -> np.ndarray:
@@ -168,7 +173,7 @@ class Distribution:
         >>> float((rate.log_prob(rate.constrain(0.5)) + rate.log_abs_det_jacobian(0.5)).round(4))
         -0.6487
         """
-        return self._mapped("constrain", u)
+        return faults.mapped(self, "constrain", u)
 
     def unconstrain(self, x: Any) -> np.ndarray:
         """The unconstrained numbers behind ``x``: the inverse of ``constrain``.
@@ -183,7 +188,7 @@ class Distribution:
         -------
         ndarray, shape (..., *transform.unconstrained_shape)
         """
-        return self._mapped("unconstrain", x)
+        return faults.mapped(self, "unconstrain", x)
 
     def log_abs_det_jacobian(self, u: Any) -> np.ndarray:
         """``log |det dx/du|`` at ``u``, summed over the event.
@@ -197,7 +202,7 @@ class Distribution:
         ndarray, shape (...)
             ``...`` broadcast with the batch of bounds that depend on parents.
         """
-        return self._mapped("log_abs_det_jacobian", u)
+        return faults.mapped(self, "log_abs_det_jacobian", u)
 
     def cdf(self, x: Any) -> np.ndarray:
         """Probability of a value at most ``x``."""
@@ -235,67 +240,10 @@ class Distribution:
         raise NotImplementedError
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
-
-    # ---- what went wrong, once something has ------------------------------------------------
-
-    def _explain_sample(self, sample_shape: Any, error: Exception) -> None:
-        """Raise what is wrong with ``sample_shape``, if that is what failed."""
-        sizes = np.asarray(sample_shape)
-        if isinstance(error, BayesmcError) or (
-            sizes.size == 0 or sizes.dtype.kind in "iu" and sizes.min() >= 0
-        ):
-            return
-        raise ShapeError(
-            f"{self._family}.sample: sample_shape must be a nonnegative whole number or a tuple of "
-            f"them; got {sample_shape!r}"
-        ) from error
-
-    def _explain_log_prob(self, x: Any, error: Exception) -> None:
-        """Raise what is wrong with the values ``x``, if that is what failed."""
-        if isinstance(error, BayesmcError):
-            return
-        values = self._numbers("log_prob", "values", x, error)
-        cut = max(values.ndim - len(self.event_shape), 0)
-        lead, event = values.shape[:cut], values.shape[cut:]
-        if event != self.event_shape:
-            raise ShapeError(
-                f"{self._family}.log_prob: the values have shape {values.shape}, not "
-                f"(..., *{self.event_shape})"
-            ) from error
-        try:
-            np.broadcast_shapes(lead, self.batch_shape)
-        except ValueError:
-            raise ShapeError(
-                f"{self._family}.log_prob: values of shape {values.shape} do not broadcast with "
-                f"batch shape {self.batch_shape}; add an axis, as in x[:, None]"
-            ) from error
-
-    def _mapped(self, what: str, value: Any) -> np.ndarray:
-        """A map of the ``transform``, whose faults are told as this family's."""
-        transform = self.transform
-        free = what != "unconstrain"
-        try:
-            return getattr(transform, what)(value)
-        except (TypeError, ValueError) as error:
-            noun = "free values" if free else "values"
-            shape = self._numbers(what, noun, value, error).shape
-            wanted = transform.unconstrained_shape if free else self.event_shape
-            if shape[max(len(shape) - len(wanted), 0) :] == wanted:
-                fault = f"does not broadcast with batch shape {self.batch_shape}"
-            else:
-                fault = f"is not (..., *{wanted})"
-            raise ShapeError(
-                f"{self._family}.{what}: the {noun} have shape {shape}, which {fault}"
-            ) from error
-
-    def _numbers(self, what: str, noun: str, value: Any, error: Exception) -> np.ndarray:
-        try:
-            return np.asarray(value, dtype=float)
-        except (TypeError, ValueError):
-            raise ParameterError(
-                f"{self._family}.{what}: the {noun} must be numbers; got {value!r:.80}"
-            ) from error
+        form = type(self).log_density
+        if form is None:
+            raise NotImplementedError
+        return form(x, **{name: getattr(self, name) for name in self.parameter_ndim})
 
     # ---- what a family's constructor calls --------------------------------------------------
 
@@ -424,11 +372,6 @@ def _may_be_traced(parameters: Iterable[Any]) -> bool:
         if type(parameter) not in _PLAIN:
             return True
     return False
-
-
-@functools.cache
-def _signature(family: type) -> inspect.Signature:
-    return inspect.signature(family)
 
 
 def as_float(value: Any) -> np.ndarray:

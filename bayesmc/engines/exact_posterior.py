@@ -198,7 +198,7 @@ class ExactPosterior(Posterior):
         plates: Plates = (),
         names: Mapping[str, str] | None = None,
     ) -> np.ndarray:
-        return self._average(function, plates, names)
+        return self._average(Query(self.model, function, plates, names))
 
     def probability(
         self,
@@ -206,17 +206,10 @@ class ExactPosterior(Posterior):
         plates: Plates = (),
         names: Mapping[str, str] | None = None,
     ) -> np.ndarray:
-        return self._average(function, plates, names, events=True)
+        return self._average(Query(self.model, function, plates, names), events=True)
 
-    def _average(
-        self,
-        function: Callable[..., Any] | str,
-        plates: Plates,
-        names: Mapping[str, str] | None,
-        events: bool = False,
-    ) -> np.ndarray:
+    def _average(self, query: Query, events: bool = False) -> np.ndarray:
         """The function on every configuration of what it needs, averaged over their joint table."""
-        query = Query(self.model, function, plates, names)
         gaussian = [n for n in query.nodes if self._is_gaussian(n)]
         if set(self._tables.missing(query.nodes)) - set(gaussian):
             self._live("expectation of a deterministic node")
@@ -229,18 +222,18 @@ class ExactPosterior(Posterior):
 
     # ---- draws and diagnostics ----------------------------------------------------------------
 
-    def mcse(self, what: Any) -> np.ndarray:
+    def _mcse(self, what: str | Query) -> np.ndarray:
         return np.zeros(self._shape_of(what))
 
-    def ess(self, what: Any) -> np.ndarray:
+    def _ess(self, what: str | Query) -> np.ndarray:
         return np.full(self._shape_of(what), np.inf)
 
-    def rhat(self, what: Any) -> np.ndarray:
+    def _rhat(self, what: str | Query) -> np.ndarray:
         return np.full(self._shape_of(what), np.nan)
 
-    def _shape_of(self, what: Any) -> tuple[int, ...]:
-        if callable(what):
-            return self.expectation(what).shape
+    def _shape_of(self, what: str | Query) -> tuple[int, ...]:
+        if isinstance(what, Query):
+            return self._average(what).shape
         node = self._node(what)
         if node.domain is not None and node.domain.labels is not None:
             return (*node.plate_shape, node.domain.size)

@@ -1,6 +1,7 @@
 """The expression graph of a function: tracer, nodes, evaluation and derivatives."""
 
 from bayesmc.expression.array import TracedArray, TracedStates, refusals, refused
+from bayesmc.expression.calls import as_one_call
 from bayesmc.expression.evaluate import Program, evaluate
 from bayesmc.expression.graph import (
     Call,
@@ -42,6 +43,7 @@ __all__ = [
     "TracedArray",
     "TracedStates",
     "as_expression",
+    "as_one_call",
     "broadcast",
     "call",
     "cast",

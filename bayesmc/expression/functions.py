@@ -112,6 +112,11 @@ class Repeated:
             found = self.function(*args, **kwargs)
         return np.asarray(found if self.output is None else found[self.output])
 
+    @property
+    def slots(self) -> list[int | None]:
+        """For each argument by place the number of the operand that it is; None where it is known."""
+        return [a.number if isinstance(a, _Slot) else None for a in self.args]
+
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Repeated) and self.key == other.key
 

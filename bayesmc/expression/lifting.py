@@ -1,4 +1,4 @@
-"""Functions whose captured arrays can be indexed by stand-ins, and what they call besides NumPy.
+"""Functions whose captured arrays can be indexed by stand-ins.
 
 NumPy hands a call on only where an argument stands for an array. So a captured array that is indexed by
 one, a list that is made an array, and functions of SciPy that are no ufuncs are put in place of
@@ -8,51 +8,26 @@ themselves in a copy of the function.
 from __future__ import annotations
 
 import contextlib
-import dis
 import types
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from scipy import special
 
 from bayesmc.expression.array import TracedArray
+from bayesmc.expression.changing import is_left, is_open, names_in
 from bayesmc.expression.functions import expression_of, of_function
 from bayesmc.expression.graph import constant
 from bayesmc.tracing.standin import TracedCall, is_traced
 
-#: modules whose functions give another answer the next time
-_CHANGING = frozenset(("time", "random", "datetime", "secrets", "uuid", "os"))
-#: modules whose functions are left as they are
-_KNOWN = frozenset(("numpy", "scipy", "bayesmc", "builtins", "math"))
-#: of these, where functions stand that users call in theirs
-_OPEN = ("bayesmc.robotics", "bayesmc.distributions")
+#: modules of which some functions are replaced
+_REPLACED = frozenset(("numpy", "scipy"))
 
 
 def lifted(function: types.FunctionType) -> types.FunctionType:
     """A copy of a function, and of those that it calls, in which captured arrays are stand-ins."""
     return _lifted_function(function, {})
-
-
-def tells_time_or_chance(function: Any) -> str | None:
-    """What a function reads that another call finds changed, or None."""
-    seen: set[int] = set()
-    todo = [function]
-    while todo:
-        value = todo.pop()
-        value = getattr(value, "__func__", value)
-        value = getattr(value, "func", value)
-        if not isinstance(value, types.FunctionType) or id(value) in seen:
-            continue
-        seen.add(id(value))
-        for name, held in _captured(value):
-            found = _changing(name, held, value)
-            if found is not None:
-                return found
-            if isinstance(held, types.FunctionType) and _is_open(held):
-                todo.append(held)
-    return None
 
 
 def log_sum_exp(a: Any, axis: Any = None, b: Any = None, keepdims: bool = False) -> Any:
@@ -69,57 +44,6 @@ def log_sum_exp(a: Any, axis: Any = None, b: Any = None, keepdims: bool = False)
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _captured(function: types.FunctionType) -> list[tuple[str, Any]]:
-    """What a function reads from around it: globals, cells, defaults."""
-    names = _globals(function.__code__)
-    found = [(n, function.__globals__[n]) for n in names if n in function.__globals__]
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        with contextlib.suppress(ValueError):  # an empty cell
-            found.append((name, cell.cell_contents))
-    found += [("a default", v) for v in function.__defaults__ or ()]
-    return found
-
-
-@lru_cache(maxsize=4096)
-def _names(code: types.CodeType) -> tuple[str, ...]:
-    """Names that code reads, of functions inside of it, too."""
-    inner = [c for c in code.co_consts if isinstance(c, types.CodeType)]
-    return (*code.co_names, *(n for c in inner for n in _names(c)))
-
-
-@lru_cache(maxsize=4096)
-def _globals(code: types.CodeType) -> frozenset[str]:
-    """Names that code looks up around it, of functions inside of it, too."""
-    found = (i.argval for i in dis.get_instructions(code) if i.opname == "LOAD_GLOBAL")
-    return frozenset(found).union(
-        *(_globals(c) for c in code.co_consts if isinstance(c, types.CodeType))
-    )
-
-
-def _changing(name: str, value: Any, function: types.FunctionType) -> str | None:
-    if isinstance(value, types.ModuleType):
-        if value.__name__ in _CHANGING:
-            return f"it reads {value.__name__}, which another call finds changed"
-        if value is np and "random" in _names(function.__code__):
-            return "it draws random numbers"
-    if isinstance(value, (np.random.Generator, np.random.RandomState)):
-        return f"it draws random numbers from {name}"
-    if _room(value) in _CHANGING and callable(value):
-        return f"it calls {name}, which another call finds changed"
-    return None
-
-
-def _is_open(function: types.FunctionType) -> bool:
-    """Whether a function is a user's, or one of those that users call in theirs."""
-    module = str(function.__module__ or "")
-    return _room(function) not in _KNOWN or module.startswith(_OPEN)
-
-
-def _room(value: Any) -> str:
-    module = getattr(value, "__module__", None)
-    return str(module or "").split(".")[0].lstrip("_")
-
-
 def _lifted_function(
     function: types.FunctionType, seen: dict[int, types.FunctionType]
 ) -> types.FunctionType:
@@ -131,7 +55,7 @@ def _lifted_function(
         function.__code__, scope, function.__name__, None, cells if function.__closure__ else None
     )
     seen[id(function)] = made
-    for name in set(_names(function.__code__)) & scope.keys():
+    for name in set(names_in(function.__code__)) & scope.keys():
         scope[name] = _lifted(scope[name], seen)
     made.__defaults__ = tuple(_lifted(v, seen) for v in function.__defaults__ or ()) or None
     kept = function.__kwdefaults__ or {}
@@ -145,9 +69,11 @@ def _lifted_function(
 def _lifted(value: Any, seen: dict[int, types.FunctionType]) -> Any:
     if type(value) is np.ndarray and value.ndim and value.dtype in (float, np.int64, bool):
         return TracedArray(constant(value))
-    if isinstance(value, types.FunctionType) and _is_open(value):
+    if isinstance(value, types.FunctionType) and is_open(value):
         return _lifted_function(value, seen)
-    if isinstance(value, types.ModuleType) and value.__name__.split(".")[0] in ("numpy", "scipy"):
+    if isinstance(value, types.ModuleType) and (
+        not is_left(value) or value.__name__.split(".")[0] in _REPLACED
+    ):
         return _Module(value)
     try:
         return _INSTEAD.get(value, value)
@@ -156,19 +82,13 @@ def _lifted(value: Any, seen: dict[int, types.FunctionType]) -> Any:
 
 
 class _Module:
-    """A module of NumPy or SciPy with some functions replaced."""
+    """A module with what it holds lifted when it is asked for."""
 
     def __init__(self, module: types.ModuleType) -> None:
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        value = getattr(self._module, name)
-        if isinstance(value, types.ModuleType):
-            return _Module(value)
-        try:
-            return _INSTEAD.get(value, value)
-        except TypeError:
-            return value
+        return _lifted(getattr(self._module, name), {})
 
 
 def _if_traced(original: Callable[..., Any], rule: Callable[..., Any]) -> Callable[..., Any]:

@@ -11,8 +11,9 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression.array import TracedArray, refusals
+from bayesmc.expression.changing import tells_time_or_chance
 from bayesmc.expression.graph import Expression, as_expression
-from bayesmc.expression.lifting import lifted, tells_time_or_chance
+from bayesmc.expression.lifting import lifted
 from bayesmc.plates import PlateArray
 from bayesmc.tracing.standin import TracedCall, is_traced
 

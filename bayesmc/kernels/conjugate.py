@@ -313,31 +313,31 @@ def conjugate_kernel(
 ) -> Conjugate | str:
     """The conjugate kernel of a node, or in words why there is none.
 
-        Parameters
-        ----------
-        blanket : Blanket
-        debug : bool
-            Check every draw against the model's densities (slow).
-        pairs : sequence of Pair
-            The conjugate table.
+    Parameters
+    ----------
+    blanket : Blanket
+    debug : bool
+        Check every draw against the model's densities (slow).
+    pairs : sequence of Pair
+        The conjugate table.
 
-        Examples
-        --------
-        >>> import bayesmc as bmc
-        >>> from bayesmc.kernels.conjugate import conjugate_kernel
-        >>> from bayesmc.network import pose
-        >>> from bayesmc.structure.blanket import Blanket
-        >>> from bayesmc.structure.target import target_of
-        >>> net = bmc.BayesNet()
-        >>> net.add("rate", bmc.Gamma(2.0, 1.0))
-        >>> net.add("shape", bmc.Gamma(2.0, 1.0))
-        >>> net.add("count", lambda rate: bmc.Poisson(10 * rate))
-        >>> net.add("time", lambda shape: bmc.Gamma(shape, 1.0))
-        >>> target = target_of(pose(net, {"count": 3, "time": 0.5}))
-        >>> conjugate_kernel(Blanket(target, "rate")).match
-        'Gamma with Poisson rate'
-        >>> conjugate_kernel(Blanket(target, "shape"))
-        "it enters the concentration of Gamma 'time'"
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.conjugate import conjugate_kernel
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.blanket import Blanket
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.Gamma(2.0, 1.0))
+    >>> net.add("shape", bmc.Gamma(2.0, 1.0))
+    >>> net.add("count", lambda rate: bmc.Poisson(10 * rate))
+    >>> net.add("time", lambda shape: bmc.Gamma(shape, 1.0))
+    >>> target = target_of(pose(net, {"count": 3, "time": 0.5}))
+    >>> conjugate_kernel(Blanket(target, "rate")).match
+    'Gamma with Poisson rate'
+    >>> conjugate_kernel(Blanket(target, "shape"))
+    "it enters the concentration of Gamma 'time'"
     """
     if blanket.own is None:
         return "it has no prior density of its own"
@@ -368,38 +368,38 @@ def conjugate_kernel(
 def full_conditional(blanket: Blanket, values: Values, part: int = 0) -> Distribution:
     """The full conditional of a conjugate node in a state.
 
-        Parameters
-        ----------
-        values : dict
-            Stored values of all nodes, hidden ones ``(chains, *plates, *event)``.
-        part : int
-            Which of ``blanket.classes``.
+    Parameters
+    ----------
+    values : dict
+        Stored values of all nodes, hidden ones ``(chains, *plates, *event)``.
+    part : int
+        Which of ``blanket.classes``.
 
-        Returns
-        -------
-        Distribution
-            Batch broadcasts to ``(chains, *plates)``, or to ``(chains, members)`` of a class of elements.
+    Returns
+    -------
+    Distribution
+        Batch broadcasts to ``(chains, *plates)``, or to ``(chains, members)`` of a class of elements.
 
-        Raises
-        ------
-        UnsupportedError
-            The node is not conjugate; the message says why.
+    Raises
+    ------
+    UnsupportedError
+        The node is not conjugate; the message says why.
 
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import bayesmc as bmc
-        >>> from bayesmc.kernels.conjugate import full_conditional
-        >>> from bayesmc.network import pose
-        >>> from bayesmc.structure.blanket import Blanket
-        >>> from bayesmc.structure.target import target_of
-        >>> net = bmc.BayesNet(plates={"toss": 4})
-        >>> net.add("p", bmc.Beta(1.0, 1.0))
-        >>> net.add("heads", lambda p: bmc.Bernoulli(p), plates="toss")
-        >>> target = target_of(pose(net, {"heads": [1, 0, 1, 1]}))
-        >>> found = full_conditional(Blanket(target, "p"), {**target.known, "p": np.array([0.5])})
-        >>> found.concentration1.tolist(), found.concentration0.tolist()
-        ([4.0], [2.0])
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.conjugate import full_conditional
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.blanket import Blanket
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet(plates={"toss": 4})
+    >>> net.add("p", bmc.Beta(1.0, 1.0))
+    >>> net.add("heads", lambda p: bmc.Bernoulli(p), plates="toss")
+    >>> target = target_of(pose(net, {"heads": [1, 0, 1, 1]}))
+    >>> found = full_conditional(Blanket(target, "p"), {**target.known, "p": np.array([0.5])})
+    >>> found.concentration1.tolist(), found.concentration0.tolist()
+    ([4.0], [2.0])
     """
     kernel = conjugate_kernel(blanket)
     if isinstance(kernel, str):

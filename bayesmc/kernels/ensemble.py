@@ -5,10 +5,15 @@ ensembles, half the members of each move given the other half, whose differences
 sizes that matter; ensembles never look at each other once the warmup is over. Angles are kept within one
 turn, and their differences taken the short way round.
 
+Steps from where a chain stands seldom lead from one hill of a density to another, and chains that start in
+one look as if it were all there is. So a few numbers that are a whole posterior are now and then proposed
+anew, from a mixture that was fitted to all hills from the prior on (``tempering``).
+
 References
 ----------
 ter Braak (2006), A Markov chain Monte Carlo version of the genetic algorithm differential evolution,
-Statistics and Computing 16; Goodman and Weare (2010), Comm. App. Math. Comp. Sci. 5 (halves).
+Statistics and Computing 16; Goodman and Weare (2010), Comm. App. Math. Comp. Sci. 5 (halves); Tierney (1994),
+Annals of Statistics 22, sec. 2.3.1 (independence chains) and 2.4 (mixtures of kernels).
 """
 
 from __future__ import annotations
@@ -21,11 +26,14 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped
+from bayesmc.errors import BayesmcError
 from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance, turning
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import Block, accepted, instead
 from bayesmc.kernels.random_walk import counted, finite, some_support, walked
+from bayesmc.kernels.tempering import MixtureOfT, fitted_mixture
 from bayesmc.shapes import Shape
 from bayesmc.structure.target import Target, Values
 
@@ -33,8 +41,12 @@ from bayesmc.structure.target import Target, Values
 _DIFFERENCES, _JUMPS = 0.5, 0.2
 #: noise of those steps, in Gaussian steps
 _NOISE = 1e-2
-#: kinds of moves: a Gaussian step, a difference of adapted length, a difference as it is
-_GAUSSIAN, _DIFFERENCE, _JUMP = 0, 1, 2
+#: kinds of moves: a Gaussian step, a difference of adapted length, a difference as it is, a draw anew
+_GAUSSIAN, _DIFFERENCE, _JUMP, _ANEW = 0, 1, 2, 3
+#: numbers to which a mixture is fitted, at most; draws it is fitted with; share of moves that draw from it
+FEW, _DRAWS, AFRESH = 6, 1000, 0.5
+#: numbers that one evaluation of the mixture's draws may take
+_ELEMENTS = 1 << 23
 
 
 @dataclass(frozen=True)
@@ -74,6 +86,10 @@ class BlockWalk(Kernel):
         As for ``AdaptiveWalk``.
     alone : bool
         Nothing else moves what the block depends on, so that densities can be kept between steps.
+    anew : float
+        Share of moves that are draws from a mixture fitted to the whole density, at the first step of a
+        warmup: of all hidden numbers, few and none of them an angle (``may_be_drawn_anew``). With 1 there are
+        no others.
 
     Examples
     --------
@@ -106,12 +122,14 @@ class BlockWalk(Kernel):
         unconstrained: bool = True,
         adaptive: bool = True,
         alone: bool = False,
+        anew: float = 0.0,
     ) -> None:
         self.block = Block(target, names)
         self.names = self.block.names
         self.ensemble = ensemble
         self.unconstrained = unconstrained
         self.alone = alone
+        self.anew = anew
         self.parts = parts_of(target, self.names, unconstrained)
         size = self.parts[-1].stop
         angles = [_angles(target, part, unconstrained) for part in self.parts]
@@ -121,6 +139,10 @@ class BlockWalk(Kernel):
             self.match = f"ensembles of {ensemble}"
         elif not adaptive:
             self.label = "random walk"
+        if anew:
+            self.label = (
+                "independent proposals" if anew == 1.0 else f"{self.label}, independent proposals"
+            )
         numbers = f"{size} number{'s' if size > 1 else ''}"
         self.match = f"{numbers} at once" + (f", {self.match}" if self.match else "")
 
@@ -138,11 +160,17 @@ class BlockWalk(Kernel):
             "log": log,
             "accepted": np.zeros(chains),
             "moves": 0,
+            "mixture": None,
+            "fitted": not self.anew,
         }
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
+        if warmup and not memory["fitted"]:
+            memory = {**memory, "fitted": True, "mixture": self._fitted(values, rng)}
+        if self.anew == 1.0 and memory["mixture"] is None:
+            return {name: values[name] for name in self.names}, memory
         if self.alone and not self.block.has_own_data(values):
             u, log = memory["u"].copy(), memory["log"].copy()
         else:
@@ -151,10 +179,10 @@ class BlockWalk(Kernel):
         rates, moves = np.empty(len(u)), np.empty(len(u), dtype=np.int8)
         taken = np.zeros(len(u))
         for rows, others in self._halves(len(u), rng):
-            tried, moves[rows] = self._proposed(u, rows, others, memory, rng)
+            tried, moves[rows], log_backward = self._proposed(u, rows, others, memory, rng)
             state = self.block.rows({**values, **new}, rows)
             moved, grown = self._evaluated(state, tried)
-            log_ratio = grown - log[rows]
+            log_ratio = grown - log[rows] + log_backward
             accept = accepted(log_ratio, rng)
             for name, value in moved.items():
                 new[name][rows] = instead(~accept, value, state[name])
@@ -174,6 +202,8 @@ class BlockWalk(Kernel):
         return {**memory, "steps": self.steps.frozen(memory["steps"])}
 
     def acceptance(self, memory: Memory) -> np.ndarray | None:
+        if self.anew == 1.0 and memory["mixture"] is None:
+            return None
         return memory["accepted"] / max(memory["moves"], 1)
 
     def replaced(self, memory: Memory, rows: np.ndarray) -> Memory:
@@ -201,10 +231,32 @@ class BlockWalk(Kernel):
         others: np.ndarray | None,
         memory: Memory,
         rng: np.random.Generator,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Where some rows might go, and by which kind of move.
+    ) -> tuple[np.ndarray, np.ndarray, Any]:
+        """Where some rows might go, by which kind of move, and log q(back) - log q(there)."""
+        tried, moves = self._stepped(u, rows, others, memory, rng)
+        mixture: MixtureOfT | None = memory["mixture"]
+        if mixture is None:
+            return tried, moves, 0.0
+        far = np.flatnonzero(rng.random(len(rows)) < self.anew)
+        if not len(far):
+            return tried, moves, 0.0
+        tried, moves, log_backward = tried.copy(), moves.copy(), np.zeros(len(rows))
+        tried[far], moves[far] = mixture.draw(rng, len(far)), _ANEW
+        log_q = mixture.log_prob(np.concatenate([u[rows[far]], tried[far]]))
+        log_backward[far] = log_q[: len(far)] - log_q[len(far) :]
+        return tried, moves, log_backward
 
-        Every move is symmetric, on a circle, too. A step d is drawn without a look at where the row stands,
+    def _stepped(
+        self,
+        u: np.ndarray,
+        rows: np.ndarray,
+        others: np.ndarray | None,
+        memory: Memory,
+        rng: np.random.Generator,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where steps lead, and of which kind each is.
+
+        Every step is symmetric, on a circle, too. A step d is drawn without a look at where the row stands,
         and -d is as likely: for a difference the two members are as likely the other way round, and the short
         way between angles then changes its sign, unless they stand opposite each other, which has
         probability zero. What is added to an angle is wrapped, and wrapping commutes with adding steps, so
@@ -227,6 +279,32 @@ class BlockWalk(Kernel):
         difference = np.where(jump, 1.0, factor)[:, None] * difference + _NOISE * steps
         moves = np.where(along, np.where(jump, _JUMP, _DIFFERENCE), _GAUSSIAN)
         return self.steps.wrapped(u[rows] + np.where(along[:, None], difference, steps)), moves
+
+    def _fitted(self, values: Values, rng: np.random.Generator) -> MixtureOfT | None:
+        """A mixture fitted to the block's posterior, from draws of the prior on; None where none will do."""
+        largest = max(math.prod(t.shape) for t in (*self.block.own.values(), *self.block.others))
+        count = min(_DRAWS, _ELEMENTS // max(largest, 1))
+        if self.block.has_own_data(values) or count < 20 * self.size:
+            return None
+        rows = np.zeros(count, dtype=np.intp)
+        state = self.block.rows(values, rows)
+        try:
+            with marking_invalid(), np.errstate(all="ignore"):
+                drawn, _ = self._placed({**state, **self._drawn(state, count, rng)})
+                return fitted_mixture(lambda u: self._evaluated(state, u)[1], drawn, rng)
+        except BayesmcError:  # parameters out of range far out: chains do without
+            return None
+
+    def _drawn(self, state: Values, count: int, rng: np.random.Generator) -> Values:
+        """Draws of the block from the prior, and what follows from them."""
+        model, drawn = self.block.target.model, dict(state)
+        for name in self.block.order:
+            dist, _ = model.evaluate(name, drawn)
+            if name in self.names:
+                drawn[name] = model.sample_stored(name, dist, rng, (count,))
+            else:
+                drawn[name] = dist
+        return drawn
 
     def _placed(self, values: Values) -> tuple[np.ndarray, np.ndarray]:
         """The vectors behind current values, and the log densities of these vectors."""
@@ -324,6 +402,21 @@ class BlockWalk(Kernel):
         if self.ensemble < 8:
             return None
         return ~stragglers(log.reshape(-1, self.ensemble)).ravel()
+
+
+def may_be_drawn_anew(target: Target, names: Sequence[str]) -> bool:
+    """Whether some nodes are all that is hidden, few numbers, each with a prior that can be drawn from.
+
+    Angles are left out, which a mixture does not know to be such, and nodes that are seen in part.
+    """
+    nodes = [target.model[n] for n in names]
+    if set(names) != set(target.chain) or any(n not in target.terms for n in names):
+        return False
+    if any(n.is_discrete or n.unsampled or target.seen(n.name) is not None for n in nodes):
+        return False
+    parts = parts_of(target, names)
+    angles = (turned for part in parts for turned in _angles(target, part, True))
+    return parts[-1].stop <= FEW and not any(angles)
 
 
 def stragglers(log: np.ndarray, ranges: float = 3.0) -> np.ndarray:

@@ -8,12 +8,13 @@ Neal (2003), Slice sampling, Annals of Statistics 31, sections 4.1 (stepping out
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions.support import Support, is_half_line
-from bayesmc.distributions.transforms import transform_of
+from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.structure.blanket import Blanket
@@ -118,6 +119,44 @@ def _shrink(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Line:
+    """What one component moves along: its numbers, their logs, an angle, or the cells of integers.
+
+    Attributes
+    ----------
+    start, end : ndarray
+        Bounds of the numbers; a density may be infinite there, which rounding can reach.
+    here : ndarray
+        Where it is, which is taken in place of numbers that are not inside.
+    """
+
+    is_integer: bool
+    on_logs: bool
+    circle: Transform | None
+    start: Any
+    end: Any
+    here: np.ndarray
+
+    def value(self, at: np.ndarray) -> np.ndarray:
+        """The component's value at places along the line."""
+        if self.is_integer:
+            return np.floor(at)
+        if self.on_logs:
+            return self.start + np.exp(at)
+        # what depends on an angle need not repeat itself beyond the cut
+        return at if self.circle is None else self.circle.constrain(at)
+
+    def candidate(self, at: np.ndarray, dtype: np.dtype) -> tuple[np.ndarray, Any]:
+        """The value to be tried at places, and what its log density lacks there, if anything."""
+        found = self.value(at)
+        if self.is_integer:
+            return found.astype(dtype), None
+        inside = (found > self.start) & (found < self.end)
+        volume = np.where(inside, at if self.on_logs else 0.0, -np.inf)
+        return np.where(inside, found, self.here), volume
+
+
 class Slice(Kernel):
     """Slice sampling of a node of numbers; components of a vector one after the other."""
 
@@ -171,44 +210,25 @@ class Slice(Kernel):
             width = width.ravel()[members]
         support = self._support(values, component)
         low, high = self._bounds(support, members)
-        growth = _GROWTH
-        circle = transform_of(support) if support.kind == "circle" else None
+        growth, circle = _GROWTH, transform_of(support) if support.kind == "circle" else None
         if circle is not None:  # one turn holds everything
             width, growth = np.full(width.shape, 2 * np.pi), 0
         if self.is_integer:  # a number uniform in the cell of each integer
             x = x + rng.random(x.shape)
             high = high + 1.0
-        start, end, here = low, high, x
+        line = _Line(self.is_integer, self.on_logs, circle, low, high, x)
         if self.on_logs:  # scales differ by factors: near zero an additive step would take forever
-            x = np.log(x - start)
-            low = high = np.inf
-            low = -low
+            x = np.log(x - low)
+            low, high = -np.inf, np.inf
 
         def log_density(tried: np.ndarray) -> np.ndarray:
-            if self.is_integer:
-                tried = np.floor(tried).astype(now.dtype)
-            if circle is not None:  # what depends on an angle need not repeat itself beyond the cut
-                tried = circle.constrain(tried)
-            logs = tried
-            inside: Any = True
-            if self.on_logs:
-                tried = start + np.exp(tried)
-            if (
-                not self.is_integer
-            ):  # a density may be infinite at a bound, which rounding can reach
-                inside = (tried > start) & (tried < end)
-                tried = np.where(inside, tried, here)
-            if not component:
-                candidate = tried
-            else:
-                candidate = np.array(np.broadcast_to(now, tried.shape + blanket.event_shape))
-                candidate[at] = tried
+            candidate, volume = line.candidate(tried, now.dtype)
+            if component:
+                whole = np.array(np.broadcast_to(now, tried.shape + blanket.event_shape))
+                whole[at] = candidate
+                candidate = whole
             log = blanket.log_density(values, candidate, members)
-            if self.on_logs:
-                log = log + logs
-            if not self.is_integer:
-                log = np.where(inside, log, -np.inf)
-            return np.broadcast_to(log, tried.shape)
+            return np.broadcast_to(log if volume is None else log + volume, tried.shape)
 
         try:
             moved = slice_move(log_density, x, width, rng, low, high, growth)
@@ -216,12 +236,7 @@ class Slice(Kernel):
             if f"{blanket.name!r}" in str(error):
                 raise
             raise DensityError(f"node {blanket.name!r}: {error}", error.index) from error
-        if self.is_integer:
-            moved = np.floor(moved)
-        if self.on_logs:
-            moved = start + np.exp(moved)
-        if circle is not None:
-            moved = circle.constrain(moved)
+        moved = line.value(moved)
         if not component:
             return moved.astype(now.dtype, copy=False)
         new = now.copy()

@@ -9,6 +9,7 @@ thousand states are the most that it is made for.
 from __future__ import annotations
 
 from bayesmc.markov.arrays import total_variation
-from bayesmc.markov.chain import CommunicatingClass, DetailedBalance, MarkovChain
+from bayesmc.markov.chain import MarkovChain
+from bayesmc.markov.findings import CommunicatingClass, DetailedBalance
 
 __all__ = ["CommunicatingClass", "DetailedBalance", "MarkovChain", "total_variation"]

@@ -30,7 +30,7 @@ from bayesmc.expression import (
 from bayesmc.network.align import Aligner
 from bayesmc.network.domain import Domain
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.passes.log_density import family_of, log_density
+from bayesmc.passes.log_density import family_of, has_own_form, log_density
 from bayesmc.passes.templates import template
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape
@@ -100,7 +100,10 @@ def log_density_of(model: Model, name: str) -> Expression:
     value: Expression = stored_leaf(model, node)
     if node.domain is not None and node.domain.low:
         value = elementwise(np.add, value, node.domain.low)
-    return broadcast(log_density(family, value), node.plate_shape)
+    result = broadcast(log_density(family, value), node.plate_shape)
+    if has_own_form(family):
+        _check_form(model, node, result)
+    return result
 
 
 def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
@@ -325,6 +328,21 @@ def _check(model: Model, node: CompiledNode, found: Followed) -> None:
                 raise TraceError(f"what was read of it fails: {error}") from error
             if not _agree(node, expected, made, batch + node.plate_shape):
                 raise TraceError("what was read of it gives other values than the function")
+
+
+def _check_form(model: Model, node: CompiledNode, form: Expression) -> None:
+    """Refuse a family's own form where ``log_prob`` gives something else at probe points."""
+    program = Program([form])
+    for values in _probes(model, node, form.leaves | {node.name}):
+        whole = dict(values)
+        with marking_invalid(), np.errstate(all="ignore"):
+            for name in _between(model, node):
+                whole[name] = model.evaluate(name, whole)[0]
+            dist, _ = model.evaluate(node.name, whole)
+            expected = model.log_density(node.name, dist, whole[node.name])
+            (found,) = program(values)
+        if not _near(*np.broadcast_arrays(expected, found)):
+            raise TraceError("its log_density gives other values than its log_prob")
 
 
 def _between(model: Model, node: CompiledNode) -> list[str]:

@@ -60,10 +60,9 @@ def excluded_products(operand: Expression, axes: Sequence[int]) -> Expression:
 
 def call_tangent(node: Call, moved: Sequence[Expression]) -> Expression:
     """How the result of a call moves when its operands move so."""
-    rule = _rules(node)
-    values = [TracedArray(a) for a in (*node.operands, node)]
+    rule, places, values = _applied(node)
     total: Expression = ZERO
-    for k, direction in enumerate(moved):
+    for k, direction in zip(places, moved, strict=True):
         part = rule.forward(k, TracedArray(direction), *values)
         total = add(total, as_expression(part.expression))
     return total
@@ -71,9 +70,8 @@ def call_tangent(node: Call, moved: Sequence[Expression]) -> Expression:
 
 def call_adjoints(node: Call, own: Expression) -> list[Expression | None]:
     """What the adjoint of a call's result adds to those of its operands."""
-    rule = _rules(node)
-    values = [TracedArray(a) for a in (*node.operands, node)]
-    parts = [rule.reverse(k, TracedArray(own), *values) for k in range(len(node.operands))]
+    rule, places, values = _applied(node)
+    parts = [rule.reverse(k, TracedArray(own), *values) for k in places]
     return [p.expression for p in parts]
 
 
@@ -153,13 +151,19 @@ class _Rule:
     reverse: Callable[..., Any]
 
 
-def _rules(node: Call) -> _Rule:
+def _applied(node: Call) -> tuple[_Rule, list[int], list[TracedArray]]:
+    """The rule of a call, the places of its operands among the arguments, and arguments and result."""
     made = node.call
-    plain = isinstance(made, Repeated) and len(made.args) == len(node.operands)
-    if plain and not made.kwargs and made.output is None and made.function in _RULES:
-        return _RULES[made.function]
     if isinstance(made, Repeated) and made.function in (np.cumsum,):
-        return _cumulative(made, node)
+        return _cumulative(made, node), [0], [TracedArray(a) for a in (*node.operands, node)]
+    plain = isinstance(made, Repeated) and not made.kwargs and made.output is None
+    if plain and made.function in _RULES:
+        slots = made.slots
+        if not set(range(len(node.operands))) <= set(slots):
+            raise TraceError(f"no derivative of {node.detail} of a list is known")
+        given = [made.args[k] if s is None else node.operands[s] for k, s in enumerate(slots)]
+        places = [slots.index(number) for number in range(len(node.operands))]
+        return _RULES[made.function], places, [TracedArray(a) for a in (*given, node)]
     raise TraceError(f"no derivative of {node.detail} is known")
 
 

@@ -166,6 +166,10 @@ def _smaller(a: Any, b: Any, y: Any) -> Any:
     return _larger(b, a, y)
 
 
+def _of_length(side: Any, length: Any) -> Any:
+    return side / np.where(np.equal(length, 0.0), 1.0, length)
+
+
 _KINKED: Mapping[Any, tuple[Any, ...]] = {
     np.absolute: (lambda x, y: np.sign(x),),
     np.fabs: (lambda x, y: np.sign(x),),
@@ -173,6 +177,7 @@ _KINKED: Mapping[Any, tuple[Any, ...]] = {
     np.fmax: (_larger, _smaller),
     np.minimum: (_smaller, _larger),
     np.fmin: (_smaller, _larger),
+    np.hypot: (lambda a, b, y: _of_length(a, y), lambda a, b, y: _of_length(b, y)),
     np.remainder: (lambda a, b, y: 1.0, lambda a, b, y: np.negative(np.floor_divide(a, b))),
 }
 

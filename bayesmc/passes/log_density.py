@@ -1,7 +1,8 @@
 """Log densities of families as expressions of value and parameters.
 
 Closed forms in NumPy, one for each family; what ``Distribution.log_prob`` computes in tuned code is the same
-to rounding, which the tests hold. Outside the support they are minus infinity.
+to rounding, which the tests hold. Outside the support they are minus infinity. A user's family brings its
+form along (``Distribution.log_density``), which is held against its ``log_prob`` where it is used.
 
 References
 ----------
@@ -21,7 +22,7 @@ from scipy import special
 
 from bayesmc import distributions as d
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression, Family, TracedArray, as_expression
+from bayesmc.expression import Expression, Family, TracedArray, as_expression, trace
 from bayesmc.expression.lifting import log_sum_exp
 
 _LOG_2PI = math.log(2 * math.pi)
@@ -77,7 +78,8 @@ def family_of(dist: d.Distribution) -> Family:
         kept = {k: _constant(getattr(dist, k)) for k in inspect.signature(type(dist)).parameters}
         return Family(type(dist), {**kept, "base": family_of(dist.base)})
     names = list(inspect.signature(type(dist)).parameters)
-    if type(dist) not in _FORMS or not all(hasattr(dist, n) for n in names):
+    known = type(dist) in _FORMS or type(dist).log_density is not None
+    if not known or not all(hasattr(dist, n) for n in names):
         raise TraceError(f"no closed log density of {type(dist).__name__} is known to derivatives")
     parameters = {n: _constant(getattr(dist, n)) for n in names}
     if parameters.get("logits") is not None:
@@ -85,15 +87,36 @@ def family_of(dist: d.Distribution) -> Family:
     return Family(type(dist), parameters)
 
 
+def has_own_form(family: Family) -> bool:
+    """Whether a family brings its form along, which nobody has checked."""
+    return family.make not in _FORMS and getattr(family.make, "log_density", None) is not None
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
 def _log_density(family: Family, x: Any) -> Any:
     form = _FORMS.get(family.make)
+    if form is None and has_own_form(family):
+        return _own_form(family, x)
     if form is None:
         name = getattr(family.make, "__name__", str(family.make))
         raise TraceError(f"no closed log density of {name} is known to derivatives")
     return form(x, **{k: _stand_in(v) for k, v in family.parameters.items()})
+
+
+def _own_form(family: Family, x: Any) -> Any:
+    """The form that a family brings along, read like any function of a user's."""
+    make: Any = family.make
+    names = [n for n in make.parameter_ndim if family.parameters.get(n) is not None]
+    form = make.log_density
+    found = trace(
+        lambda value, *parameters: form(value, **dict(zip(names, parameters, strict=True))),
+        [x, *(_stand_in(family.parameters[n]) for n in names)],
+    )
+    if not isinstance(found, Expression):
+        raise TraceError(f"{make.__name__}.log_density returns no array")
+    return TracedArray(found)
 
 
 def _stand_in(value: Any) -> Any:

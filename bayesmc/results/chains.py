@@ -20,7 +20,6 @@ from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results.checkpoint import Checkpoint
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.posterior import Posterior
-from bayesmc.results.query import Query
 from bayesmc.results.relabelling import ordered, symmetries
 from bayesmc.results.sums import Sums, SumsPosterior
 
@@ -189,7 +188,7 @@ class ChainsPosterior(_Chains, DrawsPosterior):
             shape = count.shape + (1,) * (values.ndim - 2 - count.ndim)
             return np.minimum(self._slowest, count.reshape(shape))
         fewest = self._slowest
-        nodes = [what] if isinstance(what, str) else Query(self.model, what).nodes
+        nodes = [what] if isinstance(what, str) else what.nodes
         for name, count in self._renewed(nodes).items():
             stored = self._of(name)
             still = (stored == stored[:1, :1]).reshape(*self._shape, *count.shape, -1)
@@ -260,7 +259,7 @@ class ChainsSums(_Chains, SumsPosterior):
         fewest = [c.min(initial=np.inf) for c in self._renewed([what]).values()]
         return min([self._slowest, *fewest])
 
-    def ess(self, what: Any) -> np.ndarray:
+    def _ess(self, what: Any) -> np.ndarray:
         found = self._moved(what)
         behind = self._behind_still(what, found)
         still = np.where(np.asarray(self._step(what)) > 0, behind, self._sums.draws)
@@ -286,7 +285,7 @@ class ChainsSums(_Chains, SumsPosterior):
         sizes = sizes[np.isfinite(sizes)]
         return float(sizes.min()) if sizes.size else float(self._running.chains)
 
-    def rhat(self, what: Any) -> np.ndarray:
+    def _rhat(self, what: Any) -> np.ndarray:
         variance = self._sums.draws * super()._error(what) ** 2
         series = self._batch_means(what)
         if series is None:

@@ -182,7 +182,7 @@ class DrawsPosterior(Posterior):
         plates: Plates = (),
         names: Mapping[str, str] | None = None,
     ) -> np.ndarray:
-        return self._average(self._evaluate(function, plates, names))
+        return self._average(self._evaluate(Query(self.model, function, plates, names)))
 
     def probability(
         self,
@@ -190,19 +190,19 @@ class DrawsPosterior(Posterior):
         plates: Plates = (),
         names: Mapping[str, str] | None = None,
     ) -> np.ndarray:
-        values = self._evaluate(function, plates, names)
+        values = self._evaluate(Query(self.model, function, plates, names))
         if values.dtype.kind != "b":
             raise UnsupportedError(
                 f"probability: the function returns {values.dtype} values, not booleans; use expectation"
             )
         return self._average(values.astype(float))
 
-    def mcse(self, what: Any) -> np.ndarray:
+    def _mcse(self, what: str | Query) -> np.ndarray:
         values, step = self._scalars_and_step(what)
         count = self._share_count(values, step, what)
         return diagnostics.share_mcse(self._error(values), count, step)
 
-    def ess(self, what: Any) -> np.ndarray:
+    def _ess(self, what: str | Query) -> np.ndarray:
         values, step = self._scalars_and_step(what)
         if self.ancestors is not None:
             return diagnostics.weighted_ess(*self._distinct(values))
@@ -216,7 +216,7 @@ class DrawsPosterior(Posterior):
             return np.where(still, np.fmin(found, self._behind_still(what, values)), found)
         return found
 
-    def rhat(self, what: Any) -> np.ndarray:
+    def _rhat(self, what: str | Query) -> np.ndarray:
         values = self._scalars(what)
         if self.weights is not None or self.independent or self.ancestors is not None:
             return np.full(values.shape[2:], np.nan)
@@ -396,12 +396,11 @@ class DrawsPosterior(Posterior):
 
     def _scalars_and_step(self, what: Any) -> tuple[np.ndarray, Any]:
         """What the answers are means of, and by how much an unseen state may move each (`shares`)."""
-        if not callable(what):
+        if not isinstance(what, Query):
             exact = self._of(what).shape[:2] == (1, 1) and self._shape != (1, 1)
             return self._scalars(what), steps(self._node(what), self._seen.get(what), exact)
-        values = self._evaluate(what, (), None)
-        nodes = Query(self.model, what).nodes
-        known = all(self._of(n).shape[:2] == (1, 1) for n in nodes) and self._shape != (1, 1)
+        values = self._evaluate(what)
+        known = all(self._of(n).shape[:2] == (1, 1) for n in what.nodes) and self._shape != (1, 1)
         return values.astype(float), float(is_share(values) and not known)
 
     def _distinct(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -440,10 +439,7 @@ class DrawsPosterior(Posterior):
             return np.asarray(values[0, 0], dtype=float)
         return np.asarray(diagnostics.weighted_mean(values, self.weights))
 
-    def _evaluate(
-        self, function: Any, plates: Plates, names: Mapping[str, str] | None
-    ) -> np.ndarray:
-        query = Query(self.model, function, plates, names)
+    def _evaluate(self, query: Query) -> np.ndarray:
         stored = {
             n: np.broadcast_to(self._of(n), self._shape + self.model[n].value_shape)
             for n in query.nodes
@@ -452,8 +448,8 @@ class DrawsPosterior(Posterior):
 
     def _scalars(self, what: Any) -> np.ndarray:
         """Values of a node or function; a labelled node gives the indicators of its states."""
-        if callable(what):
-            return self._evaluate(what, (), None).astype(float)
+        if isinstance(what, Query):
+            return self._evaluate(what).astype(float)
         node = self._node(what)
         if node.domain is not None and node.domain.labels is not None:
             codes = np.broadcast_to(self._of(what), self._shape + node.value_shape)

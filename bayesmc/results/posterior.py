@@ -15,6 +15,7 @@ from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_y
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
 from bayesmc.results.marginal import Marginal
+from bayesmc.results.query import Query
 from bayesmc.results.table import Summary
 
 Plates = str | Sequence[str]
@@ -147,23 +148,29 @@ class Posterior:
         """A posterior of equally weighted draws."""
         raise self._cannot("resample")
 
-    def mcse(self, what: Any) -> np.ndarray:
+    def mcse(
+        self, what: Any, plates: Plates = (), names: Mapping[str, str] | None = None
+    ) -> np.ndarray:
         """Monte Carlo standard error of the mean of a node (of each state's probability, for labels)
-        or of the expectation of a function.
+        or of the expectation of a function, with ``plates`` and ``names`` as there.
 
         Of a share (a state's probability, an event) it is never 0 unless the answer is exact: what no draw
         has shown may have a probability of some draws' (``diagnostics.share_mcse``), so that two errors about
         a share of independent draws hold the truth 95 times in 100.
         """
-        raise self._cannot("mcse")
+        return self._mcse(self._asked(what, plates, names))
 
-    def ess(self, what: Any) -> np.ndarray:
+    def ess(
+        self, what: Any, plates: Plates = (), names: Mapping[str, str] | None = None
+    ) -> np.ndarray:
         """Effective number of independent draws behind the mean of a node or function."""
-        raise self._cannot("ess")
+        return self._ess(self._asked(what, plates, names))
 
-    def rhat(self, what: Any) -> np.ndarray:
+    def rhat(
+        self, what: Any, plates: Plates = (), names: Mapping[str, str] | None = None
+    ) -> np.ndarray:
         """Split R-hat across chains (NaN where draws are independent)."""
-        raise self._cannot("rhat")
+        return self._rhat(self._asked(what, plates, names))
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Raw draws, shape ``(chain, draw, *plates, *event)``: unweighted, also where weights matter."""
@@ -187,12 +194,28 @@ class Posterior:
         """
         raise self._cannot("to_datatree")
 
+    # ---- what a posterior of its own kind knows of a node, by name, or of a query ----------------
+
+    def _mcse(self, what: str | Query) -> np.ndarray:
+        raise self._cannot("mcse")
+
+    def _ess(self, what: str | Query) -> np.ndarray:
+        raise self._cannot("ess")
+
+    def _rhat(self, what: str | Query) -> np.ndarray:
+        raise self._cannot("rhat")
+
     # ---- shared ------------------------------------------------------------------------------
 
     @property
     def names(self) -> tuple[str, ...]:
         """Nodes that can be asked about."""
         return tuple(n for n, c in self.model.nodes.items() if c.kind != "input")
+
+    def _asked(self, what: Any, plates: Plates, names: Mapping[str, str] | None) -> Any:
+        """A function as a query; a node by its name."""
+        is_query = callable(what) or plates or names
+        return Query(self.model, what, plates, names) if is_query else what
 
     def summary(self, names: Sequence[str] | None = None) -> Summary:
         """Mean, sd, quantiles, Monte Carlo error, ESS and R-hat per scalar; probabilities per label.

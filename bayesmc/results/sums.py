@@ -193,7 +193,7 @@ class SumsPosterior(Posterior):
         self._kept(names[0])
         return self._sums.counts(names[0])[0] / self._sums.weight[0]
 
-    def mcse(self, what: Any) -> np.ndarray:
+    def _mcse(self, what: Any) -> np.ndarray:
         error = self._error(what)
         return diagnostics.share_mcse(error, self._share_count(what, error), self._step(what))
 
@@ -241,7 +241,7 @@ class SumsPosterior(Posterior):
         exact = what in self._sums.constant
         return steps(self._node(what), self._seen.get(what), exact)
 
-    def ess(self, what: Any) -> np.ndarray:
+    def _ess(self, what: Any) -> np.ndarray:
         if not isinstance(what, str):
             raise self._cannot("ess of a function")
         node = self._node(what)
@@ -253,7 +253,7 @@ class SumsPosterior(Posterior):
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(error > 0, variance / error, total**2 / squares)
 
-    def rhat(self, what: Any) -> np.ndarray:
+    def _rhat(self, what: Any) -> np.ndarray:
         return np.full(np.shape(self._error(what)), np.nan)
 
     def _plain_mean(self, name: str) -> np.ndarray:

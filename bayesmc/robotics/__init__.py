@@ -13,7 +13,8 @@ from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.robotics.brightness import Ceiling
 from bayesmc.robotics.calibration import FieldFit, fit_field, fit_floor, fit_odometry
 from bayesmc.robotics.field import FieldScan, LikelihoodField
-from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
+from bayesmc.robotics.free_space import FreeSpace
+from bayesmc.robotics.grid import OccupancyGrid
 from bayesmc.robotics.landmarks import (
     bearing,
     bearing_to,

@@ -19,7 +19,8 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support
 from bayesmc.errors import ParameterError, ShapeError
-from bayesmc.robotics.grid import FreeSpace, as_number
+from bayesmc.robotics.free_space import FreeSpace
+from bayesmc.robotics.grid import as_number
 from bayesmc.robotics.pose_distributions import POSES
 from bayesmc.shapes import Shape, read_only
 

@@ -15,6 +15,7 @@ import numpy as np
 from bayesmc.distributions import Normal
 from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.expression import as_one_call
 from bayesmc.shapes import first_index
 
 
@@ -97,6 +98,7 @@ class Ceiling:
         (x, y), (nx, ny) = self.origin, self.image.shape
         return x, x + nx * self.resolution, y, y + ny * self.resolution
 
+    @as_one_call
     def brightness(self, places: Any) -> np.ndarray:
         """Brightness above places, interpolated.
 

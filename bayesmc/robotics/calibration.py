@@ -16,7 +16,8 @@ import numpy as np
 
 from bayesmc.errors import ModelError, ModelMisfitWarning, ShapeError
 from bayesmc.robotics.field import LikelihoodField
-from bayesmc.robotics.grid import FreeSpace, OccupancyGrid, as_grid, as_number
+from bayesmc.robotics.free_space import FreeSpace
+from bayesmc.robotics.grid import OccupancyGrid, as_grid, as_number
 from bayesmc.robotics.motion import OdometryMotion
 from bayesmc.robotics.poses import as_poses, compose, wrap
 

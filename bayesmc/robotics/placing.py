@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.errors import ModelMisfitWarning, ShapeError
 from bayesmc.robotics.calibration import FieldFit
 from bayesmc.robotics.field import LikelihoodField
-from bayesmc.robotics.grid import FreeSpace
+from bayesmc.robotics.free_space import FreeSpace
 from bayesmc.robotics.poses import as_poses, compose
 from bayesmc.robotics.raycast import ray_cast
 

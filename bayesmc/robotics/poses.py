@@ -391,8 +391,7 @@ def sin_cos(angle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def turned_back(heading: np.ndarray) -> np.ndarray:
     """The same as ``wrap`` to rounding, and several times faster: for headings of some turns at most."""
     turned = heading - (2 * np.pi) * np.rint(heading * (0.5 / np.pi))
-    beyond = np.abs(turned) >= np.pi
-    return np.where(beyond, -np.pi, turned) if beyond.any() else turned
+    return np.where(np.abs(turned) >= np.pi, -np.pi, turned)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesmc.distributions.base import as_float
 from bayesmc.errors import ParameterError, ShapeError
+from bayesmc.expression import as_one_call
 from bayesmc.robotics.grid import OccupancyGrid, as_grid, as_number
 from bayesmc.shapes import Shape, broadcast_shapes, first_index
 
@@ -150,6 +151,7 @@ class RayTable:
         object.__setattr__(self, "_kept", np.zeros((cells, self.headings), dtype=np.uint16))
         object.__setattr__(self, "_known", np.zeros(cells, dtype=bool))
 
+    @as_one_call
     def ranges(self, poses: Any, angles: Any) -> np.ndarray:
         """Distances (m), shapes as of ``ray_cast``.
 

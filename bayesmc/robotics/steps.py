@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.distributions.base import as_float
 from bayesmc.robotics.poses import as_poses, joined_pose, sin_cos, turned_back
+from bayesmc.tracing import is_traced
 
 #: of ``sin(a) / a`` in powers of the square, highest first and without the first; to rounding up to a = 0.5
 _SERIES = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6, 0, -1))
@@ -135,7 +136,7 @@ def unicycle(pose: Any, v: Any, omega: Any, dt: Any) -> np.ndarray:
 
 def sinc(a: np.ndarray) -> np.ndarray:
     """``sin(a) / a``; by its series where all angles are small, which is several times faster."""
-    if not np.size(a) or max(np.max(a), -np.min(a)) > 0.5:
+    if is_traced(a) or not np.size(a) or max(np.max(a), -np.min(a)) > 0.5:
         return np.sinc(a / np.pi)
     square = a * a
     value = square * _SERIES[0]

@@ -2,9 +2,10 @@
 
 Four kinds of tools. *Makers*: random nets, templates, factor graphs, distributions and weights, by seed or as
 Hypothesis strategies. *Oracles*: exact answers that share no code with the engines; `exact` picks one.
-*Tests* of posteriors (`assert_matches`, `simulation_based_calibration`, `unbiased_evidence_test`), of
-kernels (`geweke_test`, `rank_test`, `invariant`, `detailed_balance`) and of densities (`check_density`,
-`check_cpd`), each with a stated false-alarm rate and an answer that is true where nothing deviates.
+*Tests* of engines and posteriors (`engine_test`, `assert_matches`, `simulation_based_calibration`,
+`unbiased_evidence_test`), of kernels (`geweke_test`, `rank_test`, `invariant`, `detailed_balance`) and of
+densities (`check_density`, `check_cpd`), each with a stated false-alarm rate and an answer that is true
+where nothing deviates.
 *Runs*: `session` says a run's seed and whether it is thorough, for the pytest plugin that comes with
 bayesmc.
 
@@ -49,6 +50,7 @@ from bayesmc.testing.oracles.quadrature import Quadrature, quadrature_posterior
 from bayesmc.testing.posteriors.calibration import CalibrationResult, simulation_based_calibration
 from bayesmc.testing.posteriors.evidence import EvidenceResult, unbiased_evidence_test
 from bayesmc.testing.posteriors.matching import Match, assert_matches, compare
+from bayesmc.testing.posteriors.matrix import EngineResult, engine_test
 from bayesmc.testing.posteriors.repeated import repeated_test
 from bayesmc.testing.posteriors.samples import same_distribution
 from bayesmc.testing.verdict import Comparison, Verdict, uncounted
@@ -60,6 +62,7 @@ __all__ = [
     "DbnOptions",
     "DensityCheck",
     "DistributionOptions",
+    "EngineResult",
     "Enumerated",
     "EvidenceResult",
     "ExactAnswer",
@@ -86,6 +89,7 @@ __all__ = [
     "dbns",
     "detailed_balance",
     "distributions",
+    "engine_test",
     "enumerate_posterior",
     "evidence_for",
     "exact",

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import datetime
+import functools
+import os
 import random
 import time
+import types
 
 import numpy as np
 import pytest
@@ -130,6 +134,49 @@ def _python_drawn(x):
     return x + random.random()
 
 
+def _shrunk(x):
+    while x[0] > 1:
+        x = x / 2
+    return x
+
+
+class _Sensor:
+    """An object of a user's, whose methods lie."""
+
+    def __init__(self):
+        self.calls = 0
+
+    def clock(self, x):
+        return x * (time.time() > 0)
+
+    def counted(self, x):
+        self.calls += 1
+        return x if self.calls < 100 else 2 * x
+
+    def branch(self, x):
+        return x if self.above(x) else -x
+
+    def above(self, x):
+        return x[..., 0] > 0
+
+
+class _Clock:
+    def __call__(self, x):
+        return x * (time.time() > 0)
+
+
+class _Loud(_Sensor):
+    """Whose lie is inherited, and hidden behind another call."""
+
+    def read(self, x):
+        return self.clock(x)
+
+
+SENSOR, LOUD = _Sensor(), _Loud()
+HELPERS = types.ModuleType("helpers")
+exec("import time\ndef clock(x):\n    return x * (time.time() > 0)", HELPERS.__dict__)
+
+
 LIES = {
     "a branch": (_branch, "truth"),
     "a branch whose error is swallowed": (_swallowed, "truth"),
@@ -138,6 +185,25 @@ LIES = {
     "random numbers": (_drawn, "random numbers from GENERATOR"),
     "random numbers of its own": (_numpy_drawn, "random"),
     "random numbers of Python": (_python_drawn, "random"),
+    "a clock behind a method": (lambda x: SENSOR.clock(x), "time"),
+    "a clock behind two methods": (lambda x: LOUD.read(x), "time"),
+    "a clock in a method": (SENSOR.clock, "time"),
+    "a clock in a callable object": (_Clock(), "time"),
+    "a clock in an object that is made": (lambda x: _Clock()(x), "time"),
+    "a clock in another module": (lambda x: HELPERS.clock(x), "time"),
+    "a clock in a loop's function": (lambda x: sum(f(x) for f in [_clock, np.sin]), "time"),
+    "a clock in a partial": (functools.partial(lambda f, x: f(x), _clock), "time"),
+    "the date": (lambda x: x * (datetime.date.today().year > 2000), "datetime"),
+    "the environment": (lambda x: x * len(os.environ), "os"),
+    "random integers of NumPy": (lambda x: x + np.random.randint(3), "random"),  # noqa: NPY002
+    "a branch in a method": (SENSOR.branch, "truth"),
+    "a branch on a reduction": (lambda x: x if np.all(x > 0) else -x, "truth"),
+    "a branch on a string of it": (lambda x: x * len(str(x.tolist())), "."),
+    "a loop over a value": (lambda x: sum(x[0] for _ in range(x[0])), "."),
+    "a while loop": (_shrunk, "truth"),
+    "a key": (lambda x: {0.0: 1.0}.get(x[0], 2.0) * x, "hash"),
+    "item()": (lambda x: x * x[0].item(), "."),
+    "the largest of Python": (lambda x: x * sorted(x)[0], "truth"),
     "float()": (lambda x: float(x[0]) * x, r"float\(\)"),
     "math of Python": (lambda x: x * max(x[0], x[1]), "truth"),
     "a callback": (lambda x: np.apply_along_axis(lambda v: 2 * v, -1, x), "hands the numbers on"),

@@ -287,8 +287,8 @@ def test_which_numbers_of_a_block_are_angles() -> None:
 class Pulled(BlockWalk):
     """A deliberate error: proposals lean towards the other half, and nothing corrects for it."""
 
-    def _proposed(self, u: Any, rows: Any, others: Any, memory: Any, rng: Any) -> Any:
-        tried, moves = super()._proposed(u, rows, others, memory, rng)
+    def _stepped(self, u: Any, rows: Any, others: Any, memory: Any, rng: Any) -> Any:
+        tried, moves = super()._stepped(u, rows, others, memory, rng)
         return tried + 0.2 * (u[others].mean(axis=1) - u[rows]), moves
 
 

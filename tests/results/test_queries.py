@@ -156,3 +156,24 @@ def test_functions_of_single_values_are_told_how_to_write_it(weighted, function)
 def test_labels_have_no_mean(weighted) -> None:
     with pytest.raises(UnsupportedError, match=r"returns labels .*k == 'a'"):
         weighted.expectation(lambda k: k)
+
+
+@pytest.mark.parametrize("what", ["mcse", "ess", "rhat"])
+@pytest.mark.parametrize(
+    "engine", [bmc.Exact(), bmc.LikelihoodWeighting(300), bmc.Gibbs(draws=50, warmup=20)]
+)
+def test_errors_take_the_plates_and_names_of_expectations(what: str, engine) -> None:
+    net = bmc.BayesNet(plates={"cluster": 2, "point": 5})
+    net.add("mean[0]", bmc.DiscreteUniform(0, 3), plates="cluster")
+    net.add("label", bmc.Bernoulli(0.4), plates="point")
+    posterior = bmc.infer(net, {}, engine=engine, rng=0)
+    names = {"mean": "mean[0]"}
+    of_point = getattr(posterior, what)(
+        lambda mean, label: 1.0 * mean[label], plates="point", names=names
+    )
+    assert of_point.shape == (5,)
+    of_node = getattr(posterior, what)(lambda mean: mean, names=names)
+    by_name = getattr(posterior, what)("mean[0]")  # knows that a state may be unseen
+    np.testing.assert_allclose(of_node, by_name, rtol=0.05)
+    with pytest.raises(bmc.errors.UnknownNodeError, match="mean"):
+        getattr(posterior, what)(lambda mean: mean)

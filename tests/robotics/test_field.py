@@ -15,10 +15,12 @@ from scipy import stats
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import ModelError, ParameterError, ShapeError
+from bayesmc.robotics import end_points
 from bayesmc.robotics import field as field_module
 from bayesmc.robotics.beams import BeamModel, Beams, clean_ranges
 from bayesmc.robotics.field import LikelihoodField
-from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
+from bayesmc.robotics.free_space import FreeSpace
+from bayesmc.robotics.grid import OccupancyGrid
 from bayesmc.robotics.raycast import ray_cast
 from bayesmc.testing import session
 
@@ -106,9 +108,10 @@ def test_small_blocks_and_clipping_change_nothing(monkeypatch: pytest.MonkeyPatc
     particles = poses(1000, 2, beyond=3.0)
     ranges = np.random.default_rng(3).uniform(0.0, REACH, 11)
     whole = standard().given(particles, ANGLES).log_prob(ranges)
-    monkeypatch.setattr(field_module, "_BLOCK", 100)
+    for module in (end_points, field_module):
+        monkeypatch.setattr(module, "BLOCK", 100)
     np.testing.assert_array_equal(standard().given(particles, ANGLES).log_prob(ranges), whole)
-    monkeypatch.setattr(field_module, "_ROOMY", 0)
+    monkeypatch.setattr(end_points, "_ROOMY", 0)
     clipped = standard()
     assert clipped._table.clips and clipped._table.margin == 1
     near = np.abs(clipped.given(particles, ANGLES).log_prob(ranges) - whole) < 2e-4

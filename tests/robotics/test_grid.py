@@ -14,7 +14,8 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.errors import ModelError, ParameterError, ShapeError
-from bayesmc.robotics.grid import FreeSpace, OccupancyGrid
+from bayesmc.robotics.free_space import FreeSpace
+from bayesmc.robotics.grid import OccupancyGrid
 from bayesmc.robotics.pose_distributions import PoseNormal
 
 OCCUPIED = hnp.arrays(bool, hnp.array_shapes(min_dims=2, max_dims=2, max_side=9))

@@ -15,6 +15,7 @@ from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.conjugate import conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
+from bayesmc.kernels.ensemble import BlockWalk, may_be_drawn_anew
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_search import forest_blocks
@@ -196,6 +197,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     moved = set(names)
     kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets)
+    if slow and may_be_drawn_anew(target, names):
+        kernels.append(BlockWalk(target, names, anew=1.0))
     return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from bayesmc.engines.mcmc.proposals import RandomWalk, Read, read_proposals
 from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.kernels.base import Kernel
-from bayesmc.kernels.ensemble import BlockWalk, parts_of
+from bayesmc.kernels.ensemble import AFRESH, BlockWalk, may_be_drawn_anew, parts_of
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
@@ -91,7 +91,8 @@ def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
             kernels += [AdaptiveWalk(Blanket(target, n), why) for n in reversed(continuous)]
         else:
             ensemble = _members(target, size, chains)
-            kernels.append(BlockWalk(target, continuous, ensemble, alone=not kernels))
+            anew = AFRESH if may_be_drawn_anew(target, continuous) else 0.0
+            kernels.append(BlockWalk(target, continuous, ensemble, alone=not kernels, anew=anew))
     return Plan(problem, target, kernels, ensemble, refusal)
 
 

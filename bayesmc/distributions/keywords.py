@@ -1,0 +1,92 @@
+"""Parameters under names that a family does not have: what it takes, and which was meant."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Iterable, KeysView
+
+from bayesmc.errors import did_you_mean
+
+#: another name -> what it is called here, or how to say it: the first that a family takes
+_OTHERWISE: dict[str, tuple[tuple[str, str], ...]] = {
+    "alpha": (("concentration1", "concentration1"), ("concentration", "concentration")),
+    "a": (("concentration1", "concentration1"), ("concentration", "concentration")),
+    "b": (("concentration0", "concentration0"), ("rate", "rate"), ("scale", "scale")),
+    "beta": (("concentration0", "concentration0"), ("rate", "rate"), ("scale", "scale")),
+    "covariance": (("cov", "cov"),),
+    "covariance_matrix": (("cov", "cov"),),
+    "dof": (("df", "df"),),
+    "kappa": (("concentration", "concentration"),),
+    "lam": (("rate", "rate"),),
+    "max": (("high", "high"),),
+    "mean": (("loc", "loc"),),
+    "min": (("low", "low"),),
+    "mu": (("loc", "loc"),),
+    "n": (("total_count", "total_count"),),
+    "nu": (("df", "df"),),
+    "p": (("probs", "probs"),),
+    "precision": (("scale", "scale = precision**-0.5"),),
+    "prob": (("probs", "probs"),),
+    "probabilities": (("probs", "probs"),),
+    "scale": (("rate", "rate = 1 / scale"),),
+    "sd": (("scale", "scale"),),
+    "shape": (("concentration", "concentration"),),
+    "sigma": (("scale", "scale"), ("cov", "cov")),
+    "std": (("scale", "scale"),),
+    "stddev": (("scale", "scale"),),
+    "tau": (("scale", "scale = tau**-0.5"),),
+    "trials": (("total_count", "total_count"),),
+    "var": (("scale", "scale = np.sqrt(var)"),),
+    "variance": (("scale", "scale = np.sqrt(variance)"),),
+}
+
+
+@functools.cache
+def signature(family: type) -> inspect.Signature:
+    """The parameters of a family's constructor."""
+    return inspect.signature(family)
+
+
+#: families -> the names that their constructors are known to take
+_KNOWN: dict[type, frozenset[str]] = {}
+
+
+def check_keywords(family: type, keywords: KeysView[str]) -> None:
+    """Raise for a parameter that a family does not have.
+
+    Raises
+    ------
+    TypeError
+        Says what it takes and which was meant.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> bmc.Gamma(2.0, scale=3.0)
+    Traceback (most recent call last):
+        ...
+    TypeError: Gamma has no parameter 'scale' (did you mean rate = 1 / scale?); it takes concentration, rate
+    """
+    if family in _KNOWN and keywords <= _KNOWN[family]:  # for every distribution there is
+        return
+    parameters = signature(family).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in parameters.values()):
+        return
+    _KNOWN[family] = frozenset(parameters)
+    for keyword in keywords:
+        if keyword not in parameters:
+            meant = _meant(keyword, parameters)
+            raise TypeError(
+                f"{family.__name__} has no parameter {keyword!r}{meant}; it takes {', '.join(parameters)}"
+            )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _meant(keyword: str, known: Iterable[str]) -> str:
+    for parameter, said in _OTHERWISE.get(keyword, ()):
+        if parameter in known:
+            return f" (did you mean {said}?)"
+    return did_you_mean(keyword, known)
