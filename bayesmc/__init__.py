@@ -48,7 +48,7 @@ from bayesmc.distributions import (
     WrappedNormal,
 )
 from bayesmc.engines.discrete.filter import DiscreteFilter
-from bayesmc.engines.exact import Exact
+from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
 from bayesmc.engines.kalman.filter import KalmanFilter

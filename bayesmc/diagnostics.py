@@ -20,15 +20,6 @@ MAX_PARETO_K = 0.7
 _ADDED = 4.0
 
 
-def log_sum_exp(log_values: np.ndarray, axis: Any = None) -> Any:
-    """``log(sum(exp(log_values)))`` without overflow; minus infinity for an empty or zero sum."""
-    top = np.max(log_values, axis=axis, keepdims=True, initial=-np.inf)
-    safe = np.where(np.isfinite(top), top, 0.0)
-    with np.errstate(divide="ignore"):
-        total = np.log(np.sum(np.exp(log_values - safe), axis=axis, keepdims=True)) + safe
-    return total.item() if axis is None else np.squeeze(total, axis=axis)
-
-
 def normalised(log_weights: np.ndarray) -> np.ndarray:
     """Weights that sum to 1, through log-sum-exp."""
     weights = np.exp(log_weights - np.max(log_weights))

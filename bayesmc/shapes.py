@@ -95,6 +95,11 @@ def unravelled(codes: np.ndarray, shape: Shape) -> tuple[np.ndarray, ...]:
     return tuple(reversed(found))
 
 
+def padded(array: np.ndarray, ndim: int) -> np.ndarray:
+    """With axes of size one in front, up to so many in all."""
+    return array.reshape((1,) * (ndim - array.ndim) + array.shape) if array.ndim < ndim else array
+
+
 def first_index(mask: np.ndarray) -> Shape:
     """Index of the first True in ``mask``, in C order."""
     return tuple(int(i) for i in np.unravel_index(int(np.argmax(mask)), mask.shape))

@@ -35,7 +35,9 @@ factors | montecarlo
 passes
 distributions
 expression
+linalg
 resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
+categorical
 errors | shapes
 """
 DEPTH = {

@@ -9,8 +9,8 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.engines.base import Engine
-from bayesmc.engines.exact import Exact, readable_bytes
-from bayesmc.engines.exact_plan import too_large_to_search
+from bayesmc.engines.exact.exact import Exact, readable_bytes
+from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs
 from bayesmc.engines.mcmc.gibbs_plan import plan_of

@@ -6,9 +6,7 @@ probability, which is one where the value is right.
 
 from __future__ import annotations
 
-import copy
 import math
-from typing import Any
 
 import numpy as np
 
@@ -67,30 +65,3 @@ def plane_log_density(
         right = np.abs(left) <= ALLOWED * size[..., j] + ROUNDED * sums + FLOOR
         total = total + np.where(point, np.where(right, 0.0, -np.inf), log)
     return total
-
-
-def with_noise(dist: Any) -> Any:
-    """The same with unit scales where there is no noise: finite numbers for chains, which give it up anyway.
-
-    Scales that underflow while chains move are marked (``invalid``), and the point is rejected.
-
-    Examples
-    --------
-    >>> import bayesmc as bmc
-    >>> with_noise(bmc.Normal(0.0, [0.0, 2.0])).scale.tolist()
-    [1.0, 2.0]
-    """
-    if dist.noiseless is None:
-        return dist
-    other = copy.copy(dist)
-    if isinstance(dist, Normal):
-        other.scale = np.where(dist.scale == 0, 1.0, dist.scale)
-    elif isinstance(dist, MvNormal):
-        root = dist.scale_tril
-        none = (np.linalg.diagonal(root) == 0).any(axis=-1)[..., None, None]
-        other._tril, other._diag, other._cov = (
-            np.where(none, np.eye(root.shape[-1]), root),
-            None,
-            None,
-        )
-    return other

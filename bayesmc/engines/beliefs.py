@@ -6,14 +6,16 @@ belief=...)`` has given it the template again.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, DynamicBayesNet, Slices
-from bayesmc.errors import ModelError
+from bayesmc.errors import ModelError, QueryError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.results import SeriesPosterior
 
 
 class OnlineBelief:
@@ -24,6 +26,70 @@ class OnlineBelief:
 
     def __deepcopy__(self, memo: Any) -> Any:
         return self
+
+
+class SliceBelief(OnlineBelief):
+    """Base of beliefs that answer as the posterior of a series of one slice, their own, does."""
+
+    dbn: DynamicBayesNet | None
+    t: int
+
+    @cached_property
+    def _posterior(self) -> Any:
+        if self.t < 0:
+            raise QueryError(
+                "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
+            )
+        return self._answered()
+
+    def _answered(self) -> SeriesPosterior:
+        """The posterior; it is worked out once."""
+        raise NotImplementedError
+
+    @property
+    def _of_functions(self) -> Any:
+        """The posterior, where it can answer for functions."""
+        found = self._posterior
+        if self.dbn is None:
+            raise QueryError(
+                "this belief was unpickled, and pickles carry no functions: it says means, variances, "
+                "probabilities and densities of nodes; for the rest give it the template again, "
+                "engine.start(dbn, belief=belief)"
+            )
+        return found
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Nodes that are answered for, parents first."""
+        return self._posterior.names
+
+    def mean(self, name: str) -> np.ndarray:
+        """Mean, shape ``(*plates, *event)``; circular for angles; labels have none."""
+        return self._posterior.mean(name)[0]
+
+    def var(self, name: str) -> np.ndarray:
+        """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
+        return self._posterior.var(name)[0]
+
+    def std(self, name: str) -> np.ndarray:
+        """Standard deviation, shape ``(*plates, *event)``."""
+        return self._posterior.std(name)[0]
+
+    def probabilities(self, name: str) -> np.ndarray:
+        """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
+        return self._posterior.probabilities(name)[0]
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles of a node, number by number, shape ``(*q.shape, *plates, *event)``."""
+        return self._posterior.quantile(name, q)[0]
+
+    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
+        """Mean of a function of nodes of the slice, whose arguments have one leading axis."""
+        return self._of_functions.expectation(function)[0]
+
+    def probability(self, function: Callable[..., Any]) -> np.ndarray:
+        """Probability of an event (a function that returns booleans)."""
+        return self._of_functions.probability(function)[0]
 
 
 def refuse_unbound(engine: Any, belief: Any) -> None:

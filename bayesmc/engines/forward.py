@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import edges
 from bayesmc.errors import BayesmcError, ParameterError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.align import Aligner
@@ -138,15 +139,15 @@ class TableDraw:
         self.guard = _Guard(node, table)
         probs = table.probs.reshape(-1, table.probs.shape[-1])
         self.states = probs.shape[1]
-        edges = _thresholds(probs)
+        passed = _thresholds(probs)
         self.search = self.states > 5
         if self.search:
             self.width = 1 << int(np.ceil(np.log2(self.states)))
             padded = np.full((len(probs), self.width), 1 << _BITS, dtype=np.uint32)
-            padded[:, : self.states - 1] = edges
+            padded[:, : self.states - 1] = passed
             self.edges = [padded.ravel()]
         else:
-            self.edges = [np.ascontiguousarray(edges[:, k]) for k in range(self.states - 1)]
+            self.edges = [np.ascontiguousarray(passed[:, k]) for k in range(self.states - 1)]
 
     def __call__(self, state: Pass) -> None:
         index = self.index(state.values)
@@ -252,12 +253,7 @@ class _Guard:
 
 def _thresholds(probs: np.ndarray) -> np.ndarray:
     """Cumulative rows as integers of ``_BITS`` bits, shape (rows, states - 1)."""
-    cumulative = np.cumsum(probs, axis=1)
-    cumulative /= cumulative[:, -1:]
-    edges = np.rint(cumulative * float(1 << _BITS)).astype(np.uint32)
-    last = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
-    edges[np.arange(probs.shape[1]) >= last[:, None]] = 1 << _BITS
-    return edges[:, :-1]
+    return np.rint(np.minimum(edges(probs), 1.0) * float(1 << _BITS)).astype(np.uint32)
 
 
 def _random_bits(rng: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray:

@@ -269,12 +269,16 @@ def pick(operands: Sequence[Any], positions: Any) -> Expression:
 def reshape(value: Any, shape: Shape) -> Expression:
     """The same elements in another shape."""
     node = as_expression(value)
+    if node.shape == shape:
+        return node
     return pick([node], np.arange(node.size).reshape(shape))
 
 
 def broadcast(value: Any, shape: Shape) -> Expression:
     """An expression in the shape that it broadcasts to."""
     node = as_expression(value)
+    if node.shape == shape:
+        return node
     return pick([node], np.broadcast_to(np.arange(node.size).reshape(node.shape), shape))
 
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from ..categorical import pick_rows
 from ..errors import BudgetError, ZeroProbabilityError
-from .draws import draw_columns
 from .factor import Factor, sum_product
 from .program import Program
 from .propagation import Collected
@@ -142,7 +142,7 @@ class Calibrated:
             for v in clique.separator:
                 if v not in program.sliced:
                     rows = rows * tree.cardinalities[v] + codes[v]
-            picked = draw_columns(self._weights(k), rows, rng)
+            picked = pick_rows(self._weights(k), rows, rng)
             for v in reversed(clique.residual):
                 if v not in program.sliced:
                     n = tree.cardinalities[v]

@@ -7,14 +7,13 @@ a whole net is the business of `bayesmc.factors.cliquetree`; nothing here plans 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import BudgetError
-
-Variable = Hashable
+from .named import Variable, aligned, largest, sizes_of, steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +51,7 @@ class Factor:
     def __mul__(self, other: Factor) -> Factor:
         """The product, over the union of both scopes."""
         scope = self.scope + tuple(v for v in other.scope if v not in self.scope)
-        values = self._aligned(scope) * other._aligned(scope)
+        values = aligned(self, scope) * aligned(other, scope)
         return Factor(scope, values, self.log_scale + other.log_scale)
 
     def sum_out(self, variables: Collection[Variable]) -> Factor:
@@ -79,13 +78,6 @@ class Factor:
         values = np.transpose(self.values, [self.scope.index(v) for v in scope])
         return values / values.sum()
 
-    def _aligned(self, scope: tuple[Variable, ...]) -> np.ndarray:
-        """The values with axes in the order of ``scope``, 1 where a variable is absent."""
-        own = [v for v in scope if v in self.scope]
-        sizes = dict(zip(self.scope, self.values.shape, strict=True))
-        values = np.transpose(self.values, [self.scope.index(v) for v in own])
-        return values.reshape([sizes.get(v, 1) for v in scope])
-
 
 def sum_product(
     factors: Iterable[Factor], keep: Collection[Variable], max_bytes: float = math.inf
@@ -105,19 +97,18 @@ def sum_product(
     Variable elimination: Koller and Friedman (2009), Algorithm 9.1.
     """
     pending = list(factors)
-    sizes = {v: n for f in pending for v, n in zip(f.scope, f.values.shape, strict=True)}
-    order, largest = _plan([frozenset(f.scope) for f in pending], sizes, frozenset(keep))
-    if 8.0 * largest > max_bytes:
+    sizes = sizes_of(pending)
+    entries = largest([f.scope for f in pending], keep, sizes)
+    if 8.0 * entries > max_bytes:
         raise BudgetError(
             f"sum_product over {len(keep)} variables: the largest intermediate table would take "
-            f"{8.0 * largest:.3g} bytes, above the {max_bytes:.3g} allowed; ask for fewer "
+            f"{8.0 * entries:.3g} bytes, above the {max_bytes:.3g} allowed; ask for fewer "
             "variables at once, or raise the budget",
-            int(8.0 * largest),
+            int(8.0 * entries),
         )
-    for variable in order:
-        touched = [f for f in pending if variable in f.scope]
-        pending = [f for f in pending if variable not in f.scope]
-        pending.append(_product(touched).sum_out([variable]).rescaled())
+    for touched, gone, _ in steps([f.scope for f in pending], keep, sizes):
+        made = _product([pending[k] for k in touched]).sum_out(gone).rescaled()
+        pending = [f for k, f in enumerate(pending) if k not in touched] + [made]
     return _product(pending)
 
 
@@ -126,26 +117,3 @@ def _product(factors: Sequence[Factor]) -> Factor:
     for factor in sorted(factors, key=lambda f: f.values.size):
         result = result * factor
     return result
-
-
-def _plan(
-    scopes: list[frozenset[Variable]], sizes: Mapping[Variable, int], keep: frozenset[Variable]
-) -> tuple[list[Variable], float]:
-    """The order of elimination and the entries of the largest table it makes."""
-    order: list[Variable] = []
-    largest = 1.0
-    waiting = [v for v in sizes if v not in keep]
-    while waiting:
-        merged = {v: frozenset().union(*(s for s in scopes if v in s)) for v in waiting}
-        cost = {v: _entries(merged[v], sizes) for v in waiting}
-        best = min(waiting, key=cost.__getitem__)
-        largest = max(largest, cost[best])
-        scopes = [s for s in scopes if best not in s] + [merged[best] - {best}]
-        order.append(best)
-        waiting.remove(best)
-    last = frozenset().union(*scopes)
-    return order, max(largest, _entries(last, sizes))
-
-
-def _entries(scope: Iterable[Variable], sizes: Mapping[Variable, int]) -> float:
-    return math.prod(float(sizes[v]) for v in scope)

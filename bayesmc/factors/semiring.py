@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..categorical import log_sum_exp
 from .products import middle_sums, ones, row_sums, weighted_rows
 from .program import SumStep
 
@@ -87,11 +88,11 @@ class Log(Semiring):
     zero = -math.inf
 
     def row_sums(self, matrix: np.ndarray) -> np.ndarray:
-        return _log_sum_exp(matrix, 1)
+        return log_sum_exp(matrix, 1)
 
     def sum_steps(self, table: np.ndarray, steps: Sequence[SumStep]) -> np.ndarray:
         for before, summed, after in steps:
-            table = _log_sum_exp(table.reshape(before, summed, after), 1)
+            table = log_sum_exp(table.reshape(before, summed, after), 1)
         return table.reshape(-1)
 
     def rescale(self, message: np.ndarray) -> tuple[np.ndarray | None, float]:
@@ -104,7 +105,7 @@ class Log(Semiring):
         return above - np.where(below == -math.inf, 0.0, below)
 
     def weighted_rows(self, weights: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        return _log_sum_exp(matrix + weights[:, None], 0)
+        return log_sum_exp(matrix + weights[:, None], 0)
 
     def to_linear(self, values: np.ndarray) -> np.ndarray:
         return np.exp(values)
@@ -112,11 +113,3 @@ class Log(Semiring):
 
 LINEAR = Linear()
 LOG = Log()
-
-
-def _log_sum_exp(values: np.ndarray, axis: int) -> np.ndarray:
-    top = values.max(axis=axis, keepdims=True)
-    top[top == -math.inf] = 0.0  # so that a row of zeros gives log 0, not NaN
-    total = np.exp(values - top).sum(axis=axis)
-    with np.errstate(divide="ignore"):
-        return np.log(total) + np.squeeze(top, axis)

@@ -15,8 +15,9 @@ import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
+from bayesmc.factors.named import Named, log_product
 from bayesmc.network import Model
-from bayesmc.structure.tables import configure
+from bayesmc.structure.tables import configure, reads_of
 from bayesmc.structure.target import Target, Term
 
 #: entries up to which a term is tabulated
@@ -142,10 +143,9 @@ def conditional_of(terms: FiniteTerms, names: Sequence[str]) -> Conditional | No
     if rows > _CONFIGURATIONS or rows * states > _ENTRIES:
         return None
     axes = (*blanket, *block)
-    total = np.zeros(outside + cards)
-    for table in around:
-        total = total + _expanded(table, axes)
-    log = total.reshape(rows, states)
+    sizes = dict(zip(axes, outside + cards, strict=True))
+    tables = [Named(table.scope, table.log) for table in around]
+    log = log_product(tables, axes, sizes).reshape(rows, states)
     top = log.max(axis=1, keepdims=True)
     probs = np.exp(log - np.where(top > -np.inf, top, 0.0))
     sums = probs.sum(axis=1, keepdims=True)
@@ -157,8 +157,8 @@ def conditional_of(terms: FiniteTerms, names: Sequence[str]) -> Conditional | No
 
 def _tabulated(target: Target, term: Term) -> FiniteTerm | None:
     model = target.model
-    scope = _scope(target, term)
-    if scope is None:
+    scope, whole, others = reads_of(model, term.scope, term.plates, target.is_known, True)
+    if whole or others:
         return None
     cards = _cards(model, scope)
     if float(math.prod(cards)) * math.prod(term.shape) > _TERM_ENTRIES:
@@ -181,34 +181,5 @@ def _tabulated(target: Target, term: Term) -> FiniteTerm | None:
     return FiniteTerm(term, scope, log, term.plates)
 
 
-def _scope(target: Target, term: Term) -> tuple[str, ...] | None:
-    """The chain nodes a term depends on, through deterministic nodes; None where they make no table."""
-    model = target.model
-    inside = set(target.chain)
-    found: dict[str, None] = {}
-    todo = [(n, term.plates) for n in term.scope]
-    while todo:
-        name, plates = todo.pop(0)
-        node = model[name]
-        if name not in inside and name in target.known:
-            continue
-        if not set(node.plates) <= set(plates):
-            return None  # foreign: elements meet
-        if name not in inside:
-            todo += [(p, node.plates) for p in node.parents]
-        elif node.domain is None:
-            return None
-        else:
-            found[name] = None
-    return tuple(found)
-
-
 def _cards(model: Model, names: Sequence[str]) -> tuple[int, ...]:
     return tuple(model[n].domain.size for n in names)  # type: ignore[union-attr]
-
-
-def _expanded(table: FiniteTerm, axes: tuple[str, ...]) -> np.ndarray:
-    """A table without plates with its axes among ``axes``, size one where it does not vary."""
-    order = sorted(range(len(table.scope)), key=lambda i: axes.index(table.scope[i]))
-    sizes = dict(zip(table.scope, table.log.shape[: len(table.scope)], strict=True))
-    return table.log.transpose(order).reshape(tuple(sizes.get(n, 1) for n in axes))

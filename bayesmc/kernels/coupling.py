@@ -9,15 +9,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
+from bayesmc.factors.named import Named, aligned, connected, sizes_of
 from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms
 from bayesmc.structure.target import Target
 
-#: one element of a node
-_Variable = tuple[str, int]
+#: one element of a node: its name and number
+_Variable = Any
 
 #: joint states of a block
 _STATES = 256
@@ -107,20 +108,7 @@ def deterministic_constraints(
 # ---- private ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Support:
-    """Which joint states of some variables one table allows."""
-
-    scope: tuple[_Variable, ...]
-    possible: np.ndarray
-
-    def fixed(self, variable: _Variable, state: int) -> _Support:
-        axis = self.scope.index(variable)
-        scope = self.scope[:axis] + self.scope[axis + 1 :]
-        return _Support(scope, self.possible.take(state, axis=axis))
-
-
-def _supports(target: Target, terms: FiniteTerms, share: float) -> list[_Support]:
+def _supports(target: Target, terms: FiniteTerms, share: float) -> list[Named]:
     """What every table allows: entries above a share of its largest."""
     found = []
     for term in target.terms.values():
@@ -134,7 +122,7 @@ def _supports(target: Target, terms: FiniteTerms, share: float) -> list[_Support
     return found
 
 
-def _elements(target: Target, table: FiniteTerm, possible: np.ndarray) -> Iterator[_Support]:
+def _elements(target: Target, table: FiniteTerm, possible: np.ndarray) -> Iterator[Named]:
     """The supports of the elements of a term, but for those that allow all."""
     n = len(table.scope)
     shape = possible.shape[n:]
@@ -146,11 +134,11 @@ def _elements(target: Target, table: FiniteTerm, possible: np.ndarray) -> Iterat
             node = target.model[name]
             own = tuple(element[p] for p in node.plates)
             scope.append((name, int(np.ravel_multi_index(own, node.plate_shape)) if own else 0))
-        yield _Support(tuple(scope), possible[(Ellipsis, *at)])
+        yield Named(tuple(scope), possible[(Ellipsis, *at)])
 
 
 def _stuck(
-    supports: Sequence[_Support], moves: Sequence[frozenset[_Variable]]
+    supports: Sequence[Named], moves: Sequence[frozenset[_Variable]]
 ) -> list[tuple[_Variable, ...]]:
     """Sets of variables whose possible states the moves are not known to connect.
 
@@ -158,14 +146,17 @@ def _stuck(
     and what is left is smaller.
     """
     tied = _without_safe(list(supports))
+    several = [s.scope for s in tied if len(s.scope) > 1]
+    if not several:
+        return []
     return [
         scope
-        for scope, members in _components([s for s in tied if len(s.scope) > 1])
-        if not _connected(scope, [s for s in tied if set(s.scope) <= set(scope)], moves)
+        for scope in connected((v for s in several for v in s), several)
+        if not _connects(scope, [s for s in tied if set(s.scope) <= set(scope)], moves)
     ]
 
 
-def _without_safe(supports: list[_Support]) -> list[_Support]:
+def _without_safe(supports: list[Named]) -> list[Named]:
     changed = True
     while changed:
         changed = False
@@ -175,56 +166,43 @@ def _without_safe(supports: list[_Support]) -> list[_Support]:
             if state is not None:
                 changed = True
                 supports = [
-                    s.fixed(variable, state) if variable in s.scope else s for s in supports
+                    Named(
+                        tuple(v for v in s.scope if v != variable),
+                        s.values.take(state, axis=s.scope.index(variable)),
+                    )
+                    if variable in s.scope
+                    else s
+                    for s in supports
                 ]
-                supports = [s for s in supports if s.scope and not s.possible.all()]
+                supports = [s for s in supports if s.scope and not s.values.all()]
     return supports
 
 
-def _safe_state(variable: _Variable, touching: Sequence[_Support]) -> int | None:
+def _safe_state(variable: _Variable, touching: Sequence[Named]) -> int | None:
     """A state that is possible wherever any state of the variable is."""
-    safe = np.ones(touching[0].possible.shape[touching[0].scope.index(variable)], dtype=bool)
+    safe = np.ones(touching[0].values.shape[touching[0].scope.index(variable)], dtype=bool)
     for support in touching:
         axis = support.scope.index(variable)
-        front = np.moveaxis(support.possible, axis, 0).reshape(support.possible.shape[axis], -1)
+        front = np.moveaxis(support.values, axis, 0).reshape(support.values.shape[axis], -1)
         safe &= (front >= front.any(axis=0)).all(axis=1)
     return int(np.argmax(safe)) if safe.any() else None
 
 
-def _components(
-    supports: Sequence[_Support],
-) -> list[tuple[tuple[_Variable, ...], list[_Support]]]:
-    """Supports that share variables, together."""
-    groups: list[tuple[dict[_Variable, None], list[_Support]]] = []
-    for support in supports:
-        scope, members = dict.fromkeys(support.scope), [support]
-        apart = []
-        for group in groups:
-            if group[0].keys() & scope.keys():
-                scope = {**group[0], **scope}
-                members = group[1] + members
-            else:
-                apart.append(group)
-        groups = [*apart, (scope, members)]
-    return [(tuple(scope), members) for scope, members in groups]
-
-
-def _connected(
+def _connects(
     scope: tuple[_Variable, ...],
-    supports: Sequence[_Support],
+    supports: Sequence[Named],
     moves: Sequence[frozenset[_Variable]],
 ) -> bool:
     """Whether moves lead from every possible joint state to every other, by enumeration if need be."""
     if any(move.issuperset(scope) for move in moves):
         return True
-    cards = _cards(scope, supports)
+    sizes = sizes_of(supports)
+    cards = tuple(sizes[v] for v in scope)
     if math.prod(cards) > _ENUMERATED:
         return False
     possible = np.ones(cards, dtype=bool)
     for support in supports:
-        order = sorted(range(len(support.scope)), key=lambda i: scope.index(support.scope[i]))
-        shape = [c if v in support.scope else 1 for v, c in zip(scope, cards, strict=True)]
-        possible &= support.possible.transpose(order).reshape(shape)
+        possible &= aligned(support, scope)
     nowhere = possible.size
     label = np.where(possible, np.arange(nowhere).reshape(cards), nowhere)
     axes: list[tuple[int, ...]] = [(i,) for i in range(len(scope))]
@@ -238,11 +216,6 @@ def _connected(
             return len(np.unique(label[possible])) <= 1
 
 
-def _cards(scope: Sequence[_Variable], supports: Sequence[_Support]) -> tuple[int, ...]:
-    sizes = {v: n for s in supports for v, n in zip(s.scope, s.possible.shape, strict=True)}
-    return tuple(sizes[v] for v in scope)
-
-
 def _moves(target: Target, blocks: Sequence[Sequence[str]]) -> list[frozenset[_Variable]]:
     """The blocks of all elements."""
     found = []
@@ -254,14 +227,14 @@ def _moves(target: Target, blocks: Sequence[Sequence[str]]) -> list[frozenset[_V
 
 def _proposed(
     target: Target,
-    supports: Sequence[_Support],
+    supports: Sequence[Named],
     component: tuple[_Variable, ...],
     largest: int,
     grow: bool,
 ) -> Iterator[tuple[str, ...]]:
     """Blocks for a set of variables that are stuck: the scopes of its tables, or larger ones."""
     inside = set(component)
-    sizes = dict(zip(component, _cards(component, supports), strict=True))
+    sizes = {v: n for v, n in sizes_of(supports).items() if v in inside}
     tied = [s for s in supports if len(inside & set(s.scope)) > 1]
     if grow and math.prod(sizes.values()) <= largest:
         yield _ordered(target, component)
@@ -290,7 +263,7 @@ def _fitting(
 
 
 def _grown(
-    block: list[_Variable], tied: Sequence[_Support], sizes: dict[_Variable, int], largest: int
+    block: list[_Variable], tied: Sequence[Named], sizes: dict[_Variable, int], largest: int
 ) -> list[_Variable]:
     """A block with what is tied to it, nearest first, as long as it fits."""
     while True:

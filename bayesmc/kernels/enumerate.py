@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from bayesmc.errors import ModelError, ZeroProbabilityError
+from bayesmc.categorical import pick_log
+from bayesmc.errors import ModelError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
@@ -38,7 +39,8 @@ class Enumerate(Kernel):
             except ModelError:
                 log = self._possible(state, candidate, now, members)
             log = np.broadcast_to(log, (len(self.states), *now.shape))
-            new = draw_states(log, rng, blanket.name).astype(self.states.dtype)
+            new = pick_log(log, rng.random(now.shape), f"node {blanket.name!r}")
+            new = new.astype(self.states.dtype)
             state = {**state, blanket.name: blanket.moved(state, new, members)}
         return {blanket.name: state[blanket.name]}, memory
 
@@ -60,31 +62,3 @@ class Enumerate(Kernel):
             return blanket.log_density(state, candidate, members)  # the fault is another
         log = blanket.log_density(state, np.where(impossible, now, full), members)
         return np.where(impossible, -np.inf, log)
-
-
-def draw_states(log: np.ndarray, rng: np.random.Generator, name: str) -> np.ndarray:
-    """Positions drawn from unnormalised log probabilities, states first: shape ``log.shape[1:]``."""
-    return states_at(log, rng.random(log.shape[1:]), name)
-
-
-def states_at(log: np.ndarray, uniform: np.ndarray, name: str) -> np.ndarray:
-    """As ``draw_states``, from uniform random numbers of shape ``log.shape[1:]``."""
-    count = len(log)
-    top = log[0]
-    for k in range(1, count):
-        top = np.maximum(top, log[k])
-    if not np.isfinite(top).all():
-        raise ZeroProbabilityError(
-            f"node {name!r}: no state has positive probability given the others; the chain is at an "
-            "impossible configuration"
-        )
-    edges = np.exp(log[0] - top)
-    cumulative = [edges]
-    for k in range(1, count):
-        edges = edges + np.exp(log[k] - top)
-        cumulative.append(edges)
-    level = uniform * edges
-    found = (level >= cumulative[0]).view(np.uint8)
-    for k in range(1, count - 1):
-        found = found + (level >= cumulative[k])
-    return found if count > 1 else np.zeros(top.shape, dtype=np.uint8)

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesmc.kernels.enumerate import states_at
+from bayesmc.categorical import log_sum_exp, pick_log
 
 #: states up to which products of tables are sums of whole arrays, and not of many small matrices
 _FEW = 12
@@ -199,7 +199,7 @@ class _Round:
         """Put the sums in place; what the variables without neighbours add to the log normaliser."""
         if len(self.leaf.variables):
             own = single[:, None, self.leaf.variables]
-            sums = _log_sum(self.leaf.taken(tables) + own)[:, self.order]
+            sums = log_sum_exp(self.leaf.taken(tables) + own, 0)[:, self.order]
             if len(self.stems) < len(self.order):
                 sums = np.add.reduceat(sums, self.starts, axis=1)
             single[:, self.stems] += sums
@@ -207,7 +207,7 @@ class _Round:
             left = self.left.taken(tables) + single[:, None, self.left.variables]
             end = self.begin + len(self.left.variables)
             tables[:, :, self.begin : end] = _log_product(left, self.right.taken(tables))
-        return _log_sum(single[:, self.alone]).sum(axis=0)
+        return log_sum_exp(single[:, self.alone], 0).sum(axis=0)
 
     def draw(
         self,
@@ -227,7 +227,7 @@ class _Round:
             given = self.both.given(tables, drawn)
             log[:, end:] += given[:, : len(self.left.variables)]
             log[:, end:] += given[:, len(self.left.variables) :]
-        drawn[members] = states_at(log, uniform[members], what)
+        drawn[members] = pick_log(log, uniform[members], f"node {what!r}")
 
 
 def _apart(left: list[int], near: list[dict[int, int]]) -> list[int]:
@@ -280,15 +280,6 @@ def _side(rows: list[tuple[int, int, int, bool]]) -> _Side:
     return _Side(table[:, 0], table[:, 1], table[:, 2], table[:, 3].astype(bool))
 
 
-def _log_sum(log: np.ndarray) -> np.ndarray:
-    """Log of the sum of exponentials over the first axis; ``-inf`` where all are."""
-    top = _top(log)
-    total = np.exp(log[0] - top)
-    for row in log[1:]:
-        total += np.exp(row - top)
-    return np.log(total) + top
-
-
 def _log_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Log of ``sum_j exp(left[j, i] + right[j, k])`` for all i and k, axes after these together."""
     top_left, top_right = _top(left), _top(right)
@@ -305,7 +296,7 @@ def _log_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     if _is_rough(a, left) or _is_rough(b, right):
         small = np.nonzero(product < _SMALL)  # what is impossible, and what was lost
         i, k, variable, row = small
-        log[small] = _log_sum(left[:, i, variable, row] + right[:, k, variable, row])
+        log[small] = log_sum_exp(left[:, i, variable, row] + right[:, k, variable, row], 0)
     return log
 
 

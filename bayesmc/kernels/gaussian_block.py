@@ -1,10 +1,10 @@
 """Coupled Normal nodes drawn jointly: random effects and their mean, coefficients of one regression.
 
 Given everything else the block is Gaussian. Its precision and linear term are sums over the terms it
-enters, whose coefficients come from evaluating the user's functions at zero and at unit steps. Elements of a
-plate that meet only one by one (many small matrices), or the slices of a chain (a band), are eliminated
-first, then the rest (one dense matrix): the cost is linear in those elements or slices. A precision that is
-what it was in the sweep before is not factorised again.
+enters, whose coefficients are read off the expression graph. Elements of a plate that meet only one by one
+(many small matrices), or the slices of a chain (a band), are eliminated first, then the rest (one dense
+matrix): the cost is linear in those elements or slices. A precision that is what it was in the sweep before
+is not factorised again.
 
 References
 ----------
@@ -15,23 +15,21 @@ Biometrika 82, on why one at a time mixes slowly.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from operator import is_
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import LogNormal, MvNormal, Normal
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.gaussian_layout import BlockSums, Factor, Layout, factored, solved
-from bayesmc.kernels.gaussian_terms import BlockTerm, block_terms
+from bayesmc.kernels.gaussian_order import Components
+from bayesmc.kernels.gaussian_rows import NormalRows
+from bayesmc.kernels.gaussian_terms import NormalTerms
 from bayesmc.kernels.verify import check_ratio
-from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Target, Term, Values
-from bayesmc.structure.traced import Untraceable, traced_term
-from bayesmc.tracing import TracedCall, Tracer
+from bayesmc.structure.target import Target, Values
 
 #: components that one dense matrix may have, and how far from the diagonal a band may reach
 MAX_DENSE = 400
@@ -39,7 +37,6 @@ MAX_DENSE = 400
 _MAX_ENTRIES = 1 << 22
 #: nodes that are all named to the user, and how many of more
 _SHOWN, _FEW = 8, 4
-_FAMILIES = (Normal, MvNormal, LogNormal)
 
 
 class GaussianBlock(Kernel):
@@ -47,10 +44,19 @@ class GaussianBlock(Kernel):
 
     Parameters
     ----------
-    blankets : dict
-        Of the block's nodes.
-    layout : Layout, optional
-        Made before.
+    target : Target
+    names : iterable of str
+        The block's nodes.
+    normal : NormalTerms, optional
+        The target's, read before.
+
+    Attributes
+    ----------
+    terms : tuple of Term
+        All that some node enters.
+    parts : list of NormalRows
+        What these say, like ones as one.
+    layout : Layout
     """
 
     label = "conjugate block"
@@ -58,22 +64,26 @@ class GaussianBlock(Kernel):
     def __init__(
         self,
         target: Target,
-        blankets: Mapping[str, Blanket],
+        names: Iterable[str],
         debug: bool = False,
-        layout: Layout | None = None,
+        normal: NormalTerms | None = None,
     ) -> None:
-        self.target = target
-        self.names = tuple(blankets)
-        self.debug = debug
+        self.target, self.names, self.debug = target, tuple(names), debug
         self.terms = target.terms_of(self.names)
         self.path = target.below(self.names)
-        self.layout = layout or Layout(target, self.names, blankets, self.terms)
-        self.parts = block_terms(target, blankets, self.layout, self.terms)
+        normal = normal or NormalTerms(target)
+        components = Components(target, self.names)
+        like = normal.like(self.terms, components.start)
+        self.parts = [NormalRows(target, group, components) for group in like]
+        components.meetings = [part.meeting for part in self.parts]
+        self.layout = Layout(components)
+        for part in self.parts:
+            part.layout = self.layout
         self.match = "jointly Normal with " + shortened(self.names)
         #: what terms say that say the same in every sweep, and the data of which that holds
         self._standing: Any = None
         self._seen: Values = {}
-        self._moving: list[BlockTerm] = []
+        self._moving: list[NormalRows] = []
         #: the precision of the last sweep and its factor
         self._last: tuple[np.ndarray, Factor] | None = None
 
@@ -84,7 +94,7 @@ class GaussianBlock(Kernel):
         noise = rng.standard_normal(sums.linear.shape)
         factor = self._factored(sums.precision)
         if (sums.bad | factor.bad).any():
-            raise DensityError(self._why_bad(sums))
+            raise DensityError(self._why_bad(values))
         draw = factor.solved(sums.linear, noise)
         new = self.layout.split(draw, values)
         if self.debug:
@@ -110,12 +120,10 @@ class GaussianBlock(Kernel):
         if self._stands(values):
             sums.add(*self._standing)
             moving = self._moving
-        if moving:
-            base = self._at_zero(values)
-            for part in moving:
-                part.add(base, sums)
-            if self._standing is None:
-                self._part_ways(base)
+        for part in moving:
+            part.add(values, sums)
+        if self._standing is None:
+            self._part_ways(values)
         return sums
 
     def _factored(self, precision: np.ndarray) -> Factor:
@@ -125,14 +133,14 @@ class GaussianBlock(Kernel):
             last = self._last = precision, factored(self.layout, precision)
         return last[1]
 
-    def _part_ways(self, base: Values) -> None:
+    def _part_ways(self, values: Values) -> None:
         """Terms that say the same in every sweep are summed once, the others each time."""
-        standing = [p for p in self.parts if p.stands(base)]
-        self._moving = [p for p in self.parts if not p.stands(base)]
+        standing = [p.standing for p in self.parts if p.standing is not None]
+        self._moving = [p for p in self.parts if p.standing is None]
         if standing:
-            columns = zip(*(p.summed for p in standing), strict=True)
-            self._standing = tuple(sum(c) for c in columns)
-            self._seen = {n: base[n] for p in standing for n in p.data}
+            self._standing = tuple(sum(c) for c in zip(*standing, strict=True))
+            still = [p for p in self.parts if p.standing is not None]
+            self._seen = {n: values[n] for p in still for n in p.program.watched}
 
     def _stands(self, values: Values) -> bool:
         """Whether all terms that were summed once still say the same."""
@@ -141,19 +149,14 @@ class GaussianBlock(Kernel):
             map(is_, map(values.__getitem__, seen), seen.values())
         )
 
-    def _why_bad(self, sums: BlockSums) -> str:
-        if sums.problem is not None:
-            return str(sums.problem)
+    def _why_bad(self, values: Values) -> str:
+        for part in self.parts:
+            if (problem := part.problem(values)) is not None:
+                return problem
         return (
             f"nodes {shortened(self.names, quoted=True)}: their joint precision given the others is not "
             "positive definite; a scale is near zero or infinite"
         )
-
-    def _at_zero(self, values: Values) -> Values:
-        """The state with the block at zero (what is seen of it stays)."""
-        state = {**values, **self.layout.base}
-        self.target.compute(state, self.path)
-        return state
 
     def _check(
         self, values: Values, new: Values, precision: np.ndarray, linear: np.ndarray
@@ -182,29 +185,26 @@ class GaussianBlock(Kernel):
 
 
 def gaussian_blocks(
-    target: Target, blankets: Mapping[str, Blanket], debug: bool = False
+    target: Target, names: Iterable[str], debug: bool = False
 ) -> list[GaussianBlock]:
     """Blocks of two or more coupled Normal nodes whose terms are jointly affine in them."""
-    able = [n for n, b in blankets.items() if _is_able(target, b)]
-    found = []
-    for names in _joint_groups(target, able, blankets):
-        if len(names) > 1:
-            found += _fitting(target, names, blankets, debug)
-    return found
+    normal = NormalTerms(target)
+    able = [n for n in names if _is_able(normal, n)]
+    groups = [g for g in _joint_groups(normal, able) if len(g) > 1]
+    return [block for group in groups for block in _fitting(normal, group, debug)]
 
 
 def vector_blocks(
-    target: Target, blankets: Mapping[str, Blanket], joined: Collection[str], debug: bool = False
+    target: Target, names: Iterable[str], joined: Collection[str], debug: bool = False
 ) -> list[GaussianBlock]:
     """Blocks of one Normal vector each, of those that are not ``joined`` to others.
 
     Its components are coupled as scalars of their own would be.
     """
-    found = []
-    for name, blanket in blankets.items():
-        if name not in joined and math.prod(blanket.event_shape) > 1 and _is_able(target, blanket):
-            found += _fitting(target, [name], blankets, debug)
-    return found
+    normal, nodes = NormalTerms(target), target.model.nodes
+    alone = [n for n in names if n not in joined and math.prod(nodes[n].event_shape) > 1]
+    able = [n for n in alone if _is_able(normal, n)]
+    return [block for name in able for block in _fitting(normal, [name], debug)]
 
 
 def shortened(names: Sequence[str], quoted: bool = False) -> str:
@@ -225,60 +225,28 @@ def shortened(names: Sequence[str], quoted: bool = False) -> str:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _is_able(target: Target, blanket: Blanket) -> bool:
-    """Whether a node is Normal with a Gaussian full conditional, as far as blocks can use it."""
-    if blanket.own is None or len(blanket.event_shape) > 1 or blanket.node.is_discrete:
+def _is_able(normal: NormalTerms, name: str) -> bool:
+    """Whether a node is Normal with a Gaussian full conditional."""
+    if normal.target.model[name].is_discrete or not normal.is_prior(name):
         return False
-    for child in blanket.children:
-        kind = child.relation.kind
-        if kind == "whole" or (kind == "rows" and len(child.relation.rows) != 1):
-            return False
-        if child.term.is_potential or not _is_affine(target, (blanket.name,), child.term):
-            return False
-    return _is_affine(target, (), blanket.own, (Normal, MvNormal))
+    found = [normal.of(t.name) for t in normal.target.terms_of((name,))]
+    return all(f is not None and normal.are_joint(f, (name,)) for f in found)
 
 
-def _is_affine(
-    target: Target, names: tuple[str, ...], term: Term, families: tuple[type, ...] = _FAMILIES
-) -> bool:
-    """Whether a term is Gaussian with a mean affine in the nodes, and nothing else of it varies with them."""
-    if not names:
-        try:
-            known, probe = target.known, target.model.probe
-            values = {n: known[n] if n in known else probe[n] for n in term.parents}
-            result = target.model.evaluate(term.name, values)[0]
-        except Exception:
-            return False
-        return type(result) in families
-    try:
-        result = traced_term(target, names, term).result
-    except Untraceable:
-        return False
-    if not isinstance(result, TracedCall):
-        return type(result) in families  # it names the nodes and does nothing with them
-    if result.function not in families:
-        return False
-    traced = result.traced
-    return set(traced) <= {"loc"} and all(
-        isinstance(v, Tracer) and v.is_affine for v in traced.values()
-    )
-
-
-def _fitting(
-    target: Target, names: Sequence[str], blankets: Mapping[str, Blanket], debug: bool
-) -> list[GaussianBlock]:
+def _fitting(normal: NormalTerms, names: Sequence[str], debug: bool) -> list[GaussianBlock]:
     """A group as one block, or cut into halves (each drawn given the other) where that is too large."""
+    target = normal.target
     if len(names) < 2 and not any(target.model[n].event_shape for n in names):
         return []
-    own = {n: blankets[n] for n in names}
-    layout = Layout(target, names, own, target.terms_of(names))
+    block = GaussianBlock(target, names, debug, normal)
+    layout = block.layout
     if max(layout.width, layout.dg) <= MAX_DENSE and layout.entries <= _MAX_ENTRIES:
-        return [GaussianBlock(target, own, debug, layout)]
+        return [block]
     if len(names) < 2:
         return []
     half = len(names) // 2
     halves = names[:half], names[half:]
-    return [block for part in halves for block in _fitting(target, part, blankets, debug)]
+    return [block for part in halves for block in _fitting(normal, part, debug)]
 
 
 @dataclass(eq=False)
@@ -286,8 +254,8 @@ class _Group:
     """Nodes whose terms are jointly affine in them, and how they enter each term."""
 
     names: list[str]
-    #: term -> nodes that it reads, and the kinds of relation
-    children: dict[str, list[tuple[str, str]]]
+    #: the terms that these enter
+    terms: set[str]
     #: when it got its last member
     age: int
     #: the group that it has become part of
@@ -300,31 +268,26 @@ class _Group:
         return group
 
 
-def _joint_groups(
-    target: Target, able: Sequence[str], blankets: Mapping[str, Blanket]
-) -> list[list[str]]:
+def _joint_groups(normal: NormalTerms, able: Sequence[str]) -> list[list[str]]:
     """Nodes that can be drawn together, each group in the chain's order.
 
     A node joins the groups whose terms it enters. Of two groups only the terms that both enter can stand in
     the way, and the smaller goes into the larger, so a slice of a long chain costs what one of a short does.
     """
+    target = normal.target
     place = {n: i for i, n in enumerate(target.chain)}
-    owners: dict[str, list[_Group]] = {}
-    groups: list[_Group] = []
+    entered: dict[str, list[_Group]] = {}
+    owner: dict[str, _Group] = {}
     for age, name in enumerate(able):
-        children: dict[str, list[tuple[str, str]]] = {}
-        for child in blankets[name].children:
-            children.setdefault(child.term.name, []).append((name, child.relation.kind))
-        merged = alone = _Group([name], children, age)
         terms = [t.name for t in target.terms_of((name,))]
-        shared = {g.now() for t in terms for g in owners.get(t, ())}
+        merged = alone = owner[name] = _Group([name], set(terms), age)
+        shared = {g.now() for t in terms for g in entered.get(t, ())}
         for group in sorted(shared, key=lambda g: g.age):
-            if _jointly_affine(target, group, merged):
+            if _are_joint(normal, owner, group, merged):
                 merged = _merged(group, merged, age)
-        groups.append(alone)
         for term in terms:
-            owners.setdefault(term, []).append(alone)
-    found = sorted((g for g in groups if g.into is None), key=lambda g: g.age)
+            entered.setdefault(term, []).append(alone)
+    found = sorted((g for g in owner.values() if g.into is None), key=lambda g: g.age)
     return [sorted(g.names, key=place.__getitem__) for g in found]
 
 
@@ -334,21 +297,17 @@ def _merged(one: _Group, other: _Group, age: int) -> _Group:
     small.into = large
     large.age = age
     large.names += small.names
-    for term, entering in small.children.items():
-        large.children.setdefault(term, []).extend(entering)
+    large.terms |= small.terms
     return large
 
 
-def _jointly_affine(target: Target, one: _Group, other: _Group) -> bool:
+def _are_joint(normal: NormalTerms, owner: dict[str, _Group], one: _Group, other: _Group) -> bool:
     """Whether the terms that two groups share are affine in the nodes of both."""
-    small, large = sorted((one.children, other.children), key=len)
-    for name, these in small.items():
-        if name not in large:
-            continue
-        found = [*these, *large[name]]
-        entering = tuple(dict.fromkeys(n for n, _ in found))
-        if any(kind == "lookup" for _, kind in found):
-            return False
-        if not _is_affine(target, entering, target.terms[name]):
+    small, large = sorted((one.terms, other.terms), key=len)
+    for term in small & large:
+        found = normal.of(term)
+        assert found is not None, "a node that is able enters Normal terms only"
+        inside = [n for n in found.leaves if n in owner and owner[n].now() in (one, other)]
+        if not normal.are_joint(found, inside):
             return False
     return True

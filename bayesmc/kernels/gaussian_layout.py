@@ -7,16 +7,15 @@ Which is which, ``gaussian_order`` says.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bayesmc.kernels.gaussian_band import Band, cholesky, lapack
 from bayesmc.kernels.gaussian_order import Components, order_of
-from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Target, Term, Values
+from bayesmc.linalg.patterns import Band, cholesky, lapack
+from bayesmc.structure.target import Values
 
 #: components up to which triangles are solved by one call for all chains
 _SMALL = 32
@@ -36,34 +35,19 @@ class Layout:
         the rest; and one to throw away.
     """
 
-    def __init__(
-        self,
-        target: Target,
-        names: Sequence[str],
-        blankets: Mapping[str, Blanket],
-        terms: Sequence[Term],
-    ) -> None:
-        self.names = tuple(names)
-        self.nodes = {n: target.model[n] for n in names}
-        self.free: dict[str, np.ndarray] = {}
-        self.base: Values = {}
-        for n in names:
-            self.free[n], self.base[n] = _what_is_seen(target, n)
-        components = Components(target, names, blankets, terms)
-        self.counts, self.dims, self.start = components.counts, components.dims, components.start
+    def __init__(self, components: Components) -> None:
+        self.components, self.names = components, components.names
         order = order_of(components)
         self.position, self.first = order.position, order.first
         self.size = len(self.position)
         self.cut, self.dg = self.first.size, order.rest
         self.width = self.first.width if isinstance(self.first, Band) else 0
         self.entries = order.entries + 1
-        self._partly = tuple(n for n in names if not self.free[n].all())
-        self._units = self._diagonal_of_seen()
+        self._units = np.empty(0, dtype=np.intp)
+        if components.free is not None:  # the diagonal of what was seen
+            seen = self.position[~components.free]
+            self._units = self.entry(seen, seen)
         self._alike = tuple(self._like_nodes())
-
-    def place(self, name: str, component: int, elements: np.ndarray) -> np.ndarray:
-        """Position in the joined vector of one component of some elements."""
-        return self.position[self.start[name] + elements * self.dims[name] + component]
 
     def entry(self, row: np.ndarray, column: np.ndarray) -> np.ndarray:
         """Entry of the precision for two positions; what is kept elsewhere goes to the last."""
@@ -111,7 +95,7 @@ class Layout:
         new: Values = {}
         columns = None
         for names, at in self._alike:
-            shape = (len(names), chains, *self.nodes[names[0]].value_shape)
+            shape = (len(names), chains, *self.components.nodes[names[0]].value_shape)
             if len(names) == 1:
                 rows = joined.take(at[0], axis=1).reshape(shape)
             else:
@@ -119,43 +103,37 @@ class Layout:
                 rows = np.moveaxis(columns[at], -1, 1).reshape(shape)
             rows.flags.writeable = False
             new.update(zip(names, rows, strict=True))
-        for name in self._partly:
-            node = self.nodes[name]
-            free = self.free[name].reshape(node.plate_shape + (1,) * len(node.event_shape))
-            new[name] = np.where(free, new[name], values[name])
+        for name in self.components.partly:
+            new[name] = np.where(self._free(name), new[name], values[name])
         return new
 
     def joined(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Values of the nodes as one vector per chain, what was seen as zero."""
-        chains = len(values[self.names[0]])
-        joined = np.zeros((chains, self.size))
-        for name in self.names:
-            count, d, start = self.counts[name], self.dims[name], self.start[name]
-            flat = values[name].reshape(chains, count, d)
-            flat = np.where(self.free[name][:, None], flat, 0.0)
-            joined[:, self.position[start : start + count * d]] = flat.reshape(chains, -1)
+        flat = [
+            np.where(self._free(n), values[n], 0.0).reshape(len(values[n]), -1) for n in self.names
+        ]
+        joined = np.empty((len(flat[0]), self.size))
+        joined[:, self.position] = np.concatenate(flat, axis=1)
         return joined
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _diagonal_of_seen(self) -> np.ndarray:
-        """Entries of the diagonal that belong to what was seen."""
-        found = [np.empty(0, dtype=np.intp)]
-        for name in self._partly:
-            seen = np.flatnonzero(~self.free[name])
-            for c in range(self.dims[name]):
-                at = self.place(name, c, seen)
-                found.append(self.entry(at, at))
-        return np.concatenate(found)
+    def _free(self, name: str) -> np.ndarray:
+        """Which components of a node are free, in the shape of its values."""
+        components, start = self.components, self.components.start[name]
+        shape = components.nodes[name].value_shape
+        if components.free is None:
+            return np.ones(shape, dtype=bool)
+        return components.free[start : start + math.prod(shape)].reshape(shape)
 
     def _like_nodes(self) -> Iterator[tuple[tuple[str, ...], np.ndarray]]:
         """Nodes of one shape, and their positions ``(nodes, components)``."""
         groups: dict[Any, list[str]] = {}
         for name in self.names:
-            groups.setdefault(self.nodes[name].value_shape, []).append(name)
+            groups.setdefault(self.components.nodes[name].value_shape, []).append(name)
         for names in groups.values():
-            size = self.counts[names[0]] * self.dims[names[0]]
-            start = np.array([self.start[n] for n in names])
+            size, _ = self.components.size_of(names[0])
+            start = self.components.starts(names)
             yield tuple(names), self.position[start[:, None] + np.arange(size)]
 
 
@@ -170,7 +148,6 @@ class BlockSums:
         self.linear = np.zeros((chains, layout.size))
         self.constant = np.zeros(chains)
         self.bad = np.zeros(chains, dtype=bool)
-        self.problem: str | None = None
 
     def add(self, precision: np.ndarray, linear: np.ndarray, constant: np.ndarray) -> None:
         if len(precision) > len(self.precision):
@@ -179,11 +156,6 @@ class BlockSums:
             self.precision += precision
         self.linear += linear
         self.constant += constant
-
-    def mark(self, bad: np.ndarray, problem: str) -> None:
-        """Chains in which a term has no meaning."""
-        self.bad |= bad
-        self.problem = self.problem or problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -263,19 +235,6 @@ def solved(
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _what_is_seen(target: Target, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Which elements of a node are free, flat, and its value with those at zero, shape (1, *value)."""
-    node = target.model[name]
-    seen = target.seen(name)
-    base = np.zeros((1, *node.value_shape))
-    if seen is None:
-        return np.ones(math.prod(node.plate_shape), dtype=bool), base
-    assert seen.mask is not None
-    mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
-    base[0] = np.where(mask, seen.value, 0.0)
-    return ~seen.mask.ravel(), base
 
 
 def _triangle(factor: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:

@@ -14,15 +14,13 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from bayesmc.kernels.gaussian_band import Band, Blocks, Pattern
-from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.relation import Relation
-from bayesmc.structure.target import Target, Term
+from bayesmc.linalg.patterns import Band, Blocks, Pattern
+from bayesmc.structure.target import Target
 
 #: components up to which one dense matrix is best
 _SMALL = 24
@@ -30,8 +28,8 @@ _SMALL = 24
 _MANY = 4
 #: cost of one column of a band beyond its arithmetic
 _COLUMN = 100
-#: pairs of components that are looked at
-_MOST_PAIRS = 1 << 22
+#: pairs of components that are looked at, each in both orders
+_MOST_PAIRS = 1 << 23
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,46 +58,76 @@ class Order:
         return self.first.entries + self.first.size * self.rest + self.rest**2
 
 
+@dataclass(frozen=True, eq=False)
+class Meeting:
+    """Which components meet in elements of terms.
+
+    Attributes
+    ----------
+    at : ndarray of int, shape (elements, columns)
+        Components, in natural order, that each element reads always.
+    varying : tuple of (int, int, bool)
+        Components ``start`` to ``stop`` of which each element reads some that vary, and whether those are
+        always of one element of a plate.
+    """
+
+    at: np.ndarray
+    varying: tuple[tuple[int, int, bool], ...]
+
+
 class Components:
-    """The components of some nodes in natural order, and the terms that join them.
+    """The components of some nodes in natural order: nodes, elements, components of an element.
 
     Parameters
     ----------
+    target : Target
     names : sequence of str
-    terms : sequence of Term
-        All that some node enters.
+
+    Attributes
+    ----------
+    counts, dims, start : dict
+        Node -> its elements, the components of each, and where they begin.
+    state : dict
+        Node -> its value with what is free at zero, shape ``(1, *value)``.
+    free, base : ndarray or None
+        Which components are free, and the values of the others; None where all are free.
+    meetings : list of Meeting
+        Put in place by those who know the terms.
     """
 
-    def __init__(
-        self,
-        target: Target,
-        names: Sequence[str],
-        blankets: Mapping[str, Blanket],
-        terms: Sequence[Term],
-    ) -> None:
-        self.target, self.names, self.terms = target, tuple(names), tuple(terms)
-        nodes = {n: target.model[n] for n in names}
-        self.counts = {n: math.prod(nodes[n].plate_shape) for n in names}
-        self.dims = {n: math.prod(nodes[n].event_shape) for n in names}
+    def __init__(self, target: Target, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+        self.nodes = {n: target.model[n] for n in names}
+        self.counts = {n: math.prod(node.plate_shape) for n, node in self.nodes.items()}
+        self.dims = {n: math.prod(node.event_shape) for n, node in self.nodes.items()}
         sizes = [self.counts[n] * self.dims[n] for n in names]
         self.start = dict(zip(names, np.cumsum([0, *sizes[:-1]]).tolist(), strict=True))
         self.size = sum(sizes)
-        self.entering: dict[str, list[tuple[str, Relation]]] = {t.name: [] for t in terms}
-        for name in names:
-            for child in blankets[name].children:
-                self.entering[child.term.name].append((name, child.relation))
+        self.partly = tuple(n for n in names if target.seen(n) is not None)
+        self.state = {n: _known_part(target, n) for n in names}
+        self.free: np.ndarray | None = None
+        self.base: np.ndarray | None = None
+        if self.partly:
+            seen = [self._is_seen(target, n) for n in names]
+            self.free = ~np.concatenate(seen)
+            self.base = np.concatenate([self.state[n].reshape(-1) for n in names])
+        self.meetings: list[Meeting] = []
 
-    def of(self, name: str, elements: np.ndarray) -> np.ndarray:
-        """Components of elements of a node, one more axis."""
-        d = self.dims[name]
-        return self.start[name] + elements[..., None] * d + np.arange(d)
+    def size_of(self, name: str) -> tuple[int, int]:
+        """How many components a node has, and one element of it."""
+        return self.counts[name] * self.dims[name], self.dims[name]
 
-    def met(self, term: Term) -> dict[str, np.ndarray | None]:
-        """The element of each node that each element of a term reads or is; None where that varies."""
-        found = {n: elements_read(relation, term) for n, relation in self.entering[term.name]}
-        if term.name in self.start:
-            found[term.name] = np.arange(self.counts[term.name])
-        return found
+    def starts(self, names: Sequence[str]) -> np.ndarray:
+        """Where the components of some nodes begin."""
+        return np.array([self.start[n] for n in names])
+
+    def _is_seen(self, target: Target, name: str) -> np.ndarray:
+        """Of each component of a node."""
+        seen = target.seen(name)
+        if seen is None:
+            return np.zeros(self.counts[name] * self.dims[name], bool)
+        assert seen.mask is not None
+        return np.repeat(seen.mask.reshape(-1), self.dims[name])
 
 
 def order_of(components: Components) -> Order:
@@ -116,21 +144,18 @@ def order_of(components: Components) -> Order:
     return min([best, *_bands(components)], key=_cost)
 
 
-def elements_read(relation: Relation, term: Term) -> np.ndarray | None:
-    """The element of a node that each element of a term reads, shape (elements,); None where it varies."""
-    if relation.kind == "lookup":
-        return None
-    if relation.kind == "rows":
-        return relation.rows[0]
-    count = math.prod(term.shape)
-    if not relation.plates:
-        return np.zeros(count, dtype=np.intp)
-    at = np.unravel_index(np.arange(count), term.shape)
-    picked = [at[term.plates.index(p)] for p in relation.plates]
-    return np.ravel_multi_index(picked, relation.shape)
-
-
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _known_part(target: Target, name: str) -> np.ndarray:
+    """What was seen of a node, zero elsewhere, shape (1, *value)."""
+    node, seen = target.model[name], target.seen(name)
+    found = np.zeros((1, *node.value_shape))
+    if seen is not None:
+        assert seen.mask is not None
+        mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
+        found[0] = np.where(mask, seen.value, 0.0)
+    return found
 
 
 def _cost(order: Order) -> float:
@@ -152,26 +177,27 @@ def _blocks(order: Order) -> Blocks:
 def _local(components: Components) -> Order | None:
     """Nodes of one plate that meet only element by element, first; None where there are none."""
     groups: dict[tuple[str, ...], list[str]] = {}
-    for n in components.names:
-        plates = components.target.model[n].plates
-        if plates:
-            groups.setdefault(plates, []).append(n)
-    sizes = {n: components.counts[n] * components.dims[n] for n in components.names}
+    for name, node in components.nodes.items():
+        if node.plates:
+            groups.setdefault(node.plates, []).append(name)
+    sizes = {n: components.size_of(n)[0] for n in components.names}
     for group in sorted(groups.values(), key=lambda g: -sum(sizes[n] for n in g)):
-        inside = set(group)
-        if all(_meet_alone(components, inside, term) for term in components.terms):
-            return _element_by_element(components, group)
+        order = _element_by_element(components, group)
+        inside = order.position < order.first.size
+        element = np.where(inside, order.position // _blocks(order).width, -1)
+        if all(_meet_alone(meeting, element) for meeting in components.meetings):
+            return order
     return None
 
 
-def _meet_alone(components: Components, group: set[str], term: Term) -> bool:
-    """Whether every element of a term depends on one element of the group's plates only."""
-    entering = components.entering[term.name]
-    if sum(n in group for n, _ in entering) + (term.name in group) <= 1:
-        return True
-    met = [at for n, at in components.met(term).items() if n in group]
-    known = [at for at in met if at is not None]
-    return len(known) == len(met) and all(np.array_equal(known[0], at) for at in known[1:])
+def _meet_alone(meeting: Meeting, element: np.ndarray) -> bool:
+    """Whether every element of terms depends on one element of the group's plates only."""
+    met = element[meeting.at]
+    varying = [one for start, _, one in meeting.varying if element[start] >= 0]
+    if varying:
+        return varying == [True] and not (met >= 0).any()
+    highest = met.max(axis=1, initial=-1)
+    return bool(((met < 0) | (met == highest[:, None])).all())
 
 
 def _element_by_element(components: Components, group: Sequence[str]) -> Order:
@@ -181,8 +207,8 @@ def _element_by_element(components: Components, group: Sequence[str]) -> Order:
     inner = 0
     for n in group:
         d = components.dims[n]
-        at = components.of(n, np.arange(count))
-        position[at] = np.arange(count)[:, None] * width + inner + np.arange(d)
+        place = np.arange(count)[:, None] * width + inner + np.arange(d)
+        position[components.start[n] : components.start[n] + count * d] = place.reshape(-1)
         inner += d
     rest = np.flatnonzero(position < 0)
     position[rest] = count * width + np.arange(len(rest))
@@ -218,32 +244,23 @@ def _pairs(components: Components) -> np.ndarray | None:
     """Components that meet in an element of a term, shape (pairs, 2); None where they are too many."""
     found = [np.empty((0, 2), dtype=np.intp)]
     count = 0
-    for term in components.terms:
-        for a, b in _meetings(components, term):
-            count += math.prod(np.broadcast_shapes(a.shape, b.shape))
-            if count > _MOST_PAIRS:
-                return None
-            found.append(np.stack(np.broadcast_arrays(a, b), axis=-1).reshape(-1, 2))
+    for meeting in components.meetings:
+        at = meeting.at[:1] if (meeting.at == meeting.at[:1]).all() else meeting.at
+        groups = [at, *(np.arange(*span[:2])[None] for span in meeting.varying)]
+        count += sum(g.shape[0] * g.shape[1] ** 2 for g in groups)
+        count += sum(at.size * g.size for g in groups[1:])
+        if count > _MOST_PAIRS:
+            return None
+        for group in groups:
+            a, b = _two_of(group.shape[1])
+            found.append(np.stack([group[:, a], group[:, b]], axis=-1).reshape(-1, 2))
+        for group in groups[1:]:  # which one it reads varies
+            pair = np.broadcast_arrays(at.reshape(-1, 1), group)
+            found.append(np.stack(pair, axis=-1).reshape(-1, 2))
     pairs = np.concatenate(found)
     pairs = np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1)
     keys = np.unique(pairs[:, 0] * components.size + pairs[:, 1])
     return np.stack(np.divmod(keys, components.size), axis=1)
-
-
-def _meetings(components: Components, term: Term) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Arrays of components that meet pair by pair, to be broadcast."""
-    met = components.met(term)
-    known = [components.of(n, at) for n, at in met.items() if at is not None]
-    joined = np.concatenate(known, axis=1) if known else np.empty((1, 0), dtype=np.intp)
-    a, b = _two_of(joined.shape[1])
-    yield joined[:, a], joined[:, b]
-    for name, elements in met.items():
-        if elements is not None:
-            continue
-        every = components.of(name, np.arange(components.counts[name]))
-        a, b = _two_of(every.shape[1])
-        yield every[:, a], every[:, b]
-        yield joined.reshape(-1, 1), every.reshape(1, -1)  # which one it reads varies
 
 
 @functools.cache
@@ -255,8 +272,9 @@ def _two_of(count: int) -> tuple[np.ndarray, np.ndarray]:
 def _narrow(size: int, pairs: np.ndarray) -> tuple[np.ndarray, int]:
     """An order in which pairs stand near each other: the given one, or Cuthill and McKee's; and how near."""
     natural = np.arange(size)
-    if not len(pairs):
-        return natural, 0
+    width = int(np.abs(np.subtract(*pairs.T)).max(initial=0))
+    if width < 2:  # no order is narrower
+        return natural, width
     # imported here: sparse matrices take long to load, and few blocks need them
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import reverse_cuthill_mckee
@@ -265,5 +283,5 @@ def _narrow(size: int, pairs: np.ndarray) -> tuple[np.ndarray, int]:
     graph = coo_array((np.ones(len(a)), (a, b)), shape=(size, size)).tocsr()
     place = np.empty(size, dtype=np.intp)
     place[reverse_cuthill_mckee(graph, symmetric_mode=True)] = natural
-    widths = [int(np.abs(np.subtract(*p[pairs].T)).max()) for p in (natural, place)]
-    return (place, widths[1]) if widths[1] < widths[0] else (natural, widths[0])
+    other = int(np.abs(np.subtract(*place[pairs].T)).max())
+    return (place, other) if other < width else (natural, width)

@@ -1,4 +1,4 @@
-"""Small blocks of finite nodes, drawn jointly: all joint states given the rest.
+"""Finite nodes, alone or in small blocks that are drawn jointly: all their states given the rest.
 
 One at a time, nodes tied by (nearly) deterministic tables hardly move, or not at all. Which nodes those are
 is found in ``coupling``.
@@ -11,60 +11,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from bayesmc.errors import UnsupportedError, ZeroProbabilityError
+from bayesmc.categorical import pick_log
+from bayesmc.errors import UnsupportedError
+from bayesmc.factors.named import Named, aligned
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms, conditional_of
-from bayesmc.kernels.tables import TableSweep
+from bayesmc.kernels.conditionals import FiniteTerm
+from bayesmc.network import Model
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
 
 #: joint states of a block
-_STATES = 1024
-
-
-def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None = None) -> Kernel:
-    """The kernel that draws some finite nodes jointly.
-
-    Parameters
-    ----------
-    target : Target
-    names : sequence of str
-        Chain nodes with few joint states. If they live in plates, in the same ones, and nothing they enter
-        reads them across elements; the blocks of all elements are then drawn at once.
-    terms : FiniteTerms, optional
-        Tables made before.
-
-    Raises
-    ------
-    UnsupportedError
-        The nodes make no such block.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import bayesmc as bmc
-    >>> from bayesmc.kernels.joint_states import joint_states
-    >>> from bayesmc.network import pose
-    >>> from bayesmc.structure.target import target_of
-    >>> net = bmc.BayesNet()
-    >>> net.add("x", bmc.Bernoulli(0.5))
-    >>> net.add("y", bmc.Bernoulli(0.5))
-    >>> net.add("parity", lambda x, y: bmc.Bernoulli((x + y) % 2 * 1.0))
-    >>> target = target_of(pose(net, {"parity": 1}))
-    >>> kernel = joint_states(target, ("x", "y"))
-    >>> start = {"x": np.ones(4, dtype=np.uint8), "y": np.zeros(4, dtype=np.uint8)}
-    >>> new, _ = kernel.step({**target.known, **start}, {}, np.random.default_rng(0), False)
-    >>> (new["x"] + new["y"]).tolist()
-    [1, 1, 1, 1]
-    """
-    terms = FiniteTerms(target) if terms is None else terms
-    conditional = conditional_of(terms, names)
-    if conditional is not None and conditional.states <= _STATES:
-        return TableSweep(target, (conditional,))
-    around = terms.around(names)
-    if around is None or any(table.plates for table in around):
-        return JointStates(target, names)
-    return TabulatedStates(target, names, around)
+MOST_STATES = 1024
 
 
 class JointStates(Kernel):
@@ -74,7 +31,7 @@ class JointStates(Kernel):
     ----------
     target : Target
     names : sequence of str
-        As for `joint_states`.
+        As for `bayesmc.kernels.tables.joint_states`.
     """
 
     label = "enumerate jointly"
@@ -86,9 +43,9 @@ class JointStates(Kernel):
         domains = [n.domain for n in nodes]
         self.plates = nodes[0].plates
         cards = [d.size for d in domains if d is not None]
-        if len(cards) < len(nodes) or math.prod(cards) > _STATES:
+        if len(cards) < len(nodes) or (len(cards) > 1 and math.prod(cards) > MOST_STATES):
             raise UnsupportedError(
-                f"nodes {list(names)} have no joint states to try, or more than {_STATES}; leave some out"
+                f"nodes {list(names)} have no joint states to try, or more than {MOST_STATES}; leave some out"
             )
         if any(n.plates != self.plates for n in nodes):
             raise UnsupportedError(
@@ -123,6 +80,11 @@ class JointStates(Kernel):
         for term, relation in self.terms:
             log = term.log(state)
             total = total + (log if relation is None else relation.collect(log, term.shape))
+        return self._with_seen(total)
+
+    def _with_seen(self, total: np.ndarray) -> np.ndarray:
+        """What was seen of the elements leaves no other state."""
+        axes = (1,) * (total.ndim - 1)
         for name, codes in zip(self.names, self.states, strict=True):
             seen = self.target.seen(name)
             if seen is not None and seen.mask is not None:
@@ -134,21 +96,13 @@ class JointStates(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         log = self.log_density(values)
-        top = log.max(axis=0)
-        if not np.isfinite(top).all():
-            raise ZeroProbabilityError(
-                f"nodes {list(self.names)}: no joint state has positive probability given the others; the "
-                "chain is at an impossible configuration"
-            )
-        cumulative = np.cumsum(np.exp(log - top), axis=0)
-        level = rng.random(top.shape) * cumulative[-1]
-        drawn = np.minimum((level >= cumulative).sum(axis=0), len(log) - 1)
+        drawn = pick_log(log, rng.random(log.shape[1:]), f"nodes {list(self.names)}")
         moved = zip(self.names, self.states, self.dtypes, strict=True)
         return {n: codes[drawn].astype(dtype) for n, codes, dtype in moved}, memory
 
 
-class TabulatedStates(JointStates):
-    """As `JointStates`, where all terms are tables without plates: their log rows are gathered and summed.
+class RowSums(JointStates):
+    """As `JointStates`, where all terms are tables: the log rows that the rest selects are summed.
 
     Parameters
     ----------
@@ -158,39 +112,60 @@ class TabulatedStates(JointStates):
 
     def __init__(self, target: Target, names: Sequence[str], around: Sequence[FiniteTerm]) -> None:
         super().__init__(target, names)
-        self.rows = [_Rows(table, self.names, self.states) for table in around]
+        if len(self.names) == 1:
+            self.label, self.match = "enumerate", "sum of tabulated log rows"
+        relations = {term.name: relation for term, relation in self.terms}
+        self.parts = [
+            (_Rows(target.model, table, self.names, self.states), relations[table.term.name])
+            for table in around
+        ]
 
     def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        total = np.zeros((self.states.shape[1], len(values[self.names[0]])))
-        for rows in self.rows:
-            total += rows(values)
-        return total
+        total = np.zeros((self.states.shape[1], *values[self.names[0]].shape))
+        for rows, relation in self.parts:
+            log = rows(values)
+            total += (
+                log if relation is None or not rows.shape else relation.collect(log, rows.shape)
+            )
+        return self._with_seen(total)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
 class _Rows:
-    """Log factors of one table for all joint states of a block, gathered by the states of the others."""
+    """Log factors of one term for all joint states of a block, gathered by the states of the others."""
 
-    def __init__(self, table: FiniteTerm, names: Sequence[str], states: np.ndarray) -> None:
-        inside = [i for i, n in enumerate(table.scope) if n in names]
-        outside = [i for i, n in enumerate(table.scope) if n not in names]
-        log = table.log.transpose(*inside, *outside)
-        cards = log.shape[: len(inside)]
-        self.others = [table.scope[i] for i in outside]
-        sizes = log.shape[len(inside) :]
-        self.strides = [math.prod(sizes[i + 1 :]) for i in range(len(sizes))]
-        self.log = np.ascontiguousarray(log.reshape(math.prod(cards), -1))
-        own = [states[names.index(table.scope[i])] for i in inside]
-        self.local = np.ravel_multi_index(own, cards)
+    def __init__(
+        self, model: Model, table: FiniteTerm, names: Sequence[str], states: np.ndarray
+    ) -> None:
+        scope = table.scope
+        inside = [i for i, n in enumerate(scope) if n in names]
+        outside = [i for i, n in enumerate(scope) if n not in names]
+        log = table.log.transpose(*inside, *outside, *range(len(scope), table.log.ndim))
+        cards, sizes = log.shape[: len(inside)], log.shape[len(inside) :]
+        self.plates, self.shape = table.plates, sizes[len(outside) :]
+        self.others = [
+            (scope[i], model[scope[i]].plates, math.prod(sizes[k + 1 :]))
+            for k, i in enumerate(outside)
+        ]
+        self.offset = np.arange(math.prod(self.shape)).reshape(self.shape)
+        log = log.reshape(math.prod(cards), -1)
+        own = [states[names.index(scope[i])] for i in inside]
+        self.log = np.ascontiguousarray(log)
+        at = np.ravel_multi_index(own, cards)
+        self.local = None if np.array_equal(at, np.arange(len(log))) else at
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Shape ``(joint states, chains or 1)``."""
-        at = np.zeros(1, dtype=np.intp)
-        for name, stride in zip(self.others, self.strides, strict=True):
-            at = at + values[name].astype(np.intp) * stride
-        return self.log.take(at, axis=1).take(self.local, axis=0)
+        """Shape ``(joint states, chains or 1, *shape)``."""
+        index = self.offset[None]
+        for name, plates, stride in self.others:
+            at = values[name]
+            if self.shape:
+                at = aligned(Named(plates, at), self.plates)
+            index = index + at.astype(np.intp) * stride
+        found = self.log.take(index, axis=1)
+        return found if self.local is None else found.take(self.local, axis=0)
 
 
 def _enters(target: Target, name: str, term: Term) -> bool:

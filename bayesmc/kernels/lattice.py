@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
+from bayesmc.categorical import edges, pick_log
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.enumerate import draw_states
 from bayesmc.kernels.pairs import PairCounts, pair_counts
 from bayesmc.kernels.sites import Sites, sites_of
 from bayesmc.structure.blanket import Blanket
@@ -130,7 +130,8 @@ class SiteSums(_Lattice):
                 odds = part.sums(self.odds[None], state)[0]
                 new = rng.random(odds.shape) < expit(odds)
             else:
-                new = draw_states(part.sums(self.table, state), rng, name)
+                log = part.sums(self.table, state)
+                new = pick_log(log, rng.random(log.shape[1:]), f"node {name!r}")
             state[:, part.members] = new
         moved = state[:, : self.blanket.size].astype(self.dtype)
         return {name: moved.reshape(values[name].shape)}, memory
@@ -306,13 +307,8 @@ class _Around:
 
 def _edges(log_probs: np.ndarray) -> np.ndarray:
     """Cumulative probabilities as integers, shape (states - 1, rows); impossible states have no width."""
-    probs = np.exp(log_probs - log_probs.max(axis=0))
-    cumulative = np.cumsum(probs, axis=0)
-    cumulative /= cumulative[-1]
-    edges = np.rint(cumulative * float(1 << (_HIGH + _LOW))).astype(np.uint64)
-    last = len(probs) - 1 - np.argmax(probs[::-1] > 0, axis=0)
-    edges[np.arange(len(probs))[:, None] >= last] = 1 << (_HIGH + _LOW)
-    return edges[:-1]
+    sums = np.minimum(edges(np.exp(log_probs - log_probs.max(axis=0)).T).T, 1.0)
+    return np.rint(sums * float(1 << (_HIGH + _LOW))).astype(np.uint64)
 
 
 def _byte_table(row: np.ndarray) -> bytes:

@@ -17,6 +17,7 @@ from bayesmc.errors import BayesmcError
 from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.relation import Relation
+from bayesmc.structure.tables import indexed_table
 from bayesmc.structure.target import Target, Term
 
 #: entries up to which a batch is tabulated
@@ -94,7 +95,7 @@ def sites_of(blanket: Blanket) -> Sites | None:
 def _indexed(target: Target, term: Term) -> Batch | None:
     """A potential over rows of an index, at all states of its hidden entries."""
     model = target.model
-    potential, links = model.potentials[term.name]
+    potential, _ = model.potentials[term.name]
     index = potential.index
     if index is None:
         return None
@@ -106,17 +107,9 @@ def _indexed(target: Target, term: Term) -> Batch | None:
     cards = tuple(n.domain.size for n in nodes)  # type: ignore[union-attr]
     if math.prod(cards) * term.shape[0] > _ENTRIES:
         return None
-    stored = []
-    for i, (parent, link) in enumerate(links):
-        if i not in hidden:
-            stored.append(link.place(target.known[parent]))
-            continue
-        axis = hidden.index(i)
-        shape = (1,) * axis + (cards[axis],) + (1,) * (len(cards) - axis)
-        stored.append(np.arange(cards[axis]).reshape(shape))
     try:
         with marking_invalid(), np.errstate(all="ignore"):
-            log = model.potential_at(term.name, stored)
+            log = indexed_table(model, term.name, target.known, hidden)
     except BayesmcError:
         return None  # it fails at some states, perhaps at impossible ones
     if (log == log[..., :1]).all():

@@ -1,23 +1,21 @@
 """Finite nodes whose whole Markov blanket is finite tables: draws by lookup.
 
 Where the blanket has few configurations the full conditional stands in a table, and a draw is a gather and
-some comparisons; nodes, and small blocks of nodes, that do not meet are drawn together. Where it has many,
-or where nodes live in plates, the log rows of the terms are gathered and summed. Anything else is left to
-the general kernels.
+some comparisons; nodes, and small blocks of nodes, that do not meet are drawn together. Anything else is left
+to other kernels.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from bayesmc.categorical import edges
 from bayesmc.errors import ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import Conditional, FiniteTerm, FiniteTerms, conditional_of
-from bayesmc.kernels.enumerate import draw_states
-from bayesmc.network import Model
+from bayesmc.kernels.conditionals import Conditional, FiniteTerms, conditional_of
+from bayesmc.kernels.joint_states import MOST_STATES, JointStates, RowSums
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
 
@@ -29,6 +27,49 @@ _GROUP_ENTRIES = 1 << 22
 _GROUP_SIZE = 48
 #: nodes of a blanket that are gathered one by one in groups of more: long chains, whose matrix is mostly zero
 _GATHERED = 4
+
+
+def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None = None) -> Kernel:
+    """The kernel that draws some finite nodes jointly.
+
+    Parameters
+    ----------
+    target : Target
+    names : sequence of str
+        Chain nodes with few joint states. If they live in plates, in the same ones, and nothing they enter
+        reads them across elements; the blocks of all elements are then drawn at once.
+    terms : FiniteTerms, optional
+        Tables made before.
+
+    Raises
+    ------
+    UnsupportedError
+        The nodes make no such block.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.tables import joint_states
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Bernoulli(0.5))
+    >>> net.add("y", bmc.Bernoulli(0.5))
+    >>> net.add("parity", lambda x, y: bmc.Bernoulli((x + y) % 2 * 1.0))
+    >>> target = target_of(pose(net, {"parity": 1}))
+    >>> kernel = joint_states(target, ("x", "y"))
+    >>> start = {"x": np.ones(4, dtype=np.uint8), "y": np.zeros(4, dtype=np.uint8)}
+    >>> new, _ = kernel.step({**target.known, **start}, {}, np.random.default_rng(0), False)
+    >>> (new["x"] + new["y"]).tolist()
+    [1, 1, 1, 1]
+    """
+    terms = FiniteTerms(target) if terms is None else terms
+    conditional = conditional_of(terms, names)
+    if conditional is not None and conditional.states <= MOST_STATES:
+        return TableSweep(target, (conditional,))
+    around = terms.around(names)
+    return JointStates(target, names) if around is None else RowSums(target, names, around)
 
 
 def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
@@ -49,7 +90,7 @@ def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel |
     around = terms.around((blanket.name,))
     if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
         return None
-    return RowSums(blanket, around)
+    return RowSums(blanket.target, (blanket.name,), around)
 
 
 def table_kernels(
@@ -121,56 +162,6 @@ class TableSweep(Kernel):
         return {n: row.astype(dtype, copy=False) for n, row, dtype in moved}, memory
 
 
-class RowSums(Kernel):
-    """Draws a finite node from the sum of the log rows that the rest selects, state by state.
-
-    Parameters
-    ----------
-    blanket : Blanket
-        All its relations are aligned.
-    around : sequence of FiniteTerm
-        All terms that the node enters.
-    """
-
-    label = "enumerate"
-    match = "sum of tabulated log rows"
-
-    def __init__(self, blanket: Blanket, around: Sequence[FiniteTerm]) -> None:
-        self.blanket = blanket
-        self.names = (blanket.name,)
-        domain = blanket.node.domain
-        assert domain is not None
-        self.domain = domain
-        relations = {c.term.name: c.relation for c in blanket.children}
-        self.parts = [
-            (_Rows(blanket.target.model, table, blanket.name), relations.get(table.term.name))
-            for table in around
-        ]
-
-    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Log full conditional of every state up to a constant, shape ``(states, chains, *plates)``."""
-        now = values[self.blanket.name]
-        total = np.zeros((self.domain.size, *now.shape))
-        for rows, relation in self.parts:
-            log = rows(values)
-            if relation is not None and rows.shape:
-                log = relation.collect(log, rows.shape)
-            elif not rows.shape:  # the node has no plates, else some node of the scope would have
-                log = log.reshape(log.shape[:2])
-            total += log
-        return total
-
-    def step(
-        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
-    ) -> tuple[Values, Memory]:
-        name = self.blanket.name
-        new = draw_states(self.log_density(values), rng, name).astype(self.domain.dtype)
-        free = self.blanket.target.free_elements(name)
-        if free is not None:
-            new = self.blanket.moved(values, new.reshape(len(new), -1)[:, free], free)
-        return {name: new}, memory
-
-
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -225,8 +216,8 @@ class _Group:
 
     def _compare(self, index: np.ndarray, levels: np.ndarray) -> np.ndarray:
         new = np.zeros(levels.shape, dtype=np.uint8)
-        for count, edges in self.edges:
-            passed = levels[:count] >= edges.take(index[:count])
+        for count, table in self.edges:
+            passed = levels[:count] >= table.take(index[:count])
             new[:count] += passed.view(np.uint8)
         return new
 
@@ -250,38 +241,6 @@ class _Group:
                 f"{what}: no state has positive probability given the others; the chain is at an "
                 "impossible configuration"
             )
-
-
-class _Rows:
-    """Log factors of one term for all states of a node, gathered by the states of the others."""
-
-    def __init__(self, model: Model, table: FiniteTerm, name: str) -> None:
-        self.shape = table.log.shape[len(table.scope) :]
-        self.plates = table.plates
-        axis = table.scope.index(name)
-        self.others = [(n, model[n].plates) for n in table.scope if n != name]
-        log = np.moveaxis(table.log, axis, 0)
-        self.log = np.ascontiguousarray(log.reshape(len(log), -1))
-        cards = log.shape[1 : len(table.scope)]
-        elements = math.prod(self.shape)
-        self.strides = [math.prod(cards[i + 1 :]) * elements for i in range(len(cards))]
-        self.offset = np.arange(elements).reshape(self.shape)
-
-    def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Shape ``(states, chains or 1, *shape)``."""
-        index = self.offset[None]
-        for (name, plates), stride in zip(self.others, self.strides, strict=True):
-            at = _placed(values[name], plates, self.plates) if self.shape else values[name]
-            index = index + at.astype(np.intp) * stride
-        return self.log.take(index, axis=1)
-
-
-def _placed(value: np.ndarray, own: Sequence[str], plates: Sequence[str]) -> np.ndarray:
-    """``(chains, *own)`` with its axes where ``plates`` has them, size one elsewhere."""
-    order = sorted(range(len(own)), key=lambda i: plates.index(own[i]))
-    moved = value.transpose(0, *(1 + i for i in order))
-    sizes = dict(zip((own[i] for i in order), moved.shape[1:], strict=True))
-    return moved.reshape(len(value), *(sizes.get(p, 1) for p in plates))
 
 
 def _colours(conditionals: Sequence[Conditional]) -> list[list[Conditional]]:
@@ -371,10 +330,10 @@ def _neighbours(
 
 def _compared(part: Sequence[Conditional]) -> list[tuple[int, np.ndarray]]:
     """For each k the number of conditionals that have a k-th edge, and those edges over all rows."""
-    edges = [_thresholds(c.probs) for c in part]
+    rows = [edges(c.probs) for c in part]
     found = []
-    for k in range(max(e.shape[1] for e in edges)):
-        having = [e[:, k] for e in edges if e.shape[1] > k]
+    for k in range(max(e.shape[1] for e in rows)):
+        having = [e[:, k] for e in rows if e.shape[1] > k]
         found.append((len(having), np.concatenate(having)))
     return found
 
@@ -384,16 +343,6 @@ def _searched(part: Sequence[Conditional], width: int) -> list[tuple[int, np.nda
     padded = []
     for c in part:
         rows = np.full((len(c.probs), width), np.inf)
-        rows[:, : c.states - 1] = _thresholds(c.probs)
+        rows[:, : c.states - 1] = edges(c.probs)
         padded.append(rows.ravel())
     return [(len(part), np.concatenate(padded))]
-
-
-def _thresholds(probs: np.ndarray) -> np.ndarray:
-    """Cumulative rows, shape (rows, states - 1); states of probability zero have no width at all."""
-    cumulative = np.cumsum(probs, axis=1)
-    last = cumulative[:, -1:]
-    edges = cumulative / np.where(last > 0, last, 1.0)
-    top = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
-    edges[np.arange(probs.shape[1]) >= top[:, None]] = np.inf
-    return edges[:, :-1]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import Any
 
 import numpy as np
@@ -56,7 +56,7 @@ VARIANTS: tuple[Callable[[np.ndarray, int, int], np.ndarray], ...] = (
 )
 
 
-def deterministic_above(model: Model, name: str, known: Mapping[str, Any]) -> list[str]:
+def deterministic_above(model: Model, name: str, known: Container[str]) -> list[str]:
     """Deterministic nodes above one that are not known, those first on which others depend."""
     found: dict[str, None] = {}
     todo = [(name, False)]
@@ -84,7 +84,7 @@ def hold_against(
     result: Any,
     program: Program,
     given: Callable[[Probe], Mapping[str, np.ndarray]],
-    variant: int,
+    values: Probe,
 ) -> None:
     """Refuse what was read of a node or potential where its function gives something else.
 
@@ -95,14 +95,12 @@ def hold_against(
         Of its expressions.
     given : callable
         From values of all nodes to those of the program's leaves.
-    variant : int
-        Which of the probes.
+    values : Probe
 
     Raises
     ------
     TraceError
     """
-    values = Probe.of(model, variant)
     is_node = name in model.nodes
     with marking_invalid(), np.errstate(all="ignore"):
         try:

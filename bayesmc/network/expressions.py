@@ -28,7 +28,13 @@ from bayesmc.expression import (
     mapped,
     replaced,
 )
-from bayesmc.network.agreement import VARIANTS, deterministic_above, hold_against, hold_form
+from bayesmc.network.agreement import (
+    VARIANTS,
+    Probe,
+    deterministic_above,
+    hold_against,
+    hold_form,
+)
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered
@@ -60,6 +66,8 @@ class Followed:
         How it receives them.
     numbers : tuple of ndarray
         What stands for the reading's ``number 0``, ...
+    cut : frozenset of str
+        Deterministic nodes that are leaves, with what they store.
     """
 
     model: Model
@@ -67,6 +75,7 @@ class Followed:
     parents: tuple[str, ...] = ()
     arguments: tuple[Argument, ...] = ()
     numbers: tuple[np.ndarray, ...] = ()
+    cut: frozenset[str] = frozenset()
 
     @cached_property
     def result(self) -> Any:
@@ -79,9 +88,11 @@ class Followed:
             node = self.model[parent]
             if argument.known is not None:
                 continue
-            instead.setdefault(argument.leaf, _stored_value(self.model, parent))
-            if node.kind == "deterministic" and node.domain and node.domain.labels is None:
-                instead[numbers_of(argument.leaf, node.domain)] = value_of(self.model, parent)
+            instead.setdefault(argument.leaf, _stored_value(self.model, parent, self.cut))
+            follows = node.kind == "deterministic" and parent not in self.cut
+            if follows and node.domain and node.domain.labels is None:
+                value = value_of(self.model, parent, self.cut)
+                instead[numbers_of(argument.leaf, node.domain)] = value
         return mapped(self.reading.result, lambda e: replaced(e, instead))
 
     @cached_property
@@ -120,8 +131,10 @@ class Opaque:
     leaves: frozenset[str]
 
 
-def density(model: Model, name: str) -> Followed | Opaque:
+def density(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Followed | Opaque:
     """What a node's function, or a potential's, computes; it is read, and checked, once for each model.
+
+    Deterministic nodes in ``cut`` are leaves as stochastic ones are, others are substituted.
 
     Examples
     --------
@@ -141,7 +154,15 @@ def density(model: Model, name: str) -> Followed | Opaque:
             if isinstance(found, Followed):
                 _ = found.result  # one after the other, however many follow from each other
         known[name] = _read(model, name)
-    return known[name]
+    found = known[name]
+    if not cut or cut.isdisjoint(deterministic_above(model, name, ())):
+        return found
+    if (name, cut) not in known:
+        if isinstance(found, Followed):
+            known[name, cut] = replace(found, cut=cut)
+        else:
+            known[name, cut] = Opaque(found.reason, _leaves_above(model, name, cut))
+    return known[name, cut]
 
 
 def log_density_of(model: Model, name: str) -> Expression:
@@ -217,15 +238,15 @@ def log_factor_of(model: Model, name: str) -> Expression:
     return broadcast(found.result, potential_shape(model.sizes, model.potentials[name][0]))
 
 
-def value_of(model: Model, name: str) -> Expression:
+def value_of(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Expression:
     """The user value of a deterministic node; a call of its function where that cannot be followed."""
     node = model[name]
-    found = density(model, name)
+    found = density(model, name, cut)
     if isinstance(found, Followed):
         return broadcast(found.result, node.value_shape)
     parents = tuple(dict.fromkeys(node.parents))
-    operands = [_stored_value(model, p) for p in parents]
-    stored = call(_NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
+    operands = [_stored_value(model, p, cut) for p in parents]
+    stored = call(NodeCall(model, name, parents), operands, node.value_shape, _dtype(model, node))
     if node.domain is None or node.domain.labels is not None:
         return stored
     return numbers_of(stored, node.domain)
@@ -241,7 +262,7 @@ def stored_leaf(model: Model, node: CompiledNode) -> Expression:
 
 
 @dataclass(frozen=True, eq=False)
-class _NodeCall:
+class NodeCall:
     """A deterministic node's function, on stored values of its parents."""
 
     model: Model
@@ -252,9 +273,7 @@ class _NodeCall:
         return self.model.evaluate(self.name, dict(zip(self.parents, values, strict=True)))[0]
 
     def __eq__(self, other: object) -> bool:
-        return (
-            isinstance(other, _NodeCall) and other.model is self.model and other.name == self.name
-        )
+        return isinstance(other, NodeCall) and other.model is self.model and other.name == self.name
 
     def __hash__(self) -> int:
         return hash((id(self.model), self.name))
@@ -270,12 +289,12 @@ def _dtype(model: Model, node: CompiledNode) -> Any:
     return int if node.is_discrete or node.domain is not None else float
 
 
-def _stored_value(model: Model, name: str) -> Expression:
-    """A node's stored value; that of a deterministic one follows from others."""
+def _stored_value(model: Model, name: str, cut: frozenset[str]) -> Expression:
+    """A node's stored value; that of a deterministic one follows from others, or is cut."""
     node = model[name]
-    if node.kind != "deterministic":
+    if node.kind != "deterministic" or name in cut:
         return stored_leaf(model, node)
-    value = value_of(model, name)
+    value = value_of(model, name, cut)
     if node.domain is None or node.domain.labels is not None:
         return value
     numbers = node.domain.numbers
@@ -304,7 +323,7 @@ def _function(model: Model, name: str) -> Any:
     return model.potentials[name][0].function
 
 
-def _leaves_above(model: Model, name: str) -> frozenset[str]:
+def _leaves_above(model: Model, name: str, cut: frozenset[str] = frozenset()) -> frozenset[str]:
     found, seen = set(), set()
     todo = [name]
     while todo:
@@ -315,7 +334,7 @@ def _leaves_above(model: Model, name: str) -> frozenset[str]:
         for parent in parents:
             if parent not in seen:
                 seen.add(parent)
-                if model[parent].kind == "deterministic":
+                if model[parent].kind == "deterministic" and parent not in cut:
                     todo.append(parent)
                 else:
                     found.add(parent)
@@ -398,9 +417,11 @@ def _check(model: Model, name: str, found: Followed) -> None:
     if alike < _CHECKED:
         through = any(model[p].kind == "deterministic" for p in found.parents)
         for variant in range(len(VARIANTS)):
-            hold_against(model, name, reading.result, reading.program, found.local, variant)
+            values = Probe.of(model, variant)
+            hold_against(model, name, reading.result, reading.program, found.local, values)
             if through:
                 whole = Program(list(expressions_of(found.result)))
-                hold_against(model, name, found.result, whole, lambda values: values, variant)
+                hold_against(model, name, found.result, whole, lambda values: values, values)
     elif found.numbers or not uses & (uses - 1):  # another number, or function; else now and then
-        hold_against(model, name, reading.result, reading.program, found.local, len(VARIANTS) - 1)
+        values = Probe.of(model, len(VARIANTS) - 1)
+        hold_against(model, name, reading.result, reading.program, found.local, values)

@@ -18,7 +18,6 @@ import numpy as np
 from bayesmc.distributions import Affine, Categorical, Density, Distribution, Mixture, Truncated
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
-    Constant,
     Expression,
     Family,
     Leaf,
@@ -107,8 +106,8 @@ class Argument:
         Of what the parent stores.
     how : hashable
         How it is decoded and aligned.
-    known : Constant or None
-        Its value, where that never changes.
+    known : Expression or None
+        Its value, where that never changes, or what it follows from.
     """
 
     place: int
@@ -116,7 +115,7 @@ class Argument:
     dtype: str
     states: int | None
     how: Hashable
-    known: Constant | None = None
+    known: Expression | None = None
 
     @property
     def leaf(self) -> Leaf:

@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
+    Call,
     Elementwise,
     Expression,
     Gather,
@@ -31,6 +32,7 @@ from bayesmc.expression import (
 )
 from bayesmc.expression.graph import as_float
 from bayesmc.passes.arithmetic import ONE, ZERO, add, is_all, tidy
+from bayesmc.passes.linear_calls import as_product
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,14 +90,7 @@ def affine(root: Expression, names: Iterable[str]) -> Affine:
     >>> form.offset.value, form.reads["x"].gain.value, form.reads["x"].at.value
     (array(1.), array([ 2.  , -0.25]), array([0, 2]))
     """
-    wanted = frozenset(names)
-    found: dict[Expression, Affine] = {}
-    for node in ordered(root):
-        if not node.leaves & wanted:
-            found[node] = Affine(node, {})
-        else:
-            found[node] = _step(node, [found[a] for a in node.operands])
-    form = found[root]
+    form = _forms(root, frozenset(names), {})
     offset = form.offset
     if offset.dtype != float:
         offset = elementwise(as_float, offset)
@@ -103,6 +98,20 @@ def affine(root: Expression, names: Iterable[str]) -> Affine:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _forms(root: Expression, wanted: frozenset[str], found: dict[Expression, Affine]) -> Affine:
+    for node in ordered(root):
+        if node in found:
+            continue
+        if not node.leaves & wanted:
+            found[node] = Affine(node, {})
+        elif isinstance(node, Call):
+            (operand, *_) = (a for a in node.operands if a.leaves & wanted)
+            found[node] = _forms(as_product(node, operand), wanted, found)
+        else:
+            found[node] = _step(node, [found[a] for a in node.operands])
+    return found[root]
 
 
 def _step(node: Expression, inner: list[Affine]) -> Affine:

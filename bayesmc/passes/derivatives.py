@@ -28,6 +28,7 @@ from bayesmc.expression import (
     Pick,
     Reduction,
     TracedArray,
+    as_expression,
     broadcast,
     elementwise,
     gather,
@@ -45,7 +46,7 @@ from bayesmc.passes.adjoints import (
     scattered,
 )
 from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, tidy
-from bayesmc.tracing.partials import PIECES, partials
+from bayesmc.passes.partials import PIECES, partials
 
 
 def tangent(root: Expression, directions: Mapping[str, Expression]) -> Expression:
@@ -153,6 +154,29 @@ def slopes(node: Elementwise) -> list[Expression | None]:
         raise TraceError(f"no derivative of {node.detail} is known")
     values = [TracedArray(a) for a in (*node.operands, node)]
     return [_as_expression(rule(*values)) for rule in rules]
+
+
+def jumps(roots: Iterable[Expression], names: Iterable[str]) -> Expression:
+    """Whether something of what leaves move that is constant in pieces jumps just where they are.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import elementwise, evaluate, leaf
+    >>> from bayesmc.passes.derivatives import jumps
+    >>> step = elementwise(np.floor, leaf("x", ()))
+    >>> evaluate([jumps([step], ["x"])], {"x": np.array([0.5, 1.0])})
+    [array([False,  True])]
+    """
+    moving, found = frozenset(names), as_expression(False)
+    for node in ordered(*roots):
+        rule = PIECES.get(node.function) if isinstance(node, Elementwise) else None
+        if rule is None or not node.leaves & moving:
+            continue
+        at = as_expression(rule(*map(TracedArray, (*node.operands, node))).expression)
+        whole = reduction(np.logical_or, at, range(len(at.shape)))
+        found = elementwise(np.logical_or, found, whole)
+    return found
 
 
 # ---- private ------------------------------------------------------------------------------------

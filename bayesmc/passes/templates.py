@@ -9,7 +9,7 @@ from typing import TypeGuard
 
 import numpy as np
 
-from bayesmc.expression import Call, Constant, Expression, Leaf, leaf, ordered
+from bayesmc.expression import Call, Constant, Expression, Leaf, leaf, ordered, replaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +125,45 @@ def stacked_rows(
             values[name] = stack
             instead[k] = leaf(name, first.shape, first.dtype)
     return Stacked(_with_leaves(rows[0], instead), values, tuple(t.leaves for t in found))
+
+
+def without_names(
+    root: Expression,
+) -> tuple[Expression, dict[str, np.ndarray], dict[str, str]]:
+    """An expression that all share that are the same but for constants and the names of leaves.
+
+    Returns
+    -------
+    Expression
+        Of leaves ``leaf 0``, ... and ``constant 0``, ...
+    dict
+        Constants by leaf.
+    dict
+        Names by leaf.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import elementwise, leaf
+    >>> from bayesmc.passes.templates import without_names
+    >>> twice = without_names(elementwise(np.multiply, leaf("x", ()), 2.0))
+    >>> thrice = without_names(elementwise(np.multiply, leaf("y", ()), 3.0))
+    >>> twice[0] is thrice[0], thrice[1:]
+    (True, ({'constant 0': array(3.)}, {'leaf 0': 'y'}))
+    """
+    names: dict[str, str] = {}
+    constants: dict[str, np.ndarray] = {}
+    instead: dict[Expression, Expression] = {}
+    for node in ordered(root):
+        if isinstance(node, Leaf):
+            called = f"leaf {len(names)}"
+            names[called] = node.name
+            instead[node] = leaf(called, node.shape, node.dtype, node.states)
+        elif isinstance(node, Constant) and node.dtype.kind == "f" and not node.shape:
+            called = f"constant {len(constants)}"
+            constants[called] = node.value
+            instead[node] = leaf(called, node.shape, node.dtype)
+    return replaced(root, instead), constants, names
 
 
 # ---- private ------------------------------------------------------------------------------------

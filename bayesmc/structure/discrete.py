@@ -17,7 +17,13 @@ from bayesmc.network.model import potential_shape
 from bayesmc.network.node import Potential
 from bayesmc.network.rounding import point_log_density
 from bayesmc.shapes import Shape
-from bayesmc.structure.tables import TABLE_ENTRIES, configure, constants_of
+from bayesmc.structure.tables import (
+    TABLE_ENTRIES,
+    configure,
+    constants_of,
+    indexed_table,
+    reads_of,
+)
 
 #: one element of a finite node
 Variable = tuple[str, int]
@@ -39,7 +45,7 @@ class FactorSource:
         Its tables depend on the values of observed continuous nodes.
     index : tuple, optional
         Of a potential over rows of an index: for each node of ``alone``, which may stand there more than
-        once, the element that every row takes.
+        once, the element that every row takes; and which entries of the index these are.
     """
 
     name: str
@@ -49,6 +55,7 @@ class FactorSource:
     from_evidence: bool
     is_potential: bool = False
     index: tuple[list[int], ...] | None = None
+    entries: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,36 +208,22 @@ def _source(
     is_potential: bool = False,
 ) -> FactorSource:
     """The finite nodes a factor depends on, through deterministic nodes without a domain."""
-    found: dict[str, bool] = {}
-    from_evidence = name in continuous
-
-    def visit(above: Sequence[str], own: tuple[str, ...], whole: bool) -> None:
-        nonlocal from_evidence
-        for parent in above:
-            node = model[parent]
-            if node.kind in ("input", "fixed"):
-                continue
-            foreign = whole or any(p not in own for p in node.plates)
-            if node.domain is not None:
-                found[parent] = found.get(parent, False) or foreign
-            elif not node.is_stochastic:
-                visit(node.parents, node.plates, foreign)
-            else:  # observed, since a hidden one is refused before
-                from_evidence = True
-
-    visit(parents, plates, False)
-    alone = tuple(p for p, is_whole in found.items() if not is_whole)
-    whole_nodes = tuple(p for p, is_whole in found.items() if is_whole)
-    return FactorSource(name, plates, alone, whole_nodes, from_evidence, is_potential)
+    alone, whole, others = reads_of(
+        model, parents, plates, lambda n: model[n].kind in ("input", "fixed")
+    )
+    # the others are observed, since hidden ones are refused before
+    from_evidence = name in continuous or bool(others)
+    return FactorSource(name, plates, alone, whole, from_evidence, is_potential)
 
 
 def _indexed_source(model: Model, potential: Potential) -> FactorSource:
     """A potential over rows of an index, whose scope is all stochastic nodes."""
     assert potential.index is not None
-    finite = [model[n].domain is not None for n in potential.scope]
-    alone = tuple(n for n, is_finite in zip(potential.scope, finite, strict=True) if is_finite)
-    index = tuple(at.tolist() for at, f in zip(potential.index, finite, strict=True) if f)
-    return FactorSource(potential.name, (), alone, (), not all(finite), True, index)
+    entries = tuple(i for i, n in enumerate(potential.scope) if model[n].domain is not None)
+    alone = tuple(potential.scope[i] for i in entries)
+    index = tuple(potential.index[i].tolist() for i in entries)
+    from_evidence = len(entries) < len(potential.scope)
+    return FactorSource(potential.name, (), alone, (), from_evidence, True, index, entries)
 
 
 def _plate_shape(model: Model, source: FactorSource) -> Shape:
@@ -288,7 +281,8 @@ def _fill(
     """Append the factors of a source, one per plate element, and its rows with bad parameters."""
     with marking_invalid(), np.errstate(all="ignore"):
         if source.index is not None:
-            table, cards = _indexed_table(model, source, known)
+            cards = tuple(model[n].domain.size for n in source.alone)  # type: ignore[union-attr]
+            table = indexed_table(model, source.name, known, source.entries)
             is_log, invalid = True, None
         else:
             values, cards = configure(
@@ -301,26 +295,6 @@ def _fill(
         factors.append(LogTable(part) if is_log else part)
         if invalid is not None and invalid[at].any():
             bad.append((source.name, flat, _scope(model, source, element), invalid[at]))
-
-
-def _indexed_table(
-    model: Model, source: FactorSource, known: Mapping[str, np.ndarray]
-) -> tuple[np.ndarray, Shape]:
-    """Logs of a potential over rows of an index, shape ``(*cards, rows)``, one axis per finite entry."""
-    potential, links = model.potentials[source.name]
-    cards = tuple(model[n].domain.size for n in source.alone)  # type: ignore[union-attr]
-    rows: list[np.ndarray] = []
-    axis = 0
-    for name, link in links:
-        domain = model[name].domain
-        if domain is None:
-            rows.append(link.place(known[name]))
-            continue
-        shape = (1,) * axis + (domain.size,) + (1,) * (len(cards) - axis)
-        rows.append(np.arange(domain.size).reshape(shape))
-        axis += 1
-    table = model.potential_at(source.name, rows)
-    return np.broadcast_to(table, (*cards, *potential_shape(model.sizes, potential))), cards
 
 
 def _table(

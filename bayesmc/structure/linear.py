@@ -19,7 +19,8 @@ from bayesmc.errors import BudgetError, UnsupportedError
 from bayesmc.factors import LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor
 from bayesmc.network import Model, Observed
-from bayesmc.structure.affine import affine_nodes, gaussian_nodes
+from bayesmc.network.expressions import density
+from bayesmc.structure.affine import affine_nodes, finite_leaves, gaussian_nodes
 from bayesmc.structure.discrete import InvalidRows, Variable, known_values
 from bayesmc.structure.reading import Reading, hidden_elements
 from bayesmc.structure.tables import constants_of
@@ -111,25 +112,13 @@ class _Reader:
         self.kept: dict[str, tuple[Any, Reading]] = model.cache.setdefault("linear readings", {})
 
     def __call__(self, name: str) -> Reading:
-        key = tuple(self._seen(p) for p in self._boundary(name))
+        leaves = density(self.model, name, finite_leaves(self.model)).leaves
+        key = tuple((n, self._seen(n)) for n in sorted(leaves))
         latest = self.kept.get(name)
         if latest is None or latest[0] != key:
             latest = key, Reading(self.model, name, self.observed, self.known)
             self.kept[name] = latest
         return latest[1]
-
-    def _boundary(self, name: str) -> tuple[str, ...]:
-        """The nodes that a function depends on, directly or through deterministic ones."""
-        found: dict[str, None] = {}
-        todo = list(self.model[name].parents)
-        while todo:
-            parent = todo.pop()
-            node = self.model[parent]
-            if node.kind == "deterministic" and node.domain is None:
-                todo += node.parents
-            else:
-                found[parent] = None
-        return tuple(found)
 
     def _seen(self, name: str) -> Any:
         """What evidence makes of a node, as far as a function of it goes."""

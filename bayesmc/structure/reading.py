@@ -1,14 +1,9 @@
-"""One node's function read off: the linear-Gaussian conditionals of all its plate elements.
-
-That a mean is affine is proved elsewhere (``affine``); the coefficients come from the user's own function,
-called at a base point, one step away from it along every direction, and at two more points that must agree.
-"""
+"""One node's expression as the linear-Gaussian conditionals of all its plate elements."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,18 +11,25 @@ import numpy as np
 from bayesmc.distributions import MvNormal, Normal
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BudgetError, UnsupportedError
+from bayesmc.expression import Expression, Family, expressions_of
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, compressed, likelihood_rows
 from bayesmc.network import CompiledNode, Model, Observed
+from bayesmc.network.agreement import deterministic_above
+from bayesmc.network.expressions import Followed, density
+from bayesmc.passes.elements import MANY, NOTHING, elements, merged
 from bayesmc.shapes import Shape
-from bayesmc.structure.affine import is_hidden
+from bayesmc.structure.affine import (
+    Gains,
+    NotLinearError,
+    finite_leaves,
+    is_hidden,
+    linear_node,
+)
 from bayesmc.structure.discrete import InvalidRows, Variable
 from bayesmc.structure.tables import configure
 
-#: entries up to which a function is evaluated on all configurations, directions and elements
+#: entries up to which coefficients are evaluated for all configurations and elements
 _ENTRIES = 1 << 26
-#: relative error of a prediction from the coefficients that rounding may explain
-_TOLERANCE = 1e-8
-_CHECKS = 2
 
 
 def hidden_elements(node: CompiledNode, seen: Observed | None) -> list[int]:
@@ -38,26 +40,24 @@ def hidden_elements(node: CompiledNode, seen: Observed | None) -> list[int]:
     return [] if seen.mask is None else np.flatnonzero(~seen.mask).tolist()
 
 
-@dataclass(frozen=True)
-class _Parent:
-    """A node that a function varies with; ``whole``: with all its elements at once."""
-
-    name: str
-    whole: bool
-
-
-@dataclass(frozen=True, eq=False)
-class _Column:
-    """One direction in which hidden parents are moved: a component of one element, or of every own one."""
-
-    parent: str
-    element: int | None
-    component: int
-    step: float
-
-
 class Reading:
-    """One node's function read off: offsets, coefficients and scales of all its elements."""
+    """Offsets, coefficients and scales of all elements of a node.
+
+    Parameters
+    ----------
+    model : Model
+    name : str
+    observed : dict
+    known : dict
+        Stored values of inputs, fixed nodes and nodes observed in full.
+
+    Raises
+    ------
+    BudgetError
+        It has too many configurations.
+    UnsupportedError
+        It is not linear-Gaussian with these values after all.
+    """
 
     def __init__(
         self,
@@ -66,22 +66,18 @@ class Reading:
         observed: Mapping[str, Observed],
         known: Mapping[str, np.ndarray],
     ) -> None:
-        self.model, self.node, self.known, self.observed = model, model[name], known, observed
+        self.model, self.node = model, model[name]
         self.count = math.prod(self.node.plate_shape)
         self.d = math.prod(self.node.event_shape)
-        self.finite, self.hidden = self._parents()
-        #: for every element of this node the parent's element that it reads
-        self.places = {p.name: self._projected(p.name) for p in (*self.finite, *self.hidden)}
-        self.columns = list(self._directions())
-        self.alone = [p.name for p in self.finite if not p.whole]
-        self.whole = [p.name for p in self.finite if p.whole]
-        self.cards = [self._card(n) for n in self.alone]
-        for n in self.whole:
-            self.cards += [self._card(n)] * math.prod(model[n].plate_shape)
+        #: for every element of this node the element that it reads of a finite or hidden one
+        self.places: dict[str, np.ndarray] = {}
+        leaves = density(model, name, finite_leaves(model)).leaves
+        free = [n for n in model.nodes if n in leaves and n not in known]
+        hidden = [n for n in free if is_hidden(model[n], observed)]
+        self._place([n for n in free if n not in hidden])
         self._kept: dict[Any, Conditional] = {}
-        self._check_size()
-        self._evaluate()
-        del self.known, self.observed  # it outlives the question
+        self._check_size(len(hidden))
+        self._evaluate(frozenset(hidden), observed, known)
 
     def conditional(self, e: int, states: Mapping[Variable, int]) -> Conditional:
         """One element given the discrete variables and blocks it depends on."""
@@ -129,151 +125,146 @@ class Reading:
         for e in np.flatnonzero(bad).tolist():
             yield self.node.name, e, self.scope(e), self.invalid[..., e]
 
-    # ---- what the function depends on --------------------------------------------------------
+    # ---- what it depends on ------------------------------------------------------------------
 
-    def _parents(self) -> tuple[list[_Parent], list[_Parent]]:
-        """The finite and the hidden continuous nodes that it varies with."""
-        finite: dict[str, bool] = {}
-        hidden: dict[str, bool] = {}
+    def _place(self, finite: Sequence[str]) -> None:
+        """Which finite nodes take part with one element for each of this node, and which with all."""
+        self.alone, self.whole = [], []
+        for name in finite:
+            place = self._elements_of(name)
+            if (place == MANY).any():
+                self.whole.append(name)
+            else:
+                self.alone.append(name)
+                self.places[name] = np.where(place == NOTHING, 0, place)
+        self.cards = [self._card(n) for n in self.alone]
+        for name in self.whole:
+            self.cards += [self._card(name)] * math.prod(self.model[name].plate_shape)
 
-        def visit(above: Sequence[str], own: tuple[str, ...], whole: bool) -> None:
-            for parent in above:
-                node = self.model[parent]
-                if parent in self.known or node.kind in ("input", "fixed"):
-                    continue
-                foreign = whole or any(p not in own for p in node.plates)
-                if node.domain is None and not node.is_stochastic:
-                    visit(node.parents, node.plates, foreign)
-                else:
-                    found = hidden if is_hidden(node, self.observed) else finite
-                    found[parent] = found.get(parent, False) or foreign
-
-        visit(self.node.parents, self.node.plates, False)
-        own = set(self.node.plates)
-        pairs = [
-            [_Parent(n, w or not set(self.model[n].plates) <= own) for n, w in found.items()]
-            for found in (finite, hidden)
+    def _elements_of(self, name: str) -> np.ndarray:
+        """The element of a node that each element of this one depends on."""
+        node, parent = self.node, self.model[name]
+        count = math.prod(parent.plate_shape)
+        leaves = finite_leaves(self.model)
+        found = density(self.model, node.name, leaves)
+        if isinstance(found, Followed):
+            parts = [
+                self._by_element(elements(part, name, count), event_ndim)
+                for part, event_ndim in _by_event(found.result, node)
+            ]
+            return merged(np.stack(parts), 0)
+        if count > 1:  # what is known is that plates are aligned
+            direct = not deterministic_above(self.model, node.name, leaves)
+            if not (direct and set(parent.plates) <= set(node.plates)):
+                return np.full(self.count, MANY)
+        at = np.arange(count).reshape(parent.plate_shape)
+        order = sorted(range(at.ndim), key=lambda k: node.plates.index(parent.plates[k]))
+        shape = [
+            n if p in parent.plates else 1
+            for p, n in zip(node.plates, node.plate_shape, strict=True)
         ]
-        return pairs[0], pairs[1]
+        return np.broadcast_to(at.transpose(order).reshape(shape), node.plate_shape).reshape(-1)
 
-    def _directions(self) -> Iterator[_Column]:
-        for parent in self.hidden:
-            node = self.model[parent.name]
-            steps = _typical(self.model.probe[parent.name], math.prod(node.event_shape))
-            elements: Sequence[int | None] = [None]
-            if parent.whole:
-                elements = hidden_elements(node, self.observed.get(parent.name))
-            for e in elements:
-                for component, step in enumerate(steps):
-                    yield _Column(parent.name, e, component, step)
+    def _by_element(self, parts: np.ndarray, event_ndim: int) -> np.ndarray:
+        """What is read of a leaf, by element of this node."""
+        event_ndim = min(event_ndim, parts.ndim)
+        inner = merged(parts, tuple(range(parts.ndim - event_ndim, parts.ndim)))
+        return np.broadcast_to(inner, self.node.plate_shape).reshape(-1)
 
-    def _check_size(self) -> None:
-        points = 1 + len(self.columns) + _CHECKS
-        entries = float(math.prod(self.cards)) * points * self.count * self.d**2
+    def _check_size(self, columns: float) -> None:
+        entries = float(math.prod(self.cards)) * self.count * self.d * (self.d + columns)
         if entries > _ENTRIES:
             raise BudgetError(
                 f"node {self.node.name!r} depends on {len(self.cards)} discrete variables and "
-                f"{len(self.columns)} continuous components: {entries:.3g} entries to evaluate, above "
+                f"{columns:.0f} continuous components: {entries:.3g} entries to evaluate, above "
                 f"{_ENTRIES:.3g}",
                 int(min(8 * entries, 2**62)),
             )
 
-    # ---- what it returns ---------------------------------------------------------------------
+    # ---- what it says ------------------------------------------------------------------------
 
-    def _evaluate(self) -> None:
+    def _evaluate(
+        self,
+        hidden: frozenset[str],
+        observed: Mapping[str, Observed],
+        known: Mapping[str, np.ndarray],
+    ) -> None:
         """Offsets, coefficients, Cholesky factors and bad configurations, element axis last but one."""
-        points, moved = self._points()
-        shape = (*self.cards, 1 + len(self.columns) + _CHECKS, *self.node.plate_shape)
         with marking_invalid(), np.errstate(all="ignore"):
-            names = self.node.parents
-            values, _ = configure(self.model, self.known, self.alone, self.whole, names, points)
-            result, _ = self.model.evaluate(self.node.name, values)
-        axis = len(self.cards)
+            names = (*self.alone, *self.whole)
+            values, _ = configure(self.model, known, self.alone, self.whole, names)
+            given = {n: v for n, v in values.items() if n not in hidden}
+            try:
+                leaves = finite_leaves(self.model)
+                linear = linear_node(self.model, self.node.name, hidden, leaves, given)
+            except NotLinearError as error:
+                raise UnsupportedError(f"node {self.node.name!r} {error}") from error
+            result, gains = linear(values)
+        shape = (*self.cards, *self.node.plate_shape)
         mean, tril, invalid = _parameters(result, shape, self.d)
-        loc = np.broadcast_to(mean, shape + self.node.event_shape)
-        loc = loc.reshape((*shape[: axis + 1], self.count, self.d))
-        first = (slice(None),) * axis + (0,)
-        self.tril = tril[first].reshape((*self.cards, self.count, self.d, self.d))
-        bad = np.asarray(invalid.any(axis=axis))
-        self.invalid = bad.reshape((*self.cards, self.count))
-        self.offset = loc[first].copy()  # a view would keep all points alive
-        if self.hidden:
-            self._check_scale(tril, axis)
-        loc = np.moveaxis(loc, axis, -1)  # (*cards, elements, d, points)
-        steps = np.array([c.step for c in self.columns])
-        n = len(steps)
-        self.matrix = (loc[..., 1 : n + 1] - loc[..., :1]) / steps
-        self._check_affine(loc[..., n + 1 :], moved)
+        lead = (*self.cards, self.count)
+        self.tril = tril.reshape((*lead, self.d, self.d))
+        self.invalid = np.array(invalid.reshape(lead))
+        offset = np.broadcast_to(mean, shape + self.node.event_shape)
+        self.offset = np.array(offset.reshape((*lead, self.d)))
+        parts, self.columns = [], []
+        for name in (n for n in self.model.nodes if n in gains):
+            part, columns = self._coefficients(name, gains[name], observed.get(name))
+            parts.append(part)
+            self.columns += columns
+        self.matrix = np.concatenate([np.zeros((*lead, self.d, 0)), *parts], axis=-1)
         #: whether an element's mean varies along a column at all, shape (columns, elements)
-        moves = (self.matrix != 0).any(axis=-2).reshape(math.prod(self.cards), self.count, n)
+        moves = (self.matrix != 0).any(axis=-2)
+        moves = moves.reshape(math.prod(self.cards), self.count, len(self.columns))
         self.used = np.asarray(moves.any(axis=0)).T
 
-    def _points(self) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Values of the hidden parents at every point, and how far the last points moved each column."""
-        count = 1 + len(self.columns) + _CHECKS
-        points = {}
-        for parent in self.hidden:
-            node = self.model[parent.name]
-            seen = self.observed.get(parent.name)
-            base = np.zeros((math.prod(node.plate_shape), math.prod(node.event_shape)))
-            if seen is not None and seen.mask is not None:
-                known = seen.value.reshape(base.shape)
-                base = np.where(seen.mask.reshape(-1, 1), known, base)
-            points[parent.name] = np.repeat(base[None], count, axis=0)
-        moved = np.zeros((_CHECKS, len(self.columns), self.count))
-        for k, column in enumerate(self.columns):
-            node = self.model[column.parent]
-            free = hidden_elements(node, self.observed.get(column.parent))
-            chosen = free if column.element is None else [column.element]
-            value = points[column.parent]
-            value[1 + k, chosen, column.component] += column.step
-            # unlike each other, and short in binary, so that what cancels does so without rounding
-            turns = np.round(256 * np.sin(1.0 + k + np.arange(_CHECKS * len(value[0])))) / 128
-            shifts = column.step * turns.reshape(_CHECKS, -1)
-            # to both sides of the base, as every step goes to one only
-            shifts = np.abs(shifts) * (-1.0) ** np.arange(_CHECKS)[:, None]
-            value[-_CHECKS:, chosen, column.component] += shifts[:, chosen]
-            kept = np.zeros_like(shifts)
-            kept[:, chosen] = shifts[:, chosen]
-            at = self.places[column.parent] if column.element is None else column.element
-            moved[:, k] = kept[:, at] if column.element is None else kept[:, at, None]
-        shaped = {n: v.reshape((count, *self.model[n].value_shape)) for n, v in points.items()}
-        return shaped, moved
+    def _coefficients(
+        self, name: str, gains: Gains, seen: Observed | None
+    ) -> tuple[np.ndarray, list[tuple[str, int | None]]]:
+        """Coefficients of a hidden node, shape (*cards, elements, d, columns), and the columns.
 
-    def _check_scale(self, tril: np.ndarray, axis: int) -> None:
-        """The scale must be the same at all points, whatever tracing said."""
-        off = np.abs(tril - np.expand_dims(np.take(tril, 0, axis=axis), axis))
-        size = np.abs(tril).max(axis=(-2, -1), initial=0.0)
-        moves = (off.max(axis=(-2, -1), initial=0.0) > _TOLERANCE * size).any(axis=axis)
-        if (moves.reshape(self.invalid.shape) & ~self.invalid).any():
-            raise UnsupportedError(
-                f"node {self.node.name!r} has a scale that depends on "
-                f"{', '.join(repr(p.name) for p in self.hidden)}"
-            )
-
-    def _check_affine(self, found: np.ndarray, moved: np.ndarray) -> None:
-        """What the function gives at further points must be what its coefficients say."""
-        spread = np.abs(self.tril).sum(axis=-1)  # what is far below the noise does not count
-        step = max((c.step for c in self.columns), default=0.0)
-        for check in range(_CHECKS):
-            expected = self.offset + np.matvec(self.matrix, moved[check].T)
-            size = np.abs(self.offset) + np.matvec(np.abs(self.matrix), np.abs(moved[check].T))
-            allowed = _TOLERANCE * (size + spread) + 1e-12 * step
-            wrong = np.abs(found[..., check] - expected) > allowed
-            if (wrong & ~self.invalid[..., None]).any():
-                raise UnsupportedError(
-                    f"node {self.node.name!r} has a mean that is not affine in "
-                    f"{', '.join(repr(p.name) for p in self.hidden)}"
-                )
+        A column is a component of one element, or of the one that each element of this node reads. What is
+        seen goes into the offset.
+        """
+        node = self.model[name]
+        count, d = math.prod(node.plate_shape), math.prod(node.event_shape)
+        k = gains.gain.shape[-1]
+        self._check_size(k)
+        lead = (*self.cards, self.count, self.d)
+        shape = (*self.cards, *self.node.value_shape, k)
+        gain = np.broadcast_to(gains.gain, shape).reshape(-1, k)
+        at = np.broadcast_to(gains.at, shape).reshape(-1, k)
+        if seen is not None and seen.mask is not None:
+            value = np.where(np.repeat(seen.mask.reshape(-1), d), seen.value.reshape(-1), 0.0)
+            self.offset += (gain * value[at]).sum(axis=-1).reshape(lead)
+            gain = np.where(seen.mask.reshape(-1)[at // d], 0.0, gain)
+        place = np.zeros(self.count, dtype=np.intp)
+        if count > 1:
+            read = np.where(gain != 0, at // d, NOTHING).reshape(-1, self.count, self.d, k)
+            place = merged(read, (0, 2, 3))
+        width, column = d, at % d
+        columns: list[tuple[str, int | None]] = [(name, None)] * d
+        if (place == MANY).any():
+            free = hidden_elements(node, seen)
+            self._check_size(len(free) * d)
+            columns = [(name, e) for e in free for _ in range(d)]
+            width = len(columns)
+            first = np.zeros(count, dtype=np.intp)
+            first[free] = np.arange(len(free)) * d
+            column = first[at // d] + column
+        else:
+            self.places[name] = np.where(place == NOTHING, 0, place)
+        index = np.arange(len(gain))[:, None] * width + column
+        total = np.bincount(index.reshape(-1), gain.reshape(-1), len(gain) * width)
+        return total.reshape(*lead, width), columns
 
     # ---- one element, or elements that are alike -----------------------------------------------
 
     def _blocks(self, e: int) -> tuple[tuple[Variable, ...], list[int]]:
         """The blocks that an element's mean varies with, and their columns."""
         found: dict[Variable, list[int]] = {}
-        for k, column in enumerate(self.columns):
-            at = column.element
-            block = (column.parent, int(self.places[column.parent][e]) if at is None else at)
+        for k, (name, at) in enumerate(self.columns):
+            block = (name, int(self.places[name][e]) if at is None else at)
             found.setdefault(block, []).append(k)
         kept = {b: ks for b, ks in found.items() if self.used[ks, e].any()}
         return tuple(kept), [k for ks in kept.values() for k in ks]
@@ -284,10 +275,10 @@ class Reading:
             yield elements
             return
         keys = [self.places[n][elements] for n in self.alone]
-        moved = [k for k, c in enumerate(self.columns) if c.element is not None]
-        for k, c in enumerate(self.columns):
-            if c.element is None:
-                keys.append(np.where(self.used[k][elements], self.places[c.parent][elements], -1))
+        moved = [k for k, (_, at) in enumerate(self.columns) if at is not None]
+        for k, (name, at) in enumerate(self.columns):
+            if at is None:
+                keys.append(np.where(self.used[k][elements], self.places[name][elements], -1))
         bits = np.packbits(self.used[moved][:, elements], axis=0).T
         numbers = np.stack([*keys, np.zeros(len(elements), dtype=np.intp)], axis=1)
         packed = np.concatenate([np.ascontiguousarray(numbers).view(np.uint8), bits], axis=1)
@@ -296,14 +287,6 @@ class Reading:
         order = np.argsort(group, kind="stable")
         for part in np.split(order, np.flatnonzero(np.diff(group[order])) + 1):
             yield elements[part]
-
-    def _projected(self, parent: str) -> np.ndarray:
-        plates, own = self.model[parent].plates, self.node.plates
-        at = np.unravel_index(np.arange(self.count), self.node.plate_shape) if own else ()
-        picked = [at[own.index(p)] for p in plates if p in own]
-        if len(picked) < len(plates) or not plates:
-            return np.zeros(self.count, dtype=np.intp)
-        return np.ravel_multi_index(picked, self.model[parent].plate_shape)
 
     def scope(self, e: int) -> tuple[Variable, ...]:
         scope = [(n, int(self.places[n][e])) for n in self.alone]
@@ -341,9 +324,12 @@ def _reduced(
 
 def _parameters(result: Any, shape: Shape, d: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Mean, Cholesky factor ``(*shape, d, d)`` and bad places ``(*shape)`` of what a function returned."""
-    if isinstance(result, np.ndarray):
-        return result, np.broadcast_to(0.0, (*shape, d, d)), np.broadcast_to(False, shape)
-    assert isinstance(result, (Normal, MvNormal))
+    if not isinstance(result, (Normal, MvNormal)):  # computed
+        return (
+            np.asarray(result),
+            np.broadcast_to(0.0, (*shape, d, d)),
+            np.broadcast_to(False, shape),
+        )
     if isinstance(result, Normal):
         tril = np.broadcast_to(result.scale, shape)[..., None, None]
     else:
@@ -354,13 +340,17 @@ def _parameters(result: Any, shape: Shape, d: int) -> tuple[np.ndarray, np.ndarr
     return result.loc, tril, np.broadcast_to(bad, shape)
 
 
-def _typical(probe: np.ndarray, components: int) -> list[float]:
-    """A power of two near the size of each component's values, so that steps of it lose no digits."""
-    sizes = np.abs(probe).reshape(-1, components).max(axis=0, initial=0.0)
-    sizes = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
-    return (2.0 ** np.clip(np.round(np.log2(sizes)), -1000, 1000)).tolist()
-
-
 def _constant_along(array: np.ndarray, axis: int) -> bool:
     first = array.take([0], axis=axis)
     return bool((array == first).all())
+
+
+def _by_event(result: Any, node: CompiledNode) -> Iterator[tuple[Expression, int]]:
+    """The expressions that something is made of, and how many of their axes are no plates."""
+    if isinstance(result, Expression):
+        yield result, len(node.event_shape)
+    elif isinstance(result, Family):
+        for key, value in result.parameters.items():
+            own = {"loc": 1, "scale_diag": 1}.get(key, 2) if node.event_shape else 0
+            for part in expressions_of(value):
+                yield part, own

@@ -7,14 +7,15 @@ nodes above.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.network import CompiledNode, Model
+from bayesmc.network.model import potential_shape
 from bayesmc.shapes import Shape
 
 #: table entries up to which a function is evaluated on all configurations of its parents
@@ -37,6 +38,87 @@ class Table:
     parents: tuple[str, ...]
     probs: np.ndarray
     invalid: np.ndarray | None = None
+
+
+class Reads(NamedTuple):
+    """What a function reads, through the deterministic nodes between.
+
+    Attributes
+    ----------
+    alone : tuple of str
+        Finite nodes of which an element reads the one of its own place.
+    whole : tuple of str
+        Finite nodes of which it may read all elements.
+    others : tuple of str
+        Stochastic nodes that are not finite.
+    """
+
+    alone: tuple[str, ...]
+    whole: tuple[str, ...]
+    others: tuple[str, ...]
+
+
+def reads_of(
+    model: Model,
+    names: Sequence[str],
+    plates: Sequence[str],
+    is_known: Callable[[str], bool],
+    through: bool = False,
+) -> Reads:
+    """What stands above a function in some plates that reads these nodes.
+
+    What is known is left out. Finite nodes that are computed are not looked behind, unless ``through``.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.tables import reads_of
+    >>> net = bmc.BayesNet(plates={"i": 3})
+    >>> net.add("k", bmc.Bernoulli(0.5), plates="i")
+    >>> net.add("m", bmc.Normal(0.0, 1.0))
+    >>> net.add("f", lambda k, m: k * m, plates="i")
+    >>> reads_of(pose(net, {}).model, ["f"], ["i"], lambda name: False)
+    Reads(alone=('k',), whole=(), others=('m',))
+    """
+    finite: dict[str, bool] = {}
+    others: dict[str, None] = {}
+
+    def visit(names: Sequence[str], plates: Sequence[str], whole: bool) -> None:
+        for name in names:
+            if is_known(name):
+                continue
+            node = model[name]
+            foreign = whole or any(p not in plates for p in node.plates)
+            if node.domain is not None and (node.is_stochastic or not through):
+                finite[name] = finite.get(name, False) or foreign
+            elif node.is_stochastic:
+                others[name] = None
+            else:
+                visit(node.parents, node.plates, foreign)
+
+    visit(names, plates, False)
+    alone = tuple(n for n, is_whole in finite.items() if not is_whole)
+    return Reads(alone, tuple(n for n in finite if n not in alone), tuple(others))
+
+
+def indexed_table(
+    model: Model, name: str, known: Mapping[str, np.ndarray], entries: Sequence[int]
+) -> np.ndarray:
+    """Logs of a potential over rows of an index at all states of some entries, shape ``(*cards, rows)``.
+
+    The others are known.
+    """
+    potential, links = model.potentials[name]
+    cards = tuple(model[potential.scope[i]].domain.size for i in entries)  # type: ignore[union-attr]
+    stored = [
+        _along(entries.index(i), cards[entries.index(i)], len(cards) + 1, ())
+        if i in entries
+        else link.place(known[parent])
+        for i, (parent, link) in enumerate(links)
+    ]
+    table = model.potential_at(name, stored)
+    return np.broadcast_to(table, (*cards, *potential_shape(model.sizes, potential)))
 
 
 def tabulate(
@@ -96,31 +178,60 @@ def configure(
     then every element of the nodes ``whole``. ``points`` gives further values of some nodes, which run
     along one more batch axis, the last.
     """
-    sizes = [model[n].domain.size for n in alone]  # type: ignore[union-attr]
-    for name in whole:
-        node = model[name]
-        sizes += [node.domain.size] * math.prod(node.plate_shape)  # type: ignore[union-attr]
-    values = dict(known)
-    axes = len(sizes) + (points is not None)
-    for axis, name in enumerate(alone):
-        values[name] = _along(axis, sizes[axis], axes, model[name].plate_shape)
-    axis = len(alone)
-    for name in whole:
-        node = model[name]
-        count = math.prod(node.plate_shape)
-        batch = (1,) * axis + tuple(sizes[axis : axis + count]) + (1,) * (axes - axis - count)
-        value = np.empty((*batch, count), dtype=np.intp)
-        for element in range(count):
-            value[..., element] = _along(axis + element, sizes[axis + element], axes, ())
-        values[name] = value.reshape(batch + node.plate_shape)
-        axis += count
+    nodes = [model[n] for n in alone], [model[n] for n in whole]
+    axes, sizes = configurations(*nodes, behind=int(points is not None))
+    values = {**known, **dict(zip((*alone, *whole), axes, strict=True))}
     for name, value in (points or {}).items():
         values[name] = value.reshape((1,) * len(sizes) + value.shape)
     needed = _between(model, names, values)
     for name in model.nodes:
         if name in needed:
             values[name], _ = model.evaluate(name, values)
-    return values, tuple(sizes)
+    return values, sizes
+
+
+def configurations(
+    alone: Sequence[CompiledNode],
+    whole: Sequence[CompiledNode],
+    apart: Sequence[str] = (),
+    ahead: int = 0,
+    behind: int = 0,
+) -> tuple[list[np.ndarray], Shape]:
+    """All states of finite nodes along batch axes of their own, and the sizes of these axes.
+
+    Parameters
+    ----------
+    alone : sequence of CompiledNode
+        One axis each, all plate elements alike.
+    whole : sequence of CompiledNode
+        One axis for every element, those of plates ``apart`` together.
+    ahead, behind : int
+        Batch axes of size one before and after these.
+    """
+    inner = [
+        [1 if p in apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)]
+        for node in whole
+    ]
+    sizes = [node.domain.size for node in alone]  # type: ignore[union-attr]
+    for node, shape in zip(whole, inner, strict=True):
+        sizes += [node.domain.size] * math.prod(shape)  # type: ignore[union-attr]
+    ndim = ahead + len(sizes) + behind
+    found = [_along(ahead + k, sizes[k], ndim, node.plate_shape) for k, node in enumerate(alone)]
+    axis = len(alone)
+    for node, shape in zip(whole, inner, strict=True):
+        count, card = math.prod(shape), node.domain.size  # type: ignore[union-attr]
+        batch = np.ones(ndim, dtype=int)
+        batch[ahead + axis : ahead + axis + count] = card
+        value = np.empty((*batch, *node.plate_shape), dtype=np.intp)
+        for element, at in enumerate(np.ndindex(*shape)):
+            place = tuple(
+                slice(None) if p in apart else i for p, i in zip(node.plates, at, strict=True)
+            )
+            shared = (1,) * sum(p in apart for p in node.plates)
+            value[(Ellipsis, *place)] = _along(ahead + axis + element, card, ndim, shared)
+        found.append(value)
+        axis += count
+    return found, tuple(sizes)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ import pytest
 import bayesmc as bmc
 from bayesmc.engines.grid import moves as grid_moves
 from bayesmc.engines.grid.filter import GridFilter
-from bayesmc.engines.grid.terms import Term, contract, largest, maximise
 from bayesmc.errors import (
     BudgetError,
     GridWarning,
@@ -24,6 +23,7 @@ from bayesmc.errors import (
     UnsupportedError,
     ZeroProbabilityError,
 )
+from bayesmc.factors.named import Named
 
 # ---- templates ----------------------------------------------------------------------------------
 
@@ -166,7 +166,7 @@ def test_a_transposed_transition_is_seen(monkeypatch) -> None:
 
     def transposed(self, cells, now, factors):
         belief, *rest = right(self, cells, now, factors)
-        return [belief, *(Term(t.labels[::-1], t.table) for t in rest)]
+        return [belief, *(Named(t.scope[::-1], t.values) for t in rest)]
 
     monkeypatch.setattr(grid_moves.GridMover, "_moving", transposed)
     with pytest.raises(AssertionError), warnings.catch_warnings():
@@ -923,26 +923,3 @@ def test_engines_explain_themselves() -> None:
     assert why.nodes["y"] == "observed, weights the cells"
     found = bmc.explain(linear(), {"y": [0.1, 0.2]}, engine=GridFilter())
     assert "on a grid of" in found.nodes["x"]
-
-
-# ---- factors with named axes --------------------------------------------------------------------
-
-
-def test_contraction_and_maximisation_equal_the_whole_product() -> None:
-    rng = np.random.default_rng(0)
-    scopes = ["ab", "bcd", "de", "ce", "f"]
-    sizes = dict(zip("abcdef", (3, 4, 2, 3, 5, 2), strict=True))
-    terms = [Term(tuple(s), rng.normal(size=[sizes[x] for x in s])) for s in scopes]
-    arguments = [part for t in terms for part in (t.table, [ord(x) - 97 for x in t.labels])]
-    whole = np.einsum(*arguments, [0, 4])
-    np.testing.assert_allclose(contract(terms, ("a", "e")).table, whole)
-    assert largest([set(s) for s in scopes], ("a", "e"), sizes) < np.prod(list(sizes.values()))
-    total = sum(
-        t.table.reshape([sizes[x] if x in t.labels else 1 for x in "abcdef"]) for t in terms
-    )
-    best, choices = maximise(terms, ("a", "e"))
-    np.testing.assert_allclose(best.table, total.max(axis=(1, 2, 3, 5)))
-    at = {"a": 1, "e": 2}
-    for choice in reversed(choices):
-        at.update(choice.look_up(at))
-    assert total[tuple(at[x] for x in "abcdef")] == pytest.approx(best.table[1, 2])

@@ -18,7 +18,7 @@ from bayesmc.engines.kalman import base as kalman_base
 from bayesmc.engines.kalman import covariances as kalman_covariances
 from bayesmc.engines.kalman import means as kalman_means
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.kernels.kalman import Conditioned, condition
+from bayesmc.linalg.square_root import Conditioned, condition
 from bayesmc.testing import session
 from bayesmc.testing.makers.linear_dbns import LinearSeries, random_linear_dbn
 
@@ -388,9 +388,9 @@ def test_functions_that_branch_on_time_are_read_slice_by_slice() -> None:
         (lambda x_prev: bmc.Normal(x_prev, 1.0), lambda x: bmc.Normal(x, np.exp(x)), "'y' has a scale"),
         (lambda x_prev: bmc.Normal(x_prev, 1.0), lambda x: bmc.StudentT(3.0, x, 1.0), "'y' is StudentT"),
         (lambda x_prev: bmc.Normal(x_prev, 1.0), lambda x: bmc.Poisson(np.exp(x)), "'y' is discrete"),
-        # tracing sees slice 1; what is read off later slices must be affine, too
+        # slices 0 and 1 are looked at first; later ones must be affine, too
         (lambda x_prev, t: bmc.Normal(x_prev if t < 3 else x_prev**2, 1.0),
-         lambda x: bmc.Normal(x, 1.0), "'x' has a mean that is not affine"),
+         lambda x: bmc.Normal(x, 1.0), "slice 3: node 'x' has a mean that is not known to be affine"),
     ],
 )  # fmt: skip
 def test_refuses_what_is_not_linear_gaussian(x: Any, y: Any, says: str) -> None:

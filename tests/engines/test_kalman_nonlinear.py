@@ -18,12 +18,11 @@ from bayesmc.engines.kalman import posterior as kalman_posterior
 from bayesmc.engines.kalman import rows as kalman_rows
 from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.kalman.slopes import _MEANS, mean_of, mean_slopes
+from bayesmc.engines.kalman.followed import Followed
 from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
 from bayesmc.errors import ModelMisfitWarning
 from bayesmc.testing import session
 from bayesmc.testing.makers.linear_dbns import random_linear_dbn
-from bayesmc.tracing import Dual, NoTangent
 
 ENGINES = [
     ExtendedKalmanFilter(),
@@ -359,16 +358,16 @@ def test_derivatives_are_followed_and_equal_differences(
         patched.setattr(
             kalman_levels.Level,
             "slopes",
-            lambda self, *a: None if self.part.columns else plain(self, *a),
+            lambda self, mean: None if self.part.columns else plain(self, mean),
         )
         different = answers()
     assert max(off(a, b) for a, b in zip(followed, different, strict=True)) < 1e-7
-    right = kalman_levels.mean_slopes  # a slope that is off by 1e-5 is seen
+    right = Followed.slopes  # a slope that is off by 1e-5 is seen
 
     def faulty(*args: Any) -> Any:
-        return {n: Dual(d.value, d.tangent * (1 + 1e-5)) for n, d in right(*args).items()}
+        return [slope * (1 + 1e-5) for slope in right(*args) or ()]
 
-    monkeypatch.setattr(kalman_levels, "mean_slopes", faulty)
+    monkeypatch.setattr(Followed, "slopes", faulty)
     assert max(off(a, b) for a, b in zip(answers(), different, strict=True)) > 1e-7
 
 
@@ -384,7 +383,7 @@ def test_linear_templates_are_followed(seed: int, monkeypatch: pytest.MonkeyPatc
 
 
 def test_opaque_functions_are_differenced(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Functions that look at the numbers, call element by element, or have a kink where they are asked."""
+    """Functions that look at the numbers, call element by element, or jump where they are asked."""
     calls: list[int] = []
     plain = ExtendedKalmanFilter._differences
     monkeypatch.setattr(
@@ -406,97 +405,23 @@ def test_opaque_functions_are_differenced(monkeypatch: pytest.MonkeyPatch) -> No
     assert not calls
     hidden = [
         ({}, lambda x_prev: bmc.Normal(0.9 * np.vectorize(float)(x_prev), 0.1)),
-        ({}, lambda x_prev: bmc.Normal(0.9 * np.asarray(x_prev), 0.1)),
+        ({}, lambda x_prev: bmc.Normal(np.vectorize(lambda x: 0.9 * x)(x_prev), 0.1)),
         ({"vectorize": True}, lambda x_prev: bmc.Normal(0.9 * float(x_prev), 0.1)),
     ]
     for options, move in hidden:
         found = filtered(move, see, **options)
         assert len(calls) == 2
         assert off(found.mean("x"), wanted.mean("x")) < 1e-8
-    kink = filtered(
-        lambda x_prev: bmc.Normal(0.9 * x_prev, 0.1), lambda x: bmc.Normal(np.abs(x - 0.5), 0.2)
-    )
-    assert len(calls) == 1  # the mean of slice 0 is at the kink, the others are not
-    assert kink.mean("x")[0] == pytest.approx(0.5)  # between both slopes
-
-
-def test_what_gives_other_values_when_followed_is_not_believed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """A formula for a mean that is wrong is found out by its value, once and for all."""
-    dbn = bmc.DynamicBayesNet()
-    dbn.add("x", lambda x_prev: bmc.Normal(np.sin(x_prev), 0.1), initial=bmc.Normal(0.5, 0.3))
-    dbn.add("y", lambda x: bmc.Normal(x, 0.2))
-    rows = {"y": [0.4, 0.6, 0.5, 0.2]}
-    wanted = bmc.filter(dbn, rows, engine=ExtendedKalmanFilter())
-    calls: list[int] = []
-
-    def wrong(*args: Any) -> Any:
-        calls.append(1)
-        return {n: Dual(d.value + 0.01, 7.0 * d.tangent) for n, d in mean_slopes(*args).items()}
-
-    monkeypatch.setattr(kalman_levels, "mean_slopes", wrong)
-    found = bmc.filter(dbn, rows, engine=ExtendedKalmanFilter())
-    assert off(found.mean("x"), wanted.mean("x")) < 1e-8
-    assert (
-        len(calls) == 3
-    )  # once for each kind of level: x, and y in the first slice and in later ones
-
-
-FAMILIES: dict[type, Callable[[Any], Any]] = {
-    bmc.Normal: lambda x: bmc.Normal(x**2, 1 + x),
-    bmc.MvNormal: lambda x: bmc.MvNormal(np.stack([x, x**2], axis=-1), np.eye(2)),
-    bmc.Laplace: lambda x: bmc.Laplace(np.sin(x), 1.0),
-    bmc.StudentT: lambda x: bmc.StudentT(5.0, np.exp(x), x),
-    bmc.VonMises: lambda x: bmc.VonMises(2.0 * x, 3.0),
-    bmc.WrappedNormal: lambda x: bmc.WrappedNormal(2.0 * x, 3.0),
-    bmc.Affine: lambda x: bmc.Affine(bmc.Gamma(2 + x, 1 + x), x**2, -x),
-    bmc.HalfNormal: lambda x: bmc.HalfNormal(x),
-    bmc.Weibull: lambda x: bmc.Weibull(1.0 + x, 2.0 * x),
-    bmc.LogNormal: lambda x: bmc.LogNormal(x, 0.5 * x),
-    bmc.Uniform: lambda x: bmc.Uniform(-(x**2), 1 + x),
-    bmc.Beta: lambda x: bmc.Beta(x, 2.0 + x**2),
-    bmc.Gamma: lambda x: bmc.Gamma(x, 1.0 + x**2),
-    bmc.InverseGamma: lambda x: bmc.InverseGamma(3.0 + x, x**2),
-    bmc.Exponential: lambda x: bmc.Exponential(x),
-    bmc.Poisson: lambda x: bmc.Poisson(np.exp(x)),
-    bmc.Binomial: lambda x: bmc.Binomial(7, 1 / (1 + x)),
-    bmc.Geometric: lambda x: bmc.Geometric(1 / (1 + x)),
-    bmc.NegativeBinomial: lambda x: bmc.NegativeBinomial(2.0 + x, logits=-x),
-}
-
-
-@pytest.mark.parametrize("family", FAMILIES, ids=lambda f: f.__name__)
-def test_means_of_families(family: type) -> None:
-    assert set(FAMILIES) == set(_MEANS)
-    function, x, step = FAMILIES[family], np.array([0.4, 0.9, 1.3]), 1e-5
-    found = mean_of(function(Dual(x, np.ones((3, 1)))))
-    wanted = (function(x + step).mean - function(x - step).mean) / (2 * step)
-    np.testing.assert_allclose(found.tangent[..., 0], wanted, rtol=1e-8, atol=1e-9)
-    np.testing.assert_allclose(turned(found.value - function(x).mean), 0.0, atol=1e-12)
-
-
-def test_other_logits_and_families_without_a_formula() -> None:
-    x = Dual(0.3, [1.0])
-    for other in (bmc.Geometric(logits=x), bmc.Binomial(3, logits=x)):
-        assert np.isfinite(mean_of(other).tangent).all()
-    step = 1e-5
-    wanted = [bmc.Binomial(3, logits=v).mean for v in (0.3 + step, 0.3 - step)]
-    found = mean_of(bmc.Binomial(3, logits=x)).tangent[0]
-    assert found == pytest.approx((wanted[0] - wanted[1]) / (2 * step))
-    with pytest.raises(NoTangent, match="Truncated"):
-        mean_of(bmc.Truncated(bmc.Normal(x, 1.0), 0.0))  # type: ignore[call-arg]
-    net = bmc.BayesNet()
-    net.add("x", bmc.Normal(0.0, 1.0))
-    net.add("m", lambda x: x**2)
-    net.add("y", lambda m: bmc.Normal(np.sin(m), 1.0))
-    net.add("w", bmc.Normal(2.0, 1.0))
-    many = np.linspace(-1.0, 1.0, 5)
-    found = mean_slopes(net.model(), ["m", "y"], {"x": Dual(many, np.ones((5, 1)))})["y"]  # a batch
-    np.testing.assert_allclose(found.tangent[:, 0], np.cos(many**2) * 2 * many)
-    slopes = mean_slopes(net.model(), ["m", "y", "w"], {"x": x})
-    assert slopes["y"].tangent[0] == pytest.approx(np.cos(0.09) * 0.6)
-    assert (float(slopes["w"].value), slopes["w"].tangent.tolist()) == (2.0, [0.0])
+    bent = [lambda x: np.abs(x - 0.5), lambda x: np.where(x > 0.5, x - 0.5, 0.5 - x)]
+    for k, see_bent in enumerate(bent):
+        kink = filtered(
+            lambda x_prev: bmc.Normal(0.9 * x_prev, 0.1),
+            lambda x, see_bent=see_bent: bmc.Normal(see_bent(x), 0.2),
+        )
+        assert (
+            len(calls) == k
+        )  # the mean of slice 0 is where the condition jumps, the others are not
+        assert kink.mean("x")[0] == pytest.approx(0.5)  # between both slopes
 
 
 # ---- scales and refusals --------------------------------------------------------------------------

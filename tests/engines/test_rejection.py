@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 import bayesmc as bmc
-from bayesmc.engines.bounds import proved_log_bound
+from bayesmc.engines.weighted.bounds import proved_log_bound
 from bayesmc.errors import (
     BudgetError,
     EnvelopeError,

@@ -13,7 +13,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.errors import ZeroProbabilityError
-from bayesmc.kernels.kalman import condition
+from bayesmc.linalg.square_root import condition
 
 ENGINES = (bmc.KalmanFilter(), bmc.ExtendedKalmanFilter(), bmc.UnscentedKalmanFilter())
 NAN = np.nan

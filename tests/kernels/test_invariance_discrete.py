@@ -18,11 +18,11 @@ import bayesmc as bmc
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.forest_block import ForestBlock
-from bayesmc.kernels.joint_states import JointStates, TabulatedStates, joint_states
+from bayesmc.kernels.joint_states import JointStates, RowSums
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import SiteCounts, SiteSums, lattice_kernel
-from bayesmc.kernels.tables import RowSums, TableSweep, table_kernel, table_kernels
+from bayesmc.kernels.tables import TableSweep, joint_states, table_kernel, table_kernels
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target
 from tests.kernels.invariance import (
@@ -265,8 +265,8 @@ def joint(kind: type[Kernel], terms: slice = slice(None), power: float = 1.0) ->
             found = JointStates(target, ("z", "w"))
             found.terms = found.terms[terms]
             return found
-        found = TabulatedStates(target, ("z", "w"), _around(target))
-        found.rows = found.rows[terms]
+        found = RowSums(target, ("z", "w"), _around(target))
+        found.parts = found.parts[terms]
         return found
 
     return make
@@ -367,7 +367,7 @@ CASES = {
         tied(True), joint(JointStates), {"no prior": joint(JointStates, slice(1, None))}
     ),
     "joint states, tabulated terms": Case(
-        tied(False), joint(TabulatedStates), {"no prior": joint(TabulatedStates, slice(1, None))},
+        tied(False), joint(RowSums), {"no prior": joint(RowSums, slice(1, None))},
         how="moving",
     ),
     "joint states, one table": Case(

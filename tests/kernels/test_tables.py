@@ -14,7 +14,8 @@ from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels import tables
 from bayesmc.kernels.conditionals import FiniteTerms, conditional_of
-from bayesmc.kernels.tables import RowSums, TableSweep, table_kernel, table_kernels
+from bayesmc.kernels.joint_states import RowSums
+from bayesmc.kernels.tables import TableSweep, table_kernel, table_kernels
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values, target_of
@@ -148,7 +149,7 @@ def test_row_sums_of_random_plated_nets_equal_enumeration() -> None:
             around = terms.around((name,))
             if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
                 continue
-            kernel = RowSums(blanket, around)
+            kernel = RowSums(target, (name,), around)
             compared += 1
             plated += bool(blanket.node.plates)
             free = target.free_elements(name)

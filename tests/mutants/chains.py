@@ -376,7 +376,7 @@ MUTANTS = [
     ),
     Mutant(
         "an enumeration loses the last state",
-        (Edit("bayesmc.kernels.enumerate:states_at", "range(1, count - 1)", "range(1, count - 2)"),),
+        (Edit("bayesmc.categorical:pick_log", "in sums[1:-1]", "in sums[1:-2]"),),
         lambda seed: detailed_balance(enumerated, three(), {"y": 1}, alpha=ALPHA, rng=seed),
         "detailed_balance (exact)",
     ),

@@ -44,9 +44,8 @@ BY = "compare with exact() (no draws)"
 MUTANTS = [
     Mutant(
         "a table's axes are transposed",
-        (Edit("bayesmc.structure.tables:configure",
-              "values[name] = _along(axis, sizes[axis], axes, ",
-              "values[name] = _along(len(alone) - 1 - axis, sizes[axis], axes, "),),
+        (Edit("bayesmc.structure.tables:configurations",
+              "_along(ahead + k, sizes[k], ", "_along(ahead + len(alone) - 1 - k, sizes[k], "),),
         matched(collider, {"d": 1}, EXACT),
         BY,
     ),

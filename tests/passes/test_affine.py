@@ -38,6 +38,13 @@ AFFINE = {
     "a difference": lambda x, v, m, k, s: np.diff(v, axis=-1)[..., 0] + np.mean(v, axis=-1) + s * x,
     "numbers of states": lambda x, v, m, k, s: 0.5 * k * x + np.exp(0.1 * s) * v.sum(axis=-1),
     "nothing": lambda x, v, m, k, s: s + k,
+    "running sums": lambda x, v, m, k, s: np.cumsum(v, axis=-1)[..., 1] + x,
+    "a solution": lambda x, v, m, k, s: (
+        np.linalg.solve(SQUARE + 3 * np.eye(3), (v * s[..., None])[..., None])[..., 2, 0] - x
+    ),
+    "a contraction": lambda x, v, m, k, s: (
+        np.tensordot(v, SQUARE, axes=1)[..., 0] * x.shape[-1] + s
+    ),
 }
 BENT = {
     "a square": (lambda x, v, m, k, s: x**2, "np.power"),
@@ -45,6 +52,14 @@ BENT = {
     "a quotient": (lambda x, v, m, k, s: 1 / (x + 9), "np.divide"),
     "a branch on it": (lambda x, v, m, k, s: np.where(x > 0, x, 0.0), "np.greater"),
     "a maximum": (lambda x, v, m, k, s: m.max("group") + x, "np.maximum.reduce"),
+    "a largest sum": (
+        lambda x, v, m, k, s: np.maximum.accumulate(v, axis=-1)[..., 2] + x,
+        "accumulate",
+    ),
+    "a matrix of it": (
+        lambda x, v, m, k, s: np.linalg.solve(3 * np.eye(3) + v[..., None], SQUARE[0])[..., 0] + x,
+        "solve",
+    ),
     "an absolute value": (lambda x, v, m, k, s: np.abs(v[..., 0]) + x, "np.absolute"),
 }
 

@@ -13,7 +13,8 @@ import pytest
 from hypothesis import HealthCheck, Phase, find, given, settings
 
 import bayesmc as bmc
-from bayesmc.diagnostics import log_sum_exp, normalised, weight_ess
+from bayesmc.categorical import log_sum_exp
+from bayesmc.diagnostics import normalised, weight_ess
 from bayesmc.errors import MissingExtraError, UnsupportedError
 from bayesmc.network.parts import without_idle_plates
 from bayesmc.resampling import SCHEMES

@@ -13,16 +13,16 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.averages import called, naming
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
-from bayesmc.engines.discrete.rows import Rows, Term
+from bayesmc.engines.discrete.rows import Rows, Term, Variable
 from bayesmc.engines.discrete.run import Run, bad_parameters
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
-from bayesmc.engines.discrete.sums import Variable, groups, log_max, product
 from bayesmc.engines.filtering import Answers, Queries
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.factors.named import connected, log_product
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
-from bayesmc.shapes import unravelled
+from bayesmc.shapes import padded, unravelled
 
 
 class SliceAnswers:
@@ -164,38 +164,28 @@ class SliceAnswers:
 
         Probabilities, or mean and variance (cosine and sine of angles).
         """
-        with marking_invalid(), np.errstate(all="ignore"):
-            result, _ = self.reader.evaluate(term, rows)
-        bad = result.invalid if isinstance(result, Distribution) else None
-        if bad is not None:
-            lead = 1 + len(self.reader.cards(term)) + len(self.model[term.name].plates)
-            bad = _padded(bad * 1.0, lead)
-        return *self._averaged_of(term, rows), bad
-
-    def _averaged_of(self, term: Term, rows: Rows) -> tuple[Any, ...]:
-        """Probabilities, or mean and variance (cosine and sine of angles)."""
         node = self.model[term.name]
+        lead = 1 + len(self.reader.cards(term)) + len(node.plates)
+        ndim = lead + len(node.event_shape)
         with marking_invalid(), np.errstate(all="ignore"):
             result, _ = self.reader.evaluate(term, rows)
-            lead = 1 + len(self.reader.cards(term)) + len(node.plates)
             if not isinstance(result, Distribution):
                 own = self.reader.model(term.kind, 0)[term.name]
                 value = np.asarray(result)
                 if self._is_tabular(term.name):
                     one_hot = value[..., None] == np.arange(self.reader.card(term.name))
-                    return _padded(one_hot * 1.0, lead + 1), None
-                value = np.asarray(own.decode(value), dtype=float)
-                value = _padded(value, lead + len(node.event_shape))
-                return value, np.zeros((1,) * value.ndim)
+                    return padded(one_hot * 1.0, lead + 1), None, None
+                value = padded(np.asarray(own.decode(value), dtype=float), ndim)
+                return value, np.zeros((1,) * ndim), None
+            bad = None if result.invalid is None else padded(result.invalid * 1.0, lead)
             if node.domain is not None:
-                return _padded(np.asarray(result.probs_table), lead + 1), None
-            ndim = lead + len(node.event_shape)
-            mean, var = _padded(result.mean, ndim), _padded(result.var, ndim)
+                return padded(np.asarray(result.probs_table), lead + 1), None, bad
+            mean, var = padded(result.mean, ndim), padded(result.var, ndim)
             if node.angles is None:
-                return mean, var
+                return mean, var, bad
             length = np.exp(-0.5 * var)
             cosine, sine = length * np.cos(mean), length * np.sin(mean)
-            return np.where(node.angles, cosine, mean), np.where(node.angles, sine, var)
+            return np.where(node.angles, cosine, mean), np.where(node.angles, sine, var), bad
 
     def _is_tabular(self, name: str) -> bool:
         """Whether a node has the same states in all slices; computed nodes may not, and are numbers then."""
@@ -335,7 +325,7 @@ def best_path(run: Run) -> dict[Variable, np.ndarray] | None:
     plan = run.plan
     found: dict[Variable, np.ndarray] = {}
     for number, chain in enumerate(plan.chains):
-        path = most_likely(run.blocks(number, log_max), run.steps, run.sequences, chain.size)
+        path = most_likely(run.blocks(number, np.max), run.steps, run.sequences, chain.size)
         if path is None:
             return None
         shape = tuple(plan.cards[v] for v in chain.state)
@@ -359,7 +349,7 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
     for start, stop in run.stretches(plan.widest(chain) * run.sequences):
         rows = plan.rows(run.series, start, stop)
         pieces = run.pieces(number, rows)
-        for group in groups(chain.inside, [p.scope for p in pieces]):
+        for group in connected(chain.inside, [p.scope for p in pieces]):
             members = [p for p in pieces if set(group) & set(p.scope)]
             border = tuple(dict.fromkeys(v for p in members for v in p.scope if v not in group))
             sizes = tuple(plan.cards[v] for v in group)
@@ -370,7 +360,7 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
                     "meet in one density; observe more of them",
                     int(min(8 * entries, 2**62)),
                 )
-            table = product(members, (*border, *group), plan.cards)
+            table = log_product(members, (*border, *group), plan.cards)
             table = table.reshape(*table.shape[: 2 + len(border)], -1)
             here = np.arange(rows.count)[:, None] if len(table) > 1 else 0
             there = np.arange(run.sequences) if table.shape[1] > 1 else 0
@@ -393,7 +383,3 @@ def _averaged(weights: np.ndarray, values: np.ndarray, rest: int) -> np.ndarray:
     full = weights.reshape(weights.shape + (1,) * rest)
     axes = tuple(range(2, weights.ndim))
     return np.where(full > 0, full * values, 0.0).sum(axis=axes)
-
-
-def _padded(array: np.ndarray, ndim: int) -> np.ndarray:
-    return array.reshape((1,) * (ndim - array.ndim) + array.shape)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, Series, Slices
-from bayesmc.engines.averages import as_event
-from bayesmc.engines.beliefs import OnlineBelief
+from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.discrete.answers import SliceAnswers
+from bayesmc.engines.discrete.posterior import DiscretePosterior
 from bayesmc.engines.discrete.run import Run
-from bayesmc.errors import QueryError
 from bayesmc.network import Observed
 from bayesmc.results import SeriesPosterior
 
@@ -32,18 +30,15 @@ class Held(NamedTuple):
         The last rows.
     before : list of ndarray or None
         Logs of the beliefs in the slice before, by chain.
-    answers : SeriesPosterior or None
-        What it says of its slice, for a belief without functions.
     """
 
     slices: Slices
     series: Series
     before: Sequence[np.ndarray] | None
-    answers: SeriesPosterior | None = None
 
 
 @dataclass(frozen=True, eq=False)
-class DiscreteBelief(OnlineBelief):
+class DiscreteBelief(SliceBelief):
     """Probabilities of the nodes of one slice.
 
     Attributes
@@ -76,10 +71,9 @@ class DiscreteBelief(OnlineBelief):
         """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
         if self.dbn is not None and not self.dbn.template.has_functions:
             return {**self.__dict__}  # tables alone travel
-        run = None if self.run is None else self.held._replace(answers=self._posterior)
-        state = {**self.__dict__, "dbn": None, "run": run}
-        state.pop("_posterior", None)
-        return state
+        if self.run is None:
+            return {**self.__dict__, "dbn": None}
+        return {**self.__dict__, "dbn": None, "run": self.held, "_posterior": self._posterior}
 
     @property
     def held(self) -> Held:
@@ -101,61 +95,15 @@ class DiscreteBelief(OnlineBelief):
             return {}
         return {n: v[-1] for n, v in self.held.series.inputs.items()}
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Nodes that are answered for, parents first."""
-        return self._posterior.names
-
-    def mean(self, name: str) -> np.ndarray:
-        """Mean, shape ``(*plates, *event)``; circular for angles; labels have none."""
-        return self._posterior.mean(name)[0]
-
-    def var(self, name: str) -> np.ndarray:
-        """Variance, shape ``(*plates, *event)``; for angles ``-2 log R``."""
-        return self._posterior.var(name)[0]
-
-    def std(self, name: str) -> np.ndarray:
-        """Standard deviation, shape ``(*plates, *event)``."""
-        return np.sqrt(self.var(name))
-
-    def probabilities(self, name: str) -> np.ndarray:
-        """Probabilities of the states of a finite node, shape ``(*plates, states)``."""
-        return self._posterior.probabilities(name)[0]
-
-    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
-        """Mean of a function of nodes of the slice, whose arguments have a leading axis of states."""
-        return self._slice.expectation(function)[-1]
-
-    def probability(self, function: Callable[..., Any]) -> np.ndarray:
-        """Probability of an event (a function that returns booleans)."""
-        return self._slice.expectation(function, as_event)[-1]
-
-    @property
-    def _slice(self) -> SliceAnswers:
-        if self.run is None:
-            raise QueryError(
-                "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
-            )
-        if isinstance(self.run, Held):
-            raise QueryError(
-                "this belief was unpickled, and pickles carry no functions: it says means, variances and "
-                "probabilities of nodes; for the rest give it the template again, engine.start(dbn, "
-                "belief=belief)"
-            )
-        return SliceAnswers(self.run)
-
-    @cached_property
-    def _posterior(self) -> SeriesPosterior:
-        if isinstance(self.run, Held):
-            assert self.run.answers is not None
-            return self.run.answers
-        answers = self._slice
+    def _answered(self) -> SeriesPosterior:
+        assert isinstance(self.run, Run)
+        answers = SliceAnswers(self.run)
         slices = answers.plan.slices
         found = answers.of(slices.dynamic)
-        return SeriesPosterior(
+        return DiscretePosterior(
             slices.first, None, "filter", None, tables=found.tables, means=found.means,
             variances=found.variances, steps=1, start=self.t,
-        )  # fmt: skip
+        ).read_from(answers)  # fmt: skip
 
 
 def window(slices: Slices, before: Series | None, row: Row) -> Series:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bayesmc.categorical import log_sum_exp
 from bayesmc.engines.discrete.slices import Block
-from bayesmc.engines.discrete.sums import log_sum
 
 #: below this a probability may have lost digits
 TINY = 1e-290
@@ -328,7 +328,7 @@ def _in_logs(
                     moving = None if block.moving is None else block.moving[k]
                     matrix = block.fixed if moving is None else block.fixed + moving
                     now = _times_log(last, matrix) + block.likelihood[k]
-                total = log_sum(now, -1)
+                total = log_sum_exp(now, -1)
                 increments[t] = total
                 log[t] = now - np.where(np.isfinite(total), total, 0.0)[:, None]
                 last = log[t]
@@ -354,7 +354,7 @@ def _log_matrix(block: Block) -> np.ndarray:
 
 def _times_log(vectors: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """``_times`` on logs."""
-    return log_sum(vectors[..., None] + matrix, -2)
+    return log_sum_exp(vectors[..., None] + matrix, -2)
 
 
 def _from(passed: Passed, found: np.ndarray) -> Passed:

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.dbn import SeriesProblem
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.discrete.path import states_of
+from bayesmc.engines.discrete.rows import Variable
 from bayesmc.engines.discrete.run import Run
-from bayesmc.engines.discrete.sums import Variable
 from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.randomness import Purpose, stream
@@ -62,10 +61,9 @@ class _Draws:
         """Of every variable that the next slice reads, shape (count, sequences)."""
         found: dict[Variable, np.ndarray] = {}
         for chain, passed in zip(self.run.plan.chains, self.run.passed, strict=True):
-            sums = passed.belief[self.at].cumsum(axis=-1)
+            belief = passed.belief[self.at]
             sizes = [self.run.plan.cards[v] for v in chain.state]
-            drawn = rng.random((count, len(sums), 1)) * sums[:, -1:]
-            flat = np.minimum((sums <= drawn).sum(axis=-1), math.prod(sizes) - 1)
+            flat = pick(belief.T, rng.random((count, len(belief))))
             if sizes:
                 codes = np.unravel_index(flat, sizes)
                 found.update(zip(chain.state, codes, strict=True))

@@ -9,9 +9,8 @@ import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.discrete.limits import first_gap
-from bayesmc.engines.discrete.rows import Rows, Term
+from bayesmc.engines.discrete.rows import Rows, Term, Variable
 from bayesmc.engines.discrete.run import Run
-from bayesmc.engines.discrete.sums import Variable
 
 
 def path_values(

@@ -15,12 +15,42 @@ import numpy as np
 from bayesmc.dbn import TIME, Series
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.structure.tables import configurations
 
 if TYPE_CHECKING:
     from bayesmc.engines.discrete.terms import SliceReader
 
 #: slices back, node
 Key = tuple[int, str]
+#: slices back, node, element of its plates
+Variable = tuple[int, str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A log factor over finite variables.
+
+    Attributes
+    ----------
+    node : str
+        Whose conditional density it is.
+    scope : tuple of Variable
+    values : ndarray, shape (rows or 1, sequences or 1, *cards)
+    is_evidence : bool
+        It says what was seen, not what is possible.
+    invalid : ndarray of bool or None
+        Configurations with bad parameters, where ``values`` is 0; same shape.
+    """
+
+    node: str
+    scope: tuple[Variable, ...]
+    values: np.ndarray
+    is_evidence: bool = False
+    invalid: np.ndarray | None = None
+
+
+#: a factor of one
+NEUTRAL = Piece("", (), np.zeros((1, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +70,8 @@ class Term:
         Nodes that are no variables: their values come from the data.
     clock : bool
         It reads the time or an input.
+    hands_on : bool
+        It reads a computed node of the slice before that is no variable, so that slice 0 differs from others.
     """
 
     name: str
@@ -48,6 +80,7 @@ class Term:
     whole: tuple[Key, ...]
     reads: tuple[Key, ...]
     clock: bool
+    hands_on: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,35 +115,11 @@ class Rows:
 
     def on_axes(self, reader: SliceReader, term: Term) -> Rows:
         """With a term's variables along axes of their own."""
-        ndim = 1 + len(reader.cards(term))
-        axes: dict[Key, np.ndarray] = {}
-        axis = 1
-        for key in term.alone:
-            node, card = reader.slices.first[key[1]], reader.card(key[1])
-            values = _along(axis, card, ndim).reshape(
-                *_along(axis, card, ndim).shape, *(1,) * len(node.plates)
-            )
-            axes[key] = np.broadcast_to(values, (*values.shape[:ndim], *node.plate_shape))
-            axis += 1
-        for key in term.whole:
-            node, card = reader.slices.first[key[1]], reader.card(key[1])
-            count = reader.elements(key[1])
-            batch = [1] * ndim
-            batch[axis : axis + count] = [card] * count
-            value = np.empty((*batch, *node.plate_shape), dtype=np.intp)
-            inner = [n if p not in reader.apart else 1
-                     for p, n in zip(node.plates, node.plate_shape, strict=True)]  # fmt: skip
-            for element, at in enumerate(np.ndindex(*inner)):
-                place = tuple(
-                    slice(None) if p in reader.apart else i
-                    for p, i in zip(node.plates, at, strict=True)
-                )
-                along = _along(axis + element, card, ndim)
-                shared = sum(p in reader.apart for p in node.plates)
-                value[(Ellipsis, *place)] = along.reshape(*along.shape, *(1,) * shared)
-            axes[key] = value
-            axis += count
-        return Rows(self.series, self.start, self.stop, self.kind, reader, axes, ndim)
+        first = reader.slices.first
+        alone, whole = ([first[name] for _, name in keys] for keys in (term.alone, term.whole))
+        values, cards = configurations(alone, whole, reader.apart, ahead=1)
+        axes = dict(zip((*term.alone, *term.whole), values, strict=True))
+        return self.at(reader, axes, 1 + len(cards))
 
     def at(self, reader: SliceReader, values: Mapping[Key, np.ndarray], ndim: int) -> Rows:
         """With given values of variables, whose batch has ``ndim`` axes, that of time first."""
@@ -180,10 +189,6 @@ class Rows:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _along(axis: int, card: int, ndim: int) -> np.ndarray:
-    return np.arange(card).reshape((1,) * axis + (card,) + (1,) * (ndim - 1 - axis))
 
 
 def _handed_on(value: np.ndarray, source: CompiledNode, target: CompiledNode) -> np.ndarray:

@@ -11,12 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import log_sum_exp
 from bayesmc.dbn import Series
 from bayesmc.engines.discrete.chain import Passed, filtered, lagged, smoothed
-from bayesmc.engines.discrete.rows import Rows
+from bayesmc.engines.discrete.rows import Piece, Rows, Variable
 from bayesmc.engines.discrete.slices import STRETCH_ENTRIES, Block, DiscreteSlices
-from bayesmc.engines.discrete.sums import Piece, Variable, eliminate, log_sum, spread
 from bayesmc.errors import ParameterError, ZeroProbabilityError
+from bayesmc.factors.named import Named, aligned, summed
 
 #: bytes of factors that are kept for the next pass
 _KEPT = 1 << 28
@@ -73,7 +74,7 @@ class Run:
         for start, stop in self._stretches(None):
             rows = self.plan.rows(self.series, start, stop)
             for piece in self.pieces(None, rows):
-                increments[start - self.first : stop - self.first] += piece.log
+                increments[start - self.first : stop - self.first] += piece.values
                 if piece.invalid is not None and piece.invalid.any():
                     row = int(np.argmax(piece.invalid.reshape(len(piece.invalid), -1).any(axis=1)))
                     raise bad_parameters(piece.node, start + row)
@@ -100,7 +101,7 @@ class Run:
         self._kept.clear()
 
     def blocks(
-        self, number: int, reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum
+        self, number: int, reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum_exp
     ) -> Callable[[bool], Iterator[Block]]:
         """Makes the blocks of one chain, in either direction."""
 
@@ -147,7 +148,7 @@ class Run:
             found = np.ones((1, 1, *(cards[v] for v in scope)))
         for number in owners if len(owners) > 1 else ():
             own = tuple(v for v in scope if self.plan.chain_of(v) == number)
-            found = found * spread(self._marginal(number, own, start, stop), own, scope)
+            found = found * aligned(Named(own, self._marginal(number, own, start, stop)), scope)
         return np.broadcast_to(found, (stop - start, self.sequences, *found.shape[2:]))
 
     # ---- private ----------------------------------------------------------------------------
@@ -169,11 +170,11 @@ class Run:
             belief = self.beliefs[number].belief[now]
             shaped = belief.reshape(*belief.shape[:2], *(cards[v] for v in chain.state))
             out = tuple(2 + k for k, v in enumerate(chain.state) if v not in scope)
-            left = [v for v in chain.state if v in scope]
-            return spread(shaped.sum(axis=out) if out else shaped, left, scope)
+            left = tuple(v for v in chain.state if v in scope)
+            return aligned(Named(left, shaped.sum(axis=out) if out else shaped), scope)
         rows = self.plan.rows(self.series, start, stop)
         pieces = [*self.pieces(number, rows), *self._around(number, start, stop)]
-        table = eliminate(pieces, scope, cards, log_sum).log
+        table = summed(pieces, scope, cards, log_sum_exp)
         over = tuple(range(2, table.ndim))
         top = table.max(axis=over, keepdims=True)
         found = np.exp(table - np.where(np.isfinite(top), top, 0.0))
@@ -233,7 +234,7 @@ class Run:
         """The first observed node of a slice at which no probability is left."""
         rows = self.plan.rows(self.series, t, t + 1)
         for piece in self.pieces(None, rows):
-            if not (piece.log > -np.inf).all():
+            if not (piece.values > -np.inf).all():
                 return piece.node
         order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
         for number in range(len(self.plan.chains)):
@@ -244,7 +245,7 @@ class Run:
             now = [p for p in self._around(number, t, t + 1) if p.scope and p.scope[0][0] == 1]
             for piece in (p for p in pieces if p.is_evidence):
                 taken.append(piece)
-                total = eliminate([*taken, *now], (), self.plan.cards, log_sum).log
+                total = summed([*taken, *now], (), self.plan.cards, log_sum_exp)
                 if np.broadcast_to(total, (1, self.sequences))[0, sequence] == -np.inf:
                     return piece.node
         return self.plan.slices.dynamic[-1]
@@ -260,7 +261,7 @@ def _logs(passed: Passed, first: int, last: int) -> np.ndarray:
 
 
 def _bytes(pieces: Sequence[Piece]) -> int:
-    return sum(p.log.nbytes for p in pieces)
+    return sum(p.values.nbytes for p in pieces)
 
 
 def bad_parameters(node: str, t: int) -> ParameterError:

@@ -14,18 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import log_sum_exp
 from bayesmc.dbn import PREVIOUS, TIME, Series, Slices
-from bayesmc.engines.discrete.rows import Rows
-from bayesmc.engines.discrete.sums import (
-    Piece,
-    Variable,
-    eliminate,
-    groups,
-    log_sum,
-    product,
-    width,
-)
+from bayesmc.engines.discrete.rows import NEUTRAL, Piece, Rows, Variable
 from bayesmc.engines.discrete.terms import SliceReader
+from bayesmc.factors.named import connected, largest, log_product, summed
 
 #: entries of tables of many slices that are worked out together: they stay near the processor
 STRETCH_ENTRIES = 1 << 18
@@ -114,7 +107,7 @@ class DiscreteSlices:
             for e in range(self.reader.elements(n))
             for lag in (0, 1)
         }
-        self.has_second = any(self._hands_on(n) for n in slices.dynamic)
+        self.has_second = any(self.terms[n, 2].hands_on for n in slices.dynamic)
         self.chains = self._chains()
         self._home = {v: k for k, c in enumerate(self.chains) for v in (*c.state, *c.inside)}
         self._home |= {v: k for k, c in enumerate(self.chains) for v in c.before}
@@ -198,13 +191,13 @@ class DiscreteSlices:
         number: int,
         pieces: Sequence[Piece],
         rows: Rows,
-        reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum,
+        reduce: Callable[[np.ndarray, int], np.ndarray] = log_sum_exp,
     ) -> Block:
         """The tables of one chain, with what is inside its slices summed (or maximised) out."""
         chain = self.chains[number]
         inside = {*chain.before, *chain.state, *chain.inside}
         own = [p for p in pieces if p.scope and p.scope[0] in inside]
-        bound = groups(chain.inside, [p.scope for p in own])
+        bound = connected(chain.inside, [p.scope for p in own])
         fixed: list[Piece] = []
         varying: list[Piece] = []
         for group in bound:
@@ -215,7 +208,7 @@ class DiscreteSlices:
             if still and key in self._fixed:
                 fixed.append(self._fixed[key])
                 continue
-            part = eliminate(members, keep, self.cards, reduce)
+            part = Piece("", keep, summed(members, keep, self.cards, reduce))
             if still:
                 self._fixed[key] = part
             (fixed if still else varying).append(part)
@@ -237,17 +230,17 @@ class DiscreteSlices:
         keep = (*chain.before, *chain.state)
         inside = {*keep, *chain.inside}
         scopes = [s for _, s in self.scopes(2) if inside & set(s)]
-        return width(scopes, keep, self.cards)
+        return largest(scopes, keep, self.cards)
 
     def _entries_of(self, chain: Chain) -> float:
         members = {*chain.before, *chain.state, *chain.inside}
         scopes = [(n, s) for n, s in self.scopes(2) if members & set(s)]
         widest = float(chain.size)
-        for group in groups(chain.inside, [s for _, s in scopes]):
+        for group in connected(chain.inside, [s for _, s in scopes]):
             part = [(n, s) for n, s in scopes if set(group) & set(s)]
             if any(self._may_move(n) for n, _ in part):
                 keep = {v for _, s in part for v in s if v not in group}
-                widest = max(widest, width([s for _, s in part], keep, self.cards))
+                widest = max(widest, largest([s for _, s in part], keep, self.cards))
                 if any(v in keep for v in chain.before):
                     widest = max(widest, float(chain.size) ** 2)
         for name, scope in scopes:
@@ -263,22 +256,25 @@ class DiscreteSlices:
         chain = self.chains[number]
         size, scope = chain.size, chain.state
         if rows.kind == 0:
-            table = product([*fixed, *varying], scope, self.cards)
+            table = self._product([*fixed, *varying], scope)
             return Block(rows.start, rows.stop, None, None, _full(table, rows, (size,)))
         pair = (*chain.before, *scope)
         here = [p for p in varying if not set(p.scope) & set(chain.before)]
         both = [p for p in varying if set(p.scope) & set(chain.before)]
-        likelihood = _full(product(here, scope, self.cards), rows, (size,))
+        likelihood = _full(self._product(here, scope), rows, (size,))
         # which factors are fixed depends on what is observed, and that on the row where rows come singly
         key = (number, rows.kind, reduce, frozenset(id(p) for p in fixed))
         if key not in self._fixed:
-            table = product(fixed, pair, self.cards)
+            table = self._product(fixed, pair)
             self._fixed[key] = table.reshape(table.shape[1], size, size)
         moving = None
         if both:
-            table = product(both, pair, self.cards)
+            table = self._product(both, pair)
             moving = _full(table, rows, (size, size))
         return Block(rows.start, rows.stop, self._fixed[key], moving, likelihood)
+
+    def _product(self, pieces: Sequence[Piece], scope: Sequence[Variable]) -> np.ndarray:
+        return log_product(pieces or [NEUTRAL], scope, self.cards)
 
     def _moves(self, piece: Piece) -> bool:
         """Whether a piece may differ from row to row."""
@@ -290,25 +286,6 @@ class DiscreteSlices:
 
     def _reads(self, name: str) -> bool:
         return any(t.clock or t.reads for t in (self.terms[name, k] for k in (1, 2)))
-
-    def _hands_on(self, name: str) -> bool:
-        """Whether a node reads a deterministic node of the slice before that is no variable."""
-        later, first = self.slices.later, self.slices.first
-        todo, visited = [name], set()
-        while todo:
-            current = todo.pop()
-            for parent in later[current].parents:
-                stem = parent.removesuffix(PREVIOUS)
-                if stem not in self.slices.dynamic or first[stem].is_stochastic:
-                    continue
-                if stem in self.reader.variables:
-                    continue
-                if stem != parent:
-                    return True
-                if stem not in visited:
-                    visited.add(stem)
-                    todo.append(stem)
-        return False
 
     def _nodes_by_chain(self) -> dict[int | None, tuple[str, ...]]:
         """The nodes whose densities hold variables of each chain, and those that hold none."""
@@ -330,7 +307,7 @@ class DiscreteSlices:
                     read |= {v for v in scope if v[0] == 1}
         flat = [[(0, *v[1:]) for v in s] for s in scopes]
         chains = []
-        for members in groups(own, flat):
+        for members in connected(own, flat):
             state = tuple(v for v in members if (1, *v[1:]) in read)
             before = tuple((1, *v[1:]) for v in state)
             inside = tuple(v for v in members if v not in state)

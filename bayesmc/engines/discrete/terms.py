@@ -16,10 +16,10 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, TIME, Slices
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.discrete.rows import Key, Rows, Term
-from bayesmc.engines.discrete.sums import Piece, Variable
+from bayesmc.engines.discrete.rows import Key, Piece, Rows, Term, Variable
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network import CompiledNode, Model
+from bayesmc.shapes import padded
 
 #: reads arrays off a term in some slices
 Read = Callable[["Term", "Rows"], tuple[Any, ...]]
@@ -63,10 +63,10 @@ class SliceReader:
         node = self.model(kind, 0)[name]
         found: dict[Key, bool] = {}
         reads: dict[Key, None] = {}
-        clock = False
+        clock = hands_on = False
 
         def visit(parents: Sequence[str], lag: int, own: tuple[str, ...], whole: bool) -> None:
-            nonlocal clock
+            nonlocal clock, hands_on
             for parent in parents:
                 stem, back = self.origin(parent, lag)
                 if stem == TIME or stem in self.slices.template.inputs:
@@ -83,12 +83,13 @@ class SliceReader:
                     reads[back, stem] = None
                 else:
                     self._check_back(name, stem, back)
+                    hands_on |= back > lag
                     visit(self.model(kind, back)[stem].parents, back, above.plates, foreign)
 
         visit(node.parents, 0, node.plates, False)
         alone = tuple(k for k, is_whole in found.items() if not is_whole)
         whole_keys = tuple(k for k, is_whole in found.items() if is_whole)
-        return Term(name, kind, alone, whole_keys, tuple(reads), clock)
+        return Term(name, kind, alone, whole_keys, tuple(reads), clock, hands_on)
 
     def origin(self, parent: str, lag: int) -> tuple[str, int]:
         """The node that a parent of the slice ``lag`` back is, and how far back it stands."""
@@ -236,7 +237,7 @@ class SliceReader:
         Sequences are one where nothing differs between them.
         """
         plates = len(node.plates)
-        array = _padded(array, 1 + cards + plates + rest)
+        array = padded(array, 1 + cards + plates + rest)
         inner = [k for k, p in enumerate(node.plates) if p not in self.apart]
         index: list[Any] = [slice(None)] * array.ndim
         if inner:
@@ -293,20 +294,20 @@ class SliceReader:
             lead = 1 + len(self.cards(term)) + len(node.plates)
             if not isinstance(result, Distribution):
                 size = self.card(term.name)
-                return np.log(_padded(np.asarray(result), lead)[..., None] == np.arange(size)), None
+                return np.log(padded(np.asarray(result), lead)[..., None] == np.arange(size)), None
             bad = result.invalid if result.invalid is not None and result.invalid.any() else None
             if term.name in self.variables:
                 table = result.probs_table
                 assert table is not None
-                log = _padded(np.log(table), lead + 1)
-                bad = None if bad is None else _padded(bad, lead)[..., None]
+                log = padded(np.log(table), lead + 1)
+                bad = None if bad is None else padded(bad, lead)[..., None]
             else:
                 seen = placed.observed(term.name, 0)
                 assert seen is not None
                 value, mask = seen
                 log = self.model(term.kind, 0).log_density(term.name, result, value)
-                log = _padded(log, lead)
-                bad = None if bad is None else _padded(bad, lead)
+                log = padded(log, lead)
+                bad = None if bad is None else padded(bad, lead)
                 if not mask.all():
                     log = np.where(mask, log, 0.0)
                     bad = None if bad is None else bad & mask
@@ -348,11 +349,6 @@ def _stacked(parts: Sequence[Any]) -> Any:
     shape = np.broadcast_shapes(*(p.shape[1:] for p in known))
     blank = np.zeros((1, *shape), dtype=known[0].dtype)
     return np.concatenate([blank if p is None else np.broadcast_to(p, blank.shape) for p in parts])
-
-
-def _padded(array: np.ndarray, ndim: int) -> np.ndarray:
-    """With ones in front."""
-    return array.reshape((1,) * (ndim - array.ndim) + array.shape)
 
 
 def _all_static(slices: Slices, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

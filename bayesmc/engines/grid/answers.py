@@ -14,13 +14,14 @@ from bayesmc.engines.averages import called, over_line
 from bayesmc.engines.grid.moves import COUNTS
 from bayesmc.engines.grid.refined import Fine, cell_quantiles, quantiles, refined
 from bayesmc.engines.grid.slice import Placed, Scalar
-from bayesmc.engines.grid.sources import is_previous, previous
+from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label, Term, contract, dense
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.factors.named import Named, aligned, contract
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
+from bayesmc.shapes import padded
 
 Moments = tuple[np.ndarray, np.ndarray]
 
@@ -46,11 +47,11 @@ class Answers:
         before: Placed | None,
         now: Placed,
         probs: np.ndarray,
-        pair: Callable[[], list[Term]],
+        pair: Callable[[], list[Named]],
     ) -> None:
         self.model, self.before, self.now, self.pair = model, before, now, pair
         self.first = now.row.t == 0
-        self.own = Term((*now.labels, *model.apart), probs)
+        self.own = Named((*now.labels, *model.apart), probs)
         self.base = model.base(before, now)
 
     def table(self, name: str) -> np.ndarray:
@@ -109,31 +110,17 @@ class Answers:
         """
         node, model = self._node(name), self.model
         axes = model.axes.of[name]
-        cells = tuple(a.size for a in axes)
-        inner = [
-            1 if p in model.apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        out = np.full((*node.plate_shape, *cells), np.nan)
+        out = np.full((*node.plate_shape, *(a.size for a in axes)), np.nan)
         held = {s.label: s for s in self.now.scalars}
-        order = [model.apart.index(p) for p in node.plates if p in model.apart]
         events = math.prod(node.event_shape)
-        for number, plates in enumerate(np.ndindex(*inner)):
-            labels: list[Label] = [(name, number * events + k) for k in range(events)]
+        for number, at in enumerate(model.places(node)):
+            labels = [(name, number * events + k) for k in range(events)]
             if not all(label in held for label in labels):
                 continue
-            shape = (*cells, *model.lead)
-            table = dense(
-                contract([self.own], (*labels, *model.apart)), (*labels, *model.apart), shape
-            )
-            for k, label in enumerate(labels):
-                widths = held[label].widths
-                ones = (1,) * k, (1,) * (events - 1 - k)
-                table = table / widths.reshape(*ones[0], len(widths), *ones[1], *widths.shape[1:])
-            table = table.transpose(*(events + a for a in order), *range(events))
-            at = tuple(
-                slice(None) if p in model.apart else k
-                for p, k in zip(node.plates, plates, strict=True)
-            )
+            scope = (*model.apart_of(node), *labels)
+            table = aligned(contract([self.own], scope), scope)
+            for label in labels:
+                table = table / aligned(Named((label, *model.apart), held[label].widths), scope)
             out[at] = table
         seen = self.now.row.seen.get(name)
         if seen is not None and seen.mask is not None:
@@ -187,21 +174,13 @@ class Answers:
         if name not in model.axes.of or name in model.leaves or node.domain is not None:
             raise UnsupportedError(
                 f"quantile({name!r}): the node is not on the grid itself; ask of one that is (here "
-                f"{sorted({str(s.label[0]) for s in self.now.scalars})}), "  # type: ignore[index]
+                f"{sorted({s.label[0] for s in self.now.scalars})}), "
                 "or of the probability of an event, probability(function)"
             )
-        inner = [
-            1 if p in model.apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        order = [model.apart.index(p) for p in node.plates if p in model.apart]
         held = {s.label: s for s in self.now.scalars}
         events = list(np.ndindex(*node.event_shape))
         out = np.empty((*levels.shape, *node.value_shape))
-        for number, plates in enumerate(np.ndindex(*inner)):
-            at = tuple(
-                slice(None) if p in model.apart else k
-                for p, k in zip(node.plates, plates, strict=True)
-            )
+        for number, at in enumerate(model.places(node)):
             for k, event in enumerate(events):
                 scalar = held.get((name, number * len(events) + k))
                 if scalar is None:  # seen in all elements that are apart
@@ -214,9 +193,8 @@ class Answers:
                 else:
                     share = self._marginal({scalar.label}).reshape(scalar.size, *model.lead)
                     found = cell_quantiles(scalar.points, share, levels, node.is_discrete)
-                found = found.reshape((*levels.shape, *model.lead))
-                ranks = range(levels.ndim)
-                out[(..., *at, *event)] = found.transpose(*ranks, *(levels.ndim + a for a in order))
+                each = Named(model.apart, found.reshape((*levels.shape, *model.lead)))
+                out[(..., *at, *event)] = aligned(each, model.apart_of(node))
         return out
 
     # ---- private -------------------------------------------------------------------------------
@@ -248,7 +226,7 @@ class Answers:
         first, apart = self.model.slices.first, len(self.model.lead)
         widest = np.zeros(self.model.lead)
         for x in labels:
-            node = first[str(x[0]).removesuffix(PREVIOUS)]  # type: ignore[index]
+            node = first[x[0].removesuffix(PREVIOUS)]
             if node.domain is None and not node.is_discrete:
                 shares = self._marginal({x}).reshape(-1, *self.model.lead)
                 widest = np.maximum(widest, shares.max(axis=0))
@@ -269,11 +247,11 @@ class Answers:
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """The same on finer cells of the one number that is read; None where there is none, or several."""
         first = self.model.slices.first
-        numbers = [x for x in labels if first[str(x[0]).removesuffix(PREVIOUS)].domain is None]  # type: ignore[index]
+        numbers = [x for x in labels if first[x[0].removesuffix(PREVIOUS)].domain is None]
         fine = self._fine(numbers[0], labels) if len(numbers) == 1 else None
         if fine is None:
             return None
-        name, spot = str(numbers[0][0]), self._labels().index(numbers[0])  # type: ignore[index]
+        name, spot = numbers[0][0], self._labels().index(numbers[0])
         node, sizes = self._node(name), self._sizes()
         others = [sizes[x] if x in labels and x != numbers[0] else 1 for x in self._labels()]
         carried = {n for n in self.now.values if n not in self.model.own}
@@ -313,8 +291,8 @@ class Answers:
         if any(x not in held for x in labels) or label not in held:
             return None  # of the slice before, or seen
         scalar = held[label]
-        axes = self.model.axes.of[str(label[0])]  # type: ignore[index]
-        number = int(label[1])  # type: ignore[index]
+        axes = self.model.axes.of[label[0]]
+        number = label[1]
         if scalar.points.size != scalar.size:  # some elements are seen
             return None
         order = [x for x in self._labels() if x in labels]
@@ -384,22 +362,22 @@ class Answers:
                     found.add(labels[len(labels) - lead + k])
         return found
 
+    def _belief(self, used: set[Label]) -> Named:
+        """Probabilities over some axes and the plates apart."""
+        terms = self.pair() if any(map(is_previous, used)) else [self.own]
+        return contract(terms, (*(x for x in self._labels() if x in used), *self.model.apart))
+
     def _marginal(self, used: set[Label]) -> np.ndarray:
         """Probabilities over some axes, of size one along the others: shape ``(*batch, *apart)``."""
-        labels, sizes, apart = self._labels(), self._sizes(), self.model.apart
-        was = any(is_previous(x) for x in used)
-        terms = self.pair() if was else [self.own]
-        keep = (*[x for x in labels if x in used], *apart)
+        labels, sizes = self._labels(), self._sizes()
         shape = (*(sizes[x] if x in used else 1 for x in labels), *self.model.lead)
-        found = contract(terms, keep)
-        return np.array(dense(found, (*labels, *apart), shape))
+        return np.array(aligned(self._belief(used), (*labels, *self.model.apart), shape))
 
     def _average(self, node: CompiledNode, value: np.ndarray, more: int = 0) -> np.ndarray:
         """Expectation of values ``(*batch, *plates, *event)`` with ``more`` axes behind."""
         trailing = len(node.value_shape) + more
         value = np.asarray(value, dtype=float)
-        if value.ndim < trailing:
-            value = value.reshape((1,) * (trailing - value.ndim) + value.shape)
+        value = padded(value, trailing)
         lead = value.ndim - trailing
         full = (*node.value_shape, *value.shape[value.ndim - more :]) if more else node.value_shape
         used = self._used([(node, value, more)])
@@ -429,20 +407,12 @@ class Answers:
 
     def _aligned(self, used: set[Label], node: CompiledNode, tail: int) -> np.ndarray:
         """Probabilities with axes where a node's values have them."""
-        count, apart = self._batch, self.model.apart
-        weights = self._marginal(used)
-        order = [p for p in node.plates if p in apart]
-        rest = [p for p in apart if p not in order]
-        weights = weights.transpose(
-            *range(count), *(count + apart.index(p) for p in (*order, *rest))
-        )
         # a node outside the plates that are apart depends on no cell of theirs
-        for _ in rest:
-            weights = weights[..., 0]
-        shape = list(weights.shape[:count])
-        sizes = iter(weights.shape[count:])
-        shape += [next(sizes) if p in apart else 1 for p in node.plates]
-        return weights.reshape(shape + [1] * tail)
+        rest = tuple(p for p in self.model.apart if p not in node.plates)
+        weights = aligned(self._belief(used), (*self._labels(), *node.plates, *rest))
+        at: Any = (Ellipsis, *(0,) * len(rest))
+        weights = weights[at]
+        return weights.reshape(weights.shape + (1,) * tail)
 
     def _moments(self, node: CompiledNode, value: Any, var: Any) -> Moments:
         """Of values over the grid, or of distributions' means and variances; circular for angles."""

@@ -391,7 +391,7 @@ class _Search:
     def _shares(self, cells: Cells) -> np.ndarray | None:
         """Probabilities of the cells of the number, shape (n, *apart); zero where it is seen."""
         for k, scalar in enumerate(cells.placed.scalars):
-            if scalar.label[0] == self.name:  # type: ignore[index]
+            if scalar.label[0] == self.name:
                 others = tuple(j for j in range(len(cells.placed.scalars)) if j != k)
                 share = cells.probs.sum(axis=others)
                 return np.where(scalar.widths[-1] > 0, share, 0.0)

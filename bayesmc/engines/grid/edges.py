@@ -16,7 +16,7 @@ from bayesmc.dbn import Slices
 from bayesmc.distributions.support import Support
 from bayesmc.engines.grid.axes import Axes, Axis
 from bayesmc.engines.grid.slice import Placed, Scalar
-from bayesmc.engines.grid.terms import Label
+from bayesmc.engines.grid.sources import Label
 
 #: share of the turn that an axis on a circle may lack
 _TURN = 2 * np.pi * (1 - 1e-6)
@@ -69,7 +69,7 @@ class Edges:
                 if found is None or share.max() > found.share:
                     at = int(share.argmax())
                     points = np.broadcast_to(scalar.points, widths.shape)[end]
-                    found = Outer(_named(scalar)[0], float(points.flat[at]), float(share.flat[at]))
+                    found = Outer(scalar.label[0], float(points.flat[at]), float(share.flat[at]))
         return found
 
     def reached(self, positions: Mapping[Label, np.ndarray], now: Placed) -> Outer | None:
@@ -81,7 +81,7 @@ class Edges:
                 hit = (at == end % scalar.size) & (widths[-1] > 0)
                 if hit.any():
                     points = np.broadcast_to(scalar.points, widths.shape)[end]
-                    return Outer(_named(scalar)[0], float(points[hit].flat[0]), 1.0)
+                    return Outer(scalar.label[0], float(points[hit].flat[0]), 1.0)
         return None
 
     # ---- private -------------------------------------------------------------------------------
@@ -91,7 +91,7 @@ class Edges:
         first = now.row.t == 0
         key = (first, scalar.label)
         if key not in self._ends:
-            name, number = _named(scalar)
+            name, number = scalar.label
             node, axes = self.slices.model(now.row.t)[name], self.axes.of[name]
             component = number % len(axes)
             ends: tuple[int, ...] = ()
@@ -102,11 +102,6 @@ class Edges:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _named(scalar: Scalar) -> tuple[str, int]:
-    """Node of a scalar, and its number among the node's."""
-    return scalar.label  # type: ignore[return-value]
 
 
 def _open_ends(support: Support, component: int, axis: Axis) -> tuple[int, ...]:

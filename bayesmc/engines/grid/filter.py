@@ -11,19 +11,18 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
-from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
-from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
-from bayesmc.engines.grid.belief import GridBelief, Kept
+from bayesmc.engines.grid.belief import GridBelief
 from bayesmc.engines.grid.limits import too_large, unread, without_density
 from bayesmc.engines.grid.looked import draws_of
 from bayesmc.engines.grid.moves import Cells, GridMover
-from bayesmc.engines.grid.record import GridPosterior, GridRecord
-from bayesmc.engines.grid.search import GridSearch, known_static, quiet
-from bayesmc.engines.grid.slice import same_points
+from bayesmc.engines.grid.record import GridPosterior, GridRecord, answers_of
+from bayesmc.engines.grid.search import GridSearch, known_static
+from bayesmc.engines.grid.slice import quiet, same_points
+from bayesmc.engines.grid.sources import Label
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label
 from bayesmc.engines.particles.replicates import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
@@ -226,7 +225,7 @@ class GridFilter(FilterEngine):
                 "None, which keeps densities, too"
             )
         mover, kept = self._start(problem)
-        record = GridRecord(problem, mover.model, queries or {}, keep is None)
+        record = GridRecord(mover.model, problem.hidden, problem.steps, queries or {}, keep is None)
         looks = _looks(problem, mover)
         increments = np.empty((problem.steps, *mover.model.lead))
         before: Cells | None = None
@@ -237,10 +236,10 @@ class GridFilter(FilterEngine):
             looks.look(k, draws_of(mover.model, before), row)
             cells = kept[k] if kept else mover.move(before, row)
             increments[k] = cells.increment
-            record.add(k, _answers(mover, before, cells, cells.probs))
+            record.add(k, answers_of(mover, before, cells, cells.probs))
             before = cells
 
-        so_far = partial(record.posterior, self, "filter", increments)
+        so_far = partial(record.posterior, self, "filter", increments, problem)
         try:
             with Progress(problem.steps, self.label, progress) as bar, quiet():
                 pass_slices(problem.series.start, problem.steps, move, so_far, bar.advance)
@@ -260,7 +259,7 @@ class GridFilter(FilterEngine):
     ) -> GridPosterior:
         """Every slice given all rows by one pass forwards and one back, or ``lag`` back from every slice."""
         mover, kept = self._start(problem)
-        record = GridRecord(problem, mover.model, queries or {}, True)
+        record = GridRecord(mover.model, problem.hidden, problem.steps, queries or {}, True)
         looks = _looks(problem, mover)
         steps = problem.steps
         increments = np.empty((steps, *mover.model.lead))
@@ -282,7 +281,9 @@ class GridFilter(FilterEngine):
         with Progress(steps, self.label, progress) as bar, quiet():
             pass_slices(problem.series.start, steps, move, None, bar.advance)
             self._smoothed(mover, record, held, steps - 1, max(steps - 1 - reach, 0), steps - 1)
-        found = record.posterior(self, "smooth" if lag is None else "fixed-lag", increments)
+        found = record.posterior(
+            self, "smooth" if lag is None else "fixed-lag", increments, problem
+        )
         return self._judged(problem, found, looks)
 
     def most_likely(
@@ -312,7 +313,7 @@ class GridFilter(FilterEngine):
     # ---- one slice at a time ----------------------------------------------------------------
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
-        return GridBelief(dbn, static, quiet)
+        return GridBelief(dbn, static)
 
     def _bound(self, belief: GridBelief, dbn: DynamicBayesNet, slices: Slices) -> GridBelief:
         cells = belief.cells
@@ -326,13 +327,12 @@ class GridFilter(FilterEngine):
                 "started with"
             )
         return GridBelief(
-            dbn, belief.static, quiet, GridMover(model, self.tolerance), cells, belief.before,
+            dbn, belief.static, GridMover(model, self.tolerance), cells, belief.before,
             belief.log_marginal_likelihood, belief.inputs,
         )  # fmt: skip
 
     def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
         mover = belief.mover
-        assert not isinstance(mover, Kept)
         with quiet():
             if mover is None:
                 model = self.model_on_grid(slices, read_static(slices, belief.static))
@@ -340,7 +340,7 @@ class GridFilter(FilterEngine):
             cells = mover.move(belief.cells, row)
         total = belief.log_marginal_likelihood + cells.increment
         return GridBelief(
-            belief.dbn, belief.static, quiet, mover, cells, belief.cells,
+            belief.dbn, belief.static, mover, cells, belief.cells,
             total if np.ndim(total) else float(total),
             {n: row.inputs[n] for n in slices.template.inputs},
         )  # fmt: skip
@@ -398,7 +398,7 @@ class GridFilter(FilterEngine):
                 probs = mover.back(held[at], held[at + 1], probs)
             if t <= high:
                 before = held[at - 1] if t else None
-                record.add(t, _answers(mover, before, held[at], probs))
+                record.add(t, answers_of(mover, before, held[at], probs))
 
     def _check_held(self, each: int, slices: int, lag: int | None) -> None:
         """Refuse a pass back over more beliefs than fit."""
@@ -419,15 +419,6 @@ def _looks(problem: SeriesProblem, mover: GridMover) -> Replicates:
     """What holds rows against those that the grid expects; the same draws always, as of all it answers."""
     plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
     return Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK))
-
-
-def _answers(mover: GridMover, before: Cells | None, cells: Cells, probs: np.ndarray) -> Answers:
-    def pair() -> Any:
-        assert before is not None
-        return mover.pair(before, cells, probs)
-
-    placed = None if before is None else before.placed
-    return Answers(mover.model, placed, cells.placed, probs, pair)
 
 
 def _chosen(

@@ -154,7 +154,7 @@ class Landings:
 
     def _axis(self, placed: Placed) -> int | None:
         for k, scalar in enumerate(placed.scalars):
-            if scalar.label[0] == self.name:  # type: ignore[index]
+            if scalar.label[0] == self.name:
                 return k
         return None
 

@@ -7,18 +7,18 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.grid.search import quiet
-from bayesmc.engines.grid.sources import is_previous, previous
+from bayesmc.engines.grid.slice import quiet
+from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.grid.terms import Label, largest
 from bayesmc.errors import BayesmcError
+from bayesmc.factors.named import largest
 from bayesmc.network.reading import nodes_read
 
 
 def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str | None:
     """Why the tables do not fit, found from their sizes alone."""
     hidden = frozenset(n for n in problem.hidden if n in model.own and n not in model.leaves)
-    sizes: dict[Label, int] = dict(zip(model.apart, model.lead, strict=True))
+    sizes: dict[Any, int] = dict(zip(model.apart, model.lead, strict=True))
     labels: list[Label] = []
     for name in sorted(hidden):
         axes = model.axes.of[name]
@@ -39,7 +39,7 @@ def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str
                 return model.too_large(name, cells, 8 * math.prod(map(float, cells)))
             if any(map(is_previous, scope)):
                 scopes.append(scope)
-    belief = {previous(x) for x in labels} | set(model.apart)
+    belief: set[Any] = {previous(x) for x in labels} | set(model.apart)
     entries = largest([belief, *scopes], (*labels, *model.apart), sizes)
     if 8 * entries > max_bytes:
         names = ", ".join(sorted(hidden))

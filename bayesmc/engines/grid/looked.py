@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.engines.grid.moves import Cells
 from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel
@@ -36,13 +38,9 @@ def _positions(
     shape = cells.placed.shape
     if not shape:
         return ()
-    probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(np.prod(shape, dtype=int), -1)
-    found = np.empty((count, probs.shape[1]), dtype=np.intp)
-    for k, column in enumerate(probs.T):
-        sums = column.cumsum()
-        found[:, k] = sums.searchsorted(rng.random(count) * sums[-1], side="right")
-    flat = np.minimum(found, len(probs) - 1).reshape(count, *lead)
-    return tuple(np.unravel_index(flat, shape))
+    probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(math.prod(shape), -1)
+    flat = pick(probs, rng.random((probs.shape[1], count)).T)
+    return tuple(np.unravel_index(flat.reshape(count, *lead), shape))
 
 
 def _taken(model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]) -> np.ndarray:

@@ -16,19 +16,19 @@ import numpy as np
 from bayesmc.dbn import Row
 from bayesmc.engines.grid.edges import Edges
 from bayesmc.engines.grid.slice import Placed
-from bayesmc.engines.grid.sources import previous
+from bayesmc.engines.grid.sources import Label, previous
 from bayesmc.engines.grid.tables import Factor, GridModel
-from bayesmc.engines.grid.terms import (
+from bayesmc.errors import BudgetError, GridWarning, ZeroProbabilityError
+from bayesmc.factors.named import (
     Choice,
-    Label,
-    Labels,
-    Term,
+    Named,
+    Scope,
+    aligned,
     contract,
-    dense,
     largest,
     maximise,
+    sizes_of,
 )
-from bayesmc.errors import BudgetError, GridWarning, ZeroProbabilityError
 from bayesmc.shapes import Shape
 
 #: probability of bad parameters from which on they are the user's to hear of
@@ -89,12 +89,12 @@ class GridMover:
         now = model.place(row)
         factors = model.factors(before, now)
         self._refuse_invalid(cells, now, factors)
-        labels, shape = (*now.labels, *model.apart), (*now.shape, *model.lead)
+        labels, shape = (*now.labels, *model.apart), self._shape(now)
         predicted, rest = None, None
         prior, likelihood = self._local(factors, now, shape)
         if cells is not None:
             moved = contract(self._moving(cells, now, factors), labels)
-            predicted = dense(moved, labels, shape)
+            predicted = aligned(moved, labels, shape)
             rest = prior + likelihood
             prior = prior + np.log(predicted)
         mass = prior
@@ -119,50 +119,53 @@ class GridMover:
         """What a row makes of the cells of its slice, in logs; the most that the slice before allows."""
         now = self.model.place(row)
         factors = self.model.factors(None if cells is None else cells.placed, now)
-        return now, self._local(factors, now, (*now.shape, *self.model.lead))[1]
+        return now, self._local(factors, now, self._shape(now))[1]
 
     def back(self, cells: Cells, after: Cells, smoothed: np.ndarray) -> np.ndarray:
         """Smoothed probabilities of a slice, from those of the one after."""
         model, before = self.model, cells.placed
         labels = (*map(previous, before.labels), *model.apart)
         found = contract(self.pair(cells, after, smoothed), labels)
-        probs = dense(found, labels, (*before.shape, *model.lead))
+        probs = aligned(found, labels, (*before.shape, *model.lead))
         axes = tuple(range(len(before.scalars)))
         probs = probs / (probs.sum(axis=axes) if axes else 1.0)
         self._check_edges(probs, before)
         return probs
 
-    def pair(self, cells: Cells, after: Cells, smoothed: np.ndarray) -> list[Term]:
+    def pair(self, cells: Cells, after: Cells, smoothed: np.ndarray) -> list[Named]:
         """Terms whose product is the joint belief about a slice and the one after, whose belief is given."""
         assert after.predicted is not None
         now = after.placed
         factors = self.model.factors(cells.placed, now)
         some = after.predicted > 0
         ratio = np.divide(smoothed, after.predicted, out=np.zeros(some.shape), where=some)
-        return [*self._moving(cells, now, factors), Term((*now.labels, *self.model.apart), ratio)]
+        return [*self._moving(cells, now, factors), Named((*now.labels, *self.model.apart), ratio)]
 
     def best(self, rows: Sequence[Row], advance: Any) -> list[dict[Label, np.ndarray]]:
         """The most likely positions of all scalars, slice by slice: label -> positions, shape (*apart,)."""
         model, lead = self.model, self.model.lead
         elements = list(np.ndindex(*lead))
-        value: list[Term] = []
+        value: list[Named] = []
         history: list[list[list[Choice]]] = []
         placed: list[Placed] = []
         for row in rows:
             before = placed[-1] if placed else None
             now = model.place(row)
             terms = [f.table for f in model.factors(before, now)] + _closed(now, model.apart)
+            sizes = self._sizes(now) | sizes_of([*terms, *value])
             found = [
                 maximise(
                     [_at(t, model.apart, e) for t in terms] + ([value[k]] if value else []),
                     now.labels,
+                    sizes,
                 )
                 for k, e in enumerate(elements)
             ]
-            if any(not (f[0].table > -np.inf).any() for f in found):
+            if any(not (best > -np.inf).any() for best, _ in found):
                 raise self._impossible(row)
-            value = [_later(f[0], now) for f in found]
-            history.append([f[1] for f in found])
+            later = tuple(map(previous, now.labels))
+            value = [Named(later, best - best.max()) for best, _ in found]
+            history.append([choices for _, choices in found])
             placed.append(now)
             advance()
         path = _traced(value, history, placed, elements, lead)
@@ -171,15 +174,21 @@ class GridMover:
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _moving(self, cells: Cells, now: Placed, factors: Sequence[Factor]) -> list[Term]:
+    def _shape(self, now: Placed) -> Shape:
+        return (*now.shape, *self.model.lead)
+
+    def _sizes(self, now: Placed) -> dict[Any, int]:
+        return dict(zip((*now.labels, *self.model.apart), self._shape(now), strict=True))
+
+    def _moving(self, cells: Cells, now: Placed, factors: Sequence[Factor]) -> list[Named]:
         """The belief before and all densities that read it, scaled."""
         apart = self.model.apart
-        terms = [Term((*map(previous, cells.placed.labels), *apart), cells.probs)]
+        terms = [Named((*map(previous, cells.placed.labels), *apart), cells.probs)]
         terms += [f.table for f in factors if f.scale is not None]
-        sizes = {x: n for t in terms for x, n in zip(t.labels, t.table.shape, strict=True)}
-        entries = largest([set(t.labels) for t in terms], (*now.labels, *apart), sizes)
+        sizes = self._sizes(now) | sizes_of(terms)
+        entries = largest([t.scope for t in terms], (*now.labels, *apart), sizes)
         if entries * 8 > self.model.max_bytes:
-            names = ", ".join(sorted({str(s.label[0]) for s in now.scalars}))  # type: ignore[index]
+            names = ", ".join(sorted({s.label[0] for s in now.scalars}))
             raise BudgetError(
                 self.model.too_large(names, [s.size for s in now.scalars], entries * 8),
                 int(entries * 8),
@@ -196,10 +205,10 @@ class GridMover:
             axes = (scalar.label, *self.model.apart)
             full = (scalar.size, *self.model.lead)
             width = np.broadcast_to(np.log(scalar.widths), full)
-            prior += dense(Term(axes, width), labels, shape, full=False)
+            prior += aligned(Named(axes, width), labels)
         for factor in factors:
             log = factor.table if factor.scale is None else factor.scale
-            part = dense(log, labels, shape, full=False)
+            part = aligned(log, labels)
             if factor.hidden:
                 prior += part
             else:
@@ -210,10 +219,10 @@ class GridMover:
         self, cells: Cells, now: Placed, hidden: Sequence[Factor]
     ) -> np.ndarray:
         """Log masses that the slice before gives to cells, where what is seen reads it, too."""
-        labels, shape = (*now.labels, *self.model.apart), (*now.shape, *self.model.lead)
+        labels, shape = (*now.labels, *self.model.apart), self._shape(now)
         prior, _ = self._local(hidden, now, shape)
         moved = contract(self._moving(cells, now, hidden), labels)
-        return prior + np.log(dense(moved, labels, shape))
+        return prior + np.log(aligned(moved, labels, shape))
 
     def _check_mass(self, log_mass: np.ndarray, now: Placed) -> np.ndarray:
         """The mass on the grid, after a warning where some is missing."""
@@ -243,7 +252,7 @@ class GridMover:
         if "cells" in self.warned:
             return
         for k, scalar in enumerate(now.scalars):
-            name = scalar.label[0]  # type: ignore[index]
+            name = scalar.label[0]
             node = self.model.slices.first[name]
             if node.is_discrete or name in now.row.seen or scalar.size < 3:
                 continue
@@ -303,13 +312,13 @@ class GridMover:
             terms = [factor.invalid]
             if cells is not None:
                 terms += self._moving(cells, now, above)
-            shape = (*now.shape, *self.model.lead)
+            shape = self._shape(now)
             prior, _ = self._local(above, now, shape)
-            terms.append(Term((*now.labels, *self.model.apart), np.exp(prior)))
-            needed = {x for t in [f.table for f in above] + [factor.invalid] for x in t.labels}
+            terms.append(Named((*now.labels, *self.model.apart), np.exp(prior)))
+            needed = {x for t in [f.table for f in above] + [factor.invalid] for x in t.scope}
             spare = [s for s in now.scalars if s.label not in needed]
             size = float(np.prod([s.widths.sum(axis=0).max() for s in spare], initial=1.0))
-            mass = contract(terms, self.model.apart).table / size
+            mass = contract(terms, self.model.apart).values / size
             if np.any(mass > COUNTS):
                 assert factor.problem is not None
                 raise type(factor.problem)(
@@ -341,31 +350,25 @@ class GridMover:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _closed(now: Placed, apart: Labels) -> list[Term]:
+def _closed(now: Placed, apart: Scope) -> list[Named]:
     """Points that stand for nothing, as terms that rule them out."""
     with np.errstate(divide="ignore"):
         return [
-            Term((s.label, *apart), np.log(np.where(s.widths > 0, 1.0, 0.0)))
+            Named((s.label, *apart), np.log(np.where(s.widths > 0, 1.0, 0.0)))
             for s in now.scalars
             if s.widths.shape[1:] != (1,) * len(apart)
         ]
 
 
-def _at(term: Term, apart: Labels, element: tuple[int, ...]) -> Term:
+def _at(term: Named, apart: Scope, element: tuple[int, ...]) -> Named:
     """A term at one element of the plates that are apart."""
     at = dict(zip(apart, element, strict=True))
-    index = tuple(at.get(x, slice(None)) for x in term.labels)
-    return Term(tuple(x for x in term.labels if x not in at), term.table[index])
-
-
-def _later(value: Term, now: Placed) -> Term:
-    """Values of a slice as the next one reads them, all axes in place."""
-    table = dense(value, now.labels, now.shape)
-    return Term(tuple(map(previous, now.labels)), table - table.max())
+    index = tuple(at.get(x, slice(None)) for x in term.scope)
+    return Named(tuple(x for x in term.scope if x not in at), term.values[index])
 
 
 def _traced(
-    value: Sequence[Term],
+    value: Sequence[Named],
     history: Sequence[Sequence[Sequence[Choice]]],
     placed: Sequence[Placed],
     elements: Sequence[tuple[int, ...]],
@@ -374,8 +377,8 @@ def _traced(
     """Back along the best choices, for every element by itself."""
     found = [{s.label: np.zeros(lead, dtype=np.intp) for s in p.scalars} for p in placed]
     for k, element in enumerate(elements):
-        last = np.unravel_index(int(value[k].table.argmax()), placed[-1].shape)
-        at: Mapping[Label, int] = {
+        last = np.unravel_index(int(value[k].values.argmax()), placed[-1].shape)
+        at: dict[Any, int] = {
             s.label: int(i) for s, i in zip(placed[-1].scalars, last, strict=True)
         }
         for t in reversed(range(len(placed))):

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem
-from bayesmc.distributions.base import marking_invalid
+from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.averages import as_event, naming
-from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.exact.exact import readable_bytes
+from bayesmc.engines.filtering import Answers as Seen
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.grid.answers import Answers
+from bayesmc.engines.grid.moves import Cells, GridMover
+from bayesmc.engines.grid.slice import quiet
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model
@@ -25,35 +27,40 @@ class GridRecord:
 
     Parameters
     ----------
-    problem : SeriesProblem
     model : GridModel
+    names : sequence of str
+        Nodes that are answered for.
+    steps : int
     queries : dict
     densities : bool
         Keep the densities of all nodes with a grid, too.
     """
 
     def __init__(
-        self, problem: SeriesProblem, model: GridModel, queries: Queries, densities: bool
+        self,
+        model: GridModel,
+        names: Sequence[str],
+        steps: int,
+        queries: Queries,
+        densities: bool,
     ) -> None:
-        self.problem, self.model, self.asked = problem, model, queries
-        steps = problem.steps
+        self.model, self.steps, self.asked = model, steps, queries
         self.tables: dict[str, np.ndarray] = {}
         self.means: dict[str, np.ndarray] = {}
         self.variances: dict[str, np.ndarray] = {}
         self.densities: dict[str, np.ndarray] = {}
-        self.unanswered: set[str] = set()
         self.answers: dict[int, Answers] | None = {} if densities else None
         self.queries: dict[str, list[Any]] = {n: [None] * steps for n in queries}
         self.errors: dict[str, list[Any]] = {n: [None] * steps for n in queries}
-        for name in problem.hidden:
-            node = problem.model[name]
-            if _one_domain(problem, name):
+        for name in names:
+            node = model.slices.first[name]
+            if _one_domain(model.slices, name):
                 assert node.domain is not None
                 self.tables[name] = np.empty((steps, *node.plate_shape, node.domain.size))
                 continue
             self.means[name] = np.empty((steps, *node.value_shape))
             self.variances[name] = np.empty((steps, *node.value_shape))
-            if densities and node.is_stochastic and name not in model.leaves:
+            if densities and name in model.axes.of and name not in model.leaves:
                 cells = tuple(a.size for a in model.axes.of[name])
                 shape = (steps, *node.plate_shape, *cells)
                 _check_kept(name, shape, model.max_bytes)
@@ -61,6 +68,10 @@ class GridRecord:
 
     def add(self, k: int, answers: Answers) -> None:
         """Take in the k-th slice."""
+        with quiet():
+            self._add(k, answers)
+
+    def _add(self, k: int, answers: Answers) -> None:
         if self.answers is not None:
             self.answers[k] = answers
         for name, table in self.tables.items():
@@ -68,7 +79,6 @@ class GridRecord:
         for name in list(self.means):
             found = answers.moments(name)
             if found is None:
-                self.unanswered.add(name)
                 del self.means[name], self.variances[name]
                 continue
             self.means[name][k], self.variances[name][k] = found
@@ -79,30 +89,42 @@ class GridRecord:
                 self.queries[name][k], self.errors[name][k] = answers.expectation(function)
 
     def posterior(
-        self, engine: Any, kind: str, increments: np.ndarray, steps: int | None = None
+        self,
+        engine: Any,
+        kind: str,
+        increments: np.ndarray | None,
+        problem: SeriesProblem | None = None,
+        steps: int | None = None,
     ) -> GridPosterior:
-        """The answers of all slices, or of the first so many."""
-        k = self.problem.steps if steps is None else steps
-        seen = observed_answers(self.problem, k)
+        """The answers of all slices, or of the first so many, with what was seen of a problem's."""
+        k = self.steps if steps is None else steps
+        seen = Seen({}, {}, {}) if problem is None else observed_answers(problem, k)
         axes = self.model.axes.of
-        grids = {n: tuple(a.points for a in axes[n]) for n in self.densities}
         found = GridPosterior(
-            self.problem.model,
-            engine,
-            kind,
-            increments[:k],
-            grids,
+            self.model.slices.first, engine, kind, None if increments is None else increments[:k],
+            {n: tuple(a.points for a in axes[n]) for n in self.densities},
             first_slices(self.densities, k),
             tables={**seen.tables, **first_slices(self.tables, k)},
             means={**seen.means, **first_slices(self.means, k)},
             variances={**seen.variances, **first_slices(self.variances, k)},
             queries={n: np.stack(rows[:k]) for n, rows in self.queries.items()},
-            start=self.problem.series.start,
-        )
+            start=0 if problem is None else problem.series.start,
+        )  # fmt: skip
         found.queries_mcse = {n: np.stack(rows[:k]) for n, rows in self.errors.items()}
         if self.answers is not None:
             found.answers = [self.answers[t] for t in range(k)]
         return found
+
+
+def answers_of(mover: GridMover, before: Cells | None, cells: Cells, probs: np.ndarray) -> Answers:
+    """What a belief about a slice says, given cells of the slice before."""
+
+    def pair() -> Any:
+        assert before is not None
+        return mover.pair(before, cells, probs)
+
+    placed = None if before is None else before.placed
+    return Answers(mover.model, placed, cells.placed, probs, pair)
 
 
 class GridPosterior(SeriesPosterior):
@@ -168,7 +190,7 @@ class GridPosterior(SeriesPosterior):
                 f'{what}: beliefs were not kept, since a pickle carries none and keep="summaries" keeps '
                 "none; give queries= to the call"
             )
-        with marking_invalid(), np.errstate(all="ignore"):
+        with quiet():
             return np.stack([ask(one) for one in self.answers])
 
     def density(self, name: str) -> np.ndarray:
@@ -207,8 +229,8 @@ class GridPosterior(SeriesPosterior):
     def _kept(self, name: str, what: str, kept: dict[str, Any]) -> Any:
         if name not in kept:
             raise UnsupportedError(
-                f"{what}({name!r}): no density was kept of it; hidden nodes with a grid have one unless keep="
-                '"summaries" is given, finite ones have probabilities(name)'
+                f'{what}({name!r}): no density was kept of it; nodes with a grid have one unless keep="'
+                'summaries" is given, finite ones have probabilities(name), others are given one by grid='
             )
         return kept[name]
 
@@ -216,9 +238,9 @@ class GridPosterior(SeriesPosterior):
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _one_domain(problem: SeriesProblem, name: str) -> bool:
+def _one_domain(slices: Slices, name: str) -> bool:
     """Whether a node has the same finite set of states in all slices; a computed one may not."""
-    domains = [m[name].domain for m in (problem.slices.first, problem.slices.later)]
+    domains = [m[name].domain for m in (slices.first, slices.later)]
     states = [None if d is None else d.states for d in domains]
     return states[0] is not None and states[0] == states[1]
 

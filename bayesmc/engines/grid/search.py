@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
 from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.record import GridPosterior
+from bayesmc.engines.grid.slice import quiet
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
 
@@ -171,13 +170,6 @@ def _numbers(problem: SeriesProblem, model: GridModel) -> list[str]:
         for n in problem.hidden
         if n in model.own and n not in model.leaves and problem.model[n].domain is None
     ]
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Parameters out of range are marked, and floating-point warnings silent, while functions run."""
-    with marking_invalid(), np.errstate(all="ignore"):
-        yield
 
 
 def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.grid.axes import Axes
-from bayesmc.engines.grid.sources import GridStructure
-from bayesmc.engines.grid.terms import Label, Labels
+from bayesmc.engines.grid.sources import GridStructure, Label
 from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.factors.named import Named, aligned
 from bayesmc.network import CompiledNode
 from bayesmc.shapes import Shape
 
@@ -56,7 +58,7 @@ class Placed:
     values: Values
 
     @property
-    def labels(self) -> Labels:
+    def labels(self) -> tuple[Label, ...]:
         return tuple(s.label for s in self.scalars)
 
     @property
@@ -70,6 +72,13 @@ def same_points(one: Placed, other: Placed) -> bool:
         np.array_equal(a.points, b.points) and np.array_equal(a.widths, b.widths)
         for a, b in zip(one.scalars, other.scalars, strict=True)
     )
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Parameters out of range are marked, and floating-point warnings silent, while functions run."""
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield
 
 
 class GridSlices(GridStructure):
@@ -98,7 +107,7 @@ class GridSlices(GridStructure):
                 self.static[name] = slices.first.evaluate(name, self.static)[0]
         self._whole: set[tuple[bool, str]] = set()
         self._open: dict[tuple[bool, str], list[tuple[int, tuple[Any, ...], Any]]] = {}
-        self._spread: dict[tuple[bool, str, Labels], np.ndarray] = {}
+        self._spread: dict[tuple[bool, str, tuple[Label, ...]], np.ndarray] = {}
 
     def place(self, row: Row) -> Placed:
         """The scalars of a slice, and values that run over them.
@@ -171,16 +180,9 @@ class GridSlices(GridStructure):
         """Every element of a node: number, index, and its scalar, or its value where it is seen."""
         seen = row.seen.get(node.name)
         axes = self.axes.of[node.name]
-        inner = [
-            1 if p in self.apart else n for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
         events = math.prod(node.event_shape)
         number = 0
-        for plates in np.ndindex(*inner):
-            at = tuple(
-                slice(None) if p in self.apart else k
-                for p, k in zip(node.plates, plates, strict=True)
-            )
+        for at in self.places(node):
             mask = None if seen is None or seen.mask is None else self._turned(seen.mask[at], node)
             for k, event in enumerate(np.ndindex(*node.event_shape)):
                 axis = axes[k % events]
@@ -205,8 +207,7 @@ class GridSlices(GridStructure):
 
     def _turned(self, part: np.ndarray, node: CompiledNode) -> np.ndarray:
         """An array over a node's plates that are apart, with these in the common order."""
-        order = [p for p in node.plates if p in self.apart]
-        return np.asarray(part).transpose([order.index(p) for p in self.apart])
+        return aligned(Named(self.apart_of(node), np.asarray(part)), self.apart)
 
     def _filled(
         self,
@@ -215,8 +216,6 @@ class GridSlices(GridStructure):
         order: Mapping[Label, int],
     ) -> np.ndarray:
         """A hidden node's values along the batch axes of its scalars."""
-        order_here = [p for p in node.plates if p in self.apart]
-        back = [self.apart.index(p) for p in order_here]
         parts = []
         for _, index, found in mine:
             if isinstance(found, Scalar):
@@ -225,8 +224,7 @@ class GridSlices(GridStructure):
                 part = found.points.reshape(*lead, *found.points.shape[1:])
             else:
                 part = found.reshape((1,) * len(order) + found.shape)
-            count = len(order)
-            parts.append((index, part.transpose(*range(count), *(count + k for k in back))))
+            parts.append((index, aligned(Named(self.apart, part), self.apart_of(node))))
         shape = np.broadcast_shapes(*(part.shape for _, part in parts))
         batch, wide = shape[: len(order)], iter(shape[len(order) :])
         plates = [

@@ -6,14 +6,21 @@ No values and no tables: sizes of tables can be told from here before any is mad
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, Slices
-from bayesmc.engines.exact import readable_bytes
+from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.grid.axes import Axes
-from bayesmc.engines.grid.terms import Label
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import ModelError
+from bayesmc.network import CompiledNode
+
+#: node (with ``_prev`` in the slice after its own), number of a scalar among the node's
+Label = tuple[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +89,18 @@ class GridStructure:
         ]
         return math.prod(plates) * math.prod(node.event_shape)
 
+    def places(self, node: CompiledNode) -> Iterator[tuple[Any, ...]]:
+        """Where the elements of a node stand among its plates, those that are apart all at once."""
+        sizes = zip(node.plates, node.plate_shape, strict=True)
+        for at in np.ndindex(*(1 if p in self.apart else n for p, n in sizes)):
+            yield tuple(
+                slice(None) if p in self.apart else k for p, k in zip(node.plates, at, strict=True)
+            )
+
+    def apart_of(self, node: CompiledNode) -> tuple[str, ...]:
+        """The plates of a node that are apart."""
+        return tuple(p for p in node.plates if p in self.apart)
+
     def too_large(self, name: str, sizes: list[int], count: float) -> str:
         """What to say of a table that does not fit."""
         cells = " x ".join(map(str, sizes))
@@ -137,12 +156,11 @@ class GridStructure:
 
 def is_previous(label: Label) -> bool:
     """Whether an axis is one of the slice before."""
-    return isinstance(label, tuple) and label[0].endswith(PREVIOUS)
+    return label[0].endswith(PREVIOUS)
 
 
 def previous(label: Label) -> Label:
     """What a scalar's axis is called in the slice after."""
-    assert isinstance(label, tuple)
     return (label[0] + PREVIOUS, label[1])
 
 

@@ -16,10 +16,11 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Slices
 from bayesmc.engines.grid.axes import Axes
 from bayesmc.engines.grid.slice import GridSlices, Placed, Values
-from bayesmc.engines.grid.sources import is_previous, previous
-from bayesmc.engines.grid.terms import Label, Labels, Term, term_of
+from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.errors import BudgetError, ParameterError
+from bayesmc.factors.named import Named, aligned, without_ones
 from bayesmc.network import CompiledNode
+from bayesmc.shapes import padded
 
 #: entries that are evaluated at once: their temporaries stay in cache
 BLOCK = 1 << 16
@@ -31,21 +32,21 @@ class Factor:
 
     Attributes
     ----------
-    table : Term
+    table : Named
         Log densities; with a ``scale`` densities over the largest that the slice before can give.
     hidden : bool
         Whether it is the density of what is hidden (and adds up to one), not a likelihood.
-    scale : Term or None
+    scale : Named or None
         Logs of those largest densities, over axes of this slice.
-    invalid : Term or None
+    invalid : Named or None
         Configurations with bad parameters, as ones; ``problem`` says what is wrong.
     """
 
     name: str
-    table: Term
+    table: Named
     hidden: bool
-    scale: Term | None = None
-    invalid: Term | None = None
+    scale: Named | None = None
+    invalid: Named | None = None
     problem: ParameterError | None = None
 
 
@@ -126,13 +127,13 @@ class GridModel(GridSlices):
             found = self._in_blocks(
                 before, name, base, mask, labels, was, label, sizes[label], step
             )
-        scale = None if found.scale is None else term_of(found.scale, names)
-        bad = None if found.invalid is None else term_of(found.invalid.astype(float), names)
-        return Factor(name, term_of(found.table, names), hidden, scale, bad, found.problem)
+        scale = None if found.scale is None else without_ones(found.scale, names)
+        bad = None if found.invalid is None else without_ones(found.invalid.astype(float), names)
+        return Factor(name, without_ones(found.table, names), hidden, scale, bad, found.problem)
 
     def _in_blocks(
         self, before: Placed | None, name: str, base: Values, mask: np.ndarray | None,
-        labels: Labels, was: tuple[int, ...], label: Label, n: int, step: int,
+        labels: tuple[Label, ...], was: tuple[int, ...], label: Label, n: int, step: int,
     ) -> Block:  # fmt: skip
         """A large table, block by block along one axis."""
         axis = labels.index(label)
@@ -207,8 +208,7 @@ class GridModel(GridSlices):
         """Log densities summed over plates whose elements meet, shape ``(*batch, *apart)``."""
         if mask is not None:
             log = np.where(mask, log, 0.0)
-        full = count + len(node.plates)
-        log = log.reshape((1,) * (full - log.ndim) + log.shape)
+        log = padded(log, count + len(node.plates))
         kept: list[str] = []
         for k in reversed(range(len(node.plates))):
             axis, n = count + k, node.plate_shape[k]
@@ -218,15 +218,13 @@ class GridModel(GridSlices):
                 log = log.sum(axis=axis)
             else:
                 log = log.take(0, axis=axis) * n
-        if self.apart:
-            log = log.transpose(*range(count), *(count + kept.index(p) for p in self.apart))
-        return log
+        return aligned(Named(tuple(kept), log), self.apart)
 
     def _reach(self, first: bool, name: str, before: Placed | None, now: Placed) -> set[Label]:
-        hidden = {s.label[0] for s in now.scalars}  # type: ignore[index]
+        hidden = {s.label[0] for s in now.scalars}
         found = {x for x in self.scope(first, name, frozenset(hidden)) if x in set(now.labels)}
         if before is not None:
-            was = frozenset(s.label[0] for s in before.scalars)  # type: ignore[index]
+            was = frozenset(s.label[0] for s in before.scalars)
             held = {previous(x) for x in before.labels}
             found |= {x for x in self.scope(first, name, was) if x in held}
         return found
@@ -250,7 +248,7 @@ class Block(NamedTuple):
     problem: ParameterError | None
 
 
-def _both(before: Placed | None, now: Placed) -> Labels:
+def _both(before: Placed | None, now: Placed) -> tuple[Label, ...]:
     was = () if before is None else tuple(previous(x) for x in before.labels)
     return (*was, *now.labels)
 

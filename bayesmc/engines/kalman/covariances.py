@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import Conditioned, condition
+from bayesmc.linalg.square_root import Conditioned, condition
 
 _EPS = float(np.finfo(float).eps)
 #: roots among which one that repeats is looked for

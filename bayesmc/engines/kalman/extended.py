@@ -29,10 +29,10 @@ class ExtendedKalmanFilter(NonlinearFilter):
     them. What is computed from hidden nodes and takes no continuous values (truth values, whole numbers,
     states) is not answered for; functions of the same slice read it as it is.
 
-    Derivatives are followed through the declared functions (forward mode), to rounding; central differences,
-    all in one call, where a function cannot be followed (``vectorize=True``, SciPy functions that are no
-    ufuncs, ...) or has a kink just there. Where functions are affine the results are those of
-    ``KalmanFilter``.
+    Derivatives are those of the declared functions' expressions (forward mode), to rounding; at a kink they
+    are the mean of both sides. Central differences, all in one call, where a function cannot be followed
+    (``vectorize=True``, SciPy functions that are no ufuncs, ...) or jumps just there. Where functions are
+    affine the results are those of ``KalmanFilter``.
 
     Notes
     -----
@@ -65,12 +65,11 @@ class ExtendedKalmanFilter(NonlinearFilter):
 
     def made_linear(self, level: Level, mean: np.ndarray, rows: np.ndarray) -> Made:
         """Derivatives at the mean."""
-        slopes = None
-        if not level.part.opaque:
-            found, moments = level(mean[None])
-            slopes = level.slopes(mean, found[0])
+        slopes = level.slopes(mean)
         if slopes is None:
             found, moments, slopes = self._differences(level, mean)
+        else:
+            found, moments = level(mean[None])
         scales = [None if m.scale is None else m.scale[0] for m in moments]
         return Made(found[0], slopes @ rows, level.noise(scales))
 

@@ -20,7 +20,7 @@ from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_
 from bayesmc.engines.kalman.rows import Expected, Memory, contradicts, impossible_row
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
-from bayesmc.kernels.kalman import multiplied
+from bayesmc.linalg.square_root import multiplied
 
 
 @dataclass(frozen=True)

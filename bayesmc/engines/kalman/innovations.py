@@ -10,7 +10,7 @@ from scipy import special
 
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import multiplied
+from bayesmc.linalg.square_root import multiplied
 from bayesmc.results.predictive import Predictive
 
 

@@ -9,7 +9,7 @@ Kalman filter has them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -17,15 +17,11 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.kalman.data import Pattern
+from bayesmc.engines.kalman.followed import Followed
 from bayesmc.engines.kalman.passes import State
 from bayesmc.engines.kalman.reading import is_affine, typical_sizes
 from bayesmc.engines.kalman.slices import Layout, Moments, covariance_root, put_noise
-from bayesmc.engines.kalman.slopes import mean_slopes
-from bayesmc.errors import BayesmcError
-from bayesmc.tracing import Dual, NoTangent
-
-#: relative difference that rounding may explain between a function followed and called
-_SAME = 1e-9
+from bayesmc.errors import BayesmcError, TraceError
 
 
 class Made(NamedTuple):
@@ -114,8 +110,8 @@ class Part(NamedTuple):
         Which of the numbers read are.
     affine : bool
         Whether all nodes are proved affine in what they read.
-    opaque : dict
-        Why derivatives cannot be followed through these nodes, as soon as that is known.
+    followed : Followed or None
+        All of them as programs; None where a function cannot be followed.
     """
 
     nodes: tuple[str, ...]
@@ -127,7 +123,7 @@ class Part(NamedTuple):
     turns: np.ndarray | None
     read_turns: np.ndarray | None
     affine: bool
-    opaque: dict[str, str]
+    followed: Followed | None
 
 
 class Plan:
@@ -184,8 +180,15 @@ class Plan:
             tuple(nodes), order, columns,
             np.concatenate([empty, *reads]).astype(np.intp), np.concatenate(places),
             np.concatenate([empty, *sizes]), _some(turns), _some(angles),
-            all(is_affine(layout, n, self.values) for n in nodes), {},
+            all(is_affine(layout, n, self.values) for n in nodes), self._followed(nodes, columns),
         )  # fmt: skip
+
+    def _followed(self, nodes: list[str], columns: Iterable[str]) -> Followed | None:
+        known = (*self.values, *self.layout.computed)
+        try:
+            return Followed(self.layout.model, nodes, columns, known)
+        except TraceError:
+            return None
 
     def _between(self, nodes: list[str]) -> set[str]:
         """Deterministic unknown nodes above some nodes."""
@@ -214,6 +217,10 @@ class Level:
         for name, place in part.columns.items():
             values[name] = layout.unpacked(layout.model[name], points[..., place])
         batch = points.shape[:1]
+        if part.followed is not None:
+            results = zip(part.followed.nodes, part.followed(values), strict=True)
+            ordered = [layout.moments_of(node, result, batch) for node, result in results]
+            return np.concatenate([m.mean for m in ordered], axis=-1), ordered
         found = {}
         for name in part.order:
             if name in layout.silent:
@@ -227,15 +234,13 @@ class Level:
         ordered = [found[n] for n in part.nodes]
         return np.concatenate([m.mean for m in ordered], axis=-1), ordered
 
-    def slopes(self, mean: np.ndarray, expected: np.ndarray) -> np.ndarray | None:
-        """Derivatives of the means, followed through the functions, or None.
+    def slopes(self, mean: np.ndarray) -> np.ndarray | None:
+        """Derivatives of the means.
 
         Parameters
         ----------
         mean : ndarray, shape (*lead, c)
             Where they are wanted.
-        expected : ndarray, shape (*lead, e)
-            What the means are there.
 
         Returns
         -------
@@ -244,22 +249,21 @@ class Level:
         """
         layout, part = self.layout, self.part
         if not part.columns:
-            return np.zeros((*expected.shape, 0))
-        if part.opaque:
+            return np.zeros((*layout.lead, len(part.places), 0))
+        if part.followed is None:
             return None
-        try:
-            found = mean_slopes(layout.model, part.order, {**self.known, **self._seeds(mean)})
-        except NoTangent as reason:
-            if reason.always:
-                part.opaque["why"] = str(reason)
+        points, c = self._wrapped(mean), mean.shape[-1]
+        unit = np.broadcast_to(np.eye(c).reshape(c, *(1,) * len(layout.lead), c), (c, *mean.shape))
+        values, moves = dict(self.known), {}
+        for name, place in part.columns.items():
+            node = layout.model[name]
+            values[name] = layout.unpacked(node, points[..., place])
+            moves[name] = layout.unpacked(node, unit[..., place])
+        found = part.followed.slopes(values, moves)
+        if found is None:
             return None
-        nodes = [(layout.model[n], found[n]) for n in part.nodes]
-        value = np.concatenate([layout.packed(n, d.value) for n, d in nodes], axis=-1)
-        if not (np.abs(self.off(value, expected)) <= _SAME * (1 + np.abs(expected))).all():
-            part.opaque["why"] = "a function or a family gives other values when it is followed"
-            return None
-        moved = [layout.packed(n, np.moveaxis(d.tangent, -1, 0)) for n, d in nodes]
-        slopes = np.moveaxis(np.concatenate(moved, axis=-1), 0, -1)
+        packed = [layout.packed(n, s) for n, s in zip(part.followed.nodes, found, strict=True)]
+        slopes = np.moveaxis(np.concatenate(packed, axis=-1), 0, -1)
         return slopes if np.isfinite(slopes).all() else None
 
     def off(self, found: np.ndarray, centre: np.ndarray) -> np.ndarray:
@@ -286,17 +290,6 @@ class Level:
         """Numbers as functions read them: angles in [-pi, pi)."""
         turns = self.part.read_turns
         return points if turns is None else np.where(turns, wrap_angle(points), points)
-
-    def _seeds(self, mean: np.ndarray) -> dict[str, Dual]:
-        """What is read, with a direction for each number; plates apart move together."""
-        layout, c = self.layout, mean.shape[-1]
-        points, found = self._wrapped(mean), {}
-        unit = np.broadcast_to(np.eye(c).reshape(c, *(1,) * len(layout.lead), c), (c, *mean.shape))
-        for name, place in self.part.columns.items():
-            node = layout.model[name]
-            tangent = np.moveaxis(layout.unpacked(node, unit[..., place]), 0, -1)
-            found[name] = Dual(layout.unpacked(node, points[..., place]), tangent)
-        return found
 
 
 def why_not_matched(layout: Layout) -> str | None:

@@ -26,7 +26,7 @@ from bayesmc.engines.kalman.covariances import (
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import Conditioned, log_densities, multiplied, standardised, went_in
+from bayesmc.linalg.square_root import Conditioned, log_densities, multiplied, standardised, went_in
 
 #: slices of one kind on end from which on they share their matrices
 _RUN = 64

@@ -20,7 +20,7 @@ from bayesmc.engines.kalman.posterior import GaussianSeries
 from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
-from bayesmc.kernels.kalman import multiplied, turned
+from bayesmc.linalg.square_root import multiplied, turned
 
 
 class NonlinearFilter(GaussianFilter):

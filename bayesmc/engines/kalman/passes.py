@@ -1,7 +1,7 @@
 """Forward and backward over the slices of a series, whose coefficients are known beforehand.
 
 Covariances do not depend on the data, so they come first (``covariances``), and means follow (``means``). How
-one slice is conditioned is in ``kernels.kalman``.
+one slice is conditioned is in ``linalg.square_root``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.means import all_means
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.kernels.kalman import multiplied, turned
+from bayesmc.linalg.square_root import multiplied, turned
 
 
 class State(NamedTuple):

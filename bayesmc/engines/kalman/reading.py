@@ -1,34 +1,24 @@
-"""A template as matrices: whether its slices are linear-Gaussian, proved by tracing, and their coefficients.
+"""A template as matrices: whether its slices are linear-Gaussian, and their coefficients.
 
-That a mean is affine and a scale constant is proved by calling the functions with stand-ins, once for
-slice 0 and once for a later slice. The coefficients come from the functions themselves, at a base point, one
-step away along every direction, and at two more points that must agree; for all slices in one call where
-functions read the index of the slice, inputs or observed nodes, and once where they do not.
+Both are read off the expressions of the declared functions, for all slices at once. Functions that can be
+followed only where the index of the slice, inputs or observed nodes are known are read slice by slice.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import nullcontext
-from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME
-from bayesmc.distributions import Normal
 from bayesmc.engines.filtering import in_slice
-from bayesmc.engines.kalman.slices import Layout, Moments, put_noise
+from bayesmc.engines.kalman.slices import Layout, put_noise
 from bayesmc.errors import ModelError, ParameterError, UnsupportedError
-from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.node import Declaration
-from bayesmc.structure.affine import affine_nodes, why_not_linear
+from bayesmc.structure.affine import Gains, LinearNode, NotLinearError, linear_node
 
-_EPS = float(np.finfo(float).eps)
-_CHECKS = 2
-#: relative error of a prediction from the coefficients that rounding may explain
-_TOLERANCE = 1e-8
-#: numbers that one call of a function may make
+#: numbers of coefficients that are worked out at once
 _ENTRIES = 1 << 21
 
 
@@ -64,15 +54,26 @@ def why_not_gaussian(layout: Layout, values: Mapping[str, np.ndarray]) -> str | 
             return f"node {name!r} is hidden and discrete"
     for name in layout.silent:
         return f"node {name!r} is computed from hidden nodes and takes no continuous values"
-    return why_not_linear(*_posed(layout, layout.order, values))
+    for name in layout.placed:
+        node = layout.model[name]
+        try:
+            if node.is_stochastic and (node.is_discrete or node.domain is not None):
+                return f"node {name!r} is discrete and depends on continuous nodes that are hidden"
+            if node.is_stochastic and len(node.event_shape) > 1:
+                return f"node {name!r} is a matrix of shape {node.event_shape}"
+            _linear(layout, name, values)
+        except NotLinearError as error:
+            return f"node {name!r} {error}"
+    return None
 
 
 def is_affine(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> bool:
-    """Whether a node by itself is proved linear-Gaussian in unknown ones, or affine if deterministic."""
-    posed = _posed(layout, [name], values)
-    if layout.model[name].is_stochastic:
-        return why_not_linear(*posed) is None
-    return name in affine_nodes(*posed)
+    """Whether a node by itself is linear-Gaussian in unknown ones, or affine if deterministic."""
+    try:
+        _linear(layout, name, values)
+    except NotLinearError:
+        return False
+    return True
 
 
 def read_linear(layout: Layout, values: Mapping[str, np.ndarray], count: int) -> Linear:
@@ -88,7 +89,7 @@ def read_linear(layout: Layout, values: Mapping[str, np.ndarray], count: int) ->
     Raises
     ------
     UnsupportedError
-        A mean is not affine, or a scale not constant, in some slice after all.
+        Some slice is not linear-Gaussian after all.
     ParameterError
     """
     static = layout.slices.template.static
@@ -98,71 +99,15 @@ def read_linear(layout: Layout, values: Mapping[str, np.ndarray], count: int) ->
         return _collapsed(
             layout, _composed(layout, fixed | {n: v[0] for n, v in timed.items()}, ())
         )
-    stacked = {n: v[:, None] for n, v in timed.items()}
-    size = (3 + layout.n_prev + layout.n) * max(layout.n + layout.p, 1) * max(
+    size = (layout.n_prev + layout.n) * max(layout.n + layout.p, 1) * max(
         int(np.prod(layout.lead)), 1
     )  # fmt: skip
-    step = max(1, _ENTRIES // size)
+    step = max(1, _ENTRIES // max(size, 1))
     parts = []
     for low in range(0, count, step):
-        high = min(low + step, count)
-        part = {n: v[low:high] for n, v in stacked.items()}
-        parts.append(_together(layout, fixed, part, high - low))
+        part = {n: v[low : low + step] for n, v in timed.items()}
+        parts.append(_together(layout, fixed, part, min(step, count - low)))
     return _collapsed(layout, Linear(*(np.concatenate(p) for p in zip(*parts, strict=True))))
-
-
-# ---- proving ------------------------------------------------------------------------------------
-
-
-def _posed(
-    layout: Layout, names: Sequence[str], values: Mapping[str, np.ndarray]
-) -> tuple[Model, dict[str, Observed], dict[str, np.ndarray]]:
-    """A question about some nodes, as tracing of static nets takes it."""
-    model = _traceable(layout, names)
-    fixed = {n for n in model.nodes if model[n].kind in ("input", "fixed")}
-    observed = {
-        n: Observed(np.asarray(v)) for n, v in values.items() if n in model.nodes and n not in fixed
-        and model[n].is_stochastic
-    }  # fmt: skip
-    return model, observed, {n: np.asarray(v) for n, v in values.items() if n in fixed}
-
-
-def _traceable(layout: Layout, names: Sequence[str]) -> Model:
-    """Some nodes' model, in which unknown numbers above them are free and what they do not need is out."""
-    model, nodes = layout.model, {}
-    before = {n + PREVIOUS for n in layout.before} | (set(layout.drawn) - set(names))
-    wanted = _above(model, names, before)
-    for name, node in model.nodes.items():
-        if name in before or (name in wanted and name.endswith(PREVIOUS) and node.is_stochastic):
-            nodes[name] = _free(node)
-        elif name in wanted:
-            nodes[name] = node
-    return replace(model, nodes=nodes, potentials={}, cache={})
-
-
-def _above(model: Model, names: Iterable[str], stop: Iterable[str]) -> set[str]:
-    """Nodes, and those that their functions read, up to ``stop``."""
-    found: set[str] = set()
-    todo, stop = list(names), set(stop)
-    while todo:
-        name = todo.pop()
-        if name in found or name in stop:
-            continue
-        found.add(name)
-        if not (name.endswith(PREVIOUS) and model[name].is_stochastic):
-            todo += model[name].parents
-    return found
-
-
-def _free(node: CompiledNode) -> CompiledNode:
-    """The same values with nothing known of them."""
-    declaration = Declaration(
-        node.name, "function", (), node.plates, function=lambda: Normal(0.0, 1.0)
-    )
-    return CompiledNode(declaration, (), node.plate_shape, node.event_shape)
-
-
-# ---- reading ------------------------------------------------------------------------------------
 
 
 def reads_time(layout: Layout) -> bool:
@@ -178,152 +123,6 @@ def reads_time(layout: Layout) -> bool:
     return False
 
 
-def _together(
-    layout: Layout, fixed: dict[str, np.ndarray], timed: dict[str, np.ndarray], count: int
-) -> Linear:
-    """Slices in one call each of their functions, or one by one where these do not take arrays of slices."""
-
-    def one(k: int) -> Linear:
-        with in_slice(int(timed[TIME][k, 0])) if TIME in timed else nullcontext():
-            return _composed(layout, fixed | {n: v[k, 0] for n, v in timed.items()}, ())
-
-    if count > 1:
-        try:
-            found = _composed(layout, fixed | timed, (count,))
-        except (ModelError, ParameterError):  # one by one they say in which slice it is
-            found = None
-        if found is not None and all(_same(found, k, one(k)) for k in {0, count // 2, count - 1}):
-            return found
-    parts = [one(k) for k in range(count)]
-    return Linear(*(np.concatenate(p) for p in zip(*parts, strict=True)))
-
-
-def _same(found: Linear, k: int, single: Linear) -> bool:
-    """Whether slice k came out as it does by itself."""
-    return all(
-        np.allclose(a[k], b[0], rtol=1e-9, atol=1e-12 * (1 + np.abs(b[0]).max(initial=0.0)))
-        for a, b in zip(found, single, strict=True)
-    )
-
-
-def _composed(layout: Layout, known: Mapping[str, np.ndarray], batch: tuple[int, ...]) -> Linear:
-    """Matrices of ``count`` slices (``batch`` is ``(count,)``, or ``()`` for one by itself)."""
-    lead, n, total = layout.lead, layout.n_prev, layout.p + layout.n
-    columns = _Columns(layout)
-    shape = (*(batch or (1,)), *lead)
-    offset = np.zeros((*shape, total))
-    rows = np.zeros((*shape, total, n + _noises(layout)))
-    spent = n
-    for name, place, found in _read(layout, known, batch, columns):
-        mean, scale = found
-        base, matrix = columns.coefficients(name, mean, scale, len(batch))
-        own = slice(spent, spent + base.shape[-1])
-        offset[..., place] = base
-        rows[..., place, :n] = matrix[..., :n]
-        if columns.drawn.size:
-            within, at = matrix[..., n:], layout.p + columns.drawn
-            offset[..., place] += np.matvec(within, offset[..., at])
-            rows[..., place, :] += within @ rows[..., at, :]
-        if scale is not None:
-            put_noise(rows[..., place, own], np.asarray(columns.base(scale, mean, len(batch))))
-            spent = own.stop
-    return Linear(offset, rows[..., :n], rows[..., n:])
-
-
-def _noises(layout: Layout) -> int:
-    """Independent sources of chance in a slice."""
-    return layout.p + sum(layout.size(n) for n in layout.drawn)
-
-
-def _read(
-    layout: Layout, known: Mapping[str, np.ndarray], batch: tuple[int, ...], columns: _Columns
-) -> Iterator[tuple[str, slice, Moments]]:
-    """Means and scales of the nodes of a slice at all points, parents first."""
-    values = {**known, **columns.values()}
-    full = (*batch, columns.count)
-    for name in layout.order:
-        if name in layout.certain:
-            continue
-        if name in layout.computed:
-            values[name] = layout.model.evaluate(name, values)[0]
-            continue
-        found = layout.moments(name, values, full)
-        if name in layout.seen:
-            yield name, layout.seen[name], found
-            continue
-        place = layout.rows[name]
-        yield name, slice(layout.p + place.start, layout.p + place.stop), found
-        if not layout.model[name].is_stochastic:
-            values[name] = layout.unpacked(layout.model[name], found.mean)
-
-
-class _Columns:
-    """The points at which functions are read: a base, a step along every unknown number, two to check."""
-
-    def __init__(self, layout: Layout) -> None:
-        self.layout = layout
-        drawn = [np.arange(p.start, p.stop) for n, p in layout.rows.items() if n in layout.drawn]
-        #: places of the numbers with a density among the unknown ones
-        self.drawn = np.concatenate([np.zeros(0, dtype=np.intp), *drawn])
-        self.steps = np.concatenate([np.zeros(0), *self._typical()])
-        width = len(self.steps)
-        self.count = 1 + width + _CHECKS
-        turns = np.round(256 * np.sin(1.0 + np.arange(_CHECKS * width))) / 128
-        signs = (-1.0) ** np.arange(_CHECKS)[:, None]
-        self.moved = np.abs(turns.reshape(_CHECKS, width)) * self.steps * signs
-        self.points = np.concatenate([np.zeros((1, width)), np.diag(self.steps), self.moved])
-
-    def values(self) -> dict[str, np.ndarray]:
-        """Stored values of the unknown nodes at all points."""
-        layout, found = self.layout, {}
-        names = [(n, n + PREVIOUS) for n in layout.prev] + [
-            (n, n) for n in layout.rows if n in layout.drawn
-        ]
-        at = 0
-        for name, called in names:
-            size = layout.size(name)
-            lead = (self.count,) + (1,) * len(layout.lead) + (size,)
-            value = self.points[:, at : at + size].reshape(lead)
-            value = np.broadcast_to(value, (self.count, *layout.lead, size))
-            found[called] = layout.unpacked(layout.slices.first[name], value)
-            at += size
-        return found
-
-    def base(self, array: np.ndarray, mean: np.ndarray, axis: int) -> np.ndarray:
-        """What a function gives at the base point, an axis for time in front."""
-        first = array[(slice(None),) * axis + (0,)]
-        return first if axis else first[None]
-
-    def coefficients(
-        self, name: str, mean: np.ndarray, scale: np.ndarray | None, axis: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Offset and matrix of a node's mean, checked at the other points."""
-        width = len(self.steps)
-        points = np.moveaxis(mean if axis else mean[None], 1, -1)  # (time, *lead, e, points)
-        base = points[..., 0]
-        matrix = (points[..., 1 : 1 + width] - points[..., :1]) / self.steps
-        if len(matrix) > 1:  # offsets that vary with time leave their rounding in what does not
-            slack = 8 * _EPS * np.abs(points).max(axis=-1, keepdims=True) / self.steps
-            same = (np.abs(matrix - matrix[:1]) <= slack).all(axis=0)
-            matrix = np.where(same, matrix[:1], matrix)
-        size = np.abs(base)[..., None] + np.abs(matrix) @ np.abs(self.moved).T
-        wrong = np.abs(points[..., 1 + width :] - (base[..., None] + matrix @ self.moved.T))
-        noise = 0.0 if scale is None else np.abs(scale).max(initial=0.0)
-        if not (wrong <= _TOLERANCE * (size + noise)).all():
-            raise UnsupportedError(f"node {name!r} has a mean that is not affine in what is hidden")
-        if scale is not None:
-            first = np.expand_dims(np.take(scale, 0, axis=axis), axis)
-            if not (np.abs(scale - first) <= _TOLERANCE * np.abs(first).max(initial=0.0)).all():
-                raise UnsupportedError(f"node {name!r} has a scale that depends on what is hidden")
-        return base, matrix
-
-    def _typical(self) -> list[np.ndarray]:
-        """Powers of two near the size of each number's values, so that steps of them lose no digits."""
-        layout = self.layout
-        names = [*layout.prev, *(n for n in layout.rows if n in layout.drawn)]
-        return [typical_sizes(layout, n) for n in names]
-
-
 def typical_sizes(layout: Layout, name: str) -> np.ndarray:
     """A power of two near the size of each number of a node."""
     node = layout.slices.first[name]
@@ -332,6 +131,104 @@ def typical_sizes(layout: Layout, name: str) -> np.ndarray:
     sizes = layout.packed(node, probe).reshape(-1, layout.size(name)).max(axis=0, initial=0.0)
     sizes = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
     return 2.0 ** np.clip(np.round(np.log2(sizes)), -1000, 1000)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _linear(layout: Layout, name: str, values: Mapping[str, np.ndarray]) -> LinearNode:
+    """A node as an affine function of unknown ones with a density, and of the slice before."""
+    model = layout.model
+    hidden = {n + PREVIOUS for n in layout.before}.union(layout.drawn)
+    known = {n: np.asarray(v) for n, v in values.items() if n in model.nodes}
+    leaves = frozenset(n for n in (*hidden, *known) if model[n].kind == "deterministic")
+    return linear_node(model, name, hidden, leaves, known)
+
+
+def _together(
+    layout: Layout, fixed: dict[str, np.ndarray], timed: dict[str, np.ndarray], count: int
+) -> Linear:
+    """Slices at once, or one by one where functions do not take arrays of slices."""
+    try:
+        return _composed(layout, fixed | timed, (count,))
+    except (ModelError, ParameterError, UnsupportedError):  # one by one they say in which slice
+        parts = []
+        for k in range(count):
+            with in_slice(int(timed[TIME][k])) if TIME in timed else nullcontext():
+                parts.append(_composed(layout, fixed | {n: v[k] for n, v in timed.items()}, ()))
+        return Linear(*(np.concatenate(p) for p in zip(*parts, strict=True)))
+
+
+def _composed(layout: Layout, known: dict[str, np.ndarray], batch: tuple[int, ...]) -> Linear:
+    """Matrices of ``count`` slices (``batch`` is ``(count,)``, or ``()`` for one by itself)."""
+    lead, n, total = layout.lead, layout.n_prev, layout.p + layout.n
+    values = dict(known)
+    for name in layout.computed:
+        values[name] = layout.model.evaluate(name, values)[0]
+    drawn = [np.arange(p.start, p.stop) for n, p in layout.rows.items() if n in layout.drawn]
+    within = layout.p + np.concatenate([np.zeros(0, dtype=np.intp), *drawn])
+    shape = (*(batch or (1,)), *lead)
+    offset = np.zeros((*shape, total))
+    rows = np.zeros((*shape, total, n + layout.p + len(within)))
+    spent = n
+    for name in layout.placed:
+        place = layout.place(name)
+        result, gains = _at_zero(layout, name, values)
+        found = layout.moments_of(layout.model[name], result, batch)
+        own = slice(spent, spent + found.mean.shape[-1])
+        offset[..., place] = found.mean
+        matrix = _matrix(layout, name, gains, batch)
+        rows[..., place, :n] = matrix[..., :n]
+        if len(within):
+            inner = matrix[..., n:]
+            offset[..., place] += np.matvec(inner, offset[..., within])
+            rows[..., place, :] += inner @ rows[..., within, :]
+        if found.scale is not None:
+            put_noise(rows[..., place, own], found.scale if batch else found.scale[None])
+            spent = own.stop
+    return Linear(offset, rows[..., :n], rows[..., n:])
+
+
+def _at_zero(
+    layout: Layout, name: str, values: Mapping[str, np.ndarray]
+) -> tuple[Any, dict[str, Gains]]:
+    try:
+        return _linear(layout, name, values)(values)
+    except NotLinearError as error:
+        raise UnsupportedError(f"node {name!r} {error}") from error
+
+
+def _matrix(
+    layout: Layout, name: str, gains: Mapping[str, Gains], batch: tuple[int, ...]
+) -> np.ndarray:
+    """Coefficients, shape (*batch, *lead, e, numbers before and unknown ones with a density)."""
+    node = layout.model[name]
+    sources = [(n + PREVIOUS, n) for n in layout.prev]
+    sources += [(n, n) for n in layout.rows if n in layout.drawn]
+    parts = [np.zeros((*batch, *layout.lead, layout.size(name), 0))]
+    for called, stem in sources:
+        width = layout.size(stem)
+        part = np.zeros((*parts[0].shape[:-1], width))
+        if called in gains:
+            parent = layout.slices.first[stem]
+            places = np.arange(int(np.prod(parent.value_shape))).reshape(parent.value_shape)
+            column = np.empty(places.size, np.intp)
+            column[layout.packed(parent, places)] = np.arange(width)
+            found = gains[called]
+            shape = (*batch, *node.value_shape, found.gain.shape[-1])
+            gain = _by_row(layout, node, np.broadcast_to(found.gain, shape))
+            into = _by_row(layout, node, np.broadcast_to(column[found.at], shape))
+            index = np.arange(len(gain))[:, None] * width + into
+            sums = np.bincount(index.reshape(-1), gain.reshape(-1), len(gain) * width)
+            part = sums.astype(float).reshape(part.shape)
+        parts.append(part)
+    return np.concatenate(parts, axis=-1)
+
+
+def _by_row(layout: Layout, node: Any, array: np.ndarray) -> np.ndarray:
+    """What is said of a node's numbers, shape (*batch, *value shape, k), in the order of rows."""
+    packed = layout.packed(node, np.moveaxis(array, -1, 0))
+    return np.moveaxis(packed, 0, -1).reshape(-1, array.shape[-1])
 
 
 def _collapsed(layout: Layout, found: Linear) -> Linear:

@@ -19,7 +19,7 @@ from bayesmc.engines.kalman.passes import State, start_state
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityError
-from bayesmc.kernels.kalman import Conditioned, condition
+from bayesmc.linalg.square_root import Conditioned, condition
 
 #: kinds of rows of which something is remembered
 _KEPT = 64

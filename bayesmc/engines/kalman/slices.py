@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Slices
-from bayesmc.distributions import MvNormal
+from bayesmc.distributions import Distribution, MvNormal
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.network.model import invalid_error
@@ -128,9 +128,9 @@ class Layout:
         self.before = () if first else before
         self.order = _ordered(slices, first)
         self.silent = tuple(n for n in self.order if n in unknown and _jumps(slices, n))
-        placed = unknown.difference(self.silent)
-        own = (*(n for n in slices.interface if n in placed),
-               *(n for n in slices.dynamic if n in placed and n not in slices.interface))  # fmt: skip
+        loud = unknown.difference(self.silent)
+        own = (*(n for n in slices.interface if n in loud),
+               *(n for n in slices.dynamic if n in loud and n not in slices.interface))  # fmt: skip
         self.after = tuple(n for n in own if n in slices.interface)
         self.prev, self.n_prev = self._places(self.before)
         self.rows, self.n = self._places(own)
@@ -142,6 +142,8 @@ class Layout:
         )
         self.certain = tuple(n.name for n in nodes if n.is_stochastic and n.name not in depends)
         self.computed = tuple(n.name for n in nodes if not n.is_stochastic)
+        #: nodes with a place among the seen or the unknown numbers, parents first
+        self.placed = tuple(n for n in self.order if n in self.seen or n in self.rows)
         #: unknown nodes with a density: those that functions of the same slice can be moved along
         self.drawn = tuple(n for n in self.order if n in unknown and self.model[n].is_stochastic)
         self.depends = depends
@@ -156,6 +158,13 @@ class Layout:
         return math.prod(node.value_shape) // max(
             math.prod(n for p, n in zip(node.plates, node.plate_shape, strict=True) if p in self.apart), 1
         )  # fmt: skip
+
+    def place(self, name: str) -> slice:
+        """Where the numbers of a node stand among the seen and the unknown ones."""
+        if name in self.seen:
+            return self.seen[name]
+        rows = self.rows[name]
+        return slice(self.p + rows.start, self.p + rows.stop)
 
     def angles_of(self, name: str) -> np.ndarray:
         """Which of a node's numbers are angles, shape (size,): as in later slices, which all but one are."""
@@ -203,10 +212,15 @@ class Layout:
         ------
         ParameterError
         """
-        node = self.model[name]
         result, own = self.model.evaluate(name, values)
-        full = batch + node.value_shape
-        if isinstance(result, np.ndarray):
+        return self.moments_of(self.model[name], result, batch, own)
+
+    def moments_of(
+        self, node: CompiledNode, result: Any, batch: Shape, own: Shape | None = None
+    ) -> Moments:
+        """Of a distribution or values, of parents with a batch ``own`` that broadcasts to ``batch``."""
+        full, own = batch + node.value_shape, batch if own is None else own
+        if not isinstance(result, Distribution):
             return Moments(self.packed(node, np.broadcast_to(result, full)), None)
         if result.invalid is not None:
             error = invalid_error(node, result, np.ones(own, dtype=bool), own, noiseless=True)

@@ -21,7 +21,6 @@ from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_search import forest_blocks
 from bayesmc.kernels.forest_sites import site_forest
 from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
-from bayesmc.kernels.joint_states import joint_states
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import lattice_kernel
@@ -30,7 +29,7 @@ from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.kernels.rescaled import rescaled_kernels
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
-from bayesmc.kernels.tables import table_kernel, table_kernels
+from bayesmc.kernels.tables import joint_states, table_kernel, table_kernels
 from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.colouring import colours

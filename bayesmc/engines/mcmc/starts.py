@@ -11,11 +11,11 @@ import math
 
 import numpy as np
 
+from bayesmc.categorical import pick_log
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
 from bayesmc.engines.mcmc.start_faults import fault_at, impossible, refuse_impossible
 from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError
-from bayesmc.kernels.enumerate import draw_states
 from bayesmc.network import CompiledNode
 from bayesmc.network.nearer import nearer
 from bayesmc.structure.blanket import Blanket
@@ -239,7 +239,9 @@ def _drawn(
         log = _alone(target, node, values, count)
         if log is None:
             return _of_support(node, count, rng)
-        return draw_states(log, rng, node.name).astype(node.domain.dtype)  # type: ignore[union-attr]
+        assert node.domain is not None
+        states = pick_log(log, rng.random(log.shape[1:]), f"node {node.name!r}")
+        return states.astype(node.domain.dtype)
     dist, _ = target.model.evaluate(node.name, values)
     if dist.invalid is not None:
         wrong = np.broadcast_to(dist.invalid, (count, *node.plate_shape)).reshape(count, -1)

@@ -20,7 +20,6 @@ Statistics and Computing 10, sec. II-D; van der Merwe et al. (2000), The unscent
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,9 +29,9 @@ from bayesmc.engines.particles.cases import look_ahead
 from bayesmc.engines.particles.guarded import Guarded
 from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
 from bayesmc.engines.slice_steps import SlicePlan
-from bayesmc.network import CompiledNode, Model, Observed
+from bayesmc.network import Model, Observed
 from bayesmc.network.forward import Step
-from bayesmc.structure.affine import why_not_linear
+from bayesmc.structure.affine import NotLinearError, linear_node
 
 
 class OptimalPlan(SlicePlan):
@@ -251,25 +250,11 @@ def _in_full(seen: Mapping[str, Observed], name: str) -> bool:
 
 
 def _prove_affine(model: Model, group: Group) -> bool:
-    inner = {*group.block, *group.seen}
-    nodes: dict[str, CompiledNode] = {}
-    todo = list(inner)
-    while todo:
-        name = todo.pop()
-        node = model[name]
-        if name in nodes:
-            continue
-        if node.is_stochastic and name not in inner:  # known here, whatever its density is
-            nodes[name] = replace(node, links=(), declaration=replace(node.declaration, parents=()))
-            continue
-        nodes[name] = node
-        todo += node.parents
-    ordered = {n: nodes[n] for n in model.nodes if n in nodes}
-    known = {
-        n: Observed(np.asarray(model.probe[n]))
-        for n, node in ordered.items()
-        if node.is_stochastic and n not in group.block
-    }
-    inputs = {n: model.probe[n] for n in ordered if model[n].kind in ("input", "fixed")}
-    part = replace(model, nodes=ordered, potentials={}, cache={})
-    return why_not_linear(part, known, inputs) is None
+    known = {n: np.asarray(model.probe[n]) for n in model.nodes if n not in group.block}
+    known = {n: v for n, v in known.items() if model[n].kind != "deterministic"}
+    try:
+        for name in (*group.block, *group.seen):
+            linear_node(model, name, group.block, frozenset(), known)
+    except NotLinearError:
+        return False
+    return True

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc import diagnostics
+from bayesmc.categorical import log_sum_exp
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.forward import chunk_sizes
@@ -140,7 +141,7 @@ class WeightedEngine(Engine):
         )
         few = _first(stored, problem)
         posterior.densities = None if few is None else noted_densities(problem, few)
-        log_total = float(diagnostics.log_sum_exp(log_weights))
+        log_total = float(log_sum_exp(log_weights))
         self._set_evidence(posterior, log_total, total, weighted, log_weights)
         return posterior
 

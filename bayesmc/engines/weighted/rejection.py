@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.base import Engine
-from bayesmc.engines.bounds import Bounded, log_bounds, total_log_bound
 from bayesmc.engines.forward import CHUNK, chunk_sizes, fast_steps
+from bayesmc.engines.weighted.bounds import Bounded, log_bounds, total_log_bound
 from bayesmc.engines.weighted.drawing import Kept, check_count, no_memory, passes, treatment
 from bayesmc.errors import BudgetError, UnsupportedError, ZeroProbabilityError
 from bayesmc.network import Model, Problem

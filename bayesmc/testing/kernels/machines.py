@@ -37,7 +37,7 @@ from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
-from bayesmc.kernels.tables import RowSums, TableSweep
+from bayesmc.kernels.tables import TableSweep
 from bayesmc.network import pose
 from bayesmc.structure.target import Target, target_of
 from bayesmc.testing.kernels.joint import Move, NetJoint, Rows, Statistics
@@ -420,7 +420,7 @@ def _reverse_of(kernel: Any) -> Kernel | None:
         return in_classes(kernel, kernel.blanket.classes[::-1])
     if isinstance(kernel, (BlockWalk, GaussianBlock, JointStates, ProposedBlock)):
         return kernel
-    if isinstance(kernel, (Conjugate, Labels, RowSums, SiteCounts, SiteSums)):
+    if isinstance(kernel, (Conjugate, Labels, SiteCounts, SiteSums)):
         return kernel if len(kernel.blanket.classes) == 1 else None
     return None
 

@@ -18,7 +18,7 @@ import numpy as np
 from bayesmc.auto import infer
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.distributions import MvNormal, Normal
-from bayesmc.engines.exact import Exact
+from bayesmc.engines.exact.exact import Exact
 from bayesmc.network import BayesNet
 
 

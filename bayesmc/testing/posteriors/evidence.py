@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.auto import filter as filter_series
-from bayesmc.diagnostics import log_sum_exp, pareto_k
+from bayesmc.categorical import log_sum_exp
+from bayesmc.diagnostics import pareto_k
 from bayesmc.engines.base import Engine
 from bayesmc.engines.filtering import FilterEngine
 from bayesmc.engines.unrolled import pose_any

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.exact_noise import clusters
+from bayesmc.engines.exact.noiseless import clusters
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree, LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, likelihood_rows
 from bayesmc.factors.moments import Moments, mixture_scopes

@@ -66,7 +66,7 @@ class Blocks(Pattern):
     Examples
     --------
     >>> import numpy as np
-    >>> from bayesmc.kernels.gaussian_band import Blocks
+    >>> from bayesmc.linalg.patterns import Blocks
     >>> blocks = Blocks(2, 1)
     >>> root, log_det, wrong = blocks.factored(np.array([[4.0, 9.0]]))
     >>> blocks.lower(root, np.ones((1, 2, 1))).ravel().tolist()
@@ -122,7 +122,7 @@ class Band(Pattern):
     Examples
     --------
     >>> import numpy as np
-    >>> from bayesmc.kernels.gaussian_band import Band
+    >>> from bayesmc.linalg.patterns import Band
     >>> band = Band(3, 1)
     >>> stored = np.array([[4.0, 2.0, 5.0, 2.0, 5.0, 0.0]])  # diagonal, below it, next column
     >>> root, log_det, wrong = band.factored(stored)

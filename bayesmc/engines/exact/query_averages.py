@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from bayesmc.engines.exact_gaussian import GaussianAnswers
-from bayesmc.engines.exact_tables import TableAnswers
+from bayesmc.engines.exact.gaussian_answers import GaussianAnswers
+from bayesmc.engines.exact.table_answers import TableAnswers
 from bayesmc.errors import BayesmcError, BudgetError, UnsupportedError
 from bayesmc.factors.moments import Components
 from bayesmc.results.query import Query

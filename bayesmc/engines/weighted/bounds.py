@@ -1,8 +1,8 @@
 """Upper bounds on what the evidence can weigh, for rejection sampling: proved, or given and checked.
 
 A bound is on the log density of each observed element given its parents, whatever they are. It is proved by
-trying all configurations of finite parents, and by tracing that a location family's height does not depend
-on the other hidden ones; a probability is at most 1. What cannot be proved must be given.
+trying all configurations of finite parents, where a location family's height does not depend on the other
+hidden ones; a probability is at most 1. What cannot be proved must be given.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 
 from bayesmc.distributions import (
     Cauchy,
-    Distribution,
     Laplace,
     MvNormal,
     Normal,
@@ -23,13 +22,14 @@ from bayesmc.distributions import (
     marking_invalid,
 )
 from bayesmc.errors import EnvelopeError, EvidenceError, ShapeError, UnknownNodeError
+from bayesmc.expression import Family, expressions_of
 from bayesmc.network import CompiledNode, Model, Problem
+from bayesmc.network.expressions import Opaque, density
 from bayesmc.network.forward import Pass, Step
-from bayesmc.network.model import arguments_of, potential_shape
+from bayesmc.network.model import potential_shape
 from bayesmc.network.store import unknown
 from bayesmc.shapes import Shape, broadcasts_to
-from bayesmc.structure import configure, constants_of
-from bayesmc.tracing import TracedCall, Tracer
+from bayesmc.structure.tables import Reads, configure, constants_of, reads_of
 
 #: configurations, times plate elements, up to which parents are tried out
 _CONFIGURATIONS = 1 << 20
@@ -163,120 +163,83 @@ def _plate_shape(model: Model, name: str) -> Shape:
 
 def _largest_potential(problem: Problem, name: str) -> np.ndarray | None:
     """The largest value of a potential over all configurations of finite nodes."""
-    model = problem.model
-    potential, _ = model.potentials[name]
+    potential, _ = problem.model.potentials[name]
+    known = _known(problem)
+    reads = reads_of(problem.model, potential.parents, potential.plates, known.__contains__)
+    if reads.others:
+        return None
 
     def evaluate(values: Mapping[str, Any]) -> np.ndarray:
-        return model.potential(name, values, total=False)
+        return problem.model.potential(name, values, total=False)
 
-    return _largest(problem, potential.parents, potential.plates, evaluate, traced=False)
+    return _largest(problem, potential.parents, potential.plates, known, reads, evaluate)
 
 
 def _largest_density(problem: Problem, node: CompiledNode) -> np.ndarray | None:
-    """The largest log density of what was seen over all configurations of the parents."""
+    """The largest log density of what was seen over all configurations of the parents.
+
+    Of a location family whose other parameters depend on finite parents alone it is the one at its location.
+    """
     model, seen = problem.model, problem.observed[node.name].value
+    known = _known(problem)
+    reads = reads_of(model, node.parents, node.plates, known.__contains__)
+    if reads.others and not _depends_by_location(model, node.name, reads.others):
+        return None
+    for name in reads.others:  # any value will do
+        probe = model.probe[name]
+        lead = probe.ndim - len(model[name].value_shape)
+        known[name] = probe[(0,) * lead + (Ellipsis,)]
 
     def evaluate(values: Mapping[str, Any]) -> np.ndarray:
-        if any(isinstance(values[p], Tracer) for p in node.parents):
-            dist, height = _highest(model, node, values, seen)
+        dist: Any = model.evaluate(node.name, values)[0]
+        if reads.others:
+            height = np.asarray(dist.log_prob(dist.loc))
         else:
-            dist, _ = model.evaluate(node.name, values)
             height = model.log_density(node.name, dist, seen)
         return height if dist.invalid is None else np.where(dist.invalid, -np.inf, height)
 
-    return _largest(problem, node.parents, node.plates, evaluate, traced=not node.is_discrete)
+    return _largest(problem, node.parents, node.plates, known, reads, evaluate)
 
 
-def _highest(
-    model: Model, node: CompiledNode, values: Mapping[str, Any], seen: np.ndarray
-) -> tuple[Distribution, np.ndarray]:
-    """The height of a location family whose other parameters do not depend on what is traced."""
-    arguments, _ = arguments_of(node.links, values)
-    if node.declaration.vectorize or node.declaration.function is None:
-        raise _Unproved
-    call = node.declaration.function(*arguments)
-    if isinstance(call, Distribution):  # it does not depend on the traced parents at all
-        return call, model.log_density(node.name, call, seen)
-    if not isinstance(call, TracedCall) or call.function not in _LOCATION_FAMILIES:
-        raise _Unproved
-    if set(call.traced) != {"loc"}:
-        raise _Unproved
-    centre = np.zeros(node.event_shape)
-    family: Callable[..., Distribution] = call.function
-    dist = family(**{**call.arguments, "loc": centre})
-    return dist, np.asarray(dist.log_prob(centre))
+def _depends_by_location(model: Model, name: str, hidden: Sequence[str]) -> bool:
+    """Whether some nodes act on a density through its location alone."""
+    found = density(model, name)
+    if isinstance(found, Opaque) or not isinstance(found.result, Family):
+        return False
+    family = found.result
+    if family.make not in _LOCATION_FAMILIES:
+        return False
+    others = [v for parameter, v in family.parameters.items() if parameter != "loc"]
+    return not any(e.leaves & set(hidden) for e in expressions_of(others))
+
+
+def _known(problem: Problem) -> dict[str, Any]:
+    """Values that never vary."""
+    seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
+    return {**constants_of(problem.model, problem.inputs), **seen}
 
 
 def _largest(
     problem: Problem,
     parents: Sequence[str],
     plates: Sequence[str],
+    known: Mapping[str, Any],
+    reads: Reads,
     evaluate: Callable[[Mapping[str, Any]], np.ndarray],
-    traced: bool,
 ) -> np.ndarray | None:
-    """The largest value of a function over all configurations of its finite parents, by element.
-
-    Other hidden parents are traced where ``traced``; then ``evaluate`` must not depend on them.
-    """
-    model = problem.model
-    known: dict[str, Any] = {
-        **constants_of(model, problem.inputs),
-        **{n: o.value for n, o in problem.observed.items() if o.mask is None},
-    }
-    search = _Search(model, known)
-    search.visit(parents, tuple(plates), False)
-    if search.infinite and not traced:
+    """The largest value of a function over all configurations of its finite parents, by element."""
+    model, shape = problem.model, tuple(problem.model.sizes[p] for p in plates)
+    if not _few(model, reads.alone, reads.whole, shape):
         return None
-    shape = tuple(model.sizes[p] for p in plates)
-    alone = [n for n, whole in search.finite.items() if not whole]
-    whole = [n for n, whole in search.finite.items() if whole]
-    if not _few(model, alone, whole, shape):
-        return None
-    for name in search.infinite:  # any value will do: nothing looks at it
-        probe = model.probe[name]
-        lead = probe.ndim - len(model[name].value_shape)
-        known[name] = Tracer(probe[(0,) * lead + (Ellipsis,)], [name])
     try:
         with marking_invalid(), np.errstate(all="ignore"):
-            values, cards = configure(model, known, alone, whole, parents)
+            values, cards = configure(model, known, reads.alone, reads.whole, parents)
             logs = np.asarray(evaluate(values), dtype=float)
-    except Exception:  # a function may fail at what never happens, and on what is traced
+    except Exception:  # a function may fail at what never happens
         return None
     full = np.broadcast_to(logs, cards + shape)
     top = full.max(axis=tuple(range(len(cards))))
     return None if np.isnan(top).any() or (top == np.inf).any() else top
-
-
-class _Unproved(Exception):
-    """A function is not of a form whose height can be proved."""
-
-
-class _Search:
-    """What a function depends on: finite nodes to be tried out, and hidden ones that cannot be.
-
-    A deterministic node that hands on a value of the latter counts among them.
-    """
-
-    def __init__(self, model: Model, known: Mapping[str, Any]) -> None:
-        self.model = model
-        self.known = known
-        self.finite: dict[str, bool] = {}
-        self.infinite: set[str] = set()
-
-    def visit(self, parents: Sequence[str], own: tuple[str, ...], whole: bool) -> bool:
-        """Note what ``parents`` depend on; whether all of it is finite."""
-        every = True
-        for parent in parents:
-            if parent in self.known:
-                continue
-            node = self.model[parent]
-            foreign = whole or any(p not in own for p in node.plates)
-            if node.domain is not None:
-                self.finite[parent] = self.finite.get(parent, False) or foreign
-            elif node.is_stochastic or not self.visit(node.parents, node.plates, foreign):
-                self.infinite.add(parent)
-                every = False
-        return every
 
 
 def _few(model: Model, alone: Sequence[str], whole: Sequence[str], shape: Shape) -> bool:

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.gaussian import solve_lower
+from bayesmc.linalg.patterns import lapack
 
 HALF_LOG_2PI = 0.5 * math.log(2 * math.pi)
 
@@ -71,7 +72,7 @@ def condition(rows: np.ndarray, observed: int, carried: int | None = None) -> Co
     Examples
     --------
     >>> import numpy as np
-    >>> from bayesmc.kernels.kalman import condition
+    >>> from bayesmc.linalg.square_root import condition
     >>> found = condition(np.array([[3.0, 4.0], [3.0, 0.0]]), 1)  # y = x + 4 w, x = 3 v
     >>> found.root.tolist(), found.factor.round(6).tolist()  # var(x | y) = 9 - 81 / 25
     ([[5.0]], [[2.4]])
@@ -97,7 +98,7 @@ def standardised(root: np.ndarray, innovation: np.ndarray) -> np.ndarray:
     if p == 1:
         return innovation / root[..., 0]
     if root.ndim == 2 and innovation.ndim == 1 and p:
-        return _lapack().dtrtrs(root, innovation, lower=1)[0]
+        return lapack().dtrtrs(root, innovation, lower=1)[0]
     return solve_lower(root, innovation)
 
 
@@ -180,14 +181,6 @@ def turned(turn: np.ndarray, observed: int, carried: int) -> Turned:
 # ---- private ------------------------------------------------------------------------------------
 
 
-@functools.cache
-def _lapack() -> Any:
-    """SciPy's LAPACK, loaded when first used: importing scipy.linalg takes long."""
-    from scipy.linalg import lapack
-
-    return lapack
-
-
 #: what rounding leaves of a row that is a combination of those before it, relative to its size
 _ROUNDING = 16 * float(np.finfo(float).eps)
 #: pivots so small beside the largest entry are worth a look
@@ -267,9 +260,9 @@ def _lower_mask(r: int) -> np.ndarray:
 
 def _by_lapack(rows: np.ndarray, carried: int | None) -> tuple[np.ndarray, np.ndarray | None]:
     """Householder by LAPACK's own interface: a third of the time of ``numpy.linalg.qr`` on small matrices."""
-    lapack = _lapack()
+    dgeqrf, dorgqr = lapack().dgeqrf, lapack().dorgqr
     r, k = rows.shape
-    packed, tau, _, _ = lapack.dgeqrf(rows.T, overwrite_a=1)
+    packed, tau, _, _ = dgeqrf(rows.T, overwrite_a=1)
     lower = packed.T[:, :r] * _lower_mask(r)
     signs = np.copysign(1.0, lower.diagonal())
     lower *= signs
@@ -277,7 +270,7 @@ def _by_lapack(rows: np.ndarray, carried: int | None) -> tuple[np.ndarray, np.nd
         return lower, None
     square = np.zeros((k, k), order="F")
     square[:, :r] = packed
-    turn = lapack.dorgqr(square, tau, overwrite_a=1)[0][:carried].copy()
+    turn = dorgqr(square, tau, overwrite_a=1)[0][:carried].copy()
     turn[:, :r] *= signs
     return lower, turn
 

@@ -23,12 +23,6 @@ def partials(ufunc: Any) -> tuple[Partial, ...] | None:
     return _PARTIALS.get(ufunc)
 
 
-def jumps(ufunc: Any, values: Any, result: Any) -> Any:
-    """Where a ufunc that is constant in pieces jumps, as booleans; None for every other ufunc."""
-    rule = PIECES.get(ufunc)
-    return None if rule is None else rule(*values, result)
-
-
 # ---- private ------------------------------------------------------------------------------------
 
 

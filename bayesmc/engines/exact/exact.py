@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.base import Engine
-from bayesmc.engines.exact_plan import Cost, Plan, plan_for, why_no_plan
-from bayesmc.engines.exact_posterior import ExactPosterior
+from bayesmc.engines.exact.exact_posterior import ExactPosterior
+from bayesmc.engines.exact.hybrid_plan import Cost, Plan, plan_for, why_no_plan
 from bayesmc.errors import (
     BudgetError,
     ModelError,

@@ -2,7 +2,7 @@
 
 Information form has no place for a scale of 0. So what hangs together with such a node is written as ``mean +
 rows @ noise``, with independent standard normal noise, and conditioned by one triangularisation for every
-configuration of the discrete variables that switch it (``kernels.kalman``). What follows from other observed
+configuration of the discrete variables that switch it (``linalg.square_root``). What follows from other observed
 numbers counts as a probability, one where it is right.
 """
 
@@ -20,7 +20,7 @@ from bayesmc.distributions.noiseless import ALLOWED, FLOOR, ROUNDED
 from bayesmc.errors import UnsupportedError
 from bayesmc.factors import LogTable
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, along
-from bayesmc.kernels.kalman import (
+from bayesmc.linalg.square_root import (
     HALF_LOG_2PI,
     condition,
     log_densities,

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.engines.exact_gaussian import GaussianAnswers
-from bayesmc.engines.exact_plan import Solved
-from bayesmc.engines.exact_query import average, covariance, gaussian_average
-from bayesmc.engines.exact_tables import TableAnswers
+from bayesmc.engines.exact.gaussian_answers import GaussianAnswers
+from bayesmc.engines.exact.hybrid_plan import Solved
+from bayesmc.engines.exact.query_averages import average, covariance, gaussian_average
+from bayesmc.engines.exact.table_answers import TableAnswers
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.network.forward import Compute, Pass, run

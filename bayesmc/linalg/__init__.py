@@ -1,0 +1,1 @@
+"""Linear algebra of Normal laws: precisions with a pattern, covariances by their square roots."""
