@@ -148,16 +148,31 @@ def _pick(node: Pick) -> Step:
     sizes = [a.size for a in node.operands]
     dtype = node.dtype
 
+    alike = len({a.shape for a in node.operands}) == 1
+
     def several(*values: np.ndarray) -> np.ndarray:
+        first = values[0].shape
+        if alike and first and all(v.shape == first for v in values):
+            return take(_side_by_side(values, ranks[0], dtype))
         batches = [v.shape[: v.ndim - rank] for v, rank in zip(values, ranks, strict=True)]
-        batch = np.broadcast_shapes(*batches)
+        batch = np.broadcast_shapes(*set(batches))
         parts = [
-            np.broadcast_to(v.reshape((*own, size)), (*batch, size))
+            v.reshape((*own, size))
+            if own == batch
+            else np.broadcast_to(v.reshape((*own, size)), (*batch, size))
             for v, own, size in zip(values, batches, sizes, strict=True)
         ]
         return take(np.concatenate(parts, axis=-1, dtype=dtype))
 
     return several
+
+
+def _side_by_side(values: Sequence[np.ndarray], rank: int, dtype: Any) -> np.ndarray:
+    """Many arrays of one shape, flat one after the other behind their batch."""
+    shape = values[0].shape
+    whole = np.concatenate(values, axis=0, dtype=dtype).reshape(len(values), *shape)
+    lead = len(shape) - rank
+    return np.moveaxis(whole, 0, lead).reshape((*shape[:lead], -1))
 
 
 def _taken(positions: np.ndarray) -> Step:

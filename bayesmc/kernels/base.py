@@ -42,6 +42,9 @@ class Kernel:
     ) -> tuple[Values, Memory]:
         """New values of its nodes, and its memory; neither argument is changed.
 
+        With the values may come what follows from them and other kernels ask for (``label_sums``), under
+        names that no node has.
+
         Parameters
         ----------
         values : dict

@@ -1,9 +1,10 @@
 """Conjugate nodes: draws from a full conditional in closed form.
 
-A node is conjugate where its prior and every child that it enters are pairs of the table, proved by
-tracing the children's functions. Flat and truncated priors stay in closed form; where rounding leaves
-none (an interval far out in a tail, a flat prior and too few data for a proper posterior) the elements
-concerned take a slice step instead, which leaves the same distribution invariant.
+A node is conjugate where its prior and the children that it enters are sums of features that one family has
+(``conjugate_families``): the sums of their coefficients are the natural parameters, evaluated by one
+program. Flat and truncated priors stay in closed form; where rounding leaves none (an interval far out in
+a tail, a flat prior and too few data for a proper posterior) the elements concerned take a slice step
+instead, which leaves the same distribution invariant.
 
 References
 ----------
@@ -12,25 +13,20 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 2-3, 11.3; Plummer, J
 
 from __future__ import annotations
 
-from collections import ChainMap
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conjugate_children import Partner
-from bayesmc.kernels.conjugate_components import CountedShares, PlanarStep, quick_step
-from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Covariance, Kind, Naturals, split_prior
-from bayesmc.kernels.conjugate_like import partners_of
-from bayesmc.kernels.conjugate_matching import Match, match_of
-from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
-from bayesmc.kernels.conjugate_picks import is_picked
-from bayesmc.kernels.precisions import keep_precision
+from bayesmc.kernels.conjugate_families import (
+    Bounds,
+    Naturals,
+)
+from bayesmc.kernels.conjugate_forms import Form
+from bayesmc.kernels.conjugate_naturals import form_of
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
@@ -44,55 +40,36 @@ class Conjugate(Kernel):
     Parameters
     ----------
     blanket : Blanket
-    kind : Kind
-        The family of the full conditional.
-    partners : sequence of Partner
-        The children.
-    power : float
-        For a scale, the power that is Gamma.
+    forms : sequence of Form
+        For each class of elements, the family and its natural parameters.
     debug : bool
         Check every draw against the model's densities.
     """
 
     label = "conjugate"
 
-    def __init__(
-        self,
-        blanket: Blanket,
-        kind: Kind,
-        partners: Sequence[Partner],
-        power: float,
-        debug: bool = False,
-    ) -> None:
-        self.blanket, self.kind, self.partners = blanket, kind, tuple(partners)
-        self.power, self.debug = power, debug
+    def __init__(self, blanket: Blanket, forms: Sequence[Form], debug: bool = False) -> None:
+        self.blanket, self.forms, self.debug = blanket, tuple(forms), debug
         self.names = (blanket.name,)
-        words = dict.fromkeys(
-            f"{p.pair.words}{' where it is picked' if p.is_picked else ''}" for p in partners
-        )
-        self.match = f"{_prior_words(blanket)} with {', '.join(words)}"
-        self._constant = not _prior_is_hidden(blanket)
-        self._kept: dict[int, tuple[Naturals, Bounds | None]] = {}
+        self.match = forms[0].words
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
-        if self._quick is not None and not self.debug:
-            new = self._quickly(values, rng)
-            if new is not None:
-                return {blanket.name: new}, memory
-        state = values
+        derived = self.forms[0].left(values)
+        state = {**values, **derived} if derived else values
         for part, members in enumerate(blanket.classes):
             if part:  # what follows from the classes before
-                state = dict(state)
                 blanket.target.refresh(state, self.names)
             try:
                 new = self._moved(state, part, members, rng)
             except np.linalg.LinAlgError as error:
                 raise self._degenerate(error) from error
-            state = {**state, blanket.name: blanket.moved(state, new, members)}
-        return {blanket.name: state[blanket.name]}, memory
+            new = blanket.moved(state, new, members)
+            if part + 1 < len(blanket.classes):
+                state = {**state, blanket.name: new}
+        return {blanket.name: new, **derived}, memory
 
     def full_conditional(self, values: Values, part: int = 0) -> Distribution:
         """The distribution of a class's elements given all others.
@@ -103,98 +80,40 @@ class Conjugate(Kernel):
             Batch broadcasts to ``(chains, *plates)``, or ``(chains, members)`` for a class of elements.
         """
         naturals, bounds = self._naturals(values, part)
-        return self.kind.posterior(naturals, bounds, self.power)
+        return self.forms[part].family.posterior(naturals, bounds)
 
     # ---- private -------------------------------------------------------------------------------
-
-    def _quickly(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
-        assert self._quick is not None
-        try:
-            return self._quick.draw(values, rng)
-        except np.linalg.LinAlgError as error:
-            raise self._degenerate(error) from error
 
     def _moved(
         self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
     ) -> np.ndarray:
         """New values of one class of elements."""
+        if not self.debug:
+            quick = self.forms[part].drawn(values, rng, len(values[self.blanket.name]))
+            if quick is not None:
+                return quick
         now = self.blanket.current(values, members)
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
         naturals, bounds = self._naturals(values, part)
-        if isinstance(self.kind, Covariance):
-            drawn: np.ndarray | None
-            drawn, precision = self.kind.with_precision(naturals, rng, shape)
-            if precision is not None and members is None:
-                keep_precision(self.blanket.target, self.blanket.name, drawn, precision)
-        else:
-            drawn = self.kind.draw(naturals, bounds, rng, shape)
+        family = self.forms[part].family
+        drawn = family.draw(naturals, bounds, rng, shape)
         if drawn is not None and not self.debug:
             return drawn
-        posterior = self.kind.posterior(naturals, bounds, self.power)
+        posterior = family.posterior(naturals, bounds)
         if drawn is None:
-            drawn = self._drawn(values, members, posterior, bounds, now, rng)
+            drawn = self._drawn(values, part, posterior, bounds, now, rng)
         if self.debug:
             self._check(values, members, posterior, now, drawn)
         return drawn
 
-    @cached_property
-    def _quick(self) -> PlanarStep | CountedShares | None:
-        """A way round arrays, looked up at the first step."""
-        classes = self.blanket.classes
-        alone = len(self.partners) == 1 and len(classes) == 1 and classes[0] is None
-        if not alone or not self._constant:
-            return None
-        prior, bounds = self._prior({**self.blanket.target.known}, 0, None)
-        return None if bounds is not None else quick_step(self.partners[0], prior)
-
     def _naturals(self, values: Values, part: int) -> tuple[Naturals, Bounds | None]:
-        """Natural parameters of the full conditional: the prior's and what children add."""
-        members = self.blanket.classes[part]
-        prior, bounds = self._prior(values, part, members)
-        totals = list(prior)
-        for partner in self.partners:
-            for i, added in enumerate(partner.natural(values, members)):
-                totals[i] = totals[i] + added
-        return tuple(totals), bounds
-
-    def _prior(
-        self, values: Values, part: int, members: np.ndarray | None
-    ) -> tuple[Naturals, Bounds | None]:
-        if part in self._kept:
-            return self._kept[part]
-        assert self.blanket.own is not None
-        base, bounds = split_prior(self.blanket.own.distribution(values)[0])
-        if base is None:
-            assert bounds is not None
-            naturals = self.kind.flat(*(np.asarray(b, dtype=float) for b in bounds))
-        else:
-            naturals = self.kind.natural(base)
-        naturals = tuple(
-            self._picked(a, members, n)
-            for a, n in zip(naturals, self.kind.event_ndims, strict=True)
-        )
-        if bounds is not None:
-            bounds = (self._picked(bounds[0], members), self._picked(bounds[1], members))
-        if self._constant:
-            self._kept[part] = naturals, bounds
-        return naturals, bounds
-
-    def _picked(self, array: Any, members: np.ndarray | None, event_ndim: int = 0) -> np.ndarray:
-        """A prior's parameter with one axis for chains and the plates, or the members of a class."""
-        array = np.asarray(array, dtype=float)
-        node = self.blanket.node
-        ndim = 1 + len(node.plates) + event_ndim
-        array = array.reshape((1,) * (ndim - array.ndim) + array.shape)
-        if members is None:
-            return array
-        event = array.shape[array.ndim - event_ndim :]
-        full = np.broadcast_to(array, (len(array), *node.plate_shape, *event))
-        return full.reshape((len(array), self.blanket.size, *event))[:, members]
+        """Natural parameters of the full conditional of a class's elements."""
+        return self.forms[part](values)
 
     def _drawn(
         self,
         values: Values,
-        members: np.ndarray | None,
+        part: int,
         posterior: Distribution,
         bounds: Bounds | None,
         now: np.ndarray,
@@ -207,7 +126,7 @@ class Conjugate(Kernel):
         if self.blanket.event_shape:
             raise self._degenerate(posterior.problem)
         lost = np.broadcast_to(posterior.invalid, shape)
-        return np.where(lost, self._sliced(values, members, bounds, now, rng), new)
+        return np.where(lost, self._sliced(values, part, bounds, now, rng), new)
 
     def _degenerate(self, problem: Exception | None) -> DensityError:
         return DensityError(
@@ -218,17 +137,15 @@ class Conjugate(Kernel):
     def _sliced(
         self,
         values: Values,
-        members: np.ndarray | None,
+        part: int,
         bounds: Bounds | None,
         now: np.ndarray,
         rng: np.random.Generator,
     ) -> np.ndarray:
         """One slice step of every element."""
+        family, members = self.forms[part].family, self.blanket.classes[part]
         low, high = (-np.inf, np.inf) if bounds is None else bounds
-        if self.kind.name == "scale":
-            low = np.maximum(low, 0.0)
-        elif self.kind.name == "share":
-            low, high = np.maximum(low, 0.0), np.minimum(high, 1.0)
+        low, high = np.maximum(low, family.low), np.minimum(high, family.high)
         span = np.asarray(high) - np.asarray(low)
         width = np.where(np.isfinite(span), span, np.maximum(np.abs(now), 1e-3))
 
@@ -284,9 +201,7 @@ class Conjugate(Kernel):
         return total, size
 
 
-def conjugate_kernel(
-    blanket: Blanket, debug: bool = False, pairs: Sequence[Pair] = PAIRS
-) -> Conjugate | str:
+def conjugate_kernel(blanket: Blanket, debug: bool = False) -> Conjugate | str:
     """The conjugate kernel of a node, or in words why there is none.
 
     Parameters
@@ -294,8 +209,6 @@ def conjugate_kernel(
     blanket : Blanket
     debug : bool
         Check every draw against the model's densities (slow).
-    pairs : sequence of Pair
-        The conjugate table.
 
     Examples
     --------
@@ -319,26 +232,13 @@ def conjugate_kernel(
         return "it has no prior density of its own"
     if blanket.node.is_discrete or blanket.node.domain is not None:
         return "it is discrete"
-    prior = _probed_prior(blanket)
-    if prior is None:
-        return "its prior cannot be evaluated"
-    base, bounds = split_prior(prior)
-    kinds = [k for k in KINDS if (k.takes_flat if base is None else isinstance(base, k.priors))]
-    if not kinds:
-        return f"a {type(prior if base is None else base).__name__} prior has no conjugate pair"
-    best, reason = (-1, False), ""
-    for kind in kinds:
-        matches, found = _matched(blanket, kind, base, bounds, pairs)
-        if not isinstance(found, str):
-            partners = partners_of(blanket, kind, matches)
-            unlike = (p.unless_picked for p in partners if p.unless_picked and not is_picked(p))
-            found = next(unlike, found)
-            if not isinstance(found, str):
-                return Conjugate(blanket, kind, partners, found, debug)
-        told = (len(matches), "makes no conjugate pair" not in found)
-        if told > best:  # of a flat prior's kinds, the one that fits most children says most
-            best, reason = told, found
-    return reason
+    forms = []
+    for members in blanket.classes:
+        form = form_of(blanket, members)
+        if isinstance(form, str):
+            return form
+        forms.append(form)
+    return Conjugate(blanket, forms, debug)
 
 
 def full_conditional(blanket: Blanket, values: Values, part: int = 0) -> Distribution:
@@ -384,67 +284,3 @@ def full_conditional(blanket: Blanket, values: Values, part: int = 0) -> Distrib
             "blanket.log_density on a grid instead"
         )
     return kernel.full_conditional(values, part)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _matched(
-    blanket: Blanket,
-    kind: Kind,
-    base: Distribution | None,
-    bounds: Bounds | None,
-    pairs: Sequence[Pair],
-) -> tuple[list[Match], float | str]:
-    """The pairs of children, and the power that is Gamma (1 if none is) or a reason of refusal."""
-    matches: list[Match] = []
-    if base is None:
-        low, high = (np.asarray(b, dtype=float) for b in bounds)  # type: ignore[union-attr]
-        if np.isnan(kind.flat(low, high)[0]).any():
-            return matches, "its flat prior reaches beyond what the parameter allows"
-    power = kind.power(base)
-    for child in blanket.children:
-        match = match_of(blanket, child, kind, pairs)
-        if match is None:
-            continue
-        if isinstance(match, str):
-            return matches, match
-        if kind.name == "scale":
-            wanted = match.pair.exponent * match.power
-            if power is not None and wanted != power:
-                prior = f"a {type(base).__name__} prior" if base is not None else "another child"
-                return matches, (
-                    f"the density of child {child.term.name!r} has the power {wanted:g} of it in its "
-                    f"exponential, and {prior} the power {power:g}: no conjugate pair"
-                )
-            power = wanted
-        matches.append(match)
-    if not matches:
-        return matches, "no child varies with it"
-    return matches, 1.0 if power is None else power
-
-
-def _probed_prior(blanket: Blanket) -> Distribution | None:
-    """The prior at some reachable values of its parents."""
-    assert blanket.own is not None
-    target = blanket.target
-    try:
-        with marking_invalid(), np.errstate(all="ignore"):
-            return blanket.own.distribution(ChainMap(target.known, target.model.probe))[0]
-    except Exception:
-        return None
-
-
-def _prior_words(blanket: Blanket) -> str:
-    prior = _probed_prior(blanket)
-    assert prior is not None
-    base, bounds = split_prior(prior)
-    if base is None:
-        return "Uniform"
-    return f"{'truncated ' if bounds is not None else ''}{type(base).__name__}"
-
-
-def _prior_is_hidden(blanket: Blanket) -> bool:
-    """Whether the prior's parameters change from sweep to sweep."""
-    assert blanket.own is not None
-    return bool(blanket.target.hidden_above(blanket.own))

@@ -1,310 +1,259 @@
-"""What a child of a conjugate node adds to the node's full conditional.
+"""The children of a node as families whose parameters are expressions; many like ones are one.
 
-The coefficients of the pair that it makes (``conjugate_matching``) come from calling its function with the
-node at a neutral value (and at unit steps, for means). What cannot change from sweep to sweep is worked
-out once: slopes where the mean is affine in everything hidden, and all of it where nothing else is hidden.
-Many like children are one partner, see ``conjugate_like``.
+A thousand slices of a series that came from one function have the same expressions up to constants and
+names: they are one child with the slices as one more axis in front.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Distribution
-from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError
-from bayesmc.kernels.conjugate_data import TRANSFORMS, Elements, Groups, counted
-from bayesmc.kernels.conjugate_evaluation import Evaluated, Looked, slope_of
-from bayesmc.kernels.conjugate_kinds import Kind, Naturals
-from bayesmc.kernels.conjugate_labels import ByLabel, by_label, read_directly
-from bayesmc.kernels.conjugate_matching import Match
-from bayesmc.kernels.conjugate_picks import picked_natural, points_of
-from bayesmc.kernels.conjugate_sums import Collector
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Expression,
+    Family,
+    Leaf,
+    as_expression,
+    broadcast,
+    elementwise,
+    expressions_of,
+    ordered,
+    pick,
+    substituted,
+)
+from bayesmc.kernels.conjugate_labels import by_label
+from bayesmc.kernels.label_sums import LabelSums
+from bayesmc.network.expressions import Opaque, stored_leaf
+from bayesmc.network.readings import frame
+from bayesmc.passes.log_density import has_own_form, log_density
+from bayesmc.passes.templates import stacked_rows, template
+from bayesmc.passes.widening import widened
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Target, Term, Values
-from bayesmc.structure.traced import Untraceable, traced_term
-from bayesmc.tracing import TracedCall, Tracer
+from bayesmc.structure.target import Target, Term
 
 
-class Partner:
-    """One child with the pair that it makes.
+@dataclass(frozen=True, eq=False)
+class Child:
+    """One child, or many like ones.
 
-    Parameters
+    Attributes
     ----------
-    match : Match
-        The child and the pair.
-    settle : bool
-        Whether what never changes is worked out, which takes some calls.
+    terms : tuple of Term
+    family : Family
+        Known values are constants in it.
+    value : Expression, shape (*shape, *event)
+        As the family speaks of it.
+    shape : tuple of int
+        Of the entries: the plates, and the terms in front where there are many.
+    mask : ndarray of bool or None
+        Entries that count; broadcasts to the shape.
+    sums : LabelSums or None
+        Its sums by label, of which the density then is.
     """
 
-    def __init__(self, blanket: Blanket, match: Match, kind: Kind, settle: bool = True) -> None:
-        self.blanket, self.kind = blanket, kind
-        self.child, self.pair = match.child, match.pair
-        self.power, self.is_copy = match.power, match.is_copy
-        self.unless_picked, self.is_picked = match.unless_picked, match.unless_picked is not None
-        self.term, self.relation = self.child.term, self.child.relation
-        self.node = self.term.model[self.term.name]
-        neutral = kind.neutral(blanket.event_shape)
-        axes = (1,) * (1 + len(blanket.node.plates))
-        self._neutral = neutral.reshape(axes + neutral.shape)
-        self._steps = _steps(blanket) if kind.name == "mean" else np.zeros(0)
-        self._moved = self._neutral
-        if len(self._steps):
-            self._moved = _stepped(self._neutral, self._steps, blanket.event_shape)
-        self._points = np.zeros(0)
-        if self.is_picked:
-            self._points = points_of(kind.name, blanket.event_shape)
-            self._moved = self._points.reshape((len(self._points), *axes, *neutral.shape))
-        self._data = self._known_data()
-        self._slope: np.ndarray | None = None
-        self._fixed: Naturals | None = None
-        self._way: ByLabel | None = None
-        self.is_mean_by_label = False
-        if settle:
-            with marking_invalid(), np.errstate(all="ignore"):
-                self._settle()
-
-    def natural(self, values: Values, members: np.ndarray | None) -> Naturals:
-        """What the child adds, natural parameters ``(lead, *plates, ...)`` or ``(lead, members, ...)``."""
-        if self._fixed is not None:
-            return self._fixed
-        return self._natural(values, members)
-
-    @property
-    def way(self) -> ByLabel | None:
-        """How it is summed by label, if it is."""
-        return self._way
-
-    # ---- evaluating ---------------------------------------------------------------------------
-
-    def _natural(self, values: Values, members: np.ndarray | None) -> Naturals:
-        if self.counts is not None:
-            count = self.counts.at(values).count
-            return (count.reshape((len(count), -1)),)
-        if self.is_mean_by_label:
-            return self._by_label(values)
-        if self.is_picked:
-            e = self._evaluated(values, members, True)
-            assert isinstance(e, Evaluated)
-            return picked_natural(self.pair, self._points, e, len(self.shape))
-        steps = self.kind.name == "mean" and self._slope is None
-        e = self._evaluated(values, members, steps)
-        if self.kind.name == "mean":
-            return self._mean(e, e.slope(self._steps) if self._slope is None else self._slope)
-        found = self.pair.statistic(e)
-        if self.kind.name == "scale":
-            return self.power * e.sum(found[0]), e.sum(found[1])
-        if self.kind.name == "share":
-            return e.sum(found[0]), e.sum(found[1])
-        if self.kind.name == "shares":
-            return (found if self.pair.child is Categorical else e.sum(found, 1),)
-        # the node stands at the unit matrix, of which the covariance is a multiple
-        spread = np.ones(()) if self.is_copy else e.get("cov", 2)[..., 0, 0]
-        return e.sum(found), e.data.scatter(e.get("loc", 1), spread, e)
-
-    def _mean(self, e: Evaluated | Looked, slope: np.ndarray) -> Naturals:
-        """Precision and linear term of a node that enters a mean affinely."""
-        rows = self.pair.statistic(e, slope)  # (components, lead, *plates, m)
-        residual = self.pair.statistic(e, e.data.deviations(e.get("loc", self._event_ndim)))
-        count = e.data.count
-        if not self.blanket.event_shape:
-            rows = rows[0]
-            squares = count * np.vecdot(rows, rows)
-            return e.sum(squares), e.sum(np.vecdot(rows, residual))
-        weighted = _last(rows * np.sqrt(count)[..., None])
-        return e.outer(weighted), e.sum(_last(np.vecdot(rows, residual)), 1)
-
-    def _by_label(self, values: Values) -> Naturals:
-        """The same for vectors whose mean is this node itself, element k under label k."""
-        assert self._way is not None
-        precision, data = self._way.precision(values), self._way.groups.at(values)
-        d = precision.matrix.shape[-1]
-        count = data.count.reshape((len(data.count), -1, 1, 1))
-        total = data.total.reshape((len(count), -1, d))
-        return count * precision.matrix, np.matvec(precision.matrix, total)
+    terms: tuple[Term, ...]
+    family: Family
+    value: Expression
+    shape: Shape
+    mask: np.ndarray | None
+    sums: LabelSums | None = None
 
     @cached_property
-    def counts(self) -> Groups | None:
-        """Where the child is itself the label of somebody's sums, how often each of its states came.
+    def density(self) -> Expression:
+        """Log densities of all entries, or of all labels.
 
-        Looked up at the first step, when all kernels have been made.
+        Raises
+        ------
+        TraceError
+            The family has no closed form.
         """
-        alone = self.kind.name == "shares" and self.pair.child is Categorical
-        if not alone or len(self.terms) > 1 or self.is_picked or self.blanket.node.plates:
-            return None
-        target = self.blanket.target
-        return None if target.seen(self.term.name) is not None else counted(target, self.term)
+        if self.sums is not None:
+            return self.sums.expression
+        if has_own_form(self.family) and any(t.expression is None for t in self.terms):
+            raise TraceError("its form gives other values than its log_prob")
+        return broadcast(log_density(self.family, self.value), self.shape)
+
+    def read(self, name: str) -> list[str]:
+        """The parameters in which a node occurs."""
+        return [
+            k
+            for k, v in self.family.parameters.items()
+            if any(name in e.leaves for e in expressions_of(v))
+        ]
 
     @property
-    def _event_ndim(self) -> int:
-        return len(self.node.event_shape)
+    def word(self) -> str:
+        """What the family is called."""
+        return getattr(self.family.make, "__name__", str(self.family.make))
 
-    def _evaluated(
-        self, values: Values, members: np.ndarray | None, steps: bool
-    ) -> Evaluated | Looked:
-        if self._way is not None:
-            if self._way.direct is not None:
-                return self._way.looked(values)
-            return self._way.evaluated(values, self._moved if steps else self._neutral, steps)
-        candidate = self._full(self._moved if steps else self._neutral, members)
-        state = self.blanket.placed(values, candidate, members)
-        dist, keys = self._valid(state)
-        data = self._data if self._data is not None else self._data_of(self._value(values))
-        collector = Collector(self.relation, self.shape, keys, members)
-        return Evaluated(dist, steps, len(self.shape), data, collector)
 
-    def _valid(self, state: Values) -> tuple[Distribution, tuple[Any, ...]]:
-        """The distribution, and the index by which it read the node; raises where the model is at fault."""
-        dist, batch, keys = self._distribution(state)
-        if dist.invalid is not None:
-            self.term.refuse_out_of_range(dist, batch, self._value(state))
-        return dist, keys
+def children_of(blanket: Blanket) -> list[Child] | Term:
+    """The children of a node that vary with it, or the first one that cannot be followed."""
+    groups: dict[Hashable, list[Term]] = {}
+    for child in blanket.children:
+        term = child.term
+        if term.is_potential or isinstance(term.read, Opaque):
+            return term
+        if blanket.name in term.read.leaves:
+            groups.setdefault(_key(blanket, term), []).append(term)
+    return [c for terms in groups.values() for c in _made(blanket, terms)]
 
-    def _full(self, candidate: np.ndarray, members: np.ndarray | None) -> np.ndarray:
-        """A candidate for every element, or for those of a class."""
-        if members is None:
-            return candidate
-        event = self.blanket.event_shape
-        lead = candidate.shape[: candidate.ndim - len(self.blanket.node.value_shape)]
-        return np.broadcast_to(candidate.reshape(lead + (1, *event)), lead + (len(members), *event))
 
-    def _data_of(self, value: np.ndarray) -> Elements:
-        domain = self.node.domain
-        if domain is not None and (domain.low or self.kind.name != "shares"):
-            value = domain.to_support(value)
-        if value.ndim == len(self.shape) + self._event_ndim:
-            value = value[None]
-        if self.kind.name != "shares":
-            value = TRANSFORMS[self.pair.transform](value)
-        return Elements(value, self.term.mask, self._event_ndim)
+def apart(blanket: Blanket, child: Child) -> list[Child]:
+    """Many like children one by one, or one entry by entry and not by label; nothing of others."""
+    if child.sums is None and len(child.terms) == 1:
+        return []
+    return [_alone(blanket, t) for t in child.terms]
 
-    def _known_data(self) -> Elements | None:
-        target = self.blanket.target
-        if not all(target.is_known(t.name) for t in self.terms):
-            return None
-        with np.errstate(all="ignore"):
-            return self._data_of(self._value(target.known))
 
-    # ---- the child as such --------------------------------------------------------------------
-
-    @property
-    def terms(self) -> tuple[Term, ...]:
-        """The child, or those that are one here."""
-        return (self.term,)
-
-    @property
-    def shape(self) -> Shape:
-        """Of its elements."""
-        return self.term.shape
-
-    def _distribution(self, state: Values) -> tuple[Distribution, Shape, tuple[Any, ...]]:
-        """Its distribution, the batch of its parents, and the index by which it read the node."""
-        return self.blanket.distribution(self.child, state)
-
-    def _value(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """What was drawn from it, shape ``(chains, *shape, *event)``, without chains where it is known."""
-        return values[self.term.name]
-
-    def _find_way(self) -> ByLabel | None:
-        return by_label(self.blanket, self.child, self.pair)
-
-    # ---- what never changes -------------------------------------------------------------------
-
-    def _settle(self) -> None:
-        """Find sums by label, constant slopes and constant children."""
-        alone = self.relation.kind != "whole" and len(self.relation.rows) <= 1
-        if not alone or len(self.blanket.classes) > 1:
-            return
-        target, name = self.blanket.target, self.blanket.name
-        above = dict.fromkeys(n for t in self.terms for n in target.hidden_above(t))
-        members = self.blanket.classes[0]
-        if list(above) == [name] and self._data is not None:
-            value = np.broadcast_to(self._neutral, (1, *self.blanket.node.value_shape))
-            self._fixed = self._natural({**target.known, name: value}, members)
-            return
-        if members is None and self.pair.by_label and not self.is_picked:
-            self._way = self._find_way()
-        if self._way is not None:
-            if self.is_copy or self.pair.form != "multiple":
-                self._read_directly(tuple(above))
-        elif self.kind.name == "mean":
-            self._find_slope(tuple(above), members)
-
-    def _read_directly(self, above: tuple[str, ...]) -> None:
-        """Leave out calls of the function where its parameters are plain nodes by label."""
-        assert self._way is not None
-        example = read_directly(self._way, self._neutral, above)
-        if example is not None and self.kind.name == "mean":
-            # the mean varies with this node and the label alone
-            dist, _ = self._way.at_labels(example, self._moved)
-            self._slope = slope_of(dist, len(self.shape), self._steps)
-            self.is_mean_by_label = self._is_itself(self._slope)
-
-    def _is_itself(self, slope: np.ndarray) -> bool:
-        """Whether the mean of vectors is the node's value under each label."""
-        assert self._way is not None
-        if not self.blanket.event_shape or not self.blanket.node.plates or not self._event_ndim:
-            return False
-        unit = np.eye(len(self._steps)).reshape((len(slope), *(1,) * (slope.ndim - 2), -1))
-        at_zero = self._way.parameter("loc", {})
-        return bool((slope == unit).all() and not np.any(at_zero))
-
-    def _find_slope(self, above: tuple[str, ...], members: np.ndarray | None) -> None:
-        """Slopes are constant where the mean is affine in all that is hidden together."""
-        target = self.blanket.target
-        if any(target.model[n].is_discrete for n in above):
-            return
-        if not all(_mean_is_affine(target, t) for t in self.terms):
-            return
-        # values that can be: the noise may depend on some of these nodes, too
-        drawn = [t.name for t in self.terms if t.name in target.chain]
-        state = target.example((*above, *drawn))
-        candidate = self._full(self._moved, members)
-        try:
-            dist, _, _ = self._distribution(self.blanket.placed(state, candidate, members))
-        except BayesmcError:
-            return
-        slope = slope_of(dist, len(self.shape), self._steps)
-        if np.isfinite(slope).all():
-            self._slope = slope
+def with_known(target: Target, expression: Expression) -> Expression:
+    """An expression with constants in the place of what is known."""
+    values = {}
+    for node in ordered(expression):
+        if isinstance(node, Leaf) and target.is_known(node.name):
+            value = np.asarray(target.known[node.name])
+            if value.shape == node.shape:
+                values[node.name] = as_expression(value)
+    return substituted(expression, values) if values else expression
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _mean_is_affine(target: Target, term: Term) -> bool:
-    """Whether a term's mean is affine in all hidden nodes that it varies with together."""
-    try:
-        result = traced_term(target, target.hidden_above(term), term).result
-    except Untraceable:
-        return False
-    loc = result.arguments["loc"] if isinstance(result, TracedCall) else None
-    return isinstance(loc, Tracer) and loc.is_affine
+def _roots(term: Term) -> tuple[Expression, ...]:
+    """A term's parameters, and its value as it is stored."""
+    own = stored_leaf(term.model, term.model[term.name])
+    return (*expressions_of(term.read.result), own)  # type: ignore[union-attr]
 
 
-def _steps(blanket: Blanket) -> np.ndarray:
-    """For every component a power of two near the size of its values, so that steps lose no digits."""
-    d = math.prod(blanket.event_shape)
-    probe = np.abs(np.asarray(blanket.target.model.probe[blanket.name], dtype=float))
-    sizes = probe.reshape(-1, d).max(axis=0, initial=0.0)
-    sizes = np.where((sizes > 0) & np.isfinite(sizes), sizes, 1.0)
-    return 2.0 ** np.clip(np.round(np.log2(sizes)), -1000, 1000)
+def _key(blanket: Blanket, term: Term) -> Hashable:
+    """Equal for like children."""
+    known = term.model.cache.setdefault("templates of terms", {})
+    if term.name not in known:
+        known[term.name] = template(*_roots(term))
+    found = known[term.name]
+    low = _low(term)
+    return frame(term.read.result), found.key, found.leaves.index(blanket.name), term.shape, low  # type: ignore[union-attr]
 
 
-def _stepped(neutral: np.ndarray, steps: np.ndarray, event_shape: Shape) -> np.ndarray:
-    """The neutral value and a step along every component, one more axis in front."""
-    d = len(steps)
-    moves = np.concatenate([np.zeros((1, d)), np.diag(steps)])
-    lead = neutral.ndim - len(event_shape)
-    return neutral + moves.reshape((d + 1,) + (1,) * lead + event_shape)
+def _low(term: Term) -> int:
+    domain = term.model[term.name].domain
+    return 0 if domain is None else domain.low
 
 
-def _last(array: np.ndarray) -> np.ndarray:
-    """The first axis moved to the end."""
-    return array.transpose((*range(1, array.ndim), 0))
+def _made(blanket: Blanket, terms: Sequence[Term]) -> Iterator[Child]:
+    summed = {t.name: by_label(blanket.target, t, blanket.name) for t in terms}
+    if len(terms) > 1 and not any(summed.values()):
+        found = _joined(blanket, terms)
+        if found is not None:
+            yield found
+            return
+    for term in terms:
+        sums = None if len(blanket.classes) > 1 else summed[term.name]
+        child = _alone(blanket, term)
+        yield child if sums is None else replace(child, sums=sums, mask=None)
+
+
+def _alone(blanket: Blanket, term: Term) -> Child:
+    roots = [with_known(blanket.target, r) for r in _roots(term)]
+    return _child((term,), roots, term.shape, term.mask)
+
+
+def _joined(blanket: Blanket, terms: Sequence[Term]) -> Child | None:
+    """Like children as one."""
+    found = stacked_rows([_roots(t) for t in terms])
+    if found is None:
+        return None
+    leaves = {n.name: n for n in ordered(*found.roots) if isinstance(n, Leaf)}
+    values = {k: as_expression(v) for k, v in found.constants.items()}
+    for names in zip(*found.leaves, strict=True):
+        if len(set(names)) > 1:
+            if blanket.name in names:
+                return None
+            values[names[0]] = _side_by_side(blanket.target, leaves[names[0]], names)
+    count = len(terms)
+    roots = [with_known(blanket.target, widened(r, values, count)) for r in found.roots]
+    mask = None
+    if any(t.mask is not None for t in terms):
+        shape = terms[0].shape
+        mask = np.stack([np.broadcast_to(True if t.mask is None else t.mask, shape) for t in terms])
+    # of parameters, plates and event may be fewer than the value's: the group stays in front of all
+    rank = len(terms[0].shape)
+    roots = [
+        _in_front(r, o, rank, len(v)) for r, o, v in _with_events(terms[0], roots, found.roots)
+    ]
+    return _child(tuple(terms), roots, (count, *terms[0].shape), mask)
+
+
+def _with_events(
+    term: Term, wide: Sequence[Expression], roots: Sequence[Expression]
+) -> Iterator[tuple[Expression, Expression, Shape]]:
+    """Expressions with the event axes that each has."""
+    result: Any = term.read.result  # type: ignore[union-attr]
+    ndims = list(_event_ndims(result))
+    event = len(term.model[term.name].event_shape)
+    for w, r, n in zip(wide, roots, [*ndims, event], strict=True):
+        yield w, r, (1,) * n
+
+
+def _event_ndims(result: Any, make: Any = None, name: str = "") -> Iterator[int]:
+    """Axes that one value of each parameter has."""
+    if isinstance(result, Expression):
+        known = getattr(make, "parameter_ndim", {})
+        others = {"scale_tril": 2, "scale_diag": 1, "logits": known.get("probs", 0)}
+        yield known.get(name, others.get(name, 0))
+    elif isinstance(result, Family):
+        for key, value in result.parameters.items():
+            yield from _event_ndims(value, result.make, key)
+    elif isinstance(result, (list, tuple)):
+        for value in result:
+            yield from _event_ndims(value, make, name)
+
+
+def _in_front(wide: Expression, root: Expression, rank: int, event: int) -> Expression:
+    """An expression with the group in front of all plates, those that it lacks of size one."""
+    missing = rank + event - len(root.shape)
+    if missing <= 0:
+        return wide
+    shape = (wide.shape[0], *(1,) * missing, *wide.shape[1:])
+    at = np.arange(wide.size).reshape(shape)
+    return pick([wide], at)
+
+
+def _side_by_side(target: Target, first: Leaf, names: Sequence[str]) -> Expression:
+    from_names: list[Expression] = []
+    for name in names:
+        node = stored_leaf(target.model, target.model[name])
+        from_names.append(with_known(target, node))
+    at = np.arange(len(names) * first.size).reshape(len(names), *first.shape)
+    return pick(from_names, at)
+
+
+def _child(
+    terms: tuple[Term, ...], roots: Sequence[Expression], shape: Shape, mask: np.ndarray | None
+) -> Child:
+    *parameters, value = roots
+    low = _low(terms[0])
+    if low:
+        value = elementwise(np.add, value, low)
+    result: Any = terms[0].read.result  # type: ignore[union-attr]
+    if not isinstance(result, Family):
+        raise TraceError("it is no distribution that can be followed")
+    return Child(terms, _with_parts(result, iter(parameters)), value, shape, mask)
+
+
+def _with_parts(traced: Any, parts: Iterator[Expression]) -> Any:
+    """What was traced, with other expressions."""
+    if isinstance(traced, Expression):
+        return next(parts)
+    if isinstance(traced, Family):
+        return Family(traced.make, {k: _with_parts(v, parts) for k, v in traced.parameters.items()})
+    if isinstance(traced, (list, tuple)):
+        return type(traced)(_with_parts(v, parts) for v in traced)
+    return traced

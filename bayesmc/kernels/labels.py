@@ -1,7 +1,7 @@
 """Labels of mixtures: the full conditionals of all elements as one matrix product, then a draw of each.
 
 Log densities of every element at every state are features of the data times coefficients of the states
-(``label_terms``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
+(``label_sums``), taken through chunks that stay in cache. The sums by label that conjugate kernels ask
 for next come out of the same pass. A sweep whose products would cancel (components narrow beside the
 spread of the data) or whose parameters are lost goes to ``Enumerate``, which works on residuals.
 
@@ -13,31 +13,32 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 22; Diebolt and Rober
 from __future__ import annotations
 
 import itertools
-import math
-from collections.abc import Sequence
-from operator import mul
+from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical
-from bayesmc.errors import BayesmcError, ZeroProbabilityError
-from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conjugate_data import Groups
-from bayesmc.kernels.conjugate_planar import FEW
-from bayesmc.kernels.enumerate import Enumerate
-from bayesmc.kernels.label_terms import (
-    IMPOSSIBLE,
-    LabelTerm,
-    LostParameters,
-    example_of,
-    label_term,
+from bayesmc.errors import BayesmcError, TraceError, ZeroProbabilityError
+from bayesmc.expression import (
+    Expression,
+    as_expression,
+    broadcast,
+    elementwise,
+    pick,
+    reduction,
+    reshape,
 )
+from bayesmc.expression.scalars import SmallProgram
+from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.label_sums import IMPOSSIBLE, LabelSums, label_sums
 from bayesmc.kernels.verify import check_ratio
+from bayesmc.network.expressions import Opaque, density_at
+from bayesmc.passes.arithmetic import add, multiply, subtract
+from bayesmc.passes.sufficient import log_probabilities
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Values
-from bayesmc.structure.traced import Untraceable, traced_term
-from bayesmc.tracing import TracedCall, Tracer
+from bayesmc.structure.target import Target, Values
 
 #: sum of the sizes of the products in a log density, from which on rounding could reach 1e-9 of it
 _LARGEST = 2.0**19
@@ -48,13 +49,17 @@ _CHUNK, _NARROW = 1 << 14, 512
 _ZERO = 0.1 * IMPOSSIBLE
 
 
+class LostParameters(Exception):
+    """Parameters that overflowed or are out of range: the model's own density says what follows."""
+
+
 class Labels(Kernel):
     """Draws a finite plated node whose children's log densities are features times coefficients.
 
     Parameters
     ----------
     blanket : Blanket
-    terms : sequence of LabelTerm
+    terms : sequence of LabelSums
         Its children.
     debug : bool
         Check log densities against the model's in every step.
@@ -62,7 +67,7 @@ class Labels(Kernel):
 
     label = "enumerate"
 
-    def __init__(self, blanket: Blanket, terms: Sequence[LabelTerm], debug: bool = False) -> None:
+    def __init__(self, blanket: Blanket, terms: Sequence[LabelSums], debug: bool = False) -> None:
         self.blanket, self.terms, self.debug = blanket, tuple(terms), debug
         self.names = (blanket.name,)
         domain = blanket.node.domain
@@ -71,8 +76,8 @@ class Labels(Kernel):
         self.match = f"{domain.size} states, as one matrix product"
         self.members = blanket.classes[0]
         self._plain = Enumerate(blanket)
-        self._layout()
         self._prior = _Prior(blanket, self.members)
+        self._layout()
         self._parts: dict[int, list[tuple[slice, np.ndarray, _Buffers]]] = {}
         self._codes = np.arange(self.states, dtype=self.dtype)[:, None, None]
 
@@ -88,16 +93,17 @@ class Labels(Kernel):
         by_element = self._prior.by_element(values)
         if self.debug:
             self._check(values, table, by_element)
-        groups = self._fed()
         label = np.empty((chains, self._features.shape[1]), dtype=self.dtype)
-        sums = self._draw(table, by_element, rng, label, groups is not None)
+        sums = self._draw(table, by_element, rng, label)
         shape = values[name].shape
         if self.members is None:
             label = label.reshape(shape)
-        new = self.blanket.moved(values, label, self.members)
-        if groups is not None:
-            groups.feed(new, sums)
-        return {name: new}, memory
+        new = {name: self.blanket.moved(values, label, self.members)}
+        if self._is_asked:
+            for at, term in zip(self._at, self.terms, strict=True):
+                part = sums[..., at : at + len(term.statistics)]
+                new |= term.kept(new[name], part)
+        return new, memory
 
     # ---- log densities -------------------------------------------------------------------------
 
@@ -114,13 +120,13 @@ class Labels(Kernel):
         return log if by_element is None else log + by_element
 
     def _layout(self) -> None:
-        """Stack the features of all children; find the row of ones that the prior multiplies."""
+        """Stack the statistics of all children; find the row of ones that the prior multiplies."""
         parts, self._at = [], []
         start = 0
         for term in self.terms:
-            parts.append(term.features)
+            parts.append(term.statistics)
             self._at.append(start)
-            start += len(term.features)
+            start += len(term.statistics)
         whole = (a for a, t in zip(self._at, self.terms, strict=True) if t.term.mask is None)
         self._one = next(whole, start)
         if self._one == start:
@@ -131,49 +137,61 @@ class Labels(Kernel):
         may_vanish = np.zeros(len(self._features), dtype=bool)
         may_vanish[self._one] = True
         for at, term in zip(self._at, self.terms, strict=True):
-            may_vanish[at + term.ones : at + len(term.features)] = term.indicators
+            may_vanish[at + term.ones : at + len(term.statistics)] = term.indicators
         self._may_vanish = may_vanish
-        self._most_floats = self._most.tolist()
+        self._plan()
+        own = self.blanket.own
+        weighed = own is not None and bool(self.blanket.target.hidden_above(own))
+        #: whether somebody needs sums by label
+        self._is_asked = self.members is None and (weighed or any(t.is_asked for t in self.terms))
+
+    def _plan(self) -> None:
+        """Programs: log odds' coefficients and the size that products can have; coefficients of states."""
+        width = len(self._most)
+        parts: list[Expression] = [t.coefficients for t in self.terms]
+        if self._one == sum(p.shape[1] for p in parts):
+            parts.append(broadcast(as_expression(0.0), (self.states, 1)))
+        starts = np.cumsum([0, *(p.size for p in parts)])
+        at = np.concatenate(
+            [a + np.arange(p.size).reshape(p.shape) for a, p in zip(starts, parts, strict=False)], 1
+        )
+        prior = self._prior.expression
+        if prior is not None:  # in the place of the column of what multiplies ones
+            parts.append(add(pick(parts, at[:, self._one]), prior))
+            at[:, self._one] = starts[-1] + np.arange(self.states)
+        rows = pick(parts, at)
+        assert rows.shape == (self.states, width)
+        at = np.arange(rows.size).reshape(rows.shape)
+        odds = subtract(pick([rows], at[1:]), pick([rows], at[:1]))
+        sizes = reduction(np.add, multiply(elementwise(np.abs, rows), self._most), (1,))
+        most = reduction(np.maximum, sizes, (0,))
+        self._odds, self._rows = SmallProgram([odds, most]), SmallProgram([rows])
 
     def _table(self, values: Values, chains: int) -> _Table:
         """The coefficients of a state; raises ``LostParameters`` where products would cancel."""
-        if chains * self.states <= FEW:
-            quick = self._planar(values, chains)
-            if quick is not None:
-                return quick
-        table = np.zeros((self.states, chains, len(self._features)))
-        for at, term in zip(self._at, self.terms, strict=True):
-            c = term.coefficients(values)
-            constant = c.constant
-            if term.ones == 1 and constant.shape[-1] != 1:
-                constant = constant.sum(axis=-1, keepdims=True)
-            middle = at + term.ones
-            table[:, :, at:middle] = constant.swapaxes(0, 1)
-            table[:, :, middle : middle + c.rows.shape[-1]] = c.rows.swapaxes(0, 1)
-        common = self._prior.common(values)
-        if common is not None:
-            table[:, :, self._one] += common
-        if (np.abs(table) @ self._most).max() < _LARGEST:
-            return _Table(table, self._prior.steep)
+        more = self._prior.common(values)
+        if more is None:
+            odds, most = self._odds(values)
+            if np.maximum.reduce(most, axis=None) < _LARGEST:
+                if odds.ndim == 2 or len(odds) < chains:
+                    odds = np.broadcast_to(odds, (chains, *odds.shape[-2:]))
+                return _Table(odds, lambda: self._by_state(values, chains), self._prior.steep)
+        table = self._by_state(values, chains)
+        if more is not None:
+            table[:, :, self._one] += more
         finite = np.where(self._may_vanish & (table < _ZERO), 0.0, table)
         if not (np.abs(finite) @ self._most).max() < _LARGEST:
             raise LostParameters
-        return _Table(np.maximum(table, 3 * IMPOSSIBLE), True)
+        table = np.maximum(table, 3 * IMPOSSIBLE)
+        odds = (table[1:] - table[:1]).swapaxes(0, 1)
+        lost = bool((self._may_vanish & (table < _ZERO)).any())
+        return _Table(odds, lambda: table, lost or self._prior.steep)
 
-    def _planar(self, values: Values, chains: int) -> _Table | None:
-        """The same in floats for few components in the plane, or None."""
-        logs = self._prior.floats(values, chains)
-        rows = None if logs is None else self.terms[0].planar(values, chains)
-        if rows is None:
-            return None
-        for row, log in zip(rows, logs, strict=True):  # type: ignore[arg-type]
-            row[0] += log
-            if not sum(map(mul, map(abs, row), self._most_floats)) < _LARGEST:
-                return None
-        table = np.array(rows)
-        if chains == 1:
-            return _Table(table[:, None], False)
-        return _Table(table.reshape(chains, self.states, -1).swapaxes(0, 1).copy(), False)
+    def _by_state(self, values: Values, chains: int) -> np.ndarray:
+        """Coefficients, shape (states, chains, rows)."""
+        (rows,) = self._rows(values)
+        full = (chains, self.states, len(self._most))
+        return np.array(np.broadcast_to(rows, full).swapaxes(0, 1))
 
     # ---- draws ---------------------------------------------------------------------------------
 
@@ -183,7 +201,6 @@ class Labels(Kernel):
         by_element: np.ndarray | None,
         rng: np.random.Generator,
         label: np.ndarray,
-        summing: bool,
     ) -> np.ndarray:
         """Fill in labels ``(chains, elements)``; the features' sums ``(chains, states, features)``."""
         chains, total = len(label), None
@@ -197,7 +214,7 @@ class Labels(Kernel):
                     )
             drawn = label[:, part]
             buffers.draw(rng, drawn)
-            if summing:
+            if self._is_asked:
                 sums = buffers.summed(drawn, self._codes, features)
                 total = sums if total is None else total + sums
         if total is None:
@@ -224,14 +241,6 @@ class Labels(Kernel):
             }
         return self._parts[chains]
 
-    def _fed(self) -> Groups | None:
-        """The sums that conjugate kernels ask for, if they are of these features."""
-        if len(self.terms) > 1 or self.members is not None:
-            return None
-        groups = self.terms[0].groups
-        fits = groups is not None and groups.used and groups.rows == len(self._features)
-        return groups if fits else None
-
     def _check(self, values: Values, table: _Table, by_element: np.ndarray | None) -> None:
         """Refuse log densities that are not the model's."""
         found = self._product(table, by_element)
@@ -253,18 +262,29 @@ class Labels(Kernel):
 
 
 class _Table:
-    """Coefficients of every state: ``rows`` (states, chains, features), and their differences to the first.
+    """Coefficients of every state, as differences to the first or, where these may overflow, as such.
 
-    Attributes
+    Parameters
     ----------
+    odds : ndarray, shape (chains, states - 1, features)
+    rows : callable
+        Gives the coefficients, shape (states, chains, features).
     steep : bool
         Whether any state may be impossible.
     """
 
-    def __init__(self, rows: np.ndarray, steep: bool) -> None:
-        self.rows, self.steep = rows, steep
-        self.flat = rows.reshape(-1, rows.shape[-1])
-        self.odds = (rows[1:] - rows[0]).reshape(-1, rows.shape[-1])
+    def __init__(self, odds: np.ndarray, rows: Callable[[], np.ndarray], steep: bool) -> None:
+        self._rows, self.steep = rows, steep
+        wide = len(odds) > 1
+        self.odds = odds.swapaxes(0, 1).reshape(-1, odds.shape[-1]) if wide else odds[0]
+
+    @cached_property
+    def rows(self) -> np.ndarray:
+        return self._rows()
+
+    @property
+    def flat(self) -> np.ndarray:
+        return self.rows.reshape(-1, self.rows.shape[-1])
 
 
 class _Buffers:
@@ -287,7 +307,7 @@ class _Buffers:
         np.dot(table, features, out=self.flat_odds)
         if own is not None:
             log_odds += own[1:] - own[0]
-        if not log_odds.max() < _STEEP:
+        if not np.maximum.reduce(log_odds, axis=None) < _STEEP:
             return False
         np.exp(log_odds, out=log_odds)
         self.log[0] = 1.0
@@ -332,42 +352,46 @@ class _Prior:
 
     def __init__(self, blanket: Blanket, members: np.ndarray | None) -> None:
         self.blanket, self.members = blanket, members
-        own = blanket.own
+        own, target = blanket.own, blanket.target
         domain = blanket.node.domain
-        assert domain is not None
+        assert domain is not None and target.states is not None
         axes = len(blanket.node.plates)
         self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape(
             (-1,) + (1,) * (1 + axes)
         )
         self.steep = False
-        self._weights = _weights_of(blanket)
         self._kept: np.ndarray | None = None
-        target = blanket.target
-        log = self._evaluated(example_of(target))
+        log = self._evaluated(_first_of(target))
         self._is_common = log.shape[2:] == (1,) * axes
+        #: the common ones, shape (states,), where they are known or followed
+        self.expression: Expression | None = None
         above = () if own is None else target.hidden_above(own)
         if not above:
             self._kept = self._shaped(self._evaluated({**target.known}))
             self.steep = bool((self._kept < _ZERO).any())
+            if self._is_common:
+                self.expression = as_expression(self._kept[:, 0])
+        elif self._is_common:
+            self.expression = self._read()
+
+    def _read(self) -> Expression | None:
+        """The common ones as an expression, where the label's function is followed."""
+        own, domain = self.blanket.own, self.blanket.node.domain
+        if own is None or domain is None or isinstance(own.read, Opaque):
+            return None
+        values = domain.to_support(np.arange(domain.size))
+        try:
+            family = density_at(own.model, own.name, {})
+            logs = log_probabilities(family, values)
+        except TraceError:
+            return None
+        return reshape(logs, (domain.size,)) if logs.size == domain.size else None
 
     def common(self, values: Values) -> np.ndarray | None:
-        """Shape (states, chains or 1), or None where elements differ."""
-        if not self._is_common:
+        """Shape (states, chains or 1), or None where elements differ or it is an expression."""
+        if not self._is_common or self.expression is not None:
             return None
-        if self._kept is not None:
-            return self._kept
-        if self._weights is not None:
-            return np.maximum(np.log(values[self._weights].T), IMPOSSIBLE)
         return self._shaped(self._evaluated(values))
-
-    def floats(self, values: Values, chains: int) -> list[float] | None:
-        """The common ones of every chain and state, where they are the logarithms of a node's value."""
-        if not self._is_common or self._weights is None:
-            return None
-        try:
-            return list(map(math.log, values[self._weights].ravel().tolist()))
-        except ValueError:  # of zero
-            return None
 
     def by_element(self, values: Values) -> np.ndarray | None:
         """Shape (states, chains or 1, elements), or None where they are alike."""
@@ -430,11 +454,13 @@ def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
         return None
     if blanket.path or len(blanket.classes) != 1 or not blanket.children:
         return None
+    if blanket.target.states is None:
+        return None
     found = []
     with np.errstate(all="ignore"):
         for child in blanket.children:
-            term = label_term(blanket, child)
-            if term is None:
+            term = label_sums(blanket.target, child.term, blanket.name)
+            if term is None or child.relation.kind != "aligned":
                 return None
             found.append(term)
         kernel = Labels(blanket, found, debug)
@@ -444,28 +470,9 @@ def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _weights_of(blanket: Blanket) -> str | None:
-    """The node that holds the probabilities themselves, one row for all elements."""
-    own, target = blanket.own, blanket.target
-    above = () if own is None else target.hidden_above(own)
-    if own is None or len(above) != 1 or target.model[above[0]].plates:
-        return None
-    if target.model[above[0]].event_shape != (blanket.node.domain.size,):  # type: ignore[union-attr]
-        return None
-    try:
-        result = traced_term(target, (above[0],), own).result
-    except Untraceable:
-        return None
-    if not isinstance(result, TracedCall) or result.function is not Categorical:
-        return None
-    value = result.traced.get("probs")
-    alone = len(result.traced) == 1 and isinstance(value, Tracer) and value.is_copy
-    return above[0] if alone and value.whole_event else None  # type: ignore[union-attr]
-
-
 def _is_right(kernel: Labels) -> bool:
     """Whether log densities at a reachable state are the model's."""
-    state = example_of(kernel.blanket.target)
+    state = _first_of(kernel.blanket.target)
     try:
         table = kernel._table(state, 1)
         kernel._check(state, table, kernel._prior.by_element(state))
@@ -474,3 +481,9 @@ def _is_right(kernel: Labels) -> bool:
     except BayesmcError:
         return False
     return True
+
+
+def _first_of(target: Target) -> Values:
+    """One reachable state, ``(1, *plates, *event)``."""
+    assert target.states is not None
+    return {n: v if target.is_known(n) else v[:1] for n, v in target.states.items()}

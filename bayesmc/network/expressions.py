@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import TraceError
+from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import (
     Constant,
     Expression,
@@ -186,6 +186,42 @@ def log_density_of(model: Model, name: str) -> Expression:
     if has_own_form(family):
         hold_form(model, name, result)
     return result
+
+
+def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
+    """What a node's function computes where some parents have other stored values, of any plate sizes.
+
+    So a function of a label is read at every label in place of every element: whether that says the same
+    is the caller's to check, as it is here not.
+
+    Parameters
+    ----------
+    given : mapping
+        Stochastic parent -> whole numbers with its plates' axes.
+
+    Raises
+    ------
+    TraceError
+        The function cannot be followed, or does not broadcast so.
+    """
+    node = model[name]
+    declaration, links = node.declaration, node.links
+    if declaration.vectorize or declaration.value is not None:
+        raise TraceError("it is called element by element, or not at all")
+    parents = tuple(parent for parent, _ in links)
+    arguments = tuple(
+        replace(a, known=constant(given[parent])) if parent in given else a
+        for a, parent in zip(_arguments(model, links), parents, strict=True)
+    )
+    try:
+        if declaration.probs is not None:
+            reading = read_table(declaration.probs, arguments, links)
+        else:
+            reading = read_function(declaration.function, arguments, links)
+        found = Followed(model, reading, parents, arguments).result
+    except (BayesmcError, ValueError, IndexError) as error:
+        raise TraceError(str(error)) from error
+    return family_of(found) if isinstance(found, Distribution) else found
 
 
 def log_factor_of(model: Model, name: str) -> Expression:

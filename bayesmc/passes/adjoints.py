@@ -122,8 +122,10 @@ class _Gathered:
         at = np.broadcast_to(rows, (*batch, *places))
         many, size = math.prod(batch), self.shape[0]
         flat = (at.reshape(many, -1) + size * np.arange(many)[:, None]).reshape(-1)
-        found = np.zeros((many * size, *block))
-        np.add.at(found, flat, part.reshape(-1, *block))
+        columns = part.reshape(flat.size, -1)
+        found = np.empty((many * size, columns.shape[1]))
+        for k in range(columns.shape[1]):
+            found[:, k] = np.bincount(flat, columns[:, k], many * size)
         return found.reshape(*batch, *self.shape)
 
 

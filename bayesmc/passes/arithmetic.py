@@ -9,7 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.expression import Constant, Expression, as_expression, broadcast, cast, elementwise
+from bayesmc.expression import (
+    Constant,
+    Elementwise,
+    Expression,
+    as_expression,
+    broadcast,
+    cast,
+    elementwise,
+    ordered,
+)
 
 ZERO, ONE = as_expression(0.0), as_expression(1.0)
 
@@ -40,6 +49,19 @@ def tidy(function: Any, *operands: Any) -> Expression:
         if function is np.subtract and is_all(first, 0):
             return elementwise(np.negative, _filled(second, args))
     return elementwise(function, *args)
+
+
+def tidied(root: Expression) -> Expression:
+    """An expression without what changes nothing for finite values."""
+    found: dict[Expression, Expression] = {}
+    for node in ordered(root):
+        operands = [found[a] for a in node.operands]
+        if isinstance(node, Elementwise) and node.dtype == float:
+            found[node] = broadcast(tidy(node.function, *operands), node.shape)
+        else:
+            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
+            found[node] = node if same else node.with_operands(operands)
+    return found[root]
 
 
 def add(a: Any, b: Any) -> Expression:

@@ -11,6 +11,7 @@ Wainwright and Jordan (2008), Graphical Models, Exponential Families, and Variat
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,21 +19,37 @@ from scipy import special
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
+    Call,
     Elementwise,
     Expression,
+    Gather,
     Leaf,
     Pick,
     Reduction,
     as_expression,
     broadcast,
     elementwise,
+    gather,
     leaf,
+    ordered,
     pick,
     reduction,
     replaced,
 )
 from bayesmc.expression.graph import CASTS
-from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, subtract, tidy
+from bayesmc.passes.arithmetic import (
+    ONE,
+    ZERO,
+    add,
+    divide,
+    is_all,
+    multiply,
+    subtract,
+    tidied,
+    tidy,
+)
+from bayesmc.passes.branches import branches_up
+from bayesmc.passes.reads import NOTHING, element_read, matrix_function
 from bayesmc.passes.sinking import reads, sunk
 
 #: powers p of ``x**p``, and the two logarithms
@@ -50,14 +67,23 @@ class Statistics:
     coefficients : dict
         Feature (a power of x, ``LOG`` or ``LOG1M``) -> expression of the shape of the entries.
     at : Expression of whole numbers
-        Flat position of the element of the leaf that each entry reads.
+        Number of the element of the leaf that each entry reads, -1 where it reads none.
+    is_picked : bool
+        Whether it hangs on other leaves whether an entry reads its element.
     """
 
     coefficients: Features
     at: Expression
+    is_picked: bool = False
 
 
-def statistics(density: Expression, name: str) -> Statistics:
+def statistics(
+    density: Expression,
+    name: str,
+    numbers: np.ndarray | None = None,
+    strict: bool = True,
+    is_share: bool = True,
+) -> Statistics:
     """The features of a log density in a leaf, entry by entry.
 
     Parameters
@@ -65,6 +91,14 @@ def statistics(density: Expression, name: str) -> Statistics:
     density : Expression
     name : str
         Each entry reads one element of it.
+    numbers : ndarray of int, shape of the leaf
+        The element that each number of the leaf belongs to, itself by default; -1 for those that are
+        taken as given.
+    strict : bool
+        Whether to refuse entries that have features for some values of other leaves only. If not,
+        coefficients are NaN for all others.
+    is_share : bool
+        Whether it is between 0 and 1, so that one minus it may be meant.
 
     Raises
     ------
@@ -82,55 +116,56 @@ def statistics(density: Expression, name: str) -> Statistics:
     >>> sorted(found.coefficients)
     [1.0, 2.0]
     """
-    whole = sunk(density, name)
-    ways = {r: _positions(r, name) for r in reads(whole, name)}
-    shape = density.shape
-    at = {_broadcast_to(p, shape) for p in ways.values()}
-    if len(at) != 1:
-        raise TraceError(f"an entry reads {len(at)} elements of {name!r}")
-    element = leaf(f"element of {name}", ())
+    whole, own = alone(density, name, numbers)
+    if own is None:
+        return Statistics({}, broadcast(NOTHING, density.shape))
+    at = element_read(whole, own.name, own_numbers(own, numbers))
     # shapes are those of the entries, so that coefficients keep theirs
     instead: dict[Expression, Expression] = {
-        r: broadcast(leaf(element.name, r.shape), r.shape) for r in ways
+        r: leaf(own.name, r.shape) for r in reads(whole, own.name)
     }
-    found = _Reader(element.name)(replaced(whole, instead))
-    kept = {f: broadcast(c, shape) for f, c in found.items() if f != CONSTANT and not is_all(c, 0)}
-    return Statistics(kept, at.pop())
+    reader = _Reader(own.name, strict, is_share)
+    found = reader(replaced(whole, instead))
+    kept = {
+        f: broadcast(c, density.shape)
+        for f, c in found.items()
+        if f != CONSTANT and not is_all(c, 0)
+    }
+    return Statistics(kept, at, reader.is_picked)
+
+
+def alone(
+    root: Expression, name: str, numbers: np.ndarray | None
+) -> tuple[Expression, Leaf | None]:
+    """An expression with a leaf of its own for the elements that are not given, and that leaf.
+
+    All choices of elements are made near to it; it is None where the leaf does not occur.
+    """
+    own = next((n for n in ordered(root) if isinstance(n, Leaf) and n.name == name), None)
+    if own is None:
+        return root, None
+    element = leaf(f"element of {name}", own.shape)
+    moving: Expression = element
+    if numbers is not None and (numbers < 0).any():
+        moving = elementwise(np.where, numbers.reshape(own.shape) >= 0, element, own)
+    whole = sunk(tidied(replaced(root, {own: moving})), element.name)
+    return sunk(branches_up(whole, element.name), element.name), element
+
+
+def own_numbers(own: Leaf, numbers: np.ndarray | None) -> np.ndarray:
+    """The numbers of the elements of a leaf, its own by default."""
+    return np.arange(own.size).reshape(own.shape) if numbers is None else numbers.reshape(own.shape)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _positions(read: Expression, name: str) -> Expression:
-    """Positions of the elements that are read."""
-    own = [n for n in _leaves_of(read) if n.name == name]
-    numbers = as_expression(np.arange(own[0].size).reshape(own[0].shape))
-    return replaced(read, dict.fromkeys(own, numbers))
-
-
-def _leaves_of(root: Expression) -> list[Leaf]:
-    found: list[Leaf] = []
-    todo = [root]
-    while todo:
-        node = todo.pop()
-        if isinstance(node, Leaf):
-            found.append(node)
-        todo += node.operands
-    return found
-
-
-def _broadcast_to(positions: Expression, shape: tuple[int, ...]) -> Expression:
-    try:
-        return broadcast(positions, shape)
-    except ValueError as error:  # more elements than entries
-        raise TraceError("an entry reads several elements") from error
-
-
 class _Reader:
     """Features of expressions in one number."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
+    def __init__(self, name: str, strict: bool, is_share: bool) -> None:
+        self.name, self.strict, self.is_share = name, strict, is_share
+        self.is_picked = False
         self._found: dict[Expression, Features] = {}
 
     def __call__(self, node: Expression) -> Features:
@@ -154,12 +189,23 @@ class _Reader:
                 f: reduction(np.add, broadcast(c, operand.shape), node.axes)
                 for f, c in inner.items()
             }
-        if isinstance(node, Pick) and len(node.operands) == 1:
-            (operand,) = node.operands
-            inner = self(operand)
+        if isinstance(node, Pick):
+            parts = [self(a) for a in node.operands]
             return {
-                f: pick([broadcast(c, operand.shape)], node.positions) for f, c in inner.items()
+                f: pick(
+                    [
+                        broadcast(p.get(f, ZERO), a.shape)
+                        for p, a in zip(parts, node.operands, strict=True)
+                    ],
+                    node.positions,
+                )
+                for f in dict.fromkeys(f for p in parts for f in p)
             }
+        if isinstance(node, Gather) and self._is_free(node.rows):
+            inner = self(node.table)
+            return {f: gather(broadcast(c, node.table.shape), node.rows) for f, c in inner.items()}
+        if isinstance(node, Call):
+            return self.matrices(node)
         if isinstance(node, Elementwise):
             rule = _RULES.get(node.function)
             if rule is not None:
@@ -184,45 +230,108 @@ class _Reader:
             return {f: multiply(c, first) for f, c in self(second).items()}
         if self._is_free(second):
             return {f: multiply(c, second) for f, c in self(first).items()}
+        if first is second:
+            return _square(_powers(self(first)))
         return _product(_powers(self(first)), _powers(self(second)))
 
     def divide(self, node: Elementwise) -> Features:
         first, second = node.operands
         if self._is_free(second):
             return {f: divide(c, second) for f, c in self(first).items()}
-        ((power, coefficient),) = _single(_powers(self(second))).items()
-        top = _powers(self(first))
-        return {f - power: divide(c, coefficient) for f, c in top.items()}  # type: ignore[operator]
+        below = self.each(self(second), lambda c: divide(1.0, c), lambda p, c: (-p, divide(1.0, c)))
+        return _product(_powers(self(first)), below)
 
     def square(self, node: Elementwise) -> Features:
-        inner = _powers(self(node.operands[0]))
-        return _product(inner, inner)
+        return _square(_powers(self(node.operands[0])))
 
     def power(self, node: Elementwise) -> Features:
         base, exponent = node.operands
         if not is_constant(exponent):
             raise TraceError("a power that varies of it is no feature")
-        p = float(np.ravel(exponent.value)[0])  # type: ignore[attr-defined]
+        e = float(np.ravel(exponent.value)[0])  # type: ignore[attr-defined]
         inner = _powers(self(base))
-        if p == 2.0:
-            return _product(inner, inner)
-        ((power, coefficient),) = _single(inner).items()
-        return {power * p: tidy(np.power, coefficient, p)}  # type: ignore[operator]
+        if e == 2.0:
+            return _square(inner)
+        return self.each(
+            inner, lambda c: tidy(np.power, c, e), lambda p, c: (p * e, tidy(np.power, c, e))
+        )
 
     def root(self, node: Elementwise) -> Features:
-        p = {np.sqrt: 0.5, np.reciprocal: -1.0, np.cbrt: 1 / 3}[node.function]  # type: ignore[index]
-        ((power, coefficient),) = _single(_powers(self(node.operands[0]))).items()
-        return {power * p: elementwise(node.function, coefficient)}  # type: ignore[operator]
+        function = node.function
+        e = {np.sqrt: 0.5, np.reciprocal: -1.0, np.cbrt: 1 / 3}[function]  # type: ignore[index]
+        of = partial(elementwise, function)
+        return self.each(_powers(self(node.operands[0])), of, lambda p, c: (p * e, of(c)))
 
     def log(self, node: Elementwise) -> Features:
         inner = dict(self(node.operands[0]))
         if node.function is np.log1p:
             inner[CONSTANT] = add(inner.get(CONSTANT, ZERO), ONE)
-        inner = {f: c for f, c in inner.items() if not is_all(c, 0)}
-        if set(inner) == {CONSTANT, 1.0} and is_all(inner[CONSTANT], 1) and is_all(inner[1.0], -1):
-            return {LOG1M: ONE}
-        ((power, coefficient),) = _single(_powers(inner)).items()
-        return {LOG: as_expression(float(power)), CONSTANT: elementwise(np.log, coefficient)}
+        inner = _powers(inner)
+        rest = set(inner) == {CONSTANT, 1.0} and subtract(ZERO, inner[1.0]) is inner[CONSTANT]
+        if rest:
+            return {LOG1M: ONE, CONSTANT: elementwise(np.log, inner[CONSTANT])}
+        of = partial(elementwise, np.log)
+        found = self.each(inner, of, lambda p, c: (LOG, as_expression(p)), of_rest=True)
+        if LOG in found and len(inner) == 1:
+            ((_, coefficient),) = inner.items()
+            found[CONSTANT] = of(coefficient)
+        return found
+
+    def each(self, found: Features, of_free: Any, of_power: Any, of_rest: bool = False) -> Features:
+        """A function of a power of it; of what is that in some entries, and free of it in others.
+
+        With ``of_rest``, it may also be a multiple of one minus it, of which the function is the logarithm.
+        """
+        if len(found) == 1:
+            ((power, coefficient),) = found.items()
+            feature, made = of_power(power, coefficient)
+            return {feature: made}
+        if len(found) != 2 or CONSTANT not in found:
+            raise TraceError("a function of a sum of its powers is no feature")
+        (power,) = (f for f in found if f != CONSTANT)
+        free, own = found[CONSTANT], found[power]
+        varies = elementwise(np.not_equal, own, 0.0)
+        mine = elementwise(np.logical_and, varies, elementwise(np.equal, free, 0.0))
+        feature, made = of_power(power, tidy(np.where, mine, own, ONE))
+        plain = of_free(tidy(np.where, varies, ONE, free))
+        result: Features = {
+            CONSTANT: tidy(np.where, varies, ZERO, plain),
+            feature: tidy(np.where, mine, made, ZERO),
+        }
+        closed = mine
+        if of_rest and self.is_share and power == 1.0:
+            rest = elementwise(
+                np.logical_and, varies, elementwise(np.equal, free, multiply(own, -1.0))
+            )
+            result[LOG1M] = tidy(np.where, rest, ONE, ZERO)
+            closed = elementwise(np.logical_or, mine, rest)
+        closed = elementwise(np.logical_or, closed, elementwise(np.logical_not, varies))
+        lost = tidy(np.where, closed, ZERO, as_expression(np.nan))
+        if not is_all(lost, 0):
+            if self.strict:
+                raise TraceError("a function of a sum of its powers is no feature")
+            self.is_picked = True
+        result[feature] = add(result[feature], lost)
+        return result
+
+    def matrices(self, node: Call) -> Features:
+        """Functions of matrices that are a power of it times a matrix."""
+        ways = {"cholesky": 0.5, "inv": -1.0, "upper_inverse": -1.0}
+        word = matrix_function(node)
+        if word in ways:
+            (operand,) = node.operands
+            ((power, c),) = _single(_powers(self(operand))).items()
+            made = node.with_operands([broadcast(c, operand.shape)])
+            return {power * ways[word]: made}  # type: ignore[operator]
+        if word == "solve":
+            matrix, right = node.operands
+            ((power, c),) = _single(_powers(self(matrix))).items()
+            whole = broadcast(c, matrix.shape)
+            return {
+                f - power: node.with_operands([whole, broadcast(r, right.shape)])  # type: ignore[operator]
+                for f, r in _powers(self(right)).items()
+            }
+        raise TraceError(f"{node.detail} of it is no feature")
 
     def xlogy(self, node: Elementwise) -> Features:
         weight, inside = node.operands
@@ -234,11 +343,13 @@ class _Reader:
 
     def where(self, node: Elementwise) -> Features:
         condition, first, second = node.operands
+        if is_all(second, -np.inf):  # a support: its bounds are the family's affair
+            return self(first)
         if not self._is_free(condition):
-            if is_all(second, -np.inf):  # a support: its bounds are the family's affair
-                return self(first)
             raise TraceError("a branch on it is no feature")
         one, other = self(first), self(second)
+        free = [a for a in (first, second) if self._is_free(a)]
+        self.is_picked = self.is_picked or (len(free) == 1 and not is_all(free[0], 0))
         return {
             f: tidy(np.where, condition, one.get(f, ZERO), other.get(f, ZERO))
             for f in {**one, **other}
@@ -254,7 +365,27 @@ def is_constant(node: Expression) -> bool:
 def _powers(found: Features) -> Features:
     if LOG in found or LOG1M in found:
         raise TraceError("a product with a logarithm of it is no feature")
-    return {f: c for f, c in found.items() if not is_all(c, 0)}
+    kept = {f: c for f, c in found.items() if not _is_zero(c)}
+    return kept or {CONSTANT: ZERO}
+
+
+def _is_zero(node: Expression) -> bool:
+    """Whether a coefficient is 0 for all finite values."""
+    if isinstance(node, Elementwise) and node.function is np.multiply:
+        return any(map(_is_zero, node.operands))
+    if isinstance(node, Pick):
+        return all(map(_is_zero, node.operands))
+    return is_all(node, 0)
+
+
+def _square(found: Features) -> Features:
+    squares: dict[Any, Expression] = {}
+    powers = list(found.items())
+    for k, (f, u) in enumerate(powers):
+        for g, v in powers[k:]:
+            term = elementwise(np.square, u) if f == g else multiply(2.0, multiply(u, v))
+            squares[f + g] = add(squares.get(f + g, ZERO), term)  # type: ignore[operator]
+    return squares
 
 
 def _single(found: Features) -> Features:

@@ -75,8 +75,9 @@ def family_of(dist: d.Distribution) -> Family:
     if isinstance(dist, d.Categorical):
         return Family(d.Categorical, {"probs": as_expression(dist.probs), "logits": None})
     if isinstance(dist, (d.Affine, d.Truncated)):
-        kept = {k: _constant(getattr(dist, k)) for k in inspect.signature(type(dist)).parameters}
-        return Family(type(dist), {**kept, "base": family_of(dist.base)})
+        names = [k for k in inspect.signature(type(dist)).parameters if k != "base"]
+        kept = {k: _constant(getattr(dist, k)) for k in names}
+        return Family(type(dist), {"base": family_of(dist.base), **kept})
     names = list(inspect.signature(type(dist)).parameters)
     known = type(dist) in _FORMS or type(dist).log_density is not None
     if not known or not all(hasattr(dist, n) for n in names):
@@ -148,7 +149,8 @@ def _mv_normal(x: Any, loc: Any, cov: Any, scale_tril: Any, scale_diag: Any) -> 
     else:
         factor = np.linalg.cholesky(cov) if scale_tril is None else scale_tril
         scales = np.linalg.diagonal(factor)
-        z = np.linalg.solve(factor, off[..., None])[..., 0]
+        # of few factors and many values, few inverses; of a triangle, that is back substitution
+        z = np.matvec(np.linalg.inv(factor), off)
     log_det = np.sum(np.log(scales), axis=-1)
     return -0.5 * (size * _LOG_2PI + np.sum(z * z, axis=-1)) - log_det
 

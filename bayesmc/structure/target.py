@@ -80,6 +80,11 @@ class Term:
             return None
 
     @cached_property
+    def summaries(self) -> dict[str, Any]:
+        """Label -> its sums by that label, or None where they do not suffice (``kernels.label_sums``)."""
+        return {}
+
+    @cached_property
     def rejects(self) -> bool:
         """Whether its parameters depend on numbers: points where they are out of range are rejected."""
         return depends_on_numbers(self.model[self.name].links, self.model.nodes)

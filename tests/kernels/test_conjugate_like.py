@@ -1,7 +1,8 @@
-"""Like children of conjugate nodes as one partner: against one by one, and against a grid."""
+"""Like children of conjugate nodes as one: against one by one, and against a grid."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -13,21 +14,19 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.errors import BayesmcError
+from bayesmc.kernels import conjugate_children
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
-from bayesmc.kernels.conjugate_children import Partner
-from bayesmc.kernels.conjugate_like import LikePartner
-from bayesmc.kernels.conjugate_matching import Match, match_of
-from bayesmc.kernels.conjugate_pairs import PAIRS
+from bayesmc.kernels.conjugate_children import children_of
 from bayesmc.kernels.gaussian_block import GaussianBlock
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.like_functions import Slots
 from bayesmc.structure.target import Target, Values, target_of
+from tests.kernels.wrong_naturals import with_naturals
 from tests.structure.test_stacked import CHAINS, a_state
 
 DATA = np.random.default_rng(31)
-#: net, evidence, and for each node the sizes of its partners
+#: net, evidence, and for each node how many children are one
 Asked = tuple[Any, dict[str, Any], dict[str, list[int]]]
 STEPS = 7
 
@@ -200,35 +199,39 @@ def state(target: Target, seed: int) -> Values:
     return values
 
 
-def one_by_one(kernel: Conjugate) -> list[Partner]:
-    blanket = kernel.blanket
-    matches = [match_of(blanket, c, kernel.kind, PAIRS) for c in blanket.children]
-    return [Partner(blanket, m, kernel.kind) for m in matches if isinstance(m, Match)]
+def sizes(target: Target, name: str) -> list[int]:
+    found = children_of(Blanket(target, name))
+    assert isinstance(found, list)
+    return [len(c.terms) for c in found]
 
 
-def worst_difference(kernel: Conjugate, partners: list[Partner], values: Values) -> float:
-    """Between the sums of the kernel's own partners and those of others, over the sizes of what is added."""
+def worst_difference(kernel: Conjugate, other: Conjugate, values: Values) -> float:
+    """Between natural parameters, over the larger ones."""
     worst = 0.0
-    for members in kernel.blanket.classes:
-        with marking_invalid(), np.errstate(all="ignore"):
-            own = [p.natural(values, members) for p in kernel.partners]
-            others = [p.natural(values, members) for p in partners]
-        for ours, theirs in zip(zip(*own, strict=True), zip(*others, strict=True), strict=True):
-            size = sum(np.abs(added) for added in theirs)
-            off = np.abs(sum(ours) - sum(theirs)) / (size + 1e-300)
-            worst = max(worst, float(np.max(off)))
+    with marking_invalid(), np.errstate(all="ignore"):
+        for ours, theirs in zip(kernel.forms, other.forms, strict=True):
+            for a, b in zip(ours(values)[0], theirs(values)[0], strict=True):
+                worst = max(worst, float(np.max(np.abs(a - b) / (np.abs(a) + np.abs(b) + 1e-9))))
     return worst
 
 
+def apart(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if no children were alike."""
+    monkeypatch.setattr(conjugate_children, "_joined", lambda blanket, terms: None)
+
+
 @pytest.mark.parametrize(("case", "name"), NODES, ids=lambda c: getattr(c, "__name__", c))
-def test_what_children_add(case: Callable[[], Asked], name: str) -> None:
+def test_what_children_add(
+    case: Callable[[], Asked], name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     target, expected = posed(case)
     kernel = kernel_of(target, name)
-    assert [len(p.terms) for p in kernel.partners] == expected[name]
-    partners = one_by_one(kernel)
-    assert len(partners) == sum(expected[name])
+    assert sum(sizes(target, name)) == sum(expected[name])
+    assert len(sizes(target, name)) <= 1 + len(expected[name])
+    apart(monkeypatch)
+    other = kernel_of(target, name)
     for seed in range(3):
-        assert worst_difference(kernel, partners, state(target, seed)) < 1e-12
+        assert worst_difference(kernel, other, state(target, seed)) < 1e-12
 
 
 @pytest.mark.parametrize(("case", "name"), NODES, ids=lambda c: getattr(c, "__name__", c))
@@ -246,25 +249,26 @@ def test_draws_against_the_densities(case: Callable[[], Asked], name: str) -> No
             target.refresh(values, (name,))
 
 
-def test_the_wrong_neighbours_are_noticed() -> None:
+def test_the_wrong_neighbours_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control: values of other slices in their places, and the numbers of one for all."""
     target, _ = posed(autoregression)
     values = state(target, 1)
-    for name, wrong in (("phi", "parents"), ("tau", "own"), ("bias", "numbers")):
-        kernel = kernel_of(target, name)
-        (partner,) = kernel.partners
-        assert isinstance(partner, LikePartner)
-        if wrong == "numbers":
-            partner.term = target.terms[partner.term.name]
-            partner._slope = None
-        else:
-            slots = partner._parents if wrong == "parents" else partner._own
-            turned = {n: (*s[1:], s[0]) if len(s) > 1 else s for n, s in slots.sources.items()}
-            vars(partner)[f"_{wrong}"] = Slots(target, turned, len(partner.terms))
-        assert worst_difference(kernel, one_by_one(kernel), values) > 1e-3, name
+    right = conjugate_children.stacked_rows
+
+    def wrong(rows: Any) -> Any:
+        found = right(rows)
+        first, *rest = found.leaves
+        mixed = [(*a[:-1], b[-1]) for a, b in zip(rest, reversed(rest), strict=True)]
+        same = {k: np.broadcast_to(v[:1], v.shape) for k, v in found.constants.items()}
+        return dataclasses.replace(found, leaves=(first, *mixed), constants=same)
+
+    kernels = {name: kernel_of(target, name) for name in ("phi", "tau", "bias")}
+    monkeypatch.setattr(conjugate_children, "stacked_rows", wrong)
+    for name, kernel in kernels.items():
+        assert worst_difference(kernel, kernel_of(target, name), values) > 1e-3, name
 
 
-def test_functions_are_called_once() -> None:
+def test_functions_are_not_called() -> None:
     calls = []
 
     def emission(x: Any, tau: Any) -> Any:
@@ -281,23 +285,7 @@ def test_functions_are_called_once() -> None:
     values = state(target, 0)
     calls.clear()
     kernel.full_conditional(values)
-    assert len(calls) == 1
-
-
-def test_few_unlike_and_large_children_stay_alone() -> None:
-    net = bmc.BayesNet(plates={"i": 600})
-    net.add("rate", bmc.Gamma(2.0, 1.0))
-    for t in range(3):
-        net.add(f"few[{t}]", lambda rate: bmc.Poisson(rate), parents=["rate"])
-    for t in range(4):
-        net.add(f"power[{t}]", lambda rate, t=t: bmc.Poisson(rate / 3 if t > 1 else 2 * rate),
-                parents=["rate"])  # fmt: skip
-        net.add(f"large[{t}]", lambda rate: bmc.Poisson(rate), parents=["rate"], plates="i")
-    evidence: dict[str, Any] = {f"few[{t}]": t for t in range(3)}
-    evidence |= {f"power[{t}]": t for t in range(4)}
-    evidence |= {f"large[{t}]": DATA.poisson(1.0, 600) for t in range(4)}
-    kernel = kernel_of(target_of(pose(net, evidence)), "rate")
-    assert [len(p.terms) for p in kernel.partners] == [1] * 11
+    assert not calls
 
 
 def test_children_of_different_powers_are_no_group() -> None:
@@ -319,11 +307,11 @@ def test_an_error_names_the_child_at_fault() -> None:
     net = bmc.BayesNet()
     net.add("mu", bmc.Normal(0.0, 1.0))
     for t in range(5):
-        net.add(f"s[{t}]", bmc.Gamma(2.0, 1.0))
+        net.add(f"s[{t}]", bmc.Normal(2.0, 0.1))
         net.add(f"y[{t}]", lambda mu, s: bmc.Normal(mu, s), parents=["mu", f"s[{t}]"])
     target = target_of(pose(net, {f"y[{t}]": 0.0 for t in range(5)}))
     kernel = kernel_of(target, "mu")
-    assert [len(p.terms) for p in kernel.partners] == [5]
+    assert sizes(target, "mu") == [5]
     values = {**target.known, "mu": np.zeros(2)}
     values |= {f"s[{t}]": np.array([1.0, -1.0 if t == 3 else 2.0]) for t in range(5)}
     with marking_invalid(), np.errstate(all="ignore"):
@@ -435,7 +423,7 @@ def scores(change: Callable[[Conjugate], None]) -> dict[str, float]:
     states = tuple(n for n in target.chain if n.startswith("x"))
     kernels: list[Any] = [kernel_of(target, "phi"), kernel_of(target, "tau")]
     for kernel in kernels:
-        assert [len(p.terms) for p in kernel.partners] == [LENGTH - 1]
+        assert sizes(target, kernel.names[0]) == [LENGTH - 1]
         change(kernel)
     kernels.append(GaussianBlock(target, {n: plan.blankets[n] for n in states}))
     sampler = SweepSampler(target, kernels)
@@ -466,13 +454,9 @@ def test_transitions_that_count_half_show() -> None:
     """The negative control: each of the group adds half of its share to the precision's shape."""
 
     def half_a_shape(kernel: Conjugate) -> None:
-        (partner,) = kernel.partners
-        right = partner.natural
-        if kernel.kind.name == "scale":
-            vars(partner)["natural"] = lambda values, members: (
-                0.5 * right(values, members)[0],
-                right(values, members)[1],
-            )
+        if kernel.names == ("tau",):  # the prior is Gamma(3, 1)
+            wrong = with_naturals(kernel, lambda a, b: (2.0 + 0.5 * (a - 2.0), b))
+            kernel.forms = wrong.forms
 
     found = scores(half_a_shape)
     assert max(map(abs, found.values())) > LIMIT, found

@@ -6,6 +6,7 @@ model (``debug=True``) as well, which is seen to refuse a wrong closed form.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import time
 from collections.abc import Callable
@@ -16,8 +17,8 @@ import pytest
 from scipy import special
 
 import bayesmc as bmc
-from bayesmc.kernels import conjugate_picks
-from bayesmc.kernels.conjugate_kinds import Naturals
+from bayesmc.expression import elementwise
+from bayesmc.kernels import conjugate_naturals
 from bayesmc.testing import session
 
 SEED = session.seed()
@@ -148,14 +149,17 @@ def test_every_draw_fits_the_densities(name: str) -> None:
 
 
 def test_a_wrong_closed_form_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if all elements read the node."""
-    right = conjugate_picks.picked_natural
+    """As if one more element read the node."""
+    right = conjugate_naturals.features_of
 
-    def wrong(*arguments: Any) -> Naturals:
-        a, b = right(*arguments)
-        return a + 1.0, b
+    def wrong(*arguments: Any) -> Any:
+        found = right(*arguments)
+        changed = {f: elementwise(np.add, c, 1.0) for f, c in found.coefficients.items()}
+        return dataclasses.replace(
+            found, coefficients=changed if found.is_picked else found.coefficients
+        )
 
-    monkeypatch.setattr("bayesmc.kernels.conjugate_children.picked_natural", wrong)
+    monkeypatch.setattr(conjugate_naturals, "features_of", wrong)
     net, evidence = chain(SPELT["where"])
     with pytest.raises(bmc.errors.BayesmcError, match="node '[pq]'"):
         bmc.infer(net, evidence, engine=bmc.Gibbs(60, 5, debug=True), rng=SEED)
@@ -176,10 +180,7 @@ OTHERS: dict[str, Callable[..., Any]] = {
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_no_closed_form_is_claimed_of_others(name: str) -> None:
-    net, evidence = chain(OTHERS[name])
-    text = str(bmc.explain(net, evidence, engine=bmc.Gibbs())).splitlines()
-    (line,) = (row for row in text if row.split()[:1] == ["p"])
-    assert "conjugate" not in line
+    assert not is_conjugate("p", *chain(OTHERS[name]))
 
 
 def test_a_state_that_breaks_the_form_takes_a_slice() -> None:
@@ -213,6 +214,12 @@ def test_a_state_that_breaks_the_form_takes_a_slice() -> None:
 COUNTS = np.array([12, 4, 4])
 
 
+def is_conjugate(name: str, net: bmc.BayesNet, evidence: dict[str, Any]) -> bool:
+    text = str(bmc.explain(net, evidence, engine=bmc.Gibbs())).splitlines()
+    (line,) = (row for row in text if row.split()[:1] == [name])
+    return "conjugate" in line
+
+
 def rows(switches: int, breaks: bool) -> bmc.BayesNet:
     """A row that is mixed, or not read, in the one joint state of all switches on, to which they tend."""
     net = bmc.BayesNet(plates={"j": switches, "i": COUNTS.sum()})
@@ -236,14 +243,15 @@ def seen(switches: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("switches", "breaks", "claimed"), [(10, True, False), (10, False, True), (15, False, False)]
+    ("switches", "breaks", "claimed"), [(10, True, False), (10, False, True), (15, False, True)]
 )
 def test_rows_are_claimed_where_all_joint_states_pick(
     switches: int, breaks: bool, claimed: bool
 ) -> None:
-    """One of 1024 joint states; nothing is claimed of 32768, which are not all tried."""
+    """One of 1024 joint states, or of 32768: none is tried, the branches are read."""
     text = str(bmc.explain(rows(switches, breaks), seen(switches), engine=bmc.Gibbs()))
     assert ("where it is picked" in text) is claimed
+    assert is_conjugate("w", rows(switches, breaks), seen(switches)) is claimed
 
 
 def test_a_rare_joint_state_that_mixes_a_row_is_answered_right() -> None:
@@ -283,7 +291,7 @@ def test_readers_of_two_switches_each_are_tried_in_all_states(mixing: int, claim
             parents=["w", f"s[{t}]", f"s[{t + 1}]"],
         )
     evidence = {f"y[{t}]": t % 3 for t in range(30)}
-    assert ("where it is picked" in str(bmc.explain(net, evidence, engine=bmc.Gibbs()))) is claimed
+    assert is_conjugate("w", net, evidence) is claimed
 
 
 @pytest.mark.thorough

@@ -1,4 +1,4 @@
-"""Closed forms leave their posteriors invariant: every pair of the table, and jointly Normal blocks.
+"""Closed forms leave their posteriors invariant: pairs of all families, and jointly Normal blocks.
 
 Geweke's test and the rank test at a chance of false alarm of 1e-4 each, at fixed seeds; ``--bayesmc-seed``
 shifts them, and ``--bayesmc-thorough`` makes the tests longer. Each test is shown to fail on a
@@ -7,7 +7,6 @@ kernel with a deliberate error.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -18,7 +17,8 @@ import bayesmc as bmc
 from bayesmc.kernels import gaussian_layout
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
-from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
+from bayesmc.kernels.conjugate_children import children_of
+from bayesmc.kernels.conjugate_families import Conditional
 from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
 from bayesmc.kernels.slice import Slice
 from bayesmc.structure.blanket import Blanket
@@ -33,10 +33,11 @@ from tests.kernels.invariance import (
     in_turn,
     mixture,
 )
+from tests.kernels.wrong_naturals import Change, with_naturals
 
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
 
-# ---- every pair of the table, on three overlapping categories --------------------------------------
+# ---- pairs of all families, on three overlapping categories -----------------------------------------
 
 
 def _wide(x: Any) -> Any:
@@ -111,87 +112,60 @@ PRIORS: dict[str, tuple[Any, Callable[[Any], Any]]] = {
 }  # fmt: skip
 
 
-def _wrong(pair: Pair) -> Pair:
-    """A pair with an error of its kind: a variance for an sd, half a degree of freedom per datum, ..."""
-    right = pair.statistic
-
-    def unwhitened(e: Any, residual: Any) -> Any:
-        return right(e, residual) / (
-            2.0 if pair.child is bmc.MvNormal else e.get("scale")[..., None]
-        )
-
-    def half_a_shape(e: Any) -> Any:
-        power, coefficient = right(e)
-        return power + 0.5 * e.data.count * np.sign(pair.exponent), coefficient
-
-    def one_more_failure(e: Any) -> Any:
-        return right(e)[0], right(e)[1] + e.data.count
-
-    faults = {
-        "mean": unwhitened,
-        "scale": half_a_shape,
-        "share": one_more_failure,
-        "shares": lambda e: np.roll(right(e), 1, axis=-1),
-        "covariance": lambda e: 2 * right(e),
+def _wrong(family: Conditional, times: float = 1.0) -> Change:
+    """An error of its kind: a mean that is off, some degrees of freedom more, a neighbour's counts, ..."""
+    power = getattr(family, "power", 1.0)
+    faults: dict[str, Change] = {
+        "NormalConditional": lambda linear, square: (linear - 2.0 * times * square, square),
+        "MvNormalConditional": lambda precision, linear: (
+            precision,
+            linear + times * np.trace(precision, axis1=-2, axis2=-1)[..., None],
+        ),
+        "GammaConditional": lambda exponent, rate: (exponent + 3.0 * times * power, rate),
+        "BetaConditional": lambda a, b: (a, b + 6.0 * times),
+        "DirichletConditional": lambda a: (np.roll(a, 1, axis=-1),),
+        "InverseWishartConditional": lambda df, scale: (df + 6.0 * times, scale),
     }
-    return dataclasses.replace(pair, statistic=faults[pair.kind])
+    return faults[type(family).__name__]
 
 
-def _gross(pair: Pair) -> Pair:
-    """A pair with an error that few rows show."""
-    right = pair.statistic
-
-    def two_shapes(e: Any) -> Any:
-        power, coefficient = right(e)
-        return power + 3.0 * e.data.count * np.sign(pair.exponent), coefficient
-
-    faults = {
-        "mean": lambda e, residual: right(e, residual) + 1.0,
-        "scale": two_shapes,
-        "share": two_shapes,
-        "shares": lambda e: np.roll(right(e), 1, axis=-1),
-        "covariance": lambda e: 6 * right(e),
-    }
-    return dataclasses.replace(pair, statistic=faults[pair.kind])
+def _right(target: Target) -> Conjugate:
+    kernel = conjugate_kernel(Blanket(target, "x"))
+    assert isinstance(kernel, Conjugate), kernel
+    return kernel
 
 
-def _kernel(pairs: Any = PAIRS) -> Make:
+def _faulty(times: float = 1.0) -> Make:
     def make(target: Target) -> Conjugate:
-        kernel = conjugate_kernel(Blanket(target, "x"), pairs=pairs)
-        assert isinstance(kernel, Conjugate), kernel
-        return kernel
+        kernel = _right(target)
+        return with_naturals(kernel, _wrong(kernel.forms[0].family, times))
 
     return make
 
 
-def _key(pair: Pair) -> tuple[str, str, str]:
-    return pair.kind, pair.child.__name__, pair.parameter
-
-
-def _case(prior: Any, child: Callable[[Any], Any], how: str, fault: Callable[[Pair], Pair]) -> Case:
+def _case(prior: Any, child: Callable[[Any], Any], how: str, times: float = 1.0) -> Case:
     model = Model(mixture(prior, child), ("y",), ("x",))
-    wrong = _kernel([fault(p) for p in PAIRS])
     # draws are independent given the data: short chains do
-    return Case(model, _kernel(), {"wrong": wrong}, how=how, sizes={"draws": 15, "chains": 240})
+    sizes = {"draws": 15, "chains": 240}
+    return Case(model, _right, {"wrong": _faulty(times)}, how=how, sizes=sizes)
 
 
 @pytest.mark.parametrize(
-    ("pair", "fault", "test"),
-    in_turn([(p, f) for p in PAIRS for f in ("", "wrong")]),
-    ids=lambda p: "-".join(_key(p)) if isinstance(p, Pair) else None,
+    ("key", "fault", "test"),
+    in_turn([(k, f) for k in SIDES for f in ("", "wrong")]),
+    ids=lambda p: "-".join(p) if isinstance(p, tuple) else None,
 )
-def test_pair(pair: Pair, test: str, fault: str) -> None:
-    """A pair that is new in the table has no side here, and fails."""
-    case = _case(*SIDES[_key(pair)], "moving", _wrong)
+def test_pair(key: tuple[str, str, str], test: str, fault: str) -> None:
+    case = _case(*SIDES[key], "moving")
     kernel = case.make(case.model.target("moving"))
-    assert [_key(p.pair) for p in kernel.partners] == [_key(pair)]
+    assert kernel.match.removesuffix(" where it is picked").endswith(f" with {key[1]} {key[2]}")
     case.check(test, fault)
 
 
 @pytest.mark.parametrize("test", TESTS)
 @pytest.mark.parametrize("name", PRIORS)
 def test_prior(name: str, test: str) -> None:
-    _case(*PRIORS[name], "moving", _wrong).check(test)
+    _case(*PRIORS[name], "moving").check(test)
 
 
 #: pairs whose data are summed beforehand, by label and otherwise
@@ -207,7 +181,7 @@ KEPT = (
 @pytest.mark.parametrize("key", KEPT, ids="-".join)
 def test_pair_with_what_is_kept_of_the_evidence(key: tuple[str, str, str], fault: str) -> None:
     """Every row has a posed problem of its own; that the sums are right is for ``test_conjugate``."""
-    _case(*SIDES[key], "posed", _gross).check("ranks", fault, replications=60)
+    _case(*SIDES[key], "posed", 3.0).check("ranks", fault, replications=60)
 
 
 # ---- jointly Normal blocks -------------------------------------------------------------------------
@@ -235,12 +209,11 @@ SERIES = {
     [*((n, "moving") for n in SERIES), pytest.param("mean", "posed", marks=pytest.mark.thorough)],
 )
 def test_like_children(name: str, how: str, fault: str) -> None:
-    """All children are one partner."""
-    wrong = _kernel([_wrong(p) for p in PAIRS])
+    """All children are one."""
     sizes = {"replications": 200} if how == "posed" else {}
-    case = Case(SERIES[name], _kernel(), {"wrong": wrong}, how=how, sizes=sizes)
-    (partner,) = case.make(case.model.target("moving")).partners
-    assert len(partner.terms) == 8
+    case = Case(SERIES[name], _right, {"wrong": _faulty()}, how=how, sizes=sizes)
+    (child,) = children_of(Blanket(case.model.target("moving"), "x"))
+    assert len(child.terms) == 8
     case.check("ranks", fault)
 
 

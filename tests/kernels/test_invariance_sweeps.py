@@ -8,7 +8,6 @@ with an error in one kernel.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -19,12 +18,11 @@ import bayesmc as bmc
 from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.kernels.base import Kernel
-from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
-from bayesmc.kernels.conjugate_pairs import PAIRS
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.network import pose
 from bayesmc.structure.target import Target
 from tests.kernels.invariance import Case, Make, Model, in_turn
+from tests.kernels.wrong_naturals import with_naturals
 
 COV = np.array([[1.0, 0.4], [0.4, 0.7]])
 CENTRES = np.array([[-1.0, 0.0], [0.0, 1.0], [1.5, 0.0]])
@@ -83,25 +81,12 @@ class Sweep(Kernel):
         return {"each": [k.end_warmup(m) for k, m in ends]}
 
 
-def with_pairs(kind: str, change: Callable[[Callable], Callable]) -> Callable[[Conjugate], Kernel]:
-    """Changes what children add in one kind of a conjugate kernel's pairs."""
-
-    def wrong(kernel: Conjugate) -> Kernel:
-        pairs = [
-            dataclasses.replace(p, statistic=change(p.statistic)) if p.kind == kind else p
-            for p in PAIRS
-        ]
-        found = conjugate_kernel(kernel.blanket, pairs=pairs)
-        assert isinstance(found, Conjugate)
-        return found
-
-    return wrong
-
-
-#: each point counts half of its degree of freedom
+#: each point counts less of its degree of freedom
 HALF_A_SHAPE = {
-    "scale": with_pairs("scale", lambda right: lambda e: (0.5 * right(e)[0], right(e)[1])),
-    "covariance": with_pairs("covariance", lambda right: lambda e: 0.5 * right(e)),
+    "scale": lambda kernel: with_naturals(kernel, lambda a, b: (0.5 * a, b)),
+    "covariance": lambda kernel: with_naturals(
+        kernel, lambda df, scale: (3.0 + 0.5 * (df - 3.0), scale)
+    ),
 }
 
 

@@ -13,11 +13,9 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import DensityError, ZeroProbabilityError
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
-from bayesmc.kernels.conjugate_components import CountedShares, PlanarCovariances, PlanarMeans
-from bayesmc.kernels.conjugate_data import sums_by_label
 from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.label_sums import sums_by_label
 from bayesmc.kernels.labels import Labels, label_kernel
-from bayesmc.kernels.precisions import kept_precision
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values, target_of
@@ -285,14 +283,14 @@ def test_chunks_of_several_chains_follow_the_probabilities() -> None:
 
 def test_a_wrong_coefficient_is_caught() -> None:
     kernel, values = made("gaussian 3x4", 2)
-    term = kernel.terms[0]
-    true = term.coefficients
+    true = kernel._table
 
-    def wrong(state: Values) -> Any:
-        found = true(state)
-        return type(found)(found.constant, found.rows * (1 + 1e-6))
+    def wrong(state: Values, chains: int) -> Any:
+        found = true(state, chains)
+        found.rows[:, :, 1:] *= 1 + 1e-6
+        return found
 
-    term.coefficients = wrong  # type: ignore[method-assign]
+    kernel._table = wrong  # type: ignore[method-assign]
     with pytest.raises(DensityError, match="label"):
         stepped(kernel, values)
 
@@ -441,75 +439,37 @@ def sweep(states: int, chains: int, n: int = 400) -> tuple[Labels, list[Conjugat
 @pytest.mark.parametrize("chains", [1, 4])
 def test_sums_by_label_come_out_of_the_draw(chains: int) -> None:
     label, _, values = sweep(3, chains, 6000)
-    groups = label.terms[0].groups
-    assert groups is not None and groups.used
-    drawn = stepped(label, values)
-    kept = groups._kept
-    assert kept[0] is drawn
-    wanted = sums_by_label(drawn, groups.made(), 3)
-    np.testing.assert_allclose(kept[2].sums, wanted, rtol=1e-12, atol=1e-9)
-    np.testing.assert_array_equal(kept[2].sums[..., 0], wanted[..., 0])
+    (term,) = label.terms
+    with marking_invalid(), np.errstate(all="ignore"):
+        new, _ = label.step(values, {}, np.random.default_rng(1), False)
+    wanted = sums_by_label(new["label"], term.statistics, 3)
+    handed = term.sums({**values, **new})
+    assert handed is new[term.key]
+    np.testing.assert_allclose(handed, wanted, rtol=1e-12, atol=1e-9)
+    np.testing.assert_array_equal(handed[..., 0], wanted[..., 0])
 
 
-@pytest.mark.parametrize("chains", [1, 4])
-def test_quick_components_are_those_of_the_arrays(chains: int) -> None:
-    """The same random numbers through floats and through arrays: the same draws to rounding."""
-    label, kernels, values = sweep(3, chains)
-    values = {**values, "label": stepped(label, values)}
-    for kernel, kind in zip(kernels[:2], (PlanarCovariances, PlanarMeans), strict=True):
-        assert isinstance(kernel._quick, kind)
-        name = kernel.names[0]
-        quick = kernel.step(values, {}, np.random.default_rng(7), False)[0][name]
-        if name == "cov":
-            exact = np.linalg.inv(quick)
-            found = kept_precision(kernel.blanket.target, name, quick)
-            np.testing.assert_allclose(found.matrix, exact, rtol=1e-9)
-            half = 0.5 * np.linalg.slogdet(exact)[1]
-            np.testing.assert_allclose(found.half_log_det, half, rtol=1e-9)
-        kernel._quick = None
-        slow = kernel.step(values, {}, np.random.default_rng(7), False)[0][name]
-        np.testing.assert_allclose(quick, slow, rtol=1e-9, atol=1e-12)
-        if name == "cov":
-            found = kept_precision(kernel.blanket.target, name, slow)
-            np.testing.assert_allclose(found.matrix, exact, rtol=1e-9)
-        values = {**values, name: slow}
-
-
-def test_quick_coefficients_are_those_of_the_arrays(monkeypatch: pytest.MonkeyPatch) -> None:
-    label, _, values = sweep(3, 2)
-    quick = label._planar(values, 2)
-    assert quick is not None
-    monkeypatch.setattr(label, "_planar", lambda *a: None)
-    slow = label._table(values, 2)
-    np.testing.assert_allclose(quick.rows, slow.rows, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(quick.odds, slow.odds, rtol=1e-7, atol=1e-9)
-
-
-def test_a_mean_that_is_not_the_node_itself_takes_no_quick_step() -> None:
-    net = mixture(
-        lambda label, mean, cov: bmc.MvNormal(2.0 * mean[label] + 1.0, cov[label]),
-        mean=(bmc.MvNormal(np.zeros(2), 9.0 * np.eye(2)), "kind"),
-        cov=(bmc.InverseWishart(5.0, np.eye(2)), "kind"),
+def test_sums_of_labels_that_somebody_else_moved_are_taken_anew() -> None:
+    label, kernels, values = sweep(3, 1)
+    (term,) = label.terms
+    with marking_invalid(), np.errstate(all="ignore"):
+        new, _ = label.step(values, {}, np.random.default_rng(1), False)
+    moved = {**values, **new, "label": (new["label"] + 1) % 3}
+    np.testing.assert_array_equal(
+        term.sums(moved), sums_by_label(moved["label"], term.statistics, 3)
     )
-    target = target_of(pose(net, {"x": RNG.normal(size=(N, 2))}))
-    for name in ("mean", "cov"):
-        kernel = conjugate_kernel(Blanket(target, name))
-        assert isinstance(kernel, Conjugate) and kernel._quick is None
-
-
-def test_quick_shares_are_those_of_the_arrays() -> None:
-    for chains in (1, 4):
-        label, kernels, values = sweep(3, chains)
-        values = {**values, "label": stepped(label, values)}
-        kernel = kernels[2]
-        assert isinstance(kernel._quick, CountedShares)
-        quick = kernel.step(values, {}, np.random.default_rng(7), False)[0]["weights"]
-        kernel._quick = None
-        slow = kernel.step(values, {}, np.random.default_rng(7), False)[0]["weights"]
-        np.testing.assert_allclose(quick, slow, rtol=1e-12)
+    plain = {**values, "label": moved["label"]}
+    for kernel in kernels:
+        name = kernel.names[0]
+        found, wanted = (
+            kernel.step(state, {}, np.random.default_rng(2), False)[0][name]
+            for state in (moved, plain)
+        )
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_small_concentrations_are_left_to_the_family() -> None:
     _, kernels, _ = sweep(3, 1)
-    small = np.array([[0.5, 1.0, 8.0]])
-    assert kernels[2].kind.draw((small,), None, np.random.default_rng(0), (1,)) is None
+    small = np.array([[0.5, 1.0, 8.0]]) - 1.0
+    (form,) = kernels[2].forms
+    assert form.family.draw((small,), None, np.random.default_rng(0), (1,)) is None

@@ -22,7 +22,7 @@ from bayesmc.kernels.forest_search import forest_blocks
 from bayesmc.kernels.forest_sites import site_forest
 from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
 from bayesmc.kernels.jump import Jump
-from bayesmc.kernels.labels import label_kernel
+from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import lattice_kernel
 from bayesmc.kernels.parts import may_be_drawn_anew
 from bayesmc.kernels.random_walk import AdaptiveWalk
@@ -184,7 +184,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
         kernels = [k for k in kernels if k not in alone.values()]
         kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
     order = {n: i for i, n in enumerate(target.chain)}
-    kernels.sort(key=lambda k: -max(order[n] for n in k.names))
+    # labels of mixtures first: others read the sums that they leave in the state
+    kernels.sort(key=lambda k: (not isinstance(k, Labels), -max(order[n] for n in k.names)))
     slow = [n for k in kernels if _is_slice(k) for n in k.names]
     moved = set(names)
     kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]

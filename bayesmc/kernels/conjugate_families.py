@@ -1,0 +1,282 @@
+"""Full conditionals in closed form: families by the features of their log density.
+
+A family is known by which features (``passes.features``) its log density is a sum of; the sums of their
+coefficients over a node's prior and children are its natural parameters. The support of the prior only
+truncates it.
+
+References
+----------
+Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 2-3; Bernardo and Smith (1994), table A.2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import (
+    Beta,
+    Dirichlet,
+    Distribution,
+    Gamma,
+    InverseGamma,
+    InverseWishart,
+    MvNormal,
+    Normal,
+    Truncated,
+)
+from bayesmc.distributions.support import Support, interval
+from bayesmc.kernels.vector_draws import gammas, inverse_wishart_draw, normal_draw
+from bayesmc.passes.features import LOG, LOG1M, Feature
+from bayesmc.shapes import Shape
+
+Naturals = tuple[np.ndarray, ...]
+#: lower and upper end of a truncated full conditional
+Bounds = tuple[Any, Any]
+
+
+class Conditional:
+    """One family of full conditionals.
+
+    Attributes
+    ----------
+    features : tuple
+        Those whose coefficients are its natural parameters.
+    low, high : float
+        Of its support, where it is one of numbers.
+    """
+
+    features: tuple[Feature, ...] = ()
+    low, high = -math.inf, math.inf
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        """The distribution with these natural parameters, between the bounds."""
+        raise NotImplementedError
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        """A draw of ``shape`` and the event without the checks of a distribution, or None."""
+        return None
+
+
+class NormalConditional(Conditional):
+    """``exp(h x - P x^2 / 2)`` of a number."""
+
+    features = (1.0, 2.0)
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        linear, square = naturals
+        precision = -2.0 * square
+        base = Normal(linear / precision, precision**-0.5)
+        return base if bounds is None else Truncated(base, *bounds)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        if bounds is not None:
+            return None
+        linear, square = naturals
+        precision = -2.0 * square
+        draw = linear / precision + rng.standard_normal(shape) / np.sqrt(precision)
+        # where a coefficient was lost the draw is no number, and the posterior says which
+        return draw if math.isfinite(draw.sum()) else None
+
+
+class GammaConditional(Conditional):
+    """``x^a exp(-b x^power)``: a power of x is Gamma."""
+
+    low = 0.0
+
+    def __init__(self, power: float) -> None:
+        self.power = power
+        self.features = (LOG, power)
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        power, rate = self.power, -naturals[1]
+        concentration = (naturals[0] + 1.0) / power
+        if bounds is not None and _covers(bounds, 0.0, np.inf):
+            bounds = None
+        if power == -1.0:
+            base: Distribution = InverseGamma(concentration, rate)
+        else:
+            base = Gamma(concentration, rate)
+        if power in (1.0, -1.0):
+            return base if bounds is None else Truncated(base, *bounds)
+        if bounds is not None:
+            ends = [np.asarray(b, dtype=float) ** power for b in bounds]
+            base = Truncated(base, *(ends if power > 0 else ends[::-1]))
+        return RootOf(base, power)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        if bounds is not None and not _covers(bounds, 0.0, np.inf):
+            return None
+        concentration, rate = (naturals[0] + 1.0) / self.power, -naturals[1]
+        if not (concentration.min(initial=1.0) >= 1.0 and rate.min(initial=1.0) > 0.0):
+            return None  # the family looks after what underflows
+        drawn = rng.standard_gamma(concentration, shape) / rate
+        if self.power != 1.0:
+            drawn = 1.0 / drawn if self.power == -1.0 else drawn ** (1.0 / self.power)
+        return drawn if math.isfinite(drawn.sum()) and drawn.min(initial=1.0) > 0.0 else None
+
+
+class BetaConditional(Conditional):
+    """``x^a (1 - x)^b``."""
+
+    features = (LOG, LOG1M)
+    low, high = 0.0, 1.0
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        base = Beta(naturals[0] + 1.0, naturals[1] + 1.0)
+        if bounds is None or _covers(bounds, 0.0, 1.0):
+            return base
+        return Truncated(base, *bounds)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        if bounds is not None and not _covers(bounds, 0.0, 1.0):
+            return None
+        first, second = naturals[0] + 1.0, naturals[1] + 1.0
+        least = min(first.min(initial=1.0), second.min(initial=1.0))
+        if not (least >= 1.0 and np.isfinite(first + second).all()):
+            return None
+        return rng.beta(first, second, shape)
+
+
+class DirichletConditional(Conditional):
+    """``prod x_k^a_k`` on the simplex."""
+
+    features = (LOG,)
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        return Dirichlet(naturals[0] + 1.0)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        counts = naturals[0] + 1.0
+        if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
+            return None
+        shape = shape + counts.shape[-1:]
+        draw = gammas(
+            rng, counts if counts.shape == shape else np.broadcast_to(counts, shape), shape
+        )
+        draw /= draw.sum(axis=-1, keepdims=True)
+        return draw
+
+
+class MvNormalConditional(Conditional):
+    """``exp(h'x - x'Px / 2)`` of a vector."""
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        precision, linear = naturals
+        factor = _root_of_inverse(precision)
+        mean = np.matvec(factor, np.vecmat(linear, factor))
+        return MvNormal(mean, scale_tril=factor)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        precision, linear = naturals
+        draw = normal_draw(rng, precision, linear, shape)
+        return draw if math.isfinite(draw.sum()) else None
+
+
+class InverseWishartConditional(Conditional):
+    """``|x|^-(df + d + 1)/2 exp(-tr(S x^-1) / 2)``: inverse Wishart."""
+
+    def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
+        return InverseWishart(*naturals)
+
+    def draw(
+        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
+    ) -> np.ndarray | None:
+        df, scale = naturals
+        return inverse_wishart_draw(rng, df, scale, shape)
+
+
+def family_of_features(found: Mapping[Feature, Any], low: float, high: float) -> Conditional | None:
+    """The family of numbers with these features on a support, if there is one.
+
+    Examples
+    --------
+    >>> from bayesmc.kernels.conjugate_families import family_of_features
+    >>> family_of_features({"log x": 1, -2.0: 1}, 0.0, 9.0).features
+    ('log x', -2.0)
+    """
+    powers = [f for f in found if not isinstance(f, str)]
+    rows: list[Conditional] = [BetaConditional()]
+    if 2.0 in found:
+        rows.append(NormalConditional())
+    if len(powers) == 1:
+        rows.append(GammaConditional(float(powers[0])))
+    fits = (r for r in rows if set(found) <= set(r.features) and low >= r.low and high <= r.high)
+    return next(fits, None)
+
+
+class RootOf(Distribution):
+    """The distribution of x where ``x**power`` is drawn from ``base``, on positive numbers.
+
+    Parameters
+    ----------
+    base : Distribution
+        Of one positive number.
+    power : float
+        Not zero.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.conjugate_families import RootOf
+    >>> sd = RootOf(bmc.Gamma(2.0, 1.0), -2.0)  # 1 / sd**2 is Gamma
+    >>> float(sd.log_prob(1.0).round(4))
+    -0.3069
+    """
+
+    def __init__(self, base: Distribution, power: float) -> None:
+        self.base, self.exponent = base, power
+        self._set_batch(base.batch_shape)
+        self._adopt(base)
+
+    def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
+        return self.base.sample_to(rng, shape) ** (1.0 / self.exponent)
+
+    def _log_prob(self, x: np.ndarray) -> np.ndarray:
+        volume = np.log(abs(self.exponent)) + (self.exponent - 1.0) * np.log(x)
+        return np.where(x > 0, self.base.log_prob(x**self.exponent) + volume, -np.inf)
+
+    @property
+    def support(self) -> Support:
+        inner = self.base.support
+        ends = [np.asarray(e, dtype=float) for e in (inner.low, inner.high)]
+        with np.errstate(divide="ignore"):
+            ends = [e ** (1.0 / self.exponent) for e in ends]
+        low, high = ends if self.exponent > 0 else ends[::-1]
+        return interval(low, high, True, True)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _covers(bounds: Bounds, low: float, high: float) -> bool:
+    return bool(np.all(bounds[0] <= low) and np.all(bounds[1] >= high))
+
+
+def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
+    """Lower Cholesky factor of the inverse of each matrix.
+
+    With rows and columns reversed, a Cholesky factor turns into an upper triangle U with
+    ``precision = U U'``, whose inverse is back substitution.
+    """
+    spread = (
+        np.linalg.diagonal(precision) ** -0.5
+    )  # unit diagonal, whatever the units of components
+    scaled = precision * (spread[..., :, None] * spread[..., None, :])
+    upper = np.linalg.cholesky(scaled[..., ::-1, ::-1])[..., ::-1, ::-1]
+    return spread[..., :, None] * np.matrix_transpose(np.linalg.inv(upper))

@@ -1,0 +1,264 @@
+"""What a term adds to the natural parameters of a vector that enters a mean, or of a covariance.
+
+A mean that is affine in a vector makes the log density a quadratic form in it; a covariance that is a
+multiple of a matrix makes it that of an inverse Wishart.
+
+References
+----------
+Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sec. 3.5, 3.6 and 14.8.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from bayesmc.distributions import LogNormal, MvNormal, Normal
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Constant,
+    Expression,
+    TracedArray,
+    as_expression,
+    broadcast,
+    call,
+    elementwise,
+    pick,
+    reduction,
+    reshape,
+    substituted,
+)
+from bayesmc.kernels.conjugate_children import Child
+from bayesmc.kernels.conjugate_terms import Moving
+from bayesmc.passes.affine import affine
+from bayesmc.passes.arithmetic import ONE, divide, subtract
+from bayesmc.passes.derivatives import tangent
+from bayesmc.passes.features import alone, statistics
+from bayesmc.passes.reads import element_read, same_along
+from bayesmc.passes.totals import total
+from bayesmc.shapes import Shape
+
+
+def mean_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
+    """Precision ``(count, d, d)`` and linear term ``(count, d)`` of a vector that enters a mean.
+
+    Raises
+    ------
+    TraceError
+        It enters something else, or not affinely.
+    """
+    family, value = child.family, child.value
+    parameters = family.parameters
+    if family.make not in (Normal, LogNormal, MvNormal) or child.read(of.name) != ["loc"]:
+        raise TraceError("it enters no mean")
+    if family.make is LogNormal:
+        value = elementwise(np.log, value)
+    is_vector = family.make is MvNormal
+    shape = child.shape + (value.shape[-1:] if is_vector else (1,))
+    value = broadcast(value, shape if is_vector else child.shape)
+    loc, own = alone(broadcast(parameters["loc"], value.shape), of.name, of.numbers)
+    if own is None:
+        raise TraceError("it enters no mean")
+    affine(loc, [own.name])
+    mean = reshape(loc, shape)
+    at = element_read(reduction(np.add, mean, [-1]), own.name, of.numbers)
+    d = own.shape[-1]
+    units = [np.broadcast_to(row, own.shape) for row in np.eye(d)]
+    slopes = [tangent(mean, {own.name: as_expression(u)}) for u in units]
+    slope = _stacked(slopes)
+    zero = as_expression(np.zeros(own.shape))
+    off = subtract(reshape(value, shape), substituted(mean, {own.name: zero}))
+    if not is_vector:
+        weight = divide(1.0, elementwise(np.square, broadcast(parameters["scale"], child.shape)))
+        return _of_numbers(slope, off, weight, _Entries(at, of.count, child.mask))
+    root = _inverse_root(parameters, shape)
+    return _of_vectors(slope, off, root, _Entries(at, of.count, child.mask))
+
+
+def covariance_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
+    """Degrees of freedom ``(count,)`` and scale ``(count, d, d)`` of a covariance.
+
+    Raises
+    ------
+    TraceError
+        It enters something else, or not as a multiple of itself.
+    """
+    parameters, value = child.family.parameters, child.value
+    if child.family.make is not MvNormal or child.read(of.name) != ["cov"]:
+        raise TraceError("it enters no covariance")
+    d = value.shape[-1]
+    cov = broadcast(parameters["cov"], (*child.shape, d, d))
+    size = of.numbers.size
+    flat = np.arange(size).reshape(of.numbers.shape)
+    found = statistics(cov, of.name, flat)
+    if set(found.coefficients) != {1.0}:
+        raise TraceError("it is no multiple")
+    times = same_along(found.coefficients[1.0], [-1, -2])
+    whole, own = alone(cov, of.name, flat)
+    assert own is not None
+    place = element_read(whole, own.name, flat % (d * d))
+    at = same_along(element_read(whole, own.name, of.numbers), [-1, -2])
+    in_place = np.broadcast_to(np.arange(d * d).reshape(d, d), place.shape)
+    if times is None or at is None or place is not as_expression(in_place):
+        raise TraceError("it is no multiple")
+    entries = _Entries(at, of.count, child.mask)
+    off = subtract(value, broadcast(parameters["loc"], value.shape))
+    scaled = divide(off, reshape(elementwise(np.sqrt, times), (*child.shape, 1)))
+    return entries.total(broadcast(ONE, child.shape)), entries.outer(scaled, scaled)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Entries:
+    """Entries of a term, and the element that each reads."""
+
+    at: Expression
+    count: int
+    mask: np.ndarray | None
+
+    def total(self, part: Expression) -> Expression:
+        """Sums by element."""
+        return total(part, self.at, self.count, self.mask)
+
+    def outer(self, first: Expression, second: Expression) -> Expression:
+        """Sums of outer products of ``(*entries, p)`` and ``(*entries, q)``: ``(count, p, q)``."""
+        p, q = first.shape[-1], second.shape[-1]
+        if not isinstance(self.at, Constant):
+            lead = first.shape[:-1]
+            wide = reshape(first, (*lead, p, 1)), reshape(second, (*lead, 1, q))
+            return self.total(elementwise(np.multiply, *wide))
+        at = self.at.value
+        kept = at >= 0 if self.mask is None else (at >= 0) & np.broadcast_to(self.mask, at.shape)
+        entries = np.flatnonzero(kept)
+        entries = entries[np.argsort(at.reshape(-1)[entries], kind="stable")]
+        ends = np.searchsorted(at.reshape(-1)[entries], np.arange(self.count + 1))
+        rows = [
+            pick([e], np.arange(e.size).reshape(-1, n)[entries])
+            for e, n in ((first, p), (second, q))
+        ]
+        return call(_Outer(tuple(ends.tolist())), rows)
+
+    def by_element(self, part: Expression) -> Expression | None:
+        """Blocks that are the same for all entries of an element: ``(count, *block)``."""
+        ndim = len(self.at.shape)
+        once = same_along(part, range(ndim)) if ndim else part
+        return None if once is None else broadcast(once, (self.count, *part.shape[ndim:]))
+
+
+@dataclass(frozen=True)
+class _Outer:
+    """Sums of outer products of rows, between ends."""
+
+    ends: tuple[int, ...]
+
+    def __call__(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        left = np.matrix_transpose(first)
+        sizes = set(np.diff(self.ends).tolist())
+        if len(sizes) == 1:  # as many for each
+            count, size = len(self.ends) - 1, max(sizes)
+            split = [a.reshape(*a.shape[:-2], count, size, a.shape[-1]) for a in (first, second)]
+            return np.matrix_transpose(split[0]) @ split[1]
+        parts = [
+            left[..., a:b] @ second[..., a:b, :]
+            for a, b in zip(self.ends[:-1], self.ends[1:], strict=True)
+        ]
+        return np.stack(np.broadcast_arrays(*parts), axis=-3)
+
+
+def _stacked(parts: list[Expression]) -> Expression:
+    """Side by side along a new last axis."""
+    size, shape = parts[0].size, parts[0].shape
+    at = np.arange(size).reshape(*shape, 1) + size * np.arange(len(parts))
+    return pick(parts, at)
+
+
+def _of_numbers(
+    slope: Expression, off: Expression, weight: Expression, entries: _Entries
+) -> tuple[Expression, Expression]:
+    """Of slopes ``(*entries, 1, d)`` and what the offset leaves, ``(*entries, 1)``."""
+    ndim = len(entries.at.shape)
+    d = slope.shape[-1]
+    rows = reshape(slope, (*slope.shape[:ndim], d))
+    both = pick([rows, off], _joined(rows.shape, off.shape))
+    same = entries.by_element(weight)
+    if same is not None:
+        sums = entries.outer(rows, both)
+        sums = elementwise(np.multiply, sums, reshape(same, (entries.count, 1, 1)))
+    else:
+        wide = reshape(weight, (*weight.shape, 1))
+        sums = entries.outer(elementwise(np.multiply, rows, wide), both)
+    return _split(sums)
+
+
+def _of_vectors(
+    slope: Expression, off: Expression, root: Expression, entries: _Entries
+) -> tuple[Expression, Expression]:
+    """Of slopes ``(*entries, m, d)``, residuals ``(*entries, m)`` and what whitens them."""
+    same_slope, same_root = entries.by_element(slope), entries.by_element(root)
+    if same_slope is not None and same_root is not None:
+        rows = _product(same_root, same_slope)
+        count = entries.total(broadcast(ONE, entries.at.shape))
+        sums = entries.total(off)
+        gram = _product(_transposed(rows), rows)
+        precision = elementwise(np.multiply, gram, reshape(count, (entries.count, 1, 1)))
+        white = _product(same_root, reshape(sums, (*sums.shape, 1)))
+        linear = _product(_transposed(rows), white)
+        return precision, reshape(linear, linear.shape[:-1])
+    ndim, (m, d) = len(entries.at.shape), slope.shape[-2:]
+    both = pick([slope, off], _joined(slope.shape, (*off.shape, 1)))
+    white = _product(root, both)
+    at = np.repeat(np.arange(entries.at.size), m).reshape(*entries.at.shape, m)
+    wide = _Entries(pick([entries.at], at), entries.count, _expanded(entries.mask, ndim))
+    rows = pick([white], np.arange(white.size).reshape(white.shape)[..., :d])
+    return _split(wide.outer(rows, white))
+
+
+def _expanded(mask: np.ndarray | None, ndim: int) -> np.ndarray | None:
+    return None if mask is None else mask.reshape(*mask.shape, 1)
+
+
+def _split(sums: Expression) -> tuple[Expression, Expression]:
+    """Precision and linear term that stand side by side."""
+    at = np.arange(sums.size).reshape(sums.shape)
+    return pick([sums], at[..., :-1]), pick([sums], at[..., -1])
+
+
+def _joined(first: Shape, second: Shape) -> np.ndarray:
+    """Positions of two arrays side by side."""
+    size = math.prod(first)
+    at = np.arange(size).reshape(first)
+    return np.concatenate([at, size + np.arange(math.prod(second)).reshape(second)], axis=-1)
+
+
+def _inverse_root(parameters: dict[str, Any], shape: Shape) -> Expression:
+    """What whitens residuals of vectors: ``(*entries, m, m)``."""
+    entries, m = shape[:-1], shape[-1]
+    if parameters.get("scale_diag") is not None:
+        spread = broadcast(parameters["scale_diag"], (*parameters["scale_diag"].shape[:-1], m))
+        wide = divide(as_expression(np.eye(m)), reshape(spread, (*spread.shape, 1)))
+        return broadcast(wide, (*entries, m, m))
+    factor: Any = parameters.get("scale_tril")
+    factor = (
+        np.linalg.cholesky(TracedArray(parameters["cov"]))
+        if factor is None
+        else TracedArray(factor)
+    )
+    found: Any = np.linalg.inv(factor)
+    return broadcast(
+        found.expression if isinstance(found, TracedArray) else found, (*entries, m, m)
+    )
+
+
+def _product(first: Expression, second: Expression) -> Expression:
+    found: Any = np.matmul(TracedArray(first), TracedArray(second))
+    return found.expression
+
+
+def _transposed(matrix: Expression) -> Expression:
+    found: Any = np.matrix_transpose(TracedArray(matrix))
+    return found.expression

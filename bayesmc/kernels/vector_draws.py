@@ -1,0 +1,256 @@
+"""Draws of normals and covariances from natural parameters, few of them on Python's floats.
+
+Natural parameters are arrays, or expressions of a state, which makes parameters and draw one program.
+
+References
+----------
+Rue and Held (2005), Gaussian Markov Random Fields, algorithm 2.5; Smith and Hocking (1972), Wishart
+variate generator, Applied Statistics 21.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from bayesmc.distributions.wishart import gram
+from bayesmc.expression import (
+    Expression,
+    broadcast,
+    call,
+    constant,
+    elementwise,
+    leaf,
+    pick,
+    reduction,
+    reshape,
+)
+from bayesmc.expression.products import product
+from bayesmc.expression.scalars import SmallProgram, upper_inverse
+from bayesmc.passes.arithmetic import add, divide, multiply, subtract
+from bayesmc.passes.sufficient import transposed
+from bayesmc.shapes import Shape
+from bayesmc.structure.target import Values
+
+#: squared sine of an angle between rows, below which a product may be singular to rounding
+_CLOSE = 1e-6
+#: numbers that are drawn one by one
+_FEW = 24
+#: chi-square variates of few degrees of freedom underflow; squares must not
+_LEAST = 1e-280
+
+
+def normal_draw(
+    rng: np.random.Generator, precision: np.ndarray, linear: np.ndarray, shape: Shape
+) -> np.ndarray:
+    """Draws from ``exp(linear'x - x' precision x / 2)``.
+
+    Parameters
+    ----------
+    precision : ndarray, shape (*batch, d, d)
+    linear : ndarray, shape (*batch, d)
+    shape : tuple of int
+        What the batches broadcast to.
+
+    Returns
+    -------
+    ndarray, shape (*shape, d)
+
+    Raises
+    ------
+    LinAlgError
+        A precision is not positive definite to rounding.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.vector_draws import normal_draw
+    >>> rng = np.random.default_rng(0)
+    >>> draws = normal_draw(rng, np.diag([4.0, 1.0]), np.array([4.0, 0.0]), (10_000,))
+    >>> draws.mean(axis=0).round(1).tolist(), draws.std(axis=0).round(1).tolist()
+    ([1.0, 0.0], [0.5, 1.0])
+    """
+    d = linear.shape[-1]
+    noise = rng.standard_normal((*shape, d))
+    values = {"precision": precision, "linear": linear, "noise": noise}
+    if precision.shape[:-2] != shape:
+        values["precision"] = np.broadcast_to(precision, (*shape, d, d))
+    if linear.shape[:-1] != shape:
+        values["linear"] = np.broadcast_to(linear, (*shape, d))
+    (draw,) = _normal(d)(values)
+    return draw
+
+
+def inverse_wishart_draw(
+    rng: np.random.Generator, df: np.ndarray, scale: np.ndarray, shape: Shape
+) -> np.ndarray:
+    """Draws from the inverse Wishart distribution, positive definite after rounding, too.
+
+    If the scale is ``R R'`` and B is Bartlett's triangle, the draw is ``M M'`` with ``M = R B^-1'``.
+
+    Parameters
+    ----------
+    df : ndarray, shape (*batch)
+    scale : ndarray, shape (*batch, d, d)
+    shape : tuple of int
+        What the batches broadcast to.
+
+    Returns
+    -------
+    ndarray, shape (*shape, d, d)
+
+    Raises
+    ------
+    LinAlgError
+        A scale is not positive definite to rounding.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.vector_draws import inverse_wishart_draw
+    >>> rng = np.random.default_rng(0)
+    >>> draws = inverse_wishart_draw(rng, np.array(12.0), 9.0 * np.eye(2), (10_000,))
+    >>> bool(np.abs(draws.mean(axis=0) - np.eye(2)).max() < 0.05)  # the scale over df - d - 1
+    True
+    """
+    d = scale.shape[-1]
+    half = 0.5 * df[..., None] - _halves(d)
+    values = {
+        "normal": rng.standard_normal((*shape, d * (d - 1) // 2)),
+        "gamma": gammas(rng, half, (*shape, d)),
+        "scale": scale,
+    }
+    if scale.shape[:-2] != shape:
+        values["scale"] = np.broadcast_to(scale, (*shape, d, d))
+    draw, angle, factor = _inverse_wishart(d)(values)
+    return draw if _least_of(angle) >= _CLOSE else gram(factor)[0]
+
+
+class NormalDraw:
+    """Draws of all elements of a node whose natural parameters are expressions of the state.
+
+    Parameters
+    ----------
+    precision, linear : Expression, shapes (*plates, d, d) and (*plates, d), or both (*plates)
+    """
+
+    def __init__(self, precision: Expression, linear: Expression) -> None:
+        self.shape = linear.shape
+        noise = leaf("noise", self.shape)
+        if precision.shape == self.shape:
+            spread = elementwise(np.sqrt, precision)
+            draw = add(divide(linear, precision), divide(noise, spread))
+        else:
+            draw = _normal_of(precision, linear, noise)
+        self._program = SmallProgram([draw])
+
+    def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray:
+        noise = rng.standard_normal((chains, *self.shape))
+        return self._program({**values, "noise": noise})[0]
+
+
+class InverseWishartDraw:
+    """The same for covariances.
+
+    Parameters
+    ----------
+    df, scale : Expression, shapes (*plates) and (*plates, d, d)
+    """
+
+    def __init__(self, df: Expression, scale: Expression) -> None:
+        d = scale.shape[-1]
+        self.shape = scale.shape[:-1]
+        half = subtract(multiply(0.5, reshape(df, (*df.shape, 1))), _halves(d))
+        self._half = SmallProgram([broadcast(half, self.shape)])
+        self._normals = (*scale.shape[:-2], d * (d - 1) // 2)
+        gamma, normal = leaf("gamma", self.shape), leaf("normal", self._normals)
+        draw, angle, factor = _inverse_wishart_of(scale, gamma, normal)
+        self._program, self._factor = SmallProgram([draw, angle]), SmallProgram([factor])
+
+    def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray:
+        (half,) = self._half(values)
+        normal = rng.standard_normal((chains, *self._normals))
+        gamma = gammas(rng, half, (chains, *self.shape))
+        values = {**values, "gamma": gamma, "normal": normal}
+        draw, angle = self._program(values)
+        return draw if _least_of(angle) >= _CLOSE else gram(self._factor(values)[0])[0]
+
+
+def gammas(rng: np.random.Generator, concentration: np.ndarray, shape: Shape) -> np.ndarray:
+    """Standard gamma numbers as ``rng.standard_gamma`` draws them, which checks few slowly.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.vector_draws import gammas
+    >>> gammas(np.random.default_rng(0), np.array([2.0, 3.0]), (2,))
+    array([1.83431007, 3.85514353])
+    >>> np.random.default_rng(0).standard_gamma([2.0, 3.0])
+    array([1.83431007, 3.85514353])
+    """
+    if concentration.size > _FEW or concentration.shape != shape:
+        return rng.standard_gamma(concentration, shape)
+    draw = rng.standard_gamma
+    return np.array([draw(a) for a in concentration.ravel().tolist()]).reshape(shape)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _least_of(array: np.ndarray) -> float:
+    return np.minimum.reduce(array, axis=None, initial=1.0)
+
+
+@cache
+def _halves(d: int) -> np.ndarray:
+    """Half of ``d - 1, ..., 0``."""
+    return 0.5 * np.arange(d - 1, -1, -1.0)
+
+
+@cache
+def _normal(d: int) -> SmallProgram:
+    leaves = leaf("precision", (d, d)), leaf("linear", (d,)), leaf("noise", (d,))
+    return SmallProgram([_normal_of(*leaves)])
+
+
+@cache
+def _inverse_wishart(d: int) -> SmallProgram:
+    normal = leaf("normal", (d * (d - 1) // 2,))
+    return SmallProgram(_inverse_wishart_of(leaf("scale", (d, d)), leaf("gamma", (d,)), normal))
+
+
+def _normal_of(precision: Expression, linear: Expression, noise: Expression) -> Expression:
+    root = call(upper_inverse, [transposed(call(np.linalg.cholesky, [precision]))])
+    white = add(call(np.vecmat, [linear, root]), noise)
+    return call(np.matvec, [root, white])
+
+
+def _inverse_wishart_of(
+    scale: Expression, gamma: Expression, normal: Expression
+) -> tuple[Expression, Expression, Expression]:
+    """A draw, the least square of the sine of an angle between its factor's rows, and the factor."""
+    d = scale.shape[-1]
+    batch = gamma.shape[:-1]
+    least = elementwise(np.maximum, multiply(2.0, gamma), _LEAST)
+    parts = [elementwise(np.sqrt, least), normal, broadcast(constant(0.0), (*batch, 1))]
+    # the triangle, transposed an upper one: from its diagonal, what is beside it, and zero
+    at, start = np.empty((*batch, d, d), dtype=np.intp), 0
+    row, column = np.tril_indices(d, -1)
+    places = [(np.arange(d), np.arange(d)), (column, row), (row, column)]
+    for part, (i, j) in zip(parts, places, strict=True):
+        own = start + np.arange(part.size).reshape(part.shape)
+        at[..., i, j] = own
+        start += part.size
+    over = transposed(call(upper_inverse, [pick(parts, at)]))
+    lower = constant(np.tril(np.ones((d, d))))
+    factor = call(np.matmul, [multiply(call(np.linalg.cholesky, [scale]), lower), over])
+    draw = product(np.matmul, factor, transposed(factor))  # symmetric to the last bit
+    sines = divide(elementwise(np.square, _diagonal(factor)), _diagonal(draw))
+    least = reduction(np.minimum, sines, range(len(sines.shape)))
+    return draw, least, factor
+
+
+def _diagonal(matrix: Expression) -> Expression:
+    at = np.arange(matrix.size).reshape(matrix.shape)
+    return pick([matrix], at.diagonal(axis1=-2, axis2=-1))
