@@ -23,10 +23,10 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError, UnsupportedError
-from bayesmc.expression import as_expression, broadcast
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.conjugate_children import Partner
 from bayesmc.kernels.conjugate_kinds import KINDS, Bounds, Kind, Naturals, split_prior
+from bayesmc.kernels.conjugate_labels import summed, with_sums
 from bayesmc.kernels.conjugate_like import partners_of
 from bayesmc.kernels.conjugate_matching import Match, match_of
 from bayesmc.kernels.conjugate_pairs import PAIRS, Pair
@@ -35,7 +35,6 @@ from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.vector_draws import InverseWishartDraw, NormalDraw
 from bayesmc.kernels.verify import check_ratio
-from bayesmc.passes.arithmetic import add
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_children import with_like_children
 from bayesmc.structure.target import Values
@@ -81,15 +80,13 @@ class Conjugate(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         blanket = self.blanket
-        derived: Values = {}
-        for sums in self._sums:
-            placed = sums.placed(values)
-            if placed is not values:  # others read the same
-                derived |= sums.kept(placed[sums.label], placed[sums.key])
-                values = placed
+        values, derived = with_sums(values, self._sums)
         if self._whole is not None and not self.debug:
-            new = self._whole_draw(values, rng)
-            if new is not None:
+            try:
+                new = self._whole(values, rng, len(values[blanket.name]))
+            except np.linalg.LinAlgError as error:
+                raise self._degenerate(error) from error
+            if math.isfinite(np.add.reduce(new, axis=None)):  # else the posterior says why
                 return {blanket.name: new, **derived}, memory
         state = values
         for part, members in enumerate(blanket.classes):
@@ -130,29 +127,9 @@ class Conjugate(Kernel):
         if make is None or not self._constant or len(classes) > 1 or classes[0] is not None:
             return None
         prior, bounds = self._prior({**self.blanket.target.known}, 0, None)
-        if bounds is not None or any(len(a) != 1 for a in prior):
-            return None
-        totals = [as_expression(a[0]) for a in prior]
-        for partner in self.partners:
-            parts = partner.expressions
-            if parts is None:
-                return None
-            totals = [add(a, b) for a, b in zip(totals, parts, strict=True)]
-        shape, ranks = self.blanket.node.plate_shape, self.kind.event_ndims
-        whole = [
-            broadcast(t, shape + t.shape[len(t.shape) - n :])
-            for t, n in zip(totals, ranks, strict=True)
-        ]
-        return make(*whole)
-
-    def _whole_draw(self, values: Values, rng: np.random.Generator) -> np.ndarray | None:
-        """A draw; None where it is no number, of which the posterior says more."""
-        assert self._whole is not None
-        try:
-            new = self._whole(values, rng, len(values[self.blanket.name]))
-        except np.linalg.LinAlgError as error:
-            raise self._degenerate(error) from error
-        return new if math.isfinite(np.add.reduce(new, axis=None)) else None
+        added = [p.expressions if bounds is None else None for p in self.partners]
+        totals = summed(prior, added, self.blanket.node.plate_shape, self.kind.event_ndims)
+        return None if totals is None else make(*totals)
 
     def _moved(
         self, values: Values, part: int, members: np.ndarray | None, rng: np.random.Generator
@@ -262,8 +239,7 @@ class Conjugate(Kernel):
         return slice_move(log_density, now, width, rng, low, high)
 
     @cached_property
-    def _density(self) -> Blanket:
-        """What slice steps ask."""
+    def _density(self) -> Blanket:  # what slice steps ask
         return with_like_children(self.blanket)
 
     # ---- verified conjugacy --------------------------------------------------------------------

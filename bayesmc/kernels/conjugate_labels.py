@@ -7,6 +7,7 @@ mean, or the scatter about it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -88,6 +89,36 @@ def counted(target: Target, label: str) -> LabelSums | None:
         if sums is not None and sums.ones == 1 and term.mask is None:
             return sums
     return None
+
+
+def with_sums(values: Values, every: Sequence[LabelSums]) -> tuple[Values, Values]:
+    """A state with sums by label in it, and those that were not there: others read the same."""
+    derived: Values = {}
+    for sums in every:
+        placed = sums.placed(values)
+        if placed is not values:
+            derived |= sums.kept(placed[sums.label], placed[sums.key])
+            values = placed
+    return values, derived
+
+
+def summed(
+    prior: Sequence[np.ndarray],
+    added: Sequence[Sequence[Expression] | None],
+    shape: tuple[int, ...],
+    event_ndims: Sequence[int],
+) -> list[Expression] | None:
+    """Natural parameters ``(*shape, *event)`` of prior and children; None where one is no expression."""
+    if any(len(a) != 1 for a in prior) or any(a is None for a in added):
+        return None
+    totals: list[Expression] = [as_expression(a[0]) for a in prior]
+    for parts in added:
+        assert parts is not None
+        totals = [add(a, b) for a, b in zip(totals, parts, strict=True)]
+    return [
+        broadcast(t, shape + t.shape[len(t.shape) - n :])
+        for t, n in zip(totals, event_ndims, strict=True)
+    ]
 
 
 # ---- private ------------------------------------------------------------------------------------
