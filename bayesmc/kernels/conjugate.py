@@ -155,8 +155,7 @@ class Conjugate(Kernel):
         return slice_move(log_density, now, width, rng, low, high)
 
     @cached_property
-    def _density(self) -> Blanket:
-        """What slice steps ask."""
+    def _density(self) -> Blanket:  # what slice steps ask
         return with_like_children(self.blanket)
 
     # ---- verified conjugacy --------------------------------------------------------------------
