@@ -108,7 +108,10 @@ def fitted_mixture(
     0.8
     """
     count = len(draws)
-    first = current = _about(draws, np.full(count, 1.0 / count), rng)
+    draws = draws[np.isfinite(draws).all(axis=1)]
+    if len(draws) < 0.5 * count:
+        return None
+    first = current = _about(draws, np.full(len(draws), 1.0 / len(draws)), rng)
     heat = 0.0
     for _ in range(_ROUNDS):
         u = current.draw(rng, count)
@@ -116,10 +119,13 @@ def fitted_mixture(
         from_first = log_q if current is first else first.log_prob(u)
         target = log_density(u)
         target = np.where(np.isnan(target), -np.inf, target)
-        if not (target > -np.inf).any():
+        if not (target > -np.inf).any() or target.max() == np.inf:
             return None
-        heat = _hotter(target - from_first, from_first - log_q, heat)
-        log_w = heat * (target - from_first) + from_first - log_q
+        gain, base = target - from_first, from_first - log_q
+        heat = _hotter(gain, base, heat)
+        log_w = _heated(gain, base, heat)
+        if not np.isfinite(log_w.max()):
+            return None
         weights = np.exp(log_w - log_w.max())
         effective = weights.sum() ** 2 / (weights @ weights) / count
         # one draw far out must not be all that the next are drawn about (Ionides 2008)
@@ -133,11 +139,17 @@ def fitted_mixture(
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _heated(gain: np.ndarray, base: np.ndarray, power: float) -> np.ndarray:
+    """Log weights at a power of the target; what it excludes has none at power 0, either."""
+    possible = gain > -np.inf
+    return np.where(possible, power * np.where(possible, gain, 0.0) + base, -np.inf)
+
+
 def _hotter(gain: np.ndarray, base: np.ndarray, heat: float) -> float:
     """The largest power of the target, at least what it was, that leaves enough draws effective."""
 
     def effective(power: float) -> float:
-        log = np.where(gain > -np.inf, power * gain, -np.inf) + base if power else base
+        log = _heated(gain, base, power)
         w = np.exp(log - log.max())
         return float(w.sum() ** 2 / (w @ w)) / len(w)
 
