@@ -165,17 +165,15 @@ def density(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Follo
     return known[name, cut]
 
 
-def log_density_of(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Expression:
+def log_density_of(model: Model, name: str) -> Expression:
     """The log density of a stochastic node at its stored value, shape its plates.
-
-    Deterministic nodes in ``cut`` are leaves.
 
     Raises
     ------
     TraceError
         Its function cannot be followed, or its family has no closed form.
     """
-    node, found = model[name], density(model, name, cut)
+    node, found = model[name], density(model, name)
     if isinstance(found, Opaque):
         raise TraceError(f"node {name!r}: {found.reason}")
     family = found.result
@@ -226,17 +224,15 @@ def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
     return family_of(found) if isinstance(found, Distribution) else found
 
 
-def log_factor_of(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Expression:
+def log_factor_of(model: Model, name: str) -> Expression:
     """A potential's log factors, shape its plates or the rows of its index.
-
-    Deterministic nodes in ``cut`` are leaves.
 
     Raises
     ------
     TraceError
         Its function cannot be followed.
     """
-    found = density(model, name, cut)
+    found = density(model, name)
     if isinstance(found, Opaque):
         raise TraceError(f"potential {name!r}: {found.reason}")
     return broadcast(found.result, potential_shape(model.sizes, model.potentials[name][0]))

@@ -224,9 +224,12 @@ def _tables(at: Expression) -> set[int] | None:
 
 def _gathered(node: Gather, inner: list[Expression | None]) -> Expression:
     at, of_rows = inner
-    if of_rows is not None or at is None:
-        raise TraceError("an index depends on it")
     block = len(node.table.shape) - 1
+    if of_rows is not None:
+        if at is not None:
+            raise TraceError("an index depends on it")
+        return broadcast(reshape(of_rows, of_rows.shape + (1,) * block), node.shape)
+    assert at is not None
     short = same_along(at, range(1, block + 1)) if block else at
     if short is None:
         row = same_along(at, [0])
@@ -247,7 +250,7 @@ def _along(at: Expression, axes: Sequence[int]) -> Expression:
     if short is not None:
         return short
     if isinstance(at, Constant):
-        most = at.value.max(axis=tuple(axes))
+        most = at.value.max(axis=tuple(axes), initial=-1)
         wide = np.expand_dims(most, tuple(axes))
         if ((at.value >= 0) & (at.value != wide)).any():
             raise _several()

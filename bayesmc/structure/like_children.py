@@ -132,7 +132,7 @@ def as_one_child(blanket: Blanket, children: Sequence[Child]) -> tuple[LikeTerms
     if relation.kind == "lookup" and isinstance(term, StackedTerm):
         assert term.function is not None and relation.source is not None
         try:
-            found = positions(blanket.target, term.form(), relation.source)
+            found = positions(blanket.target, term.function.result, relation.source, term.shape)
         except TraceError:
             return None
         if len(found) != 1:

@@ -10,9 +10,6 @@ import numpy as np
 
 from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.errors import BayesmcError, DensityError
-from bayesmc.expression import Expression, broadcast
-from bayesmc.network.expressions import stored_leaf
-from bayesmc.passes.log_density import log_density
 from bayesmc.shapes import Shape, broadcast_shapes
 from bayesmc.structure.like_functions import Signature, Slots, StackedFunction, as_one
 from bayesmc.structure.target import Target, Term, Values
@@ -37,20 +34,6 @@ class StackedTerm(Term):
         dist = as_distribution(made)
         assert dist is not None
         return dist, batch
-
-    def form(self) -> Expression:
-        """Log factors of one of them, shape its plates, of what the function reads and its constants.
-
-        Raises
-        ------
-        TraceError
-            The family has no closed form.
-        """
-        assert self.function is not None
-        found = self.function.result
-        if not self.is_potential:
-            found = log_density(found, stored_leaf(self.model, self.model[self.name]))
-        return broadcast(found, self.shape)
 
     def log(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Log factors of every element of all, shape ``(*lead, group, *plates)``."""

@@ -25,13 +25,15 @@ from bayesmc.expression import (
     Expression,
     Leaf,
     Program,
-    constant,
+    as_expression,
+    broadcast,
     elementwise,
     ordered,
-    replaced,
+    substituted,
 )
 from bayesmc.network import Model
-from bayesmc.network.expressions import log_density_of, log_factor_of
+from bayesmc.network.expressions import Opaque, density
+from bayesmc.network.readings import by_element
 from bayesmc.passes.reads import elements_read
 from bayesmc.shapes import Shape
 from bayesmc.structure.target import Target, Term
@@ -250,17 +252,14 @@ def _looked_up(target: Target, name: str, term: Term, source: str, whole: Relati
     if node.domain is not None:
         return whole
     links = frozenset(p for p in term.parents if target.model[p].kind == "deterministic")
-    form = log_factor_of if term.is_potential else log_density_of
+    read = density(target.model, term.name, links)
+    if isinstance(read, Opaque):
+        return whole
     try:
-        found = positions(target, form(target.model, term.name, links), source)
+        found = positions(target, read.result, source, term.shape)
     except TraceError:
         return whole
-    known = {
-        at: constant(target.known[at.name])
-        for at in ordered(*found)
-        if isinstance(at, Leaf) and target.is_known(at.name)
-    }
-    fixed = [replaced(at, known) for at in found]
+    fixed = [with_known(target, at) for at in found]
     if fixed and all(isinstance(at, Constant) for at in fixed):
         roles = np.stack([np.ravel(at.value) for at in fixed])  # type: ignore[attr-defined]
         # where one role reads nothing it stands with another; what reads nothing at all may be anyone's
@@ -272,24 +271,45 @@ def _looked_up(target: Target, name: str, term: Term, source: str, whole: Relati
     return Relation("lookup", node.plates, node.plate_shape, term.plates, source, index)
 
 
-def positions(target: Target, root: Expression, source: str) -> tuple[Expression, ...]:
-    """The flat elements of a node that each entry of a term reads, one expression for each way.
+def positions(target: Target, result: Any, source: str, shape: Shape) -> tuple[Expression, ...]:
+    """The flat elements of a node that each element of a term reads, one expression for each way.
+
+    Parameters
+    ----------
+    result : Family, Distribution or Expression
+        What the term's function computes.
+    source : str
+    shape : tuple of int
+        Of the term.
 
     Raises
     ------
     TraceError
-        An entry may read several in one way.
+        An element may read several in one way.
     """
     node = target.model[source]
     count = math.prod(node.plate_shape)
     numbers = np.repeat(np.arange(count), math.prod(node.event_shape)).reshape(node.value_shape)
-    found = []
-    for at in elements_read(root, source, numbers):
-        lacks = any(isinstance(n, Constant) and n.size and n.value.min() < 0 for n in ordered(at))
-        is_open = lacks and not isinstance(at, Constant)
-        # a factor that reads no element is a constant, whoever gets it
-        found.append(elementwise(np.maximum, at, 0) if is_open else at)
+    found: dict[Expression, None] = {}
+    for root in by_element(result):
+        for at in elements_read(root, source, numbers) if source in root.leaves else ():
+            lacks = any(isinstance(n, Constant) and (n.value < 0).any() for n in ordered(at))
+            if lacks and not isinstance(at, Constant):
+                # a factor that reads no element is a constant, whoever gets it
+                at = elementwise(np.maximum, at, 0)
+            found[broadcast(at, shape)] = None
     return tuple(found)
+
+
+def with_known(target: Target, expression: Expression) -> Expression:
+    """An expression with constants in the place of what is known."""
+    values = {}
+    for node in ordered(expression):
+        if isinstance(node, Leaf) and target.is_known(node.name):
+            value = np.asarray(target.known[node.name])
+            if value.shape == node.shape:
+                values[node.name] = as_expression(value)
+    return substituted(expression, values) if values else expression
 
 
 def looked_up(program: Program, values: Mapping[str, np.ndarray]) -> np.ndarray:
