@@ -185,8 +185,9 @@ def test_errors_hold_where_numbers_change_and_some_begin_anew(options: dict[str,
     assert 0.67 < logs.std(ddof=1) / stated < 1.4
 
 
-#: runs of three thousand rows whose error may be infinite, of 100: it is no answer
-UNTOLD = 5
+#: runs of three thousand rows whose error may be infinite, of 100: it is no answer. Two such tests of a
+#: thousand particles had 6 in 200; more than 10 of 100 come once in 1,000 times where 4 are to be expected
+UNTOLD = 10
 
 
 def three_thousand(kind: str, engine: bmc.ParticleFilter) -> np.ndarray:
