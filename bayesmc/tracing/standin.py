@@ -52,11 +52,6 @@ class TracedCall:
     function: Callable[..., Any]
     arguments: dict[str, Any]
 
-    @property
-    def traced(self) -> dict[str, Any]:
-        """The arguments that are traced, or hold something traced."""
-        return {name: value for name, value in self.arguments.items() if is_traced(value)}
-
 
 def is_traced(value: Any) -> bool:
     """Whether a value is traced, or is a sequence that holds something traced."""
