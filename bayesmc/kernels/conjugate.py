@@ -192,11 +192,10 @@ class Conjugate(Kernel):
         total = blanket.own_log(state, members)
         size = np.abs(total)
         for child in blanket.children:
-            dist, batch, keys = blanket.distribution(child, state)
-            log = child.term.log_of(dist, batch, state[child.term.name])
+            log = child.term.log(state)
             collect = child.relation.collect
-            total = total + collect(log, child.term.shape, keys, members)
-            size = size + collect(np.abs(log), child.term.shape, keys, members)
+            total = total + collect(log, child.term.shape, members, state)
+            size = size + collect(np.abs(log), child.term.shape, members, state)
         return total, size
 
 

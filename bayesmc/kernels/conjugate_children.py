@@ -24,7 +24,6 @@ from bayesmc.expression import (
     expressions_of,
     ordered,
     pick,
-    substituted,
 )
 from bayesmc.kernels.conjugate_labels import by_label
 from bayesmc.kernels.label_sums import LabelSums
@@ -35,6 +34,7 @@ from bayesmc.passes.templates import stacked_rows, template
 from bayesmc.passes.widening import widened
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.relation import with_known
 from bayesmc.structure.target import Target, Term
 
 
@@ -110,17 +110,6 @@ def apart(blanket: Blanket, child: Child) -> list[Child]:
     if child.sums is None and len(child.terms) == 1:
         return []
     return [_alone(blanket, t) for t in child.terms]
-
-
-def with_known(target: Target, expression: Expression) -> Expression:
-    """An expression with constants in the place of what is known."""
-    values = {}
-    for node in ordered(expression):
-        if isinstance(node, Leaf) and target.is_known(node.name):
-            value = np.asarray(target.known[node.name])
-            if value.shape == node.shape:
-                values[node.name] = as_expression(value)
-    return substituted(expression, values) if values else expression
 
 
 # ---- private ------------------------------------------------------------------------------------

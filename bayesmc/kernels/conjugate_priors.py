@@ -20,7 +20,6 @@ from bayesmc.expression import (
     pick,
     reshape,
 )
-from bayesmc.kernels.conjugate_children import with_known
 from bayesmc.kernels.conjugate_families import Conditional
 from bayesmc.kernels.conjugate_terms import Moving, features_of
 from bayesmc.network.expressions import Opaque, stored_leaf
@@ -28,6 +27,7 @@ from bayesmc.passes.arithmetic import add
 from bayesmc.passes.features import Feature
 from bayesmc.passes.log_density import family_of, has_own_form, log_density
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.relation import with_known
 
 
 @dataclass(frozen=True, eq=False)

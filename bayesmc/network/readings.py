@@ -7,7 +7,7 @@ unrolled template have one reading, and so do nodes that were given one function
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from types import FunctionType
@@ -29,6 +29,7 @@ from bayesmc.expression import (
     expressions_of,
     gather,
     leaf,
+    reduction,
     reshape,
     trace,
 )
@@ -222,6 +223,28 @@ def with_axes(traced: Any, rank: int) -> Any:
     if isinstance(traced, (list, tuple)):
         return type(traced)(with_axes(v, rank) for v in traced)
     return traced
+
+
+def by_element(traced: Any, event_ndim: int = 0) -> Iterator[Expression]:
+    """What was traced as expressions of its plates alone: sums over all that one element is made of.
+
+    They tell what an element depends on, not its density.
+
+    Raises
+    ------
+    TraceError
+        It is not known how many axes one value of a parameter has.
+    """
+    if isinstance(traced, Expression):
+        ndim = len(traced.shape)
+        yield reduction(np.add, traced, range(max(ndim - event_ndim, 0), ndim))
+    elif isinstance(traced, Family):
+        ranks = _ranks(traced)
+        for key, value in traced.parameters.items():
+            yield from by_element(value, event_ndim + ranks.get(key, 0))
+    elif isinstance(traced, (list, tuple)):
+        for value in traced:
+            yield from by_element(value, event_ndim)
 
 
 # ---- private ------------------------------------------------------------------------------------

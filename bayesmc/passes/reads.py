@@ -1,7 +1,7 @@
 """Which element of a leaf each entry of an expression reads.
 
 The numbers of the elements go the way that the elements themselves go: through picks, gathers and
-broadcasting. Where two of them meet in one entry there is no answer.
+broadcasting. Where two of them meet in one entry there is no answer, unless they come in apart.
 """
 
 from __future__ import annotations
@@ -24,10 +24,13 @@ from bayesmc.expression import (
     broadcast,
     elementwise,
     gather,
+    leaf,
     ordered,
     pick,
+    replaced,
     reshape,
 )
+from bayesmc.passes.sinking import reads, sunk
 
 #: functions of whole matrices: their batch axes are all but the last two
 _OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det", "upper_inverse"))
@@ -35,14 +38,14 @@ _OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det", "upper_inverse"))
 NOTHING = as_expression(-1)
 
 
-def element_read(root: Expression, name: str, numbers: np.ndarray) -> Expression:
+def element_read(root: Expression, name: str, numbers: np.ndarray | Expression) -> Expression:
     """The number of the element that each entry reads, -1 where it reads none.
 
     Parameters
     ----------
     root : Expression
     name : str
-    numbers : ndarray of int, shape of the leaf
+    numbers : ndarray of int or Expression, shape of the leaf
         The element that each number of the leaf belongs to.
 
     Returns
@@ -69,10 +72,44 @@ def element_read(root: Expression, name: str, numbers: np.ndarray) -> Expression
         if name not in node.leaves:
             continue
         if isinstance(node, Leaf):
-            found[node] = as_expression(np.asarray(numbers).reshape(node.shape))
+            found[node] = reshape(as_expression(numbers), node.shape)
         else:
             found[node] = _read(node, [found.get(a) for a in node.operands])
     return found[root] if root in found else broadcast(NOTHING, root.shape)
+
+
+def elements_read(root: Expression, name: str, numbers: np.ndarray) -> tuple[Expression, ...]:
+    """The numbers of the elements that each entry reads, one expression for each way in which they come in.
+
+    As ``element_read``, where the elements of a pair come in apart: ``x[i] - x[j]``.
+
+    Raises
+    ------
+    TraceError
+        An entry reads several elements in one way, or may do so.
+
+    Examples
+    --------
+    >>> from bayesmc.expression import TracedArray, leaf, trace
+    >>> from bayesmc.passes.reads import elements_read
+    >>> x = TracedArray(leaf("x", (3,)))
+    >>> found = trace(lambda x: abs(2 * x[..., 1:] - x[..., :2]), [x])
+    >>> elements_read(found, "x", np.arange(3))
+    (<Constant [1 2] (2,)>, <Constant [0 1] (2,)>)
+    """
+    whole = sunk(root, name)
+    ways: dict[Expression, Expression] = {
+        read: leaf(f"way {k} into {name}", read.shape, read.dtype)
+        for k, read in enumerate(reads(whole, name))
+    }
+    apart = replaced(whole, ways)
+    if name in apart.leaves:
+        raise TraceError("an index depends on it")
+    found = [
+        element_read(apart, way.name, element_read(read, name, numbers))  # type: ignore[attr-defined]
+        for read, way in ways.items()
+    ]
+    return tuple(dict.fromkeys(found))
 
 
 def same_along(expression: Expression, axes: Sequence[int]) -> Expression | None:
@@ -187,9 +224,12 @@ def _tables(at: Expression) -> set[int] | None:
 
 def _gathered(node: Gather, inner: list[Expression | None]) -> Expression:
     at, of_rows = inner
-    if of_rows is not None or at is None:
-        raise TraceError("an index depends on it")
     block = len(node.table.shape) - 1
+    if of_rows is not None:
+        if at is not None:
+            raise TraceError("an index depends on it")
+        return broadcast(reshape(of_rows, of_rows.shape + (1,) * block), node.shape)
+    assert at is not None
     short = same_along(at, range(1, block + 1)) if block else at
     if short is None:
         row = same_along(at, [0])
@@ -210,7 +250,7 @@ def _along(at: Expression, axes: Sequence[int]) -> Expression:
     if short is not None:
         return short
     if isinstance(at, Constant):
-        most = at.value.max(axis=tuple(axes))
+        most = at.value.max(axis=tuple(axes), initial=-1)
         wide = np.expand_dims(most, tuple(axes))
         if ((at.value >= 0) & (at.value != wide)).any():
             raise _several()

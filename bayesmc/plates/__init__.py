@@ -2,6 +2,5 @@
 
 from bayesmc.plates.array import PlateArray, align, stack
 from bayesmc.plates.gathered import Gathered
-from bayesmc.plates.lookups import Lookups
 
-__all__ = ["Gathered", "Lookups", "PlateArray", "align", "stack"]
+__all__ = ["Gathered", "PlateArray", "align", "stack"]

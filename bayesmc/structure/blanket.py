@@ -9,12 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Distribution
-from bayesmc.network.model import arguments_of, call, fit
-from bayesmc.plates import Lookups, PlateArray
 from bayesmc.shapes import Shape
 from bayesmc.structure.colouring import colours
-from bayesmc.structure.like_terms import StackedTerm
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
 
@@ -149,61 +145,10 @@ class Blanket:
         self, child: Child, state: Mapping[str, np.ndarray], members: np.ndarray | None = None
     ) -> np.ndarray:
         """One term's log factors in a state, summed for every element of the node."""
-        term = child.term
-        keys: tuple[Any, ...] = ()
-        if child.relation.kind != "lookup":
-            log = term.log(state)
-        elif term.is_potential:
-            log, keys = self.potential_looked_up(child, state)
-        else:
-            dist, batch, keys = self.distribution_looked_up(child, state)
-            log = term.log_of(dist, batch, state[term.name])
-        return child.relation.collect(log, term.shape, keys, members)
-
-    def distribution(
-        self, child: Child, state: Mapping[str, np.ndarray]
-    ) -> tuple[Distribution, Shape, tuple[Any, ...]]:
-        """A child's distribution, the batch of its parents, and the index by which it read the node."""
-        if child.relation.kind != "lookup":
-            return (*child.term.distribution(state), ())
-        return self.distribution_looked_up(child, state)
-
-    def distribution_looked_up(
-        self, child: Child, state: Mapping[str, np.ndarray]
-    ) -> tuple[Distribution, Shape, tuple[Any, ...]]:
-        if isinstance(child.term, StackedTerm):
-            return (*child.term.distribution(state), child.term.keys(child.relation, state))
-        node = self.target.model[child.term.name]
-        arguments, batch, watched = self._watched(child, node.links, state)
-        dist = call(node.declaration, arguments, batch + node.plate_shape, node.links)
-        fit(node.declaration, dist, batch, node.plate_shape)
-        return dist, batch, watched.keys[0]
-
-    def potential_looked_up(
-        self, child: Child, state: Mapping[str, np.ndarray]
-    ) -> tuple[np.ndarray, tuple[Any, ...]]:
-        if isinstance(child.term, StackedTerm):
-            return child.term.log(state), child.term.keys(child.relation, state)
-        potential, links = self.target.model.potentials[child.term.name]
-        arguments, batch, watched = self._watched(child, links, state)
-        log = np.asarray(potential.function(*arguments), dtype=float)
-        return np.broadcast_to(log, batch + child.term.shape), watched.keys[0]
+        log = child.term.log(state)
+        return child.relation.collect(log, child.term.shape, members, state)
 
     # ---- private -------------------------------------------------------------------------------
-
-    def _watched(
-        self, child: Child, links: Any, state: Mapping[str, np.ndarray]
-    ) -> tuple[list[Any], Shape, Lookups]:
-        """Arguments, with the one through which the node arrives noting how it is looked up."""
-        arguments, batch = arguments_of(links, state)
-        watched: Any = None
-        for i, (parent, _) in enumerate(links):
-            if parent == child.relation.source:
-                a = arguments[i]
-                assert isinstance(a, PlateArray)
-                watched = Lookups(a.array, a.plates, a.own, a.event_ndim, parent)
-                arguments[i] = watched
-        return arguments, batch, watched
 
     def _flat(self, value: np.ndarray) -> np.ndarray:
         """Value with its plates in one axis."""

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
-from bayesmc.errors import BayesmcError
+from bayesmc.errors import BayesmcError, TraceError
+from bayesmc.expression import Program
 from bayesmc.structure.blanket import Blanket, Child
 from bayesmc.structure.like_terms import FEWEST, LikeTerms, StackedTerm, like_terms, repeated
+from bayesmc.structure.relation import positions
 
 #: the plate that stands for a group
 GROUP = "\0group"
@@ -54,15 +56,8 @@ class GroupedBlanket(Blanket):
         """The log factors of a group, summed for every element of the node."""
         terms, child = self.groups[k]
         gathered = terms.gathered(state)
-        keys: tuple[Any, ...] = ()
-        if child.relation.kind != "lookup":
-            log = terms.term.log(gathered)
-        elif terms.term.is_potential:
-            log, keys = self.potential_looked_up(child, gathered)
-        else:
-            dist, batch, keys = self.distribution_looked_up(child, gathered)
-            log = terms.term.log_of(dist, batch, gathered[terms.term.name])
-        return child.relation.collect(terms.full(log), terms.shape, keys, members)
+        log = terms.full(terms.term.log(gathered))
+        return child.relation.collect(log, terms.shape, members, gathered)
 
 
 def with_like_children(blanket: Blanket) -> Blanket:
@@ -120,7 +115,7 @@ def like_children(
         source = None if relation.source is None else scope.index(relation.source)
         # the node, and what follows from it, in the same places
         reached = tuple(n == blanket.name or n in blanket.path for n in scope)
-        how = (relation.kind, relation.foreign, relation.coupled, relation.term_plates)
+        how = (relation.kind, relation.coupled, relation.term_plates)
         more = None if also is None else also(child)
         key = (signature.key, reached, repeated(scope), source, how, len(relation.rows), more)
         groups.setdefault(key, []).append(child)
@@ -136,8 +131,12 @@ def as_one_child(blanket: Blanket, children: Sequence[Child]) -> tuple[LikeTerms
     term = terms.term
     if relation.kind == "lookup" and isinstance(term, StackedTerm):
         assert term.function is not None and relation.source is not None
-        elements = term.function.elements(relation.source, blanket.target, term.shape)
-        if elements is None:
+        try:
+            found = positions(blanket.target, term.function.result, relation.source, term.shape)
+        except TraceError:
             return None
-        terms.term = term = replace(term, elements=elements)
+        if len(found) != 1:
+            return None
+        index = partial(term.function.found, Program([found[0]]))
+        relation = replace(relation, index=index)
     return terms, Child(term, relation)

@@ -21,22 +21,18 @@ from bayesmc.errors import ModelError
 from bayesmc.expression import (
     Expression,
     Program,
-    broadcast,
-    constant,
     expressions_of,
     leaf,
     mapped,
     ordered,
-    pick,
     rebuilt,
     replaced,
 )
 from bayesmc.network import CompiledNode
 from bayesmc.network.expressions import Followed, density
 from bayesmc.network.readings import Reading, identity, with_axes
-from bayesmc.passes.sinking import reads, sunk
 from bayesmc.passes.templates import stacked_rows
-from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to
+from bayesmc.shapes import Shape, broadcast_shapes
 
 if TYPE_CHECKING:  # a target recomputes like links as one
     from bayesmc.structure.target import Target, Values
@@ -184,32 +180,9 @@ class StackedFunction:
         leads = (values[n].shape[: values[n].ndim - len(s)] for n, s in self.shapes.items())
         return broadcast_shapes((self.count,), *leads)
 
-    def elements(self, source: str, target: Target, shape: Shape) -> Program | None:
-        """A program for the flat element of a parent that each element of a term looks up, if it is one."""
-        node = target.model[source]
-        own = [e for e in expressions_of(self.result) if source in e.leaves]
-        numbers = np.arange(int(np.prod(node.plate_shape, dtype=int)))
-        whole = broadcast(
-            constant(numbers.reshape(node.plate_shape + (1,) * len(node.event_shape))),
-            node.value_shape,
-        )
-        found = set()
-        for root in (sunk(e, source) for e in own):
-            for read in reads(root, source):
-                at = replaced(read, {_leaf(read, source): whole})
-                if not broadcasts_to(at.shape, shape):  # an event, all of one element
-                    rank = len(at.shape) - len(node.event_shape)
-                    one: Any = (..., *(0,) * len(node.event_shape))
-                    first = np.arange(at.size).reshape(at.shape)[one]
-                    at = pick([at], first)
-                    if rank < 0 or not broadcasts_to(at.shape, shape):
-                        return None
-                found.add(broadcast(at, shape))
-        return Program(list(found)) if len(found) == 1 else None
-
-    def looked_up(self, elements: Program, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Flat elements ``(*lead, group, *plates)``."""
-        (found,) = self._evaluated(elements, values)
+    def found(self, program: Program, values: Mapping[str, np.ndarray]) -> np.ndarray:
+        """What a program of one expression finds of the same leaves, ``(*lead, group, *shape)``."""
+        (found,) = self._evaluated(program, values)
         return found
 
     @cached_property
@@ -339,10 +312,3 @@ def _full(value: np.ndarray, shape: Shape) -> np.ndarray:
     """A value with all its elements, where candidates have one for all of a plate."""
     lead = value.shape[: value.ndim - len(shape)]
     return value if value.shape == lead + shape else np.broadcast_to(value, lead + shape)
-
-
-def _leaf(read: Expression, name: str) -> Expression:
-    """The leaf of a name that elements are chosen from."""
-    while read.operands:
-        read = next(a for a in read.operands if name in a.leaves)
-    return read

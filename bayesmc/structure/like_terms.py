@@ -10,10 +10,8 @@ import numpy as np
 
 from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.errors import BayesmcError, DensityError
-from bayesmc.expression import Program
 from bayesmc.shapes import Shape, broadcast_shapes
 from bayesmc.structure.like_functions import Signature, Slots, StackedFunction, as_one
-from bayesmc.structure.relation import Relation
 from bayesmc.structure.target import Target, Term, Values
 
 #: terms that are worth a group
@@ -28,8 +26,6 @@ class StackedTerm(Term):
     """
 
     function: StackedFunction | None = None
-    #: which element of a parent in plates of its own each of its elements looks up
-    elements: Program | None = None
 
     def distribution(self, values: Mapping[str, np.ndarray]) -> tuple[Distribution, Shape]:
         """The distribution of all given their parents, and the batch shape of those."""
@@ -38,13 +34,6 @@ class StackedTerm(Term):
         dist = as_distribution(made)
         assert dist is not None
         return dist, batch
-
-    def keys(self, relation: Relation, values: Mapping[str, np.ndarray]) -> tuple[np.ndarray, ...]:
-        """The indices along foreign plates by which a parent is looked up."""
-        assert self.function is not None and self.elements is not None
-        at = self.function.looked_up(self.elements, values)
-        along = np.unravel_index(at, relation.shape) if len(relation.shape) > 1 else (at,)
-        return tuple(along[relation.plates.index(p)] for p in relation.foreign)
 
     def log(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Log factors of every element of all, shape ``(*lead, group, *plates)``."""

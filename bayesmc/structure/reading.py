@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import MvNormal, Normal
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BudgetError, UnsupportedError
-from bayesmc.expression import Expression, Family, expressions_of
+from bayesmc.errors import BudgetError, TraceError, UnsupportedError
+from bayesmc.expression import Constant, Expression
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, compressed, likelihood_rows
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.agreement import deterministic_above
 from bayesmc.network.expressions import Followed, density
-from bayesmc.passes.elements import MANY, NOTHING, elements, merged
+from bayesmc.network.readings import by_element
+from bayesmc.passes.reads import element_read
 from bayesmc.shapes import Shape
 from bayesmc.structure.affine import (
     Gains,
@@ -30,6 +31,8 @@ from bayesmc.structure.tables import configure
 
 #: entries up to which coefficients are evaluated for all configurations and elements
 _ENTRIES = 1 << 26
+#: an element of the node reads no element of another one, or more than one
+NOTHING, MANY = -1, -2
 
 
 def hidden_elements(node: CompiledNode, seen: Observed | None) -> list[int]:
@@ -148,11 +151,8 @@ class Reading:
         leaves = finite_leaves(self.model)
         found = density(self.model, node.name, leaves)
         if isinstance(found, Followed):
-            parts = [
-                self._by_element(elements(part, name, count), event_ndim)
-                for part, event_ndim in _by_event(found.result, node)
-            ]
-            return merged(np.stack(parts), 0)
+            event_ndim = 0 if self.node.is_stochastic else len(self.node.event_shape)
+            return self._read_of(name, by_element(found.result, event_ndim))
         if count > 1:  # what is known is that plates are aligned
             direct = not deterministic_above(self.model, node.name, leaves)
             if not (direct and set(parent.plates) <= set(node.plates)):
@@ -165,11 +165,21 @@ class Reading:
         ]
         return np.broadcast_to(at.transpose(order).reshape(shape), node.plate_shape).reshape(-1)
 
-    def _by_element(self, parts: np.ndarray, event_ndim: int) -> np.ndarray:
-        """What is read of a leaf, by element of this node."""
-        event_ndim = min(event_ndim, parts.ndim)
-        inner = merged(parts, tuple(range(parts.ndim - event_ndim, parts.ndim)))
-        return np.broadcast_to(inner, self.node.plate_shape).reshape(-1)
+    def _read_of(self, name: str, roots: Iterable[Expression]) -> np.ndarray:
+        """The element of a node that all expressions of an element read."""
+        parent = self.model[name]
+        count = math.prod(parent.plate_shape)
+        numbers = np.repeat(np.arange(count), math.prod(parent.event_shape))
+        parts = [np.full(self.node.plate_shape, NOTHING)]
+        try:
+            found = [element_read(r, name, numbers) for r in roots if name in r.leaves]
+        except TraceError:
+            return np.full(self.count, MANY)
+        for at in found:
+            if not isinstance(at, Constant):
+                return np.full(self.count, MANY)
+            parts.append(np.broadcast_to(at.value, self.node.plate_shape))
+        return _merged(np.stack(parts), 0).reshape(-1)
 
     def _check_size(self, columns: float) -> None:
         entries = float(math.prod(self.cards)) * self.count * self.d * (self.d + columns)
@@ -241,7 +251,7 @@ class Reading:
         place = np.zeros(self.count, dtype=np.intp)
         if count > 1:
             read = np.where(gain != 0, at // d, NOTHING).reshape(-1, self.count, self.d, k)
-            place = merged(read, (0, 2, 3))
+            place = _merged(read, (0, 2, 3))
         width, column = d, at % d
         columns: list[tuple[str, int | None]] = [(name, None)] * d
         if (place == MANY).any():
@@ -345,12 +355,9 @@ def _constant_along(array: np.ndarray, axis: int) -> bool:
     return bool((array == first).all())
 
 
-def _by_event(result: Any, node: CompiledNode) -> Iterator[tuple[Expression, int]]:
-    """The expressions that something is made of, and how many of their axes are no plates."""
-    if isinstance(result, Expression):
-        yield result, len(node.event_shape)
-    elif isinstance(result, Family):
-        for key, value in result.parameters.items():
-            own = {"loc": 1, "scale_diag": 1}.get(key, 2) if node.event_shape else 0
-            for part in expressions_of(value):
-                yield part, own
+def _merged(parts: np.ndarray, axes: int | tuple[int, ...]) -> np.ndarray:
+    """What entries along some axes read together."""
+    most = np.iinfo(np.intp).max
+    low = np.min(np.where(parts == NOTHING, most, parts), axis=axes, initial=most)
+    high = np.max(parts, axis=axes, initial=NOTHING)
+    return np.where((high == NOTHING) | (low == high), high, MANY)

@@ -5,22 +5,38 @@
 * ``rows``: it gathers by indices that never change, several perhaps (pairs of sites, players of a game);
 * ``whole``: anything else: every element of the term may depend on every element of the node.
 
-The first needs no look at the function, by the shape rules; the others are found by tracing it.
+The first needs no look at the function, by the shape rules; lookups and rows are those that its expression
+makes, and what cannot be followed is whole.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from bayesmc.errors import TraceError
+from bayesmc.expression import (
+    Constant,
+    Expression,
+    Leaf,
+    Program,
+    as_expression,
+    broadcast,
+    elementwise,
+    ordered,
+    substituted,
+)
 from bayesmc.network import Model
+from bayesmc.network.expressions import Opaque, density
+from bayesmc.network.readings import by_element
+from bayesmc.passes.reads import elements_read
 from bayesmc.shapes import Shape
 from bayesmc.structure.target import Target, Term
-from bayesmc.structure.traced import trace_term
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,6 +53,9 @@ class Relation:
         Sizes of the node's plates.
     source : str or None
         For a lookup, the parent of the term through which the node arrives (it has the node's plates).
+    index : callable or None
+        For a lookup: from stored values to the flat element that each element of the term reads, shape
+        ``(*lead, *term plates)``.
     rows : tuple of ndarray
         For ``rows``: flat elements of the node, one array over the term's flat elements for every role.
     coupled : tuple of str
@@ -48,7 +67,7 @@ class Relation:
     shape: Shape
     term_plates: tuple[str, ...] = ()
     source: str | None = None
-    foreign: tuple[str, ...] = ()
+    index: Callable[[Mapping[str, np.ndarray]], np.ndarray] | None = None
     rows: tuple[np.ndarray, ...] = ()
     coupled: tuple[str, ...] = ()
     _kept: dict[Any, Any] = field(default_factory=dict, repr=False)
@@ -71,18 +90,18 @@ class Relation:
         self,
         array: np.ndarray,
         term_shape: Shape,
-        keys: Sequence[Any] = (),
         members: np.ndarray | None = None,
+        state: Mapping[str, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Sum a term's elements for every element of the node.
 
         Parameters
         ----------
         array : ndarray, shape (*lead, *term plates)
-        keys : sequence
-            The index of a lookup, as the function used it in this very call.
         members : ndarray of int, optional
             Flat elements wanted; all by default.
+        state : dict, optional
+            Stored values, which a lookup needs.
 
         Returns
         -------
@@ -97,27 +116,10 @@ class Relation:
         flat = array.reshape(*lead, -1)
         if self.kind == "rows":
             return self._by_rows(flat, members)
-        index = self.index_of(keys, term_shape)
+        assert self.index is not None and state is not None
+        index = self.index(state)
         index = index.reshape(*index.shape[: index.ndim - len(term_shape)], -1)
         return self._picked(segment_sum(flat, index, self.size).reshape(lead + self.shape), members)
-
-    def index_of(self, keys: Sequence[Any], term_shape: Shape) -> np.ndarray:
-        """Flat element that each element of the term looked up, shape ``(*lead, *term plates)``."""
-        n = len(term_shape)
-        found: Any = 0
-        for plate, size in zip(self.plates, self.shape, strict=True):
-            if plate in self.foreign:
-                key = keys[self.foreign.index(plate)]
-                at = np.asarray(getattr(key, "codes", key))
-            else:
-                axis = self.term_plates.index(plate)
-                at = np.arange(size).reshape((size,) + (1,) * (n - 1 - axis))
-            found = found * size + at
-        found = np.asarray(found)
-        if found.ndim < n or found.shape[found.ndim - n :] != term_shape:
-            lead = found.shape[: max(found.ndim - n, 0)]
-            found = np.broadcast_to(found, lead + term_shape)
-        return found
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -245,20 +247,72 @@ def _indexed(target: Target, name: str, term: Term) -> Relation | None:
 
 
 def _looked_up(target: Target, name: str, term: Term, source: str, whole: Relation) -> Relation:
-    """A lookup or rows, if tracing proves it."""
-    model = target.model
-    node = model[name]
-    traced = trace_term(target, (name,), term)
-    if traced is None:
+    """A lookup or rows, if that is what the term's expression says."""
+    node = target.model[name]
+    if node.domain is not None:
         return whole
-    sources = traced.sources
-    foreign = tuple(p for p in node.plates if p not in term.plates)
-    used = {s for s in sources if s.startswith(f"{name}[")}
-    if not used or any(s.endswith("[*]") for s in used) or name in sources:
+    links = frozenset(p for p in term.parents if target.model[p].kind == "deterministic")
+    read = density(target.model, term.name, links)
+    if isinstance(read, Opaque):
         return whole
-    lookup = Relation("lookup", node.plates, node.plate_shape, term.plates, source, foreign)
-    if traced.keys_are_constant:
-        rows = tuple(lookup.index_of(k, term.shape).ravel() for k in traced.keys)
-        if all(len(r) == math.prod(term.shape) for r in rows):
-            return Relation("rows", node.plates, node.plate_shape, term.plates, source, rows=rows)
-    return lookup if len(used) == 1 and len(traced.keys) == 1 else whole
+    try:
+        found = positions(target, read.result, source, term.shape)
+    except TraceError:
+        return whole
+    fixed = [with_known(target, at) for at in found]
+    if fixed and all(isinstance(at, Constant) for at in fixed):
+        roles = np.stack([np.ravel(at.value) for at in fixed])  # type: ignore[attr-defined]
+        # where one role reads nothing it stands with another; what reads nothing at all may be anyone's
+        rows = tuple(np.maximum(np.where(roles < 0, roles.max(axis=0), roles), 0))
+        return Relation("rows", node.plates, node.plate_shape, term.plates, source, rows=rows)
+    if len(found) != 1:
+        return whole
+    index = partial(looked_up, Program([found[0]]))
+    return Relation("lookup", node.plates, node.plate_shape, term.plates, source, index)
+
+
+def positions(target: Target, result: Any, source: str, shape: Shape) -> tuple[Expression, ...]:
+    """The flat elements of a node that each element of a term reads, one expression for each way.
+
+    Parameters
+    ----------
+    result : Family, Distribution or Expression
+        What the term's function computes.
+    source : str
+    shape : tuple of int
+        Of the term.
+
+    Raises
+    ------
+    TraceError
+        An element may read several in one way.
+    """
+    node = target.model[source]
+    count = math.prod(node.plate_shape)
+    numbers = np.repeat(np.arange(count), math.prod(node.event_shape)).reshape(node.value_shape)
+    found: dict[Expression, None] = {}
+    for root in by_element(result):
+        for at in elements_read(root, source, numbers) if source in root.leaves else ():
+            lacks = any(isinstance(n, Constant) and (n.value < 0).any() for n in ordered(at))
+            if lacks and not isinstance(at, Constant):
+                # a factor that reads no element is a constant, whoever gets it
+                at = elementwise(np.maximum, at, 0)
+            found[broadcast(at, shape)] = None
+    return tuple(found)
+
+
+def with_known(target: Target, expression: Expression) -> Expression:
+    """An expression with constants in the place of what is known."""
+    values = {}
+    for node in ordered(expression):
+        if isinstance(node, Leaf) and target.is_known(node.name):
+            value = np.asarray(target.known[node.name])
+            if value.shape == node.shape:
+                values[node.name] = as_expression(value)
+    return substituted(expression, values) if values else expression
+
+
+def looked_up(program: Program, values: Mapping[str, np.ndarray]) -> np.ndarray:
+    """What a program of one expression finds."""
+    (found,) = program(values)
+    return found

@@ -262,23 +262,6 @@ class Target:
             found = self._below[key] = self._in_order(reached)
         return found
 
-    def between(self, names: Iterable[str], term: Term) -> tuple[str, ...]:
-        """Deterministic nodes through which some nodes reach a term, parents first."""
-        above: set[str] = set()
-        todo = list(term.parents)
-        while todo:
-            name = todo.pop()
-            if name not in above and name in self._order and not self.model[name].is_stochastic:
-                above.add(name)
-                todo += self.model[name].parents
-        reached = set(names)
-        found = []
-        for link in self._in_order(above):
-            if not reached.isdisjoint(self.model[link].parents):
-                reached.add(link)
-                found.append(link)
-        return tuple(found)
-
     def refresh(self, values: Values, moved: Iterable[str]) -> None:
         """Recompute the deterministic nodes that depend on nodes that moved."""
         self.compute(values, self.below(moved))

@@ -1,52 +1,17 @@
-"""What all rules of tracing share: the stand-in as they see it, what is claimed of it, and its bare numbers.
+"""What all rules of tracing share: the stand-in as they see it, and its bare numbers.
 
-The rules (``affine``, ``margins``, ``axes``, ``claims``) read stand-ins; ``tracer`` makes them.
+The rules (``affine``, ``margins``) read stand-ins; ``tracer`` makes them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.shapes import Shape
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Claims:
-    """What is certain of a value besides being affine; the default claims nothing.
-
-    Attributes
-    ----------
-    power : float or None
-        It is ``c * x**power`` element by element, wherever that is a real number.
-    is_copy : bool
-        Every element is an element of a source.
-    event_ndim : int
-        Event axes of the sources.
-    whole_event : bool
-        Its last axes are those, in order, and of a power ``c`` is the same all over the event.
-    form : hashable or None
-        Values of equal form, broadcast against each other, have equal elements of the source in equal places.
-    behind : int
-        Axes behind those of the plates; means something while ``places`` is not empty.
-    places : mapping
-        Sources that are read at one place for each element of the plates (``x[0]``), and what they are
-        called where that is no longer certain (``x[*]``).
-    spread : frozenset of str
-        Sources called so by now.
-    """
-
-    power: float | None = None
-    is_copy: bool = False
-    event_ndim: int = 0
-    whole_event: bool = True
-    form: Hashable = None
-    behind: int = 0
-    places: Mapping[str, str] = field(default_factory=dict)
-    spread: frozenset[str] = frozenset()
 
 
 class StandIn:
@@ -58,7 +23,6 @@ class StandIn:
     sources: frozenset[str]
     reason: str | None
     margin: Any
-    claims: Claims
 
     @property
     def is_affine(self) -> bool:
@@ -87,11 +51,6 @@ class TracedCall:
 
     function: Callable[..., Any]
     arguments: dict[str, Any]
-
-    @property
-    def traced(self) -> dict[str, Any]:
-        """The arguments that are traced, or hold something traced."""
-        return {name: value for name, value in self.arguments.items() if is_traced(value)}
 
 
 def is_traced(value: Any) -> bool:

@@ -286,7 +286,7 @@ MUTANTS = [
     ),
     Mutant(
         "a child that hides its parent in a closure is left out of a closed form",
-        (Edit("bayesmc.structure.traced:_refuse_hidden", "if not _is_open(result):", "if False:"),),
+        (Edit("bayesmc.kernels.conjugate_children:children_of", "return term", "continue"),),
         ranks(lambda: bmc.Gibbs(), veiled, warmup=20),
         "rank_test, 500 replications",
     ),

@@ -15,6 +15,7 @@ from bayesmc.structure.target import target_of
 
 CHAINS = 3
 DATA = np.random.default_rng(7)
+ONES, OTHERS = np.array([1, 1, 3]), np.array([0, 2, 0])
 
 
 def _net(**plates: int) -> bmc.BayesNet:
@@ -119,6 +120,34 @@ def two_labels():
     return net, {"x": DATA.normal(size=6)}, {"mean": "whole", "label": "aligned"}
 
 
+def vectors():
+    net = _net(cluster=3, point=6)
+    net.add("mean", bmc.MvNormal(np.zeros(2), 4 * np.eye(2)), plates="cluster")
+    net.add("label", bmc.Categorical(np.ones(3) / 3), plates="point")
+    net.add("x", lambda label, mean: bmc.MvNormal(mean[label], np.eye(2)), plates="point")
+    return net, {"x": DATA.normal(size=(6, 2))}, {"mean": "lookup"}
+
+
+def seen_labels():
+    net, evidence, _ = mixture()
+    return net, {**evidence, "label": DATA.integers(0, 3, 9)}, {"mean": "rows"}
+
+
+def in_two_parameters():
+    net = _net(i=4, j=3)
+    net.add("a", bmc.Laplace(0.0, 1.0), plates="i")
+    net.add("y", lambda a: bmc.Normal(a[OTHERS] - a[ONES], np.exp(a[ONES])), plates="j")
+    return net, {"y": DATA.normal(size=3)}, {"a": "rows"}
+
+
+def no_closed_form():
+    net = _net(cluster=3, point=6)
+    net.add("mean", bmc.Laplace(0.0, 3.0), plates="cluster")
+    net.add("label", bmc.Categorical(np.ones(3) / 3), plates="point")
+    net.add("x", lambda label, mean: bmc.WrappedNormal(mean[label], 1.0), plates="point")
+    return net, {"x": DATA.normal(size=6)}, {"mean": "lookup"}
+
+
 def potential():
     net = _net(i=4)
     net.add("x", bmc.Normal(0.0, 1.0), plates="i")
@@ -128,7 +157,7 @@ def potential():
 
 CASES = [
     aligned, mixture, constant_index, pairs, whole, cumulative, through_deterministic, partly_seen,
-    own_and_foreign, two_labels, potential,
+    own_and_foreign, two_labels, vectors, seen_labels, in_two_parameters, no_closed_form, potential,
 ]  # fmt: skip
 
 
