@@ -1,4 +1,4 @@
-"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as seventy.
+"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as thirty.
 
 Every element becomes a variable, equal ones once. What Python refuses (a logarithm of zero, a division
 by it, the root of a negative number) and what has no rule here is evaluated as arrays, which say in NumPy's
@@ -30,7 +30,7 @@ from bayesmc.expression.graph import (
 from bayesmc.shapes import Shape
 
 #: operations of one call of NumPy's time
-_PER_CALL = 70
+_PER_CALL = 30
 #: elements of a graph up to which code is made
 _MOST = 10_000
 
@@ -81,7 +81,9 @@ class SmallProgram:
             function, count = _compiled(self._roots, self._leaves)
         except NotImplementedError:
             return None
-        return function, self._calls * _PER_CALL // max(count, 1)
+        count += sum(size for *_, size in self._leaves) + sum(r.size for r in self._roots)
+        most = self._calls * _PER_CALL // max(count, 1)
+        return (function, most) if most else None
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         code = self._code
