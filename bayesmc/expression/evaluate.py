@@ -20,7 +20,7 @@ from bayesmc.expression.graph import (
     Reduction,
     ordered,
 )
-from bayesmc.expression.shaped import power_of, shaped
+from bayesmc.expression.shaped import FEW, power_of, shaped
 from bayesmc.shapes import Shape
 
 Step = Callable[..., np.ndarray]
@@ -153,13 +153,7 @@ def _elementwise(node: Elementwise) -> Step:
 def _pick(node: Pick) -> Step:
     take = _taken(node.positions)
     if len(node.operands) == 1:
-        (operand,) = node.operands
-        rank, size = len(operand.shape), operand.size
-
-        def one(value: np.ndarray) -> np.ndarray:
-            return take(value.reshape((*value.shape[: value.ndim - rank], size)))
-
-        return one
+        return _picked_of_one(node, take)
     ranks = [len(a.shape) for a in node.operands]
     sizes = [a.size for a in node.operands]
     dtype = node.dtype
@@ -183,6 +177,17 @@ def _pick(node: Pick) -> Step:
     return several
 
 
+def _picked_of_one(node: Pick, take: Step) -> Step:
+    (operand,) = node.operands
+    rank, size, shape = len(operand.shape), operand.size, node.shape
+    order = np.arange(size)
+    if size == node.size and np.array_equal(node.positions.ravel(), order):
+        return lambda value: value.reshape(value.shape[: value.ndim - rank] + shape)
+    if rank > 1 and np.array_equal(node.positions, order.reshape(operand.shape).swapaxes(-1, -2)):
+        return lambda value: value.swapaxes(-1, -2)
+    return lambda value: take(value.reshape((*value.shape[: value.ndim - rank], size)))
+
+
 def _side_by_side(values: Sequence[np.ndarray], rank: int, dtype: Any) -> np.ndarray:
     """Many arrays of one shape, flat one after the other behind their batch."""
     shape = values[0].shape
@@ -192,11 +197,25 @@ def _side_by_side(values: Sequence[np.ndarray], rank: int, dtype: Any) -> np.nda
 
 
 def _taken(positions: np.ndarray) -> Step:
-    """Elements of the last axis at positions, as a view where they are evenly spaced."""
+    """Elements of the last axis at positions: a view where many are evenly spaced.
+
+    Few are copied, as code for known shapes does: sums to the last bit depend on how numbers lie.
+    """
+    view, count = _viewed(positions), positions.size
+
+    def taken(flat: np.ndarray) -> np.ndarray:
+        if view is None or math.prod(flat.shape[:-1]) * count <= FEW:
+            return np.take(flat, positions, axis=-1)
+        return view(flat)
+
+    return taken
+
+
+def _viewed(positions: np.ndarray) -> Step | None:
     shape = positions.shape
     even = _strides(positions)
     if even is None:
-        return lambda flat: np.take(flat, positions, axis=-1)
+        return None
     offset, strides = even
     count = positions.size
     run = _run(shape, strides)

@@ -25,7 +25,7 @@ from bayesmc.expression.graph import (
 from bayesmc.shapes import Shape
 
 #: numbers up to which positions are written out with the batch
-_MOST = 1 << 12
+FEW = 1 << 12
 #: powers that have a function of their own, which ``x ** 2`` of an array takes, too
 POWERS: dict[float, Callable[..., np.ndarray]] = {
     2.0: np.square,
@@ -121,7 +121,7 @@ def _written(
         scope[f"f{k}"] = node.ufunc.reduce
         axes = tuple(a - len(node.operands[0].shape) for a in node.axes)
         return f"f{k}({given[0]}, {axes})"
-    if isinstance(node, Pick) and np.size(values[node]) <= _MOST:
+    if isinstance(node, Pick) and np.size(values[node]) <= FEW:
         return _picked(node, k, given, values, scope)
     scope[f"f{k}"] = steps[node]
     return f"f{k}({', '.join(given)})"
@@ -152,6 +152,8 @@ def _picked(
     order, (shape,) = np.arange(start), shapes
     if start == places.size and np.array_equal(places.ravel(), order):
         return given[0] if shape == whole else f"{given[0]}.reshape({whole})"
-    if len(shape) > 1 and np.array_equal(places, order.reshape(shape).swapaxes(-1, -2)):
+    if len(node.operands[0].shape) > 1 and np.array_equal(
+        places, order.reshape(shape).swapaxes(-1, -2)
+    ):
         return f"{given[0]}.swapaxes(-1, -2)"
     return f"{given[0]}.take(p{k})"
