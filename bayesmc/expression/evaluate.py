@@ -20,9 +20,12 @@ from bayesmc.expression.graph import (
     Reduction,
     ordered,
 )
+from bayesmc.expression.shaped import FEW, power_of, shaped
 from bayesmc.shapes import Shape
 
 Step = Callable[..., np.ndarray]
+#: uses of one set of shapes before code is made for it, and how many such sets
+_USES, _SHAPES = 4, 16
 
 
 def evaluate(roots: Sequence[Expression], values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
@@ -60,26 +63,50 @@ class Program:
     """
 
     def __init__(self, roots: Sequence[Expression]) -> None:
-        nodes = ordered(*roots)
-        at = {node: k for k, node in enumerate(nodes)}
-        self._leaves = [(at[n], n.name) for n in nodes if isinstance(n, Leaf)]
-        self._constants = [(at[n], n.value) for n in nodes if isinstance(n, Constant)]
+        self._roots = tuple(roots)
+        self._nodes = ordered(*roots)
+        at = {node: k for k, node in enumerate(self._nodes)}
+        self._leaves = [(at[n], n.name) for n in self._nodes if isinstance(n, Leaf)]
+        self._constants = [(at[n], n.value) for n in self._nodes if isinstance(n, Constant)]
         self._steps = [
-            (at[n], _step(n), tuple(at[a] for a in n.operands)) for n in nodes if n.operands
+            (at[n], _step(n), tuple(at[a] for a in n.operands)) for n in self._nodes if n.operands
         ]
-        self._roots = [at[r] for r in roots]
-        self._count = len(nodes)
+        self._at = [at[r] for r in roots]
+        #: by the shapes of leaves, how often they came or the code for them
+        self._made: dict[tuple[Any, ...], Any] = {}
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        slots: list[Any] = [None] * self._count
+        key = tuple([getattr(values[name], "shape", None) for _, name in self._leaves])
+        made = self._made.get(key, 0)
+        if made == 0 and len(self._made) >= _SHAPES:
+            made = _USES + 1
+        with np.errstate(all="ignore"):
+            if callable(made):
+                return made(values)
+            slots = self._evaluated(values)
+            if made < _USES:
+                self._made[key] = made + 1
+            elif made == _USES and None not in key:
+                steps = {self._nodes[k]: step for k, step, _ in self._steps}
+                known = dict(zip(self._nodes, slots, strict=True))
+                self._made[key] = shaped(self._roots, steps, known, self._whatever)
+        return [slots[k] for k in self._at]
+
+    def _whatever(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Values of the roots, whatever the shapes."""
+        slots = self._evaluated(values)
+        return [slots[k] for k in self._at]
+
+    def _evaluated(self, values: Mapping[str, np.ndarray]) -> list[Any]:
+        """Values of all nodes."""
+        slots: list[Any] = [None] * len(self._nodes)
         for k, value in self._constants:
             slots[k] = value
         for k, name in self._leaves:
             slots[k] = values[name]
-        with np.errstate(all="ignore"):
-            for k, step, operands in self._steps:
-                slots[k] = step(*[slots[a] for a in operands])
-        return [slots[k] for k in self._roots]
+        for k, step, operands in self._steps:
+            slots[k] = step(*[slots[a] for a in operands])
+        return slots
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -100,21 +127,10 @@ def _step(node: Expression) -> Step:
     return node.call
 
 
-#: powers that have a function of their own, which ``x ** 2`` of an array takes, too
-_POWERS: dict[float, Callable[..., np.ndarray]] = {
-    2.0: np.square,
-    0.5: np.sqrt,
-    -1.0: np.reciprocal,
-}
-
-
 def _elementwise(node: Elementwise) -> Step:
-    if node.function is np.power:
-        base, exponent = node.operands
-        if isinstance(exponent, Constant) and not exponent.shape and base.dtype.kind == "f":
-            power = _POWERS.get(float(exponent.value))
-            if power is not None:
-                return lambda x, _: power(x)
+    power = power_of(node)
+    if power is not None:
+        return lambda x, _: power(x)
     ndim = len(node.shape)
     pads = [ndim - len(a.shape) if a.leaves else 0 for a in node.operands]
     function = node.function
@@ -137,13 +153,7 @@ def _elementwise(node: Elementwise) -> Step:
 def _pick(node: Pick) -> Step:
     take = _taken(node.positions)
     if len(node.operands) == 1:
-        (operand,) = node.operands
-        rank, size = len(operand.shape), operand.size
-
-        def one(value: np.ndarray) -> np.ndarray:
-            return take(value.reshape((*value.shape[: value.ndim - rank], size)))
-
-        return one
+        return _picked_of_one(node, take)
     ranks = [len(a.shape) for a in node.operands]
     sizes = [a.size for a in node.operands]
     dtype = node.dtype
@@ -167,6 +177,17 @@ def _pick(node: Pick) -> Step:
     return several
 
 
+def _picked_of_one(node: Pick, take: Step) -> Step:
+    (operand,) = node.operands
+    rank, size, shape = len(operand.shape), operand.size, node.shape
+    order = np.arange(size)
+    if size == node.size and np.array_equal(node.positions.ravel(), order):
+        return lambda value: value.reshape(value.shape[: value.ndim - rank] + shape)
+    if rank > 1 and np.array_equal(node.positions, order.reshape(operand.shape).swapaxes(-1, -2)):
+        return lambda value: value.swapaxes(-1, -2)
+    return lambda value: take(value.reshape((*value.shape[: value.ndim - rank], size)))
+
+
 def _side_by_side(values: Sequence[np.ndarray], rank: int, dtype: Any) -> np.ndarray:
     """Many arrays of one shape, flat one after the other behind their batch."""
     shape = values[0].shape
@@ -176,11 +197,25 @@ def _side_by_side(values: Sequence[np.ndarray], rank: int, dtype: Any) -> np.nda
 
 
 def _taken(positions: np.ndarray) -> Step:
-    """Elements of the last axis at positions, as a view where they are evenly spaced."""
+    """Elements of the last axis at positions: a view where many are evenly spaced.
+
+    Few are copied, as code for known shapes does: sums to the last bit depend on how numbers lie.
+    """
+    view, count = _viewed(positions), positions.size
+
+    def taken(flat: np.ndarray) -> np.ndarray:
+        if view is None or math.prod(flat.shape[:-1]) * count <= FEW:
+            return np.take(flat, positions, axis=-1)
+        return view(flat)
+
+    return taken
+
+
+def _viewed(positions: np.ndarray) -> Step | None:
     shape = positions.shape
     even = _strides(positions)
     if even is None:
-        return lambda flat: np.take(flat, positions, axis=-1)
+        return None
     offset, strides = even
     count = positions.size
     run = _run(shape, strides)

@@ -1,4 +1,4 @@
-"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as seventy.
+"""Small expressions as straight-line code on Python's floats: a call of NumPy takes as long as thirty.
 
 Every element becomes a variable, equal ones once. What Python refuses (a logarithm of zero, a division
 by it, the root of a negative number) and what has no rule here is evaluated as arrays, which say in NumPy's
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 from typing import Any
@@ -30,7 +31,9 @@ from bayesmc.expression.graph import (
 from bayesmc.shapes import Shape
 
 #: operations of one call of NumPy's time
-_PER_CALL = 70
+_PER_CALL = 30
+#: calls that a factor or an inverse takes the time of
+_MATRIX = 5
 #: elements of a graph up to which code is made
 _MOST = 10_000
 
@@ -60,7 +63,7 @@ class SmallProgram:
         self._roots = tuple(roots)
         nodes = ordered(*roots)
         self._leaves = [(n.name, len(n.shape), n.size) for n in nodes if isinstance(n, Leaf)]
-        self._calls = sum(bool(n.operands) for n in nodes)
+        self._calls = sum(_MATRIX if _is_matrix(n) else bool(n.operands) for n in nodes)
         self._size = sum(n.size for n in nodes)
         ends = np.cumsum([0, *(r.size for r in roots)]).tolist()
         self._parts = [
@@ -81,7 +84,9 @@ class SmallProgram:
             function, count = _compiled(self._roots, self._leaves)
         except NotImplementedError:
             return None
-        return function, self._calls * _PER_CALL // max(count, 1)
+        count += sum(size for *_, size in self._leaves) + sum(r.size for r in self._roots)
+        most = self._calls * _PER_CALL // max(count, 1)
+        return (function, most) if most else None
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
         code = self._code
@@ -134,19 +139,42 @@ def upper_inverse(matrix: np.ndarray) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _is_matrix(node: Expression) -> bool:
+    return isinstance(node, Call) and node.call in _MATRICES
+
+
 class _Lines:
     """Assignments, one for every different right side."""
 
     def __init__(self) -> None:
-        self.lines: list[str] = []
+        self.lines: dict[str, str] = {}
         self._names: dict[str, str] = {}
 
     def __call__(self, right: str) -> str:
         found = self._names.get(right)
         if found is None:
             found = self._names[right] = f"t{len(self.lines)}"
-            self.lines.append(f"{found} = {right}")
+            self.lines[found] = right
         return found
+
+    def needed(self, names: Sequence[str]) -> list[str]:
+        """The assignments that names rest on."""
+        kept, found = set(names), []
+        for name, right in reversed(self.lines.items()):
+            if name in kept:
+                found.append(f"{name} = {right}")
+                kept.update(_NAME.findall(right))
+        return found[::-1]
+
+
+def _operation(function: Any, row: Sequence[str], lines: _Lines) -> str:
+    """The name of what a function makes of some elements; in one order where that does not matter."""
+    if function in (np.add, np.multiply):
+        row = sorted(row)
+        neutral = "0.0" if function is np.add else "1.0"
+        if neutral in row:
+            return row[1] if row[0] == neutral else row[0]
+    return lines(_TEXTS[function].format(*row))
 
 
 def _compiled(
@@ -157,21 +185,21 @@ def _compiled(
     made: dict[Expression, np.ndarray] = {}
     for node in ordered(*roots):
         made[node] = _written(node, [made[a] for a in node.operands], names, lines)
-    body = "\n    ".join(lines.lines) or "pass"
-    result = ", ".join(x for r in roots for x in made[r].ravel())
+    results = [x for r in roots for x in made[r].ravel()]
+    needed = lines.needed(results)
     heads = [
         f"{', '.join(f'{v}_{i}' for i in range(size))}, = {v}"
         for (_, _, size), v in zip(leaves, names.values(), strict=True)
         if size
     ]
     text = f"def function({', '.join(names.values())}):\n    "
-    text += "\n    ".join([*heads, body, f"return ({result},)"])
+    text += "\n    ".join([*heads, *needed, f"return ({', '.join(results)},)"])
     scope: dict[str, Any] = {
         "log": math.log, "log1p": math.log1p, "exp": math.exp, "sqrt": math.sqrt, "pow": math.pow,
         "lgamma": math.lgamma, "inf": math.inf, "nan": math.nan,
     }  # fmt: skip
     exec(text, scope)  # noqa: S102 - nothing of a user's is in the text
-    return scope["function"], len(lines.lines)
+    return scope["function"], len(needed)
 
 
 def _written(
@@ -191,9 +219,11 @@ def _written(
         rows = moved.reshape(node.size, -1).tolist() if a.size else [[]] * node.size
         return _objects([_reduced(node.ufunc, row, lines) for row in rows], node.shape)
     if isinstance(node, Elementwise) and node.function in _TEXTS:
-        text = _TEXTS[node.function]
+        function = node.function
         wide = [np.broadcast_to(a, node.shape).ravel() for a in operands]
-        return _objects([lines(text.format(*row)) for row in zip(*wide, strict=True)], node.shape)
+        return _objects(
+            [_operation(function, row, lines) for row in zip(*wide, strict=True)], node.shape
+        )
     if (
         isinstance(node, Elementwise)
         and node.function is as_float
@@ -218,7 +248,7 @@ def _reduced(ufunc: np.ufunc, row: list[str], lines: _Lines) -> str:
         raise NotImplementedError
     found = row[0]
     for x in row[1:]:
-        found = lines(_TEXTS[ufunc].format(found, x))
+        found = _operation(ufunc, (found, x), lines)
     return found
 
 
@@ -241,7 +271,7 @@ def _multiplied(node: Call, operands: list[np.ndarray], lines: _Lines) -> np.nda
                 where = {**place, "j": j}
                 x, y = one[tuple(where[c] for c in left)], other[tuple(where[c] for c in right)]
                 if "0.0" not in (x, y):
-                    terms.append(f"{x} * {y}")
+                    terms.append(" * ".join(sorted((x, y))))
             found.append(lines(" + ".join(terms)) if terms else "0.0")
     return _objects(found, node.shape)
 
@@ -287,6 +317,8 @@ _PRODUCTS: dict[Any, tuple[str, str, str]] = {
     np.matmul: ("ij", "jk", "ik"), np.matvec: ("ij", "j", "i"),
     np.vecmat: ("j", "jk", "k"), np.vecdot: ("j", "j", ""),
 }  # fmt: skip
+#: what stands for an element that was computed
+_NAME = re.compile(r"\bt\d+\b")
 #: right sides, and what happens to NaN as in NumPy
 _TEXTS: dict[Any, str] = {
     np.add: "{} + {}", np.subtract: "{} - {}", np.multiply: "{} * {}", np.divide: "{} / {}",

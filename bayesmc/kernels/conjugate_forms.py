@@ -13,6 +13,7 @@ from bayesmc.kernels.conjugate_children import Child
 from bayesmc.kernels.conjugate_families import (
     Bounds,
     Conditional,
+    DirichletConditional,
     InverseWishartConditional,
     MvNormalConditional,
     Naturals,
@@ -21,10 +22,13 @@ from bayesmc.kernels.conjugate_families import (
 from bayesmc.kernels.conjugate_labels import Counts
 from bayesmc.kernels.conjugate_range import refuse
 from bayesmc.kernels.label_sums import LabelSums
-from bayesmc.kernels.vector_draws import InverseWishartDraw, NormalDraw
+from bayesmc.kernels.vector_draws import DirichletDraw, InverseWishartDraw, NormalDraw
 from bayesmc.passes.arithmetic import multiply
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
+
+#: numbers that are added up one by one
+_FEW = 64
 
 
 class Form:
@@ -91,7 +95,7 @@ class Form:
         if self._draw is None:
             return None
         found = self._draw(self._with_sums(values), rng, chains)
-        return found if math.isfinite(np.add.reduce(found, axis=None)) else None
+        return found if found is None or _is_finite(found) else None
 
     def left(self, values: Values) -> Values:
         """Sums by label that it reads and that are not in the state yet, for others that read them."""
@@ -124,13 +128,21 @@ def is_closed(form: Form, blanket: Blanket) -> bool:
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _is_finite(numbers: np.ndarray) -> bool:
+    if numbers.size <= _FEW:
+        return math.isfinite(sum(numbers.ravel().tolist()))
+    return math.isfinite(np.add.reduce(numbers, axis=None))
+
+
 def _one_program(
     family: Conditional, naturals: list[Expression]
-) -> NormalDraw | InverseWishartDraw | None:
+) -> NormalDraw | InverseWishartDraw | DirichletDraw | None:
     """Natural parameters and draw as one."""
     if isinstance(family, NormalConditional):
         linear, square = naturals
         return NormalDraw(multiply(square, -2.0), linear)
     if isinstance(family, MvNormalConditional):
         return NormalDraw(*naturals)
-    return InverseWishartDraw(*naturals) if isinstance(family, InverseWishartConditional) else None
+    if isinstance(family, InverseWishartConditional):
+        return InverseWishartDraw(*naturals)
+    return DirichletDraw(*naturals) if isinstance(family, DirichletConditional) else None

@@ -24,7 +24,6 @@ from bayesmc.expression import (
     pick,
     reduction,
 )
-from bayesmc.expression.scalars import SmallProgram
 from bayesmc.network.expressions import Opaque, density_at
 from bayesmc.passes.arithmetic import add, multiply
 from bayesmc.passes.sufficient import VALUE, NaturalForm, natural_form, tabulated
@@ -100,7 +99,7 @@ class LabelSums:
         self.indicators = form.indicators
         self.statistics = self._measured(form, mask)
         self._express(form)
-        self._program = SmallProgram([self.coefficients])
+        self._program = Program([self.coefficients])
         self._check()
 
     def table(self, values: Values) -> np.ndarray:

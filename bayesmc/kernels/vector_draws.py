@@ -177,6 +177,38 @@ class InverseWishartDraw:
         return draw if _least_of(angle) >= _CLOSE else gram(self._factor(values)[0])[0]
 
 
+class DirichletDraw:
+    """The same for shares; nothing where a concentration below 1 may underflow.
+
+    Parameters
+    ----------
+    powers : Expression, shape (*plates, k)
+        Of the shares in the density.
+    """
+
+    def __init__(self, powers: Expression) -> None:
+        self.shape = powers.shape
+        self._program = SmallProgram([add(powers, 1.0)])
+
+    def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray | None:
+        (concentration,) = self._program(values)
+        shape = (chains, *self.shape)
+        if concentration.shape == shape and concentration.size <= _FEW:
+            flat = concentration.ravel().tolist()
+            if not all(a >= 1.0 for a in flat):  # nor where one is no number
+                return None
+            drawn = [rng.standard_gamma(a) for a in flat]
+            if len(drawn) == shape[-1]:
+                total = sum(drawn)
+                return np.array([x / total for x in drawn]).reshape(shape)
+            found = np.array(drawn).reshape(shape)
+        else:
+            if not concentration.min(initial=1.0) >= 1.0:
+                return None
+            found = rng.standard_gamma(concentration, shape)
+        return found / np.add.reduce(found, -1, keepdims=True)
+
+
 def gammas(rng: np.random.Generator, concentration: np.ndarray, shape: Shape) -> np.ndarray:
     """Standard gamma numbers as ``rng.standard_gamma`` draws them, which checks few slowly.
 
@@ -199,6 +231,8 @@ def gammas(rng: np.random.Generator, concentration: np.ndarray, shape: Shape) ->
 
 
 def _least_of(array: np.ndarray) -> float:
+    if array.size == 1:
+        return array.item()
     return np.minimum.reduce(array, axis=None, initial=1.0)
 
 
