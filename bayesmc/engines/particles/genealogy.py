@@ -363,7 +363,9 @@ def _variance(families: Families, off: np.ndarray) -> np.ndarray:
 
 def _square(values: np.ndarray, axis: int) -> np.ndarray:
     """Sums of squares along an axis."""
-    return np.vecdot(values, values, axis=axis)
+    dot: Any = np.vecdot  # its stub knows no axis
+    found: np.ndarray = dot(values, values, axis=axis)
+    return found
 
 
 def _explained(now: Particles) -> Any:
@@ -389,7 +391,7 @@ def _explained(now: Particles) -> Any:
 
 def _at_edge(
     families: Families, variance: np.ndarray, off: np.ndarray, explained: np.ndarray, n: int
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Any, Any]:
     """Whether families differ by far more than the slices' weights explain, and whether some seem to.
 
     Many of them must where rows do not pull the same way: a few are an accident.
