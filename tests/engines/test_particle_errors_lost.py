@@ -232,7 +232,7 @@ def test_without_looking_a_level_claims_too_much(monkeypatch: pytest.MonkeyPatch
     """The negative control."""
     monkeypatch.setattr(Compass, "after", lambda self, drift, earlier, block: [None])
     monkeypatch.setattr(record, "TOGETHER", 1)
-    monkeypatch.setattr(genealogy, "_beyond", lambda *given: False)
+    monkeypatch.setattr(genealogy, "_at_edge", lambda *given: (np.array(False), np.array(False)))
     assert small_errors() > 2
 
 

@@ -142,6 +142,11 @@ class Block:
 
     def weighted(self, rows: np.ndarray) -> np.ndarray:
         """Weighted means of rows, shape ``(slices, elements, numbers)``."""
+        if (
+            rows.size == self.particles
+        ):  # one number in one slice: without what a stack of matrices costs
+            mean = self.weights.reshape(-1).dot(rows.reshape(-1)) / self.total.item()
+            return np.array(mean).reshape(1, 1, 1)
         return np.matvec(rows, self.weights) / self.total[..., None]
 
     def unturned(
@@ -190,7 +195,7 @@ class Block:
         mean = self.weighted(rows)
         off = self._array(("off", node.name), rows.shape)
         weighted = self._array(("weighted", node.name), rows.shape)
-        angles = self._angles(node, rows)
+        angles = None if node.angles is None else self._angles(node, rows)
         if angles is not None:
             cosine, sine = self.weighted(np.cos(rows)), self.weighted(np.sin(rows))
             mean = np.where(angles, np.arctan2(sine, cosine), mean)
@@ -211,10 +216,9 @@ class Block:
             kept = self._room[key] = np.empty(size, dtype)
         return kept[:size].reshape(shape)
 
-    def _angles(self, node: CompiledNode, rows: np.ndarray) -> np.ndarray | None:
+    def _angles(self, node: CompiledNode, rows: np.ndarray) -> np.ndarray:
         """Which numbers are angles, shape (1, 1, numbers)."""
-        if node.angles is None:
-            return None
+        assert node.angles is not None
         event = np.broadcast_to(node.angles, node.event_shape).reshape(-1)
         times = rows.shape[2] // max(event.size, 1)
         return np.tile(event, times).reshape(1, 1, -1)

@@ -32,8 +32,8 @@ class Drift(NamedTuple):
 
     Attributes
     ----------
-    moved, variance : ndarray, shape (elements, numbers)
-    worst : ndarray, shape (*apart,)
+    moved, variance : ndarray, shape (elements, numbers), or float
+    worst : ndarray, shape (*apart,), or float
         The largest sum of moves of any number, in units of what is expected of it.
     largest : float
         That of the elements.
@@ -41,9 +41,9 @@ class Drift(NamedTuple):
         From which on particles are missing.
     """
 
-    moved: np.ndarray
-    variance: np.ndarray
-    worst: np.ndarray
+    moved: Any
+    variance: Any
+    worst: Any
     largest: float
     limit: float
 
@@ -75,6 +75,8 @@ class Compass:
         self.counts = [math.prod(n.value_shape) // elements for n in self.nodes]
         every = max(sum(math.prod(n.value_shape) for n in self.nodes), 1)
         self.limit = math.sqrt(IS**2 + 2.0 * math.log(every))
+        #: there is one number, without plates: figures are floats
+        self.is_alone = not layout.lead and self.counts == [1]
 
     def after(
         self, drift: Drift | None, earlier: Particles | None, block: Block
@@ -85,23 +87,59 @@ class Compass:
         """
         if block.slices[0].rejuvenated is not False:
             return [None]
+        if self.is_alone and len(block.slices) == 1:
+            return [self.after_one(drift, earlier, block.slices[0])]
         carried = self._carried(earlier, block)
         counts = zip(self.nodes, self.counts, strict=True)
         parts = [_moves(block, node, count, carried) for node, count in counts]
         steps = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
-        state: Any = 0.0 if drift is None else np.stack([drift.moved, drift.variance])
+        state: Any = 0.0
+        if drift is not None:
+            state = np.reshape([drift.moved, drift.variance], (2, block.elements, -1))
         for k in range(steps.shape[1]):
             steps[:, k] = state = _FADED * state + steps[:, k]
         moved, variance = steps
         worst = (np.abs(moved) / np.sqrt(variance + _LEAST)).max(axis=-1)
         if drift is not None:
-            worst[0] = np.maximum(worst[0], KEPT * drift.worst.reshape(-1))
+            worst[0] = np.maximum(worst[0], KEPT * np.reshape(drift.worst, -1))
         if len(worst) > 1:
             kept = KEPT ** np.arange(len(worst))[:, None]
             worst = np.maximum.accumulate(worst / kept) * kept
         largest = worst.max(axis=-1).tolist()
+        if self.is_alone:
+            rows = zip(moved.reshape(-1).tolist(), variance.reshape(-1).tolist(), strict=True)
+            both = zip(rows, largest, strict=True)
+            return [Drift(*row, top, top, self.limit) for row, top in both]
         figures = zip(moved, variance, worst.reshape(-1, *self.layout.lead), largest, strict=True)
         return [Drift(*own, self.limit) for own in figures]
+
+    def after_one(
+        self, drift: Drift | None, earlier: Particles | None, now: Particles
+    ) -> Drift | None:
+        """The same of one number in one slice, by itself: there NumPy's calls are what costs."""
+        if now.rejuvenated is not False:
+            return None
+        moved, variance, worst = 0.0, 0.0, 0.0
+        if drift is not None:
+            moved, variance = FADING * drift.moved, FADING**2 * drift.variance
+            worst = KEPT * drift.largest
+        values, n = now.values[self.nodes[0].name].reshape(-1), len(now.weights)
+        if len(values) == n:  # not the same for all particles
+            prior = None if now.resampled or earlier is None else earlier
+            if prior is None or len(prior.weights) != n:
+                off = values - float(np.add.reduce(values)) / n
+                shift, squares = float(now.weights.dot(off)) / now.total, off * off
+                wide = float(np.add.reduce(squares)) / n
+            else:
+                off = values - float(prior.weights.dot(values)) / prior.total
+                shift, squares = float(now.weights.dot(off)) / now.total, off * off
+                wide = float(prior.weights.dot(squares)) / prior.total
+            if wide > 0.0:
+                left = float(now.weights.dot(squares)) / now.total - shift * shift
+                moved += shift / math.sqrt(wide)
+                variance += max(1.0 - left / wide, 0.0)
+        worst = max(worst, abs(moved) / math.sqrt(variance + _LEAST))
+        return Drift(moved, variance, worst, worst, self.limit)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -137,12 +175,10 @@ def _moves(
     shift, wide = np.add.reduce(off, axis=-1) / n, np.vecdot(off, off) / n
     for k, some, earlier in carried:
         weights, total = earlier.weights.reshape(n, -1).T, np.reshape(earlier.total, (-1, 1))
-        own = np.vecdot(weights[:, None], off[k]) / total
-        square = np.einsum("en,ekn,ekn->ek", weights, off[k], off[k])
+        part = weights[:, None] * off[k]
+        own, square = np.add.reduce(part, axis=-1) / total, np.vecdot(part, off[k]) / total
         shift[k] = own if some is None else np.where(some[:, None], own, shift[k])
-        wide[k] = (
-            square / total if some is None else np.where(some[:, None], square / total, wide[k])
-        )
+        wide[k] = square if some is None else np.where(some[:, None], square, wide[k])
     wide = wide - shift**2
     found = np.empty((2, *wide.shape))
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -144,7 +144,8 @@ def followed(
     gained: Any = 0.0
     if now.ancestors is not None:
         found = _moved(families, earlier, now, steady)
-        if now.t % STRIDE == 0 and np.any(now.resampled):
+        some = now.resampled if isinstance(now.resampled, bool) else now.resampled.any()
+        if some and now.t % STRIDE == 0:
             found, gained = _looked_at(found, now)
     poor: Any = now.ess < min(RESTS, 0.9 * len(now.weights))
     if poor if isinstance(poor, bool) else poor.any():
@@ -190,7 +191,7 @@ def evidence_error(families: Families, now: Particles) -> Any:
     off = _off(families, _weights(families, now))
     variance = _variance(families, off)
     explained = families.explained + _explained(now)
-    at_edge = _at_edge(families, variance, off, explained, now)
+    at_edge, _ = _at_edge(families, variance, off, explained, len(now.weights))
     total = np.where(at_edge, np.inf, np.maximum(families.settled + variance[OLD], variance[OLD]))
     if families.scouts is not None:
         total = total + families.scouts.share**2
@@ -267,21 +268,24 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
 
     And the variance that is settled by that.
     """
+    n = len(now.weights)
+    counts = (families.bounds[:, 1:] - families.bounds[:, :-1]) / n
+    if families.kept.any():
+        off = _off(families, counts * np.exp(families.kept))
+    else:
+        off = counts - families.shares
+        if not _matters(families, now, off):
+            return families, 0.0
     resampled = np.asarray(now.resampled)
-    counts = (families.bounds[:, 1:] - families.bounds[:, :-1]) / len(now.weights)
-    kept = families.kept.any()
-    if not kept and not _matters(families, now, counts):
-        return families, 0.0
-    off = _off(families, counts * np.exp(families.kept)) if kept else counts - families.shares
     variance = _variance(families, off)
     edge = np.zeros(resampled.shape, dtype=bool)
-    if variance.max() > _level(len(now.weights)):
-        edge = resampled & _at_edge(families, variance, off, families.explained, now)
-        suspect = families._replace(drift=None)
-        doubted = resampled & _at_edge(suspect, variance, off, families.explained, now)
-        families = families._replace(doubted=np.where(doubted, now.t, families.doubted))
+    if variance.max() > _level(n):
+        at_edge, odd = _at_edge(families, variance, off, families.explained, n)
+        if odd.any():
+            edge, doubted = resampled & at_edge, np.where(resampled & odd, now.t, families.doubted)
+            families = families._replace(doubted=doubted)
     age = now.t - families.born[YOUNG]
-    left = (families.shares[OLD] ** 2).sum(axis=0) / (counts[OLD] ** 2).sum(axis=0)
+    left = _square(families.shares[OLD], 0) / _square(counts[OLD], 0)
     due = resampled & ~edge & ((age > LONGEST) | ((age > SHORTEST) & (left < LEFT)))
     if edge.any():  # what has happened is told once
         families = _begun_again(families, now, edge, True)
@@ -293,12 +297,13 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
     return _begun_again(families, now, due, False), gained
 
 
-def _matters(families: Families, now: Particles, counts: np.ndarray) -> bool:
-    """Whether anything can be due: the older origin has drifted far, or the younger one is old."""
-    spread = ((counts - families.shares) ** 2).sum(axis=1).max()
-    groups = counts.shape[1]
-    bound = min(_level(len(now.weights)), (1.0 / LEFT - 1.0) / groups)
-    return bool(spread > 0.9 * bound or (now.t - families.born[YOUNG]).max() > LONGEST)
+def _matters(families: Families, now: Particles, off: np.ndarray) -> bool:
+    """Whether anything can be due: an origin has drifted far, or the younger one is old."""
+    spread, age = _square(off, 1), now.t - int(families.born[YOUNG].min())
+    far, n = float(spread.max()), len(now.weights)
+    if age > LONGEST or far > 0.9 * _level(n):
+        return True
+    return age > SHORTEST and far > 0.9 * (1.0 / LEFT - 1.0) / off.shape[1]
 
 
 def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Families, Any]:
@@ -351,9 +356,16 @@ def _variance(families: Families, off: np.ndarray) -> np.ndarray:
     Shares drift apart like those of families in a population: it is minus the log of what is left of their
     evenness, and infinite where a single family is left.
     """
-    even = 1.0 - (families.shares**2).sum(axis=1)
-    left = 1.0 - (off**2).sum(axis=1) / np.where(even > 0, even, np.nan)
+    even = 1.0 - _square(families.shares, 1)
+    left = 1.0 - _square(off, 1) / np.where(even > 0, even, np.nan)
     return np.where(left > 1e-9, -np.log(np.maximum(left, 1e-9)), np.inf)
+
+
+def _square(values: np.ndarray, axis: int) -> np.ndarray:
+    """Sums of squares along an axis."""
+    dot: Any = np.vecdot  # its stub knows no axis
+    found: np.ndarray = dot(values, values, axis=axis)
+    return found
 
 
 def _explained(now: Particles) -> Any:
@@ -378,26 +390,23 @@ def _explained(now: Particles) -> Any:
 
 
 def _at_edge(
-    families: Families, variance: np.ndarray, off: np.ndarray, explained: np.ndarray, now: Particles
-) -> np.ndarray:
-    """Whether families differ by far more than the slices' weights explain.
+    families: Families, variance: np.ndarray, off: np.ndarray, explained: np.ndarray, n: int
+) -> tuple[Any, Any]:
+    """Whether families differ by far more than the slices' weights explain, and whether some seem to.
 
     Many of them must where rows do not pull the same way: a few are an accident.
     """
-    squares = off**2
-    by = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
-    some: Any = math.inf
-    if families.drift is not None:
-        some = np.where(families.drift.worst < SEEMS, SOME, np.inf)
-    return np.any(_beyond(variance, explained, by, some, len(now.weights)), axis=0)
-
-
-def _beyond(variance: Any, explained: Any, by: Any, some: Any, n: int) -> Any:
-    """The same by origin, given how many families make up the differences, and how many must not."""
     every, bounded = explained[:, 0], explained[:, 1]
     odd = (variance > _level(n)) & (variance > EDGE * every)
     odd |= (variance > LONG) & (variance > EDGE * bounded)
-    return (odd & (by < some)) | (variance > MOST)
+    far = variance > MOST
+    either = (odd | far).any(axis=0)
+    if families.drift is None or not odd.any():
+        return either, either
+    squares = off**2
+    by = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
+    some = np.where(families.drift.worst < SEEMS, SOME, np.inf)
+    return ((odd & (by < some)) | far).any(axis=0), either
 
 
 def _level(n: int) -> float:

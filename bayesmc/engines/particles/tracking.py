@@ -13,7 +13,7 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.drift import Compass
+from bayesmc.engines.particles.drift import Compass, Drift
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.forgetting import Sight
 from bayesmc.engines.particles.genealogy import Families, begun, drifted, followed, scouted
@@ -56,15 +56,40 @@ class Tracker:
             drifts = self.compass.after(drift, earlier, block)
         found = []
         for now, row, drift in zip(block.slices, rows, drifts, strict=True):
-            if families is None or earlier is None:
-                families = begun(now, self.sight)
-            else:
-                families = followed(families, earlier, now, self.steady, self.sight)
-            if self.compass is not None:
-                families = drifted(families, drift, now, self.sight)
-            if self.scouting.nodes:
-                scouts = self.scouting.after(families.scouts, earlier, now, row)
-                families = scouted(families, scouts, now, self.sight)
+            families = self._followed(families, earlier, now, row, drift)
             found.append(families)
             earlier = now
         return found
+
+    def after_one(
+        self, families: Families | None, earlier: Particles | None, now: Particles, row: Row
+    ) -> Families:
+        """The same in one slice."""
+        compass, drift = self.compass, None if families is None else families.drift
+        if compass is not None and compass.is_alone:
+            return self._followed(
+                families, earlier, now, row, compass.after_one(drift, earlier, now)
+            )
+        block = Block(self.sight.layout, [now], room=self.room)
+        return self.after(families, earlier, block, [row])[0]
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _followed(
+        self,
+        families: Families | None,
+        earlier: Particles | None,
+        now: Particles,
+        row: Row,
+        drift: Drift | None,
+    ) -> Families:
+        if families is None or earlier is None:
+            families = begun(now, self.sight)
+        else:
+            families = followed(families, earlier, now, self.steady, self.sight)
+        if self.compass is not None:
+            families = drifted(families, drift, now, self.sight)
+        if self.scouting.nodes:
+            scouts = self.scouting.after(families.scouts, earlier, now, row)
+            families = scouted(families, scouts, now, self.sight)
+        return families
