@@ -157,8 +157,8 @@ def _mv_normal(x: Any, loc: Any, cov: Any, scale_tril: Any, scale_diag: Any) -> 
 
 def _student_t(x: Any, df: Any, loc: Any, scale: Any) -> Any:
     z = (x - loc) / scale
-    constant = special.gammaln(0.5 * (df + 1)) - special.gammaln(0.5 * df)
-    constant = constant - 0.5 * np.log(math.pi * df)
+    # a difference of gammaln has no digits left where df is large
+    constant = -special.betaln(0.5 * df, 0.5) - 0.5 * np.log(df)
     return constant - 0.5 * (df + 1) * np.log1p(z * z / df) - np.log(scale)
 
 

@@ -121,6 +121,10 @@ _PARTIALS: Mapping[Any, tuple[Partial, ...]] = {
     special.ndtr: (lambda x, y: np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi),),
     special.log_ndtr: (lambda x, y: np.exp(-0.5 * x * x - y) / np.sqrt(2.0 * np.pi),),
     special.gammaln: (lambda x, y: special.digamma(x),),
+    special.betaln: (
+        lambda a, b, y: special.digamma(a) - special.digamma(a + b),
+        lambda a, b, y: special.digamma(b) - special.digamma(a + b),
+    ),
     special.digamma: (lambda x, y: special.zeta(2.0, x),),
     special.i0e: (lambda x, y: special.i1e(x) - np.sign(x) * y,),
     special.xlogy: (lambda a, b, y: np.log(b), lambda a, b, y: np.true_divide(a, b)),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.expression import Program, TracedArray, leaf, reduction, trace
+from bayesmc.expression import Family, Program, TracedArray, constant, leaf, reduction, trace
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.log_density import log_density
 
@@ -125,3 +125,14 @@ def test_derivatives_are_those_of_differences(name):
                 at.append(total(**{**base, leaf_name: moved}))
             expected = (at[0] - 8 * at[1] + 8 * at[2] - at[3]) / 12e-4
             assert found[index] == pytest.approx(expected, rel=1e-6, abs=1e-6), (leaf_name, index)
+
+
+def test_student_t_of_many_degrees_is_the_normal_density() -> None:
+    df = np.array([0.3, 5.0, 1e4, 1e12, 1e18, 1e300])
+    x = np.array([0.1, 5.0, -2.0, 1.0, 30.0, 2.0])
+    shown = Family(
+        bmc.StudentT, {"df": leaf("df", (6,), float), "loc": constant(0.5), "scale": constant(2.0)}
+    )
+    (found,) = Program([log_density(shown, leaf("x", (6,), float))])({"df": df, "x": x})
+    np.testing.assert_allclose(found, bmc.StudentT(df, 0.5, 2.0).log_prob(x), rtol=1e-10)
+    np.testing.assert_allclose(found[3:], bmc.Normal(0.5, 2.0).log_prob(x[3:]), rtol=1e-9)
