@@ -284,11 +284,12 @@ def test_tied_nodes_move_together() -> None:
 
 
 def test_a_run_that_has_not_mixed_says_so() -> None:
-    net = bmc.BayesNet()
-    net.add("x", bmc.Normal(0.0, 10.0))
-    net.add("y", lambda x: bmc.Normal(np.abs(x), 0.3))
+    """Signs of more numbers than independent proposals are fitted to."""
+    net = bmc.BayesNet(plates={"number": 8})
+    net.add("x", bmc.Normal(0.0, 10.0), plates="number")
+    net.add("y", lambda x: bmc.Normal(np.abs(x), 0.3), plates="number")
     with pytest.warns(ConvergenceWarning, match="'x'"):
-        bmc.infer(net, {"y": 8.0}, engine=bmc.Gibbs(200, 100), rng=0)
+        bmc.infer(net, {"y": np.full(8, 8.0)}, engine=bmc.Gibbs(200, 100), rng=0)
 
 
 def test_nodes_that_nothing_observed_depends_on_are_drawn_afresh() -> None:

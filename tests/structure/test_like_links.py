@@ -219,10 +219,6 @@ def test_an_error_names_the_node_at_fault() -> None:
         target.refresh(values, target.chain)
 
 
-def test_links_between_a_node_and_a_term() -> None:
+def test_links_below_a_node() -> None:
     target, _ = posed(slices)
-    term = target.terms["y n[2]"]
-    assert target.between(("x[2]",), term) == ("m[2]", "n[2]")
-    assert target.between(("a",), term) == ("m[2]", "n[2]")
-    assert target.between(("x[3]",), term) == ()
     assert target.below(("x[2]",)) == ("m[2]", "n[2]")
