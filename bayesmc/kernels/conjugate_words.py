@@ -83,9 +83,9 @@ def _form(family: Family, parameter: str, read: list[str]) -> str | None:
     others: dict[str, Any] = {**family.parameters}
     if family.parameters[parameter] is None:  # given instead of what is read
         others |= dict.fromkeys(read)
-    others[parameter] = leaf("itself", ())
+    others[parameter] = leaf("\0itself", ())
     try:
-        found = statistics(log_density(Family(family.make, others), leaf("value", ())), "itself")
+        found = statistics(log_density(Family(family.make, others), leaf("\0value", ())), "\0itself")
     except (TraceError, TypeError):
         return None
     if set(found.coefficients) == {1.0, 2.0}:

@@ -33,6 +33,8 @@ from bayesmc.passes.sufficient import transposed
 from bayesmc.shapes import Shape
 from bayesmc.structure.target import Values
 
+#: what is drawn, beside the nodes of a model: no node has such a name
+_NOISE, _GAMMA, _NORMAL = "\0noise", "\0gamma", "\0normal"
 #: squared sine of an angle between rows, below which a product may be singular to rounding
 _CLOSE = 1e-6
 #: numbers that are drawn one by one
@@ -137,7 +139,7 @@ class NormalDraw:
 
     def __init__(self, precision: Expression, linear: Expression) -> None:
         self.shape = linear.shape
-        noise = leaf("noise", self.shape)
+        noise = leaf(_NOISE, self.shape)
         if precision.shape == self.shape:
             spread = elementwise(np.sqrt, precision)
             draw = add(divide(linear, precision), divide(noise, spread))
@@ -147,7 +149,7 @@ class NormalDraw:
 
     def __call__(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray:
         noise = rng.standard_normal((chains, *self.shape))
-        return self._program({**values, "noise": noise})[0]
+        return self._program({**values, _NOISE: noise})[0]
 
 
 class InverseWishartDraw:
@@ -164,7 +166,7 @@ class InverseWishartDraw:
         half = subtract(multiply(0.5, reshape(df, (*df.shape, 1))), _halves(d))
         self._half = SmallProgram([broadcast(half, self.shape)])
         self._normals = (*scale.shape[:-2], d * (d - 1) // 2)
-        gamma, normal = leaf("gamma", self.shape), leaf("normal", self._normals)
+        gamma, normal = leaf(_GAMMA, self.shape), leaf(_NORMAL, self._normals)
         draw, angle, factor = _inverse_wishart_of(scale, gamma, normal)
         self._program, self._factor = SmallProgram([draw, angle]), SmallProgram([factor])
 
@@ -172,7 +174,7 @@ class InverseWishartDraw:
         (half,) = self._half(values)
         normal = rng.standard_normal((chains, *self._normals))
         gamma = gammas(rng, half, (chains, *self.shape))
-        values = {**values, "gamma": gamma, "normal": normal}
+        values = {**values, _GAMMA: gamma, _NORMAL: normal}
         draw, angle = self._program(values)
         return draw if _least_of(angle) >= _CLOSE else gram(self._factor(values)[0])[0]
 

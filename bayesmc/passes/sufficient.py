@@ -48,7 +48,7 @@ from bayesmc.passes.log_density import log_density
 from bayesmc.shapes import Shape
 
 #: name of the leaf that statistics are functions of
-VALUE = "value"
+VALUE = "\0value"
 #: how far probabilities may be off one
 _SUM = 1e-8
 #: statistic -> coefficient

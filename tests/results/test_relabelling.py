@@ -88,7 +88,7 @@ def test_components_without_a_plate() -> None:
     posterior, warned = asked(vectors(), {"x": DATA}, bmc.Gibbs(300, 150, 6))
     named = posterior.relabelled("mean")
     np.testing.assert_allclose(named.mean("mean"), [-3.0, 3.0], atol=0.5)
-    assert posterior.rhat("mean").max() > 1.1 and not warned
+    assert not warned  # whether chains keep to one order of the components, or change it
 
 
 def test_rows_and_columns_of_a_chain() -> None:
