@@ -29,7 +29,14 @@ from bayesmc.kernels.conjugate_priors import (
     prior_of,
 )
 from bayesmc.kernels.conjugate_range import least_values
-from bayesmc.kernels.conjugate_terms import Added, Moving, features_of, moving, shares_sum_to_one
+from bayesmc.kernels.conjugate_terms import (
+    Added,
+    Moving,
+    features_of,
+    moving,
+    refuse_moving_support,
+    shares_sum_to_one,
+)
 from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
 from bayesmc.kernels.conjugate_words import why_not
 from bayesmc.kernels.label_sums import LabelSums
@@ -115,6 +122,7 @@ def _added(
     """What a child adds; like ones one by one, where together they are no sum of features."""
     is_share = ends[0] >= 0.0 and ends[1] <= 1.0
     alone = apart(blanket, child)
+    refuse_moving_support(child.density, blanket.name)
     try:
         found = {child: features_of(child.density, of, child.mask, False, is_share)}
         both = {**own, **found[child].coefficients}

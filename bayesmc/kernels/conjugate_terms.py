@@ -12,15 +12,17 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Constant,
+    Elementwise,
     Expression,
     Reduction,
     broadcast,
     ordered,
     replaced,
 )
-from bayesmc.passes.arithmetic import ONE, ZERO, add, multiply, tidied
+from bayesmc.passes.arithmetic import ONE, ZERO, add, is_all, multiply, tidied
 from bayesmc.passes.branches import branches_up
 from bayesmc.passes.features import Feature, statistics
 from bayesmc.passes.reads import element_read, same_along
@@ -112,6 +114,20 @@ def features_of(
             sums = total(whole, some.at, of.count, part.mask)
             found[feature] = add(found.get(feature, ZERO), sums)
     return Added(found, picked)
+
+
+def refuse_moving_support(expression: Expression, name: str) -> None:
+    """Raise where what is possible under a density depends on a node: its features alone say less.
+
+    Raises
+    ------
+    TraceError
+    """
+    for node in ordered(expression):
+        if isinstance(node, Elementwise) and node.function is np.where:
+            condition, _, impossible = node.operands
+            if name in condition.leaves and is_all(impossible, -np.inf):
+                raise TraceError("what is possible under it depends on the node")
 
 
 def shares_sum_to_one(expression: Expression, blanket: Blanket) -> Expression:

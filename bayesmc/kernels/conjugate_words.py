@@ -85,7 +85,9 @@ def _form(family: Family, parameter: str, read: list[str]) -> str | None:
         others |= dict.fromkeys(read)
     others[parameter] = leaf("\0itself", ())
     try:
-        found = statistics(log_density(Family(family.make, others), leaf("\0value", ())), "\0itself")
+        found = statistics(
+            log_density(Family(family.make, others), leaf("\0value", ())), "\0itself"
+        )
     except (TraceError, TypeError):
         return None
     if set(found.coefficients) == {1.0, 2.0}:
