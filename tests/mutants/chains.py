@@ -351,19 +351,15 @@ MUTANTS = [
     ),
     Mutant(
         "counts go to the neighbouring category",
-        (Edit("bayesmc.kernels.conjugate_priors:of_members",
-              "natural = reshape(natural, (blanket.size, *block))",
-              "natural = pick([natural], np.roll(np.arange(natural.size), 1)"
-              ".reshape(blanket.size, *block))"),),
+        (Edit("bayesmc.kernels.conjugate_families:DirichletConditional.posterior",
+              "Dirichlet(naturals[0] + 1.0)", "Dirichlet(np.roll(naturals[0] + 1.0, 1, axis=-1))"),),
         ranks(lambda: closed_form, shares, 400),
         "rank_test, 400 replications",
     ),
     Mutant(
         "a variance is taken for a standard deviation: a block of means",
-        (Edit("bayesmc.kernels.gaussian_terms:BlockTerm._whitened",
-              "joint / scale[..., None]", "joint / scale[..., None] ** 2"),
-         Edit("bayesmc.kernels.gaussian_terms:BlockTerm._uniform_scale",
-              "return scale.reshape(-1)", "return scale.reshape(-1) ** 2")),
+        (Edit("bayesmc.kernels.gaussian_rows:NormalRows._summed",
+              "weight = scale**-2.0", "weight = scale**-4.0"),),
         matched(effects, {"y": 1.0}, bmc.Gibbs(draws=100, warmup=0, chains=20)),
         "compare with exact(), 20 chains of 100 draws",
     ),
