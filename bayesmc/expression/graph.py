@@ -258,6 +258,9 @@ def pick(operands: Sequence[Any], positions: Any) -> Expression:
     if all(isinstance(a, Constant) for a in args):
         flat = np.concatenate([a.value.reshape(-1) for a in args])  # type: ignore[attr-defined]
         return constant(flat[at])
+    inner = [a for a in args if isinstance(a, Pick) and a.operands == args[0].operands]
+    if len(inner) == len(args):  # parts of one array, put together again
+        return pick(inner[0].operands, np.concatenate([a.positions.reshape(-1) for a in inner])[at])
     dtype = _standard(np.result_type(*(a.dtype for a in args)))
     made = _interned(Pick, args, _content(at), at.shape, dtype)
     if not hasattr(made, "positions"):

@@ -30,6 +30,7 @@ from bayesmc.kernels.conjugate_naturals import form_of
 from bayesmc.kernels.slice import slice_move
 from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.joint_values import JointValues
 from bayesmc.structure.like_children import with_like_children
 from bayesmc.structure.target import Values
 
@@ -81,6 +82,13 @@ class Conjugate(Kernel):
         """
         naturals, bounds = self._naturals(values, part)
         return self.forms[part].family.posterior(naturals, bounds)
+
+    def reading(self, joints: Sequence[JointValues]) -> Conjugate:
+        """The same kernel, with what others draw together read as one array."""
+        forms = self.forms
+        for joint in joints:
+            forms = tuple(f.reading(joint) for f in forms)
+        return self if forms is self.forms else Conjugate(self.blanket, forms, self.debug)
 
     # ---- private -------------------------------------------------------------------------------
 

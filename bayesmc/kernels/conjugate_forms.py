@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.kernels.vector_draws import DirichletDraw, InverseWishartDraw, NormalDraw
 from bayesmc.passes.arithmetic import multiply
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.joint_values import JointValues
 from bayesmc.structure.target import Values
 
 #: numbers that are added up one by one
@@ -46,7 +48,7 @@ class Form:
     positive : sequence of tuple
         What must be positive, and the child that it is a parameter of.
     placed : sequence
-        Sums by label that are beside the state.
+        What it reads beside the state: sums by label, and values of many nodes as one array.
     """
 
     def __init__(
@@ -56,9 +58,10 @@ class Form:
         naturals: list[Expression],
         bounds: list[Expression],
         positive: list[tuple[Expression, Child]],
-        placed: list[LabelSums | Counts],
+        placed: Sequence[LabelSums | Counts | JointValues],
     ) -> None:
         self.family, self.words, self._placed = family, words, placed
+        self._naturals, self._bounds, self._least = naturals, bounds, positive
         self._positive = [child for _, child in positive]
         roots = [*naturals, *bounds, *(e for e, _ in positive)]
         self._program = SmallProgram(roots)
@@ -69,11 +72,25 @@ class Form:
         if not any(r.leaves for r in roots):
             self._kept = self({})
 
+    def reading(self, joint: JointValues) -> Form:
+        """The same, with an array of many nodes' values in their place where it reads several of them."""
+
+        def changed(found: list[Expression]) -> list[Expression]:
+            return [joint.read_by(e) for e in found]
+
+        naturals, bounds = changed(self._naturals), changed(self._bounds)
+        positive = [(joint.read_by(e), child) for e, child in self._least]
+        before = [*self._naturals, *self._bounds, *(e for e, _ in self._least)]
+        after = [*naturals, *bounds, *(e for e, _ in positive)]
+        if all(a is b for a, b in zip(before, after, strict=True)):
+            return self
+        return Form(self.family, self.words, naturals, bounds, positive, [*self._placed, joint])
+
     def __call__(self, values: Values) -> tuple[Naturals, Bounds | None]:
         """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
         if self._kept is not None:
             return self._kept
-        values = self._with_sums(values)
+        values = self._with_placed(values)
         found = [
             a if a.ndim > n else a[None]
             for a, n in zip(self._program(values), self._ndims, strict=True)
@@ -94,22 +111,24 @@ class Form:
         """
         if self._draw is None:
             return None
-        found = self._draw(self._with_sums(values), rng, chains)
+        found = self._draw(self._with_placed(values), rng, chains)
         return found if found is None or _is_finite(found) else None
 
     def left(self, values: Values) -> Values:
         """Sums by label that it reads and that are not in the state yet, for others that read them."""
         found: Values = {}
         for placed in self._placed:
+            if isinstance(placed, JointValues):  # left by who draws them
+                continue
             sums = placed.sums if isinstance(placed, Counts) else placed
             state = values if sums is None else sums.placed(values)
             if sums is not None and state is not values:
                 found |= sums.kept(state[sums.label], state[sums.key])
         return found
 
-    def _with_sums(self, values: Values) -> Values:
-        for sums in self._placed:
-            values = sums.placed(values)
+    def _with_placed(self, values: Values) -> Values:
+        for placed in self._placed:
+            values = placed.placed(values)
         return values
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.forest import Forest
 from bayesmc.kernels.forest_terms import COLOURS, Readers
+from bayesmc.structure.joint_values import FEWEST, JointValues
 from bayesmc.structure.target import Target, Values
 
 
@@ -96,6 +97,9 @@ class ForestBlock(Kernel):
                 for k in range(self.cards[i]):
                     self.possible[k, i][seen.mask & (seen.value != k)] = -np.inf
         self._kept: tuple[np.ndarray, np.ndarray] | None = None
+        alike = len(set(self.dtypes)) == 1 and len(names) >= FEWEST
+        #: the array of all values that is left in the state for others
+        self.joint = JointValues(target.model, self.names) if alike else None
         size = f"{len(edges)} pairs of {len(names)} nodes, {self.states} states"
         self.match = f"filtering and sampling along {size}"
 
@@ -150,7 +154,10 @@ class ForestBlock(Kernel):
             stored = stored.reshape(len(self.names), -1, *self.plate_shape)
         stored.flags.writeable = False
         if alike:
-            return dict(zip(self.names, stored, strict=True))
+            new = dict(zip(self.names, stored, strict=True))
+            if self.joint is not None:
+                new |= self.joint.kept(new, np.ascontiguousarray(stored.swapaxes(0, 1)))
+            return new
         return {n: v.astype(t) for n, v, t in zip(self.names, stored, self.dtypes, strict=True)}
 
     def _check(self, values: Values) -> None:

@@ -13,11 +13,12 @@ from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conditionals import FiniteTerms
-from bayesmc.kernels.conjugate import conjugate_kernel
+from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
+from bayesmc.kernels.forest_block import ForestBlock
 from bayesmc.kernels.forest_search import forest_blocks
 from bayesmc.kernels.forest_sites import site_forest
 from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
@@ -176,7 +177,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     kernels, constraints = _finite(target, blankets, forms, debug)
     left = [n for n in names if n not in joined and target.model[n].domain is None]
     conjugate, refusals = _conjugate(blankets, forms, left, debug)
-    kernels += conjugate
+    joints = [k.joint for k in kernels if isinstance(k, ForestBlock) and k.joint is not None]
+    kernels += [k.reading(joints) if isinstance(k, Conjugate) else k for k in conjugate]
     kernels += _numbers(target, blankets, forms, list(refusals))
     for block in blocks:
         scales = governing(target, block, blankets)
