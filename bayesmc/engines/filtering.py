@@ -17,6 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.beliefs import refuse_unbound, slices_like
 from bayesmc.errors import (
     BayesmcError,
@@ -352,6 +353,13 @@ def hand_over(stop: BaseException, found: SeriesPosterior | None) -> None:
             last = found.start + found.steps - 1
             before = f"slices {found.start} to {last}" if found.steps > 1 else f"slice {last}"
             stop.add_note(f"the answer about {before} is in `error.filtered`")
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Parameters out of range are marked, and floating-point warnings silent, while functions run."""
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield
 
 
 @contextmanager

@@ -12,7 +12,14 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.exact.exact import readable_bytes
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
+from bayesmc.engines.filtering import (
+    Asked,
+    FilterEngine,
+    Queries,
+    answer_so_far,
+    pass_slices,
+    quiet,
+)
 from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.belief import GridBelief
 from bayesmc.engines.grid.limits import too_large, unread, without_density
@@ -20,7 +27,7 @@ from bayesmc.engines.grid.looked import draws_of
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.record import GridPosterior, GridRecord, answers_of
 from bayesmc.engines.grid.search import GridSearch, known_static
-from bayesmc.engines.grid.slice import quiet, same_points
+from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.grid.sources import Label
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.particles.predictive import Replicates

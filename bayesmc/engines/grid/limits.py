@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Mapping
 from typing import Any
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.grid.slice import quiet
+from bayesmc.engines.filtering import quiet
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError

@@ -11,10 +11,15 @@ from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.averages import as_event, naming
 from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import Answers as Seen
-from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
+from bayesmc.engines.filtering import (
+    Queries,
+    first_slices,
+    observed_answers,
+    quiet,
+    refuse_forecast,
+)
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
-from bayesmc.engines.grid.slice import quiet
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model

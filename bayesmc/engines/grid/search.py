@@ -11,11 +11,11 @@ from typing import Any, Protocol
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
+from bayesmc.engines.filtering import quiet
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
 from bayesmc.engines.grid.axes import Axis
 from bayesmc.engines.grid.lattice import line_of
 from bayesmc.engines.grid.record import GridPosterior
-from bayesmc.engines.grid.slice import quiet
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
 

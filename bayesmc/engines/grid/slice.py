@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.grid.axes import Axes
 from bayesmc.engines.grid.sources import GridStructure, Label
 from bayesmc.errors import BayesmcError, UnsupportedError
@@ -72,13 +70,6 @@ def same_points(one: Placed, other: Placed) -> bool:
         np.array_equal(a.points, b.points) and np.array_equal(a.widths, b.widths)
         for a, b in zip(one.scalars, other.scalars, strict=True)
     )
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Parameters out of range are marked, and floating-point warnings silent, while functions run."""
-    with marking_invalid(), np.errstate(all="ignore"):
-        yield
 
 
 class GridSlices(GridStructure):

@@ -21,8 +21,7 @@ from bayesmc.engines.kalman.covariances import (
     worked_out,
 )
 from bayesmc.engines.kalman.data import SeriesData
-from bayesmc.engines.kalman.innovations import Innovations
-from bayesmc.engines.kalman.means import all_means
+from bayesmc.engines.kalman.means import Innovations, all_means
 from bayesmc.engines.kalman.reading import Linear
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.linalg.square_root import multiplied, turned
