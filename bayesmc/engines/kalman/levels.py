@@ -16,6 +16,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions.circular import wrap_angle
+from bayesmc.engines.kalman.covariances import without_absent
 from bayesmc.engines.kalman.data import Pattern
 from bayesmc.engines.kalman.followed import Followed
 from bayesmc.engines.kalman.passes import State
@@ -76,16 +77,6 @@ def expected_slice(
     if pattern.absent is not None:
         rows = without_absent(rows, pattern.absent)
     return mean[..., chosen], rows
-
-
-def without_absent(rows: np.ndarray, absent: np.ndarray) -> np.ndarray:
-    """Rows of what some elements lack as noise of their own, which tells nothing."""
-    p = absent.shape[-1]
-    rows[..., :p, :] = np.where(absent[..., None], 0.0, rows[..., :p, :])
-    fresh = np.zeros((*rows.shape[:-1], p))
-    index = np.arange(p)
-    fresh[..., index, index] = absent
-    return np.concatenate([rows, fresh], axis=-1)
 
 
 class Part(NamedTuple):

@@ -170,8 +170,8 @@ def absorbed(
     if angles is not None:
         off = np.where(angles, wrap_angle(off), off)
     off, seen = _present(pattern, off)
-    eta = standardised(found.root, off)
-    after = mean[..., p:] + multiplied(found.gain, eta)
+    eta = _solved(_single(found.root), off)
+    after = mean[..., p:] + _times(found.gain, eta)
     after = _placed(layout, pattern, after, given)
     log = log_densities(found.root, eta, seen, found.certain)
     if found.certain is not None:
@@ -192,11 +192,9 @@ class _Part(NamedTuple):
     kinds: np.ndarray
     offset: np.ndarray
     moves: np.ndarray
-    root: np.ndarray
-    gain: np.ndarray
+    made: Conditioned
     row: np.ndarray
     given: np.ndarray | None
-    certain: np.ndarray | None
 
 
 class _Work:
@@ -265,16 +263,15 @@ class _Work:
 
         moves = linear.moves if len(linear.moves) == 1 else linear.moves[slices - 1]
         offset = linear.offset if len(linear.offset) == 1 else linear.offset[slices - 1]
+        certain = certain_of(records)
+        if certain is not None:
+            certain = self._wide(certain, 1, inverse)
+        made = Conditioned(whole("root"), whole("gain"), np.zeros(0), None, certain)
         return _Part(
             slices, pattern, kinds, offset[..., pattern.chosen],
-            self._wide(moves[..., pattern.chosen, :], 2), whole("root"), whole("gain"),
-            self._row(layout, pattern, slices),
-            None if self.data.given is None else self.data.given[0][slices], self._certain(records, inverse),
+            self._wide(moves[..., pattern.chosen, :], 2), made, self._row(layout, pattern, slices),
+            None if self.data.given is None else self.data.given[0][slices],
         )  # fmt: skip
-
-    def _certain(self, records: list[Any], inverse: np.ndarray) -> np.ndarray | None:
-        found = certain_of(records)
-        return None if found is None else self._wide(found, 1, inverse)
 
     def _wide(self, array: np.ndarray, tail: int, inverse: np.ndarray | None = None) -> np.ndarray:
         """With axes for the plates apart, and one entry per slice where there are several."""
@@ -289,8 +286,8 @@ class _Work:
         look = part.moves[..., :p, :]
         if pattern.absent is not None:
             look = np.where(pattern.absent[..., None], 0.0, look)
-        root = _single(part.root)
-        gain = part.gain[..., :c, :]
+        root = _single(part.made.root)
+        gain = part.made.gain[..., :c, :]
         each = root if root.ndim == 2 else root[..., None, :, :]
         scaled = np.matrix_transpose(_solved(each, np.matrix_transpose(look)))
         matrices = part.moves[..., p : p + c, :] - gain @ scaled
@@ -304,24 +301,22 @@ class _Work:
 
     def _write(self, part: _Part, previous: np.ndarray) -> None:
         """Everything that follows from the means of the slices before."""
-        layout, p = self.data.layouts[1], len(part.pattern.observed)
+        layout, pattern, made = self.data.layouts[1], part.pattern, part.made
         expected = part.offset + _times(part.moves, previous)
-        off, seen = _present(part.pattern, part.row - expected[..., :p])
-        eta = _solved(_single(part.root), off)
-        after = expected[..., p:] + _times(part.gain, eta)
-        self.found.means[part.slices] = _placed(layout, part.pattern, after, part.given)
-        log = log_densities(part.root, eta, seen, part.certain)
-        if part.certain is not None:
-            terms = np.abs(part.offset) + _times(np.abs(part.moves), np.abs(previous))
-            seen_as = expected[..., :p], terms[..., :p]
-            wrong = _contradicts(part.certain, part.root, eta, part.row, *seen_as)
-            log = np.where(wrong, -np.inf, log)
+
+        def terms() -> np.ndarray:
+            return np.abs(part.offset) + _times(np.abs(part.moves), np.abs(previous))
+
+        after, eta, log = absorbed(
+            layout, pattern, made, expected, part.row, part.given, terms=terms
+        )
+        self.found.means[part.slices] = after
         self.found.increments[part.slices] += log
-        self.found.innovations.put(part.slices, layout, part.pattern, part.root, eta)
+        self.found.innovations.put(part.slices, layout, pattern, made.root, eta)
         if self.found.shifts is not None:
             records = [self.covariances.conditioned[k] for k in part.kinds]
             inverse = np.searchsorted(part.kinds, self.covariances.which[part.slices])
-            turn = stacked_fields(records, "turn")[..., :p]
+            turn = stacked_fields(records, "turn")[..., : len(pattern.observed)]
             self.found.shifts[part.slices] = _times(self._wide(turn, 2, inverse), eta)
 
     def _row(self, layout: Layout, pattern: Pattern, slices: np.ndarray) -> np.ndarray:
