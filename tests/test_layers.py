@@ -72,7 +72,6 @@ LONG_FUNCTIONS: set[str] = set()
 #: modules that import each other for types
 TYPE_CIRCLES = {
     "engines.discrete.rows engines.discrete.terms",
-    "factors.calibrated factors.cliquetree",
     "kernels.conjugate_children kernels.conjugate_matching kernels.conjugate_picks",
     "structure.like_functions structure.like_links structure.target",
 }

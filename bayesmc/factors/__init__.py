@@ -9,7 +9,6 @@ from __future__ import annotations
 from .calibrated import Calibrated
 from .cliquetree import BoundTree, CliqueTree
 from .elimination import HEURISTICS, Elimination, elimination_order
-from .factor import Factor, sum_product
 from .structure import TreeCost
 from .tables import FactorLike, LogTable, factor_from_log
 
@@ -19,11 +18,9 @@ __all__ = [
     "Calibrated",
     "CliqueTree",
     "Elimination",
-    "Factor",
     "FactorLike",
     "LogTable",
     "TreeCost",
     "elimination_order",
     "factor_from_log",
-    "sum_product",
 ]

@@ -15,24 +15,24 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
 from ..errors import EvidenceError, ShapeError
 from .calibrated import Calibrated, Context
-from .elimination import Elimination, elimination_order
+from .elimination import Elimination
 from .program import Program, compile_program
 from .propagation import Mask, Potentials, collect, distribute, total_log_scale
 from .semiring import LINEAR, LOG
-from .structure import TreeCost, build_cliques, tree_cost
+from .structure import TreeStructure
 from .tables import FactorLike, Given, Placement, add_logs, check_factor, multiply_linear
 
 _SLICE_ABOVE = 30_000  # entries; below, compiling shapes for an evidence costs more than it saves
 _PROGRAMS_KEPT = 8
 
 
-class CliqueTree:
+class CliqueTree(TreeStructure):
     """The plan for exact inference in a product of factors with fixed scopes.
 
     Parameters
@@ -69,22 +69,7 @@ class CliqueTree:
         scopes: Iterable[Sequence[Hashable]],
         elimination: Elimination | None = None,
     ) -> None:
-        named = cardinalities if isinstance(cardinalities, Mapping) else None
-        self.variables: tuple[Hashable, ...] = (
-            tuple(range(len(cardinalities))) if named is None else tuple(named)
-        )
-        sizes = list(cardinalities) if named is None else list(named.values())
-        self.cardinalities: tuple[int, ...] = tuple(int(cast(int, n)) for n in sizes)
-        self.scopes = tuple(tuple(scope) for scope in scopes)
-        self.index = {v: k for k, v in enumerate(self.variables)}
-        self._check()
-        self._scopes = [tuple(self.index[v] for v in scope) for scope in self.scopes]
-        if elimination is None:
-            elimination = elimination_order(self.cardinalities, self._scopes)
-        self.cliques = build_cliques(elimination)
-        self.cost: TreeCost = tree_cost(self.cliques, self.cardinalities)
-        self._position = {v: k for k, v in enumerate(elimination.order)}
-        self.home = {v: k for k, c in enumerate(self.cliques) for v in c.residual}
+        super().__init__(cardinalities, scopes, elimination)
         self._programs: dict[frozenset[int], Program] = {}
 
     def bind(self, factors: Sequence[FactorLike]) -> BoundTree:
@@ -128,30 +113,6 @@ class CliqueTree:
         return found
 
     @cached_property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """The full shape of each clique's table."""
-        return tuple(tuple(self.cardinalities[v] for v in c.variables) for c in self.cliques)
-
-    @cached_property
-    def containing(self) -> tuple[tuple[int, ...], ...]:
-        """For each variable the cliques that hold it."""
-        found: list[list[int]] = [[] for _ in self.variables]
-        for k, clique in enumerate(self.cliques):
-            for v in clique.variables:
-                found[v].append(k)
-        return tuple(map(tuple, found))
-
-    @cached_property
-    def mask_shapes(self) -> tuple[tuple[int, int, int], ...]:
-        """For each variable its home clique's table seen as (before, states, after)."""
-        found = []
-        for v in range(len(self.variables)):
-            shape = self.shapes[self.home[v]]
-            axis = self.cliques[self.home[v]].variables.index(v)
-            found.append((math.prod(shape[:axis]), shape[axis], math.prod(shape[axis + 1 :])))
-        return tuple(found)
-
-    @cached_property
     def _placements(self) -> list[Placement]:
         found = []
         for scope in self._scopes:
@@ -166,18 +127,6 @@ class CliqueTree:
             shape = tuple(self.cardinalities[v] if v in scope else 1 for v in order)
             found.append(Placement(clique, axes, shape, own))
         return found
-
-    def _check(self) -> None:
-        for v, n in zip(self.variables, self.cardinalities, strict=True):
-            if n < 1:
-                raise ValueError(f"CliqueTree: variable {v!r} has {n} states; it needs at least 1")
-        for scope in self.scopes:
-            unknown = [v for v in scope if v not in self.index]
-            if unknown or len(set(scope)) != len(scope):
-                raise ValueError(
-                    f"CliqueTree: the scope {scope} must name known variables, each once"
-                    + (f"; unknown: {unknown}" if unknown else "")
-                )
 
 
 class BoundTree:
@@ -255,7 +204,7 @@ class BoundTree:
         return Calibrated(context, log_z, collected, ratios, flat)
 
 
-def _evidence_states(tree: CliqueTree, evidence: Mapping[Any, int]) -> dict[int, int]:
+def _evidence_states(tree: TreeStructure, evidence: Mapping[Any, int]) -> dict[int, int]:
     states = {}
     for variable, state in evidence.items():
         k = tree.index.get(variable)
@@ -271,7 +220,7 @@ def _evidence_states(tree: CliqueTree, evidence: Mapping[Any, int]) -> dict[int,
 
 
 def _entered(
-    tree: CliqueTree, program: Program, states: Mapping[int, int]
+    tree: TreeStructure, program: Program, states: Mapping[int, int]
 ) -> tuple[set[int], dict[int, list[Mask]]]:
     """The cliques whose tables evidence changes, with all above them, and what is masked where."""
     changed: set[int] = set()

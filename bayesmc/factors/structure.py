@@ -7,10 +7,12 @@ table exists. It does not compute with tables.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, cast
 
-from .elimination import Elimination
+from .elimination import Elimination, elimination_order
 
 
 @dataclass(frozen=True)
@@ -94,6 +96,80 @@ def tree_cost(cliques: Sequence[Clique], cardinalities: Sequence[int]) -> TreeCo
     total, largest = math.fsum(entries), max(entries, default=0.0)
     width = max((len(c.variables) for c in cliques), default=0) - 1
     return TreeCost(width, largest, total, 8.0 * (3.0 * total + largest))
+
+
+class TreeStructure:
+    """What is known of a clique tree without its tables; see ``CliqueTree`` for the parameters.
+
+    Attributes
+    ----------
+    variables : tuple of hashable
+    cardinalities : tuple of int
+    scopes : tuple of tuple of variables
+    cliques : tuple of Clique
+    home : dict
+        The clique that each variable is a residual of.
+    cost : TreeCost
+    """
+
+    def __init__(
+        self,
+        cardinalities: Mapping[Any, int] | Sequence[int],
+        scopes: Iterable[Sequence[Hashable]],
+        elimination: Elimination | None = None,
+    ) -> None:
+        named = cardinalities if isinstance(cardinalities, Mapping) else None
+        self.variables: tuple[Hashable, ...] = (
+            tuple(range(len(cardinalities))) if named is None else tuple(named)
+        )
+        sizes = list(cardinalities) if named is None else list(named.values())
+        self.cardinalities: tuple[int, ...] = tuple(int(cast(int, n)) for n in sizes)
+        self.scopes = tuple(tuple(scope) for scope in scopes)
+        self.index = {v: k for k, v in enumerate(self.variables)}
+        self._check()
+        self._scopes = [tuple(self.index[v] for v in scope) for scope in self.scopes]
+        if elimination is None:
+            elimination = elimination_order(self.cardinalities, self._scopes)
+        self.cliques = build_cliques(elimination)
+        self.cost: TreeCost = tree_cost(self.cliques, self.cardinalities)
+        self._position = {v: k for k, v in enumerate(elimination.order)}
+        self.home = {v: k for k, c in enumerate(self.cliques) for v in c.residual}
+
+    @cached_property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """The full shape of each clique's table."""
+        return tuple(tuple(self.cardinalities[v] for v in c.variables) for c in self.cliques)
+
+    @cached_property
+    def containing(self) -> tuple[tuple[int, ...], ...]:
+        """For each variable the cliques that hold it."""
+        found: list[list[int]] = [[] for _ in self.variables]
+        for k, clique in enumerate(self.cliques):
+            for v in clique.variables:
+                found[v].append(k)
+        return tuple(map(tuple, found))
+
+    @cached_property
+    def mask_shapes(self) -> tuple[tuple[int, int, int], ...]:
+        """For each variable its home clique's table seen as (before, states, after)."""
+        found = []
+        for v in range(len(self.variables)):
+            shape = self.shapes[self.home[v]]
+            axis = self.cliques[self.home[v]].variables.index(v)
+            found.append((math.prod(shape[:axis]), shape[axis], math.prod(shape[axis + 1 :])))
+        return tuple(found)
+
+    def _check(self) -> None:
+        for v, n in zip(self.variables, self.cardinalities, strict=True):
+            if n < 1:
+                raise ValueError(f"CliqueTree: variable {v!r} has {n} states; it needs at least 1")
+        for scope in self.scopes:
+            unknown = [v for v in scope if v not in self.index]
+            if unknown or len(set(scope)) != len(scope):
+                raise ValueError(
+                    f"CliqueTree: the scope {scope} must name known variables, each once"
+                    + (f"; unknown: {unknown}" if unknown else "")
+                )
 
 
 def _oriented(members: list[list[int]], parents: list[int]) -> tuple[Clique, ...]:
