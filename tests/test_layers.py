@@ -71,7 +71,6 @@ LONG_MODULES = {
 LONG_FUNCTIONS: set[str] = set()
 #: modules that import each other for types
 TYPE_CIRCLES = {
-    "engines.discrete.rows engines.discrete.terms",
     "kernels.conjugate_children kernels.conjugate_matching kernels.conjugate_picks",
     "structure.like_functions structure.like_links structure.target",
 }

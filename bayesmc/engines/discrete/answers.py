@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.averages import called, naming
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term, Variable
 from bayesmc.engines.discrete.run import Run, bad_parameters
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
-from bayesmc.engines.filtering import Answers, Queries
+from bayesmc.engines.filtering import Answers, Queries, quiet
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.factors.named import connected, log_product
 from bayesmc.network import CompiledNode
@@ -167,7 +166,7 @@ class SliceAnswers:
         node = self.model[term.name]
         lead = 1 + len(self.reader.cards(term)) + len(node.plates)
         ndim = lead + len(node.event_shape)
-        with marking_invalid(), np.errstate(all="ignore"):
+        with quiet():
             result, _ = self.reader.evaluate(term, rows)
             if not isinstance(result, Distribution):
                 own = self.reader.model(term.kind, 0)[term.name]
@@ -213,31 +212,11 @@ class SliceAnswers:
             second[mask] = np.where(node.angles, np.sin(here), 0.0)
 
     def _place(
-        self,
-        out: np.ndarray,
-        start: int,
-        stop: int,
-        node: CompiledNode,
-        element: int,
-        array: np.ndarray,
-    ) -> None:
-        """Write an element's answers ``(rows, sequences, *rest)`` where they belong."""
-        reader = self.reader
-        shape = (array.shape[0], *(reader.lead if array.shape[1] > 1 else (1,) * len(reader.lead)))
-        full = array.reshape(*shape, *array.shape[2:])
-        outer = [p for p in node.plates if p in reader.apart]
-        index: list[Any] = [slice(None)]
-        index += [slice(None) if p in outer else 0 for p in reader.apart]
-        kept = [p for p in reader.apart if p in outer]
-        full = full[tuple(index)]
-        order = [1 + kept.index(p) for p in outer]
-        full = full.transpose(0, *order, *range(1 + len(order), full.ndim))
-        inner = [p for p in node.plates if p not in reader.apart]
-        sizes = tuple(self.model.sizes[p] for p in inner)
-        at = iter(np.unravel_index(element, sizes) if inner else ())
-        where = [int(next(at)) if p in inner else slice(None) for p in node.plates]
-        rows = slice(start - self.run.first, stop - self.run.first)
-        out[(rows, *where)] = full
+        self, out: np.ndarray, start: int, stop: int, node: CompiledNode, element: int, array: np.ndarray
+    ) -> None:  # fmt: skip
+        """Write an element's answers about some slices where they belong."""
+        rows = out[start - self.run.first : stop - self.run.first]
+        self.reader.put_element(rows, node, element, array)
 
     def _stretches(self, scope: Sequence[Variable]) -> list[tuple[int, int]]:
         """Slices cut so that the joint of some variables stays within bounds."""
@@ -281,15 +260,15 @@ class SliceAnswers:
         read: Callable[[Any], np.ndarray],
     ) -> np.ndarray:
         reader = self.reader
-        placed = rows.on_axes(reader, term)
+        placed = reader.placed(term, rows)
         cards = reader.cards(term)
         lead = (rows.count, *cards)
         count = math.prod(lead)
         arguments = []
-        with marking_invalid(), np.errstate(all="ignore"):
+        with quiet():
             for name in names:
                 node = reader.model(term.kind, 0)[name]
-                value = np.broadcast_to(placed.value(name, 0), (*lead, *node.value_shape))
+                value = np.broadcast_to(reader.value(placed, name, 0), (*lead, *node.value_shape))
                 arguments.append(node.decode(value.reshape(count, *node.value_shape)))
             values = read(called(function, arguments))
         if (

@@ -14,13 +14,11 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
-from bayesmc.engines.discrete.belief import DiscreteBelief, Held, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
-from bayesmc.engines.discrete.looked import rows_compared
-from bayesmc.engines.discrete.path import path_values
-from bayesmc.engines.discrete.posterior import DiscretePosterior
+from bayesmc.engines.discrete.posterior import DiscreteBelief, DiscretePosterior, Held, window
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
+from bayesmc.engines.discrete.states import path_values, rows_compared
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, observed_answers
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, UnsupportedError
