@@ -7,10 +7,9 @@ the layers above.
 from __future__ import annotations
 
 from .calibrated import Calibrated
-from .cliquetree import BoundTree, CliqueTree
+from .cliquetree import BoundTree, CliqueTree, FactorLike, LogTable, factor_from_log
 from .elimination import HEURISTICS, Elimination, elimination_order
 from .structure import TreeCost
-from .tables import FactorLike, LogTable, factor_from_log
 
 __all__ = [
     "HEURISTICS",

@@ -15,10 +15,8 @@ import numpy as np
 from ..categorical import pick_rows
 from ..errors import BudgetError, ZeroProbabilityError
 from .named import Named, aligned, contract, largest, without_ones
-from .program import Program
-from .propagation import Collected
-from .semiring import Semiring
-from .structure import TreeStructure
+from .propagation import Collected, Semiring
+from .structure import Program, TreeStructure
 
 JOINT_BYTES = 1e9
 """Default limit on the tables of a joint query."""

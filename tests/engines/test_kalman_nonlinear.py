@@ -14,10 +14,10 @@ from scipy.special import ndtr
 import bayesmc as bmc
 from bayesmc.engines.kalman import levels as kalman_levels
 from bayesmc.engines.kalman import means as kalman_means
+from bayesmc.engines.kalman import passes as kalman_rows
 from bayesmc.engines.kalman import queries as kalman_queries
-from bayesmc.engines.kalman import rows as kalman_rows
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.kalman.followed import Followed
+from bayesmc.engines.kalman.levels import Followed
 from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
 from bayesmc.errors import ModelMisfitWarning
 from bayesmc.testing import session

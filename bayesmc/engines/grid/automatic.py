@@ -16,9 +16,8 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.filtering import in_slice
-from bayesmc.engines.grid.axes import Axis, axis_of
+from bayesmc.engines.grid.axes import Axis, Lattice, Line, axis_of
 from bayesmc.engines.grid.landings import Landings, narrowest_piece
-from bayesmc.engines.grid.lattice import Lattice, Line
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import UnsupportedError, ZeroProbabilityError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar
 
@@ -20,13 +20,22 @@ from bayesmc.engines.filtering import (
     pass_slices,
     quiet,
 )
-from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
-from bayesmc.engines.grid.belief import GridBelief
-from bayesmc.engines.grid.limits import too_large, unread, without_density
-from bayesmc.engines.grid.looked import draws_of
 from bayesmc.engines.grid.moves import Cells, GridMover
-from bayesmc.engines.grid.record import GridPosterior, GridRecord, answers_of
-from bayesmc.engines.grid.search import GridSearch, known_static
+from bayesmc.engines.grid.options import (
+    GridOptions,
+    known_static,
+    too_large,
+    unread,
+    without_density,
+)
+from bayesmc.engines.grid.posterior import (
+    GridBelief,
+    GridPosterior,
+    GridRecord,
+    answers_of,
+    draws_of,
+)
+from bayesmc.engines.grid.search import GridSearch
 from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.grid.sources import Label
 from bayesmc.engines.grid.tables import GridModel
@@ -40,7 +49,7 @@ from bayesmc.results.predictive import warn_of_misfit
 
 
 @dataclass(frozen=True)
-class GridFilter(FilterEngine):
+class GridFilter(GridOptions, FilterEngine):
     """Histogram filter (Markov localisation): beliefs as probabilities of the cells of a grid.
 
     Exact but for the grid: sums over points stand for integrals. With points closer than the narrowest
@@ -99,30 +108,8 @@ class GridFilter(FilterEngine):
     ([-0.907, 1.044, 2.179], -8.3043)
     """
 
-    grid: Mapping[str, Any] = field(default_factory=dict)
-    cells: int | None = None
-    quadrature: str = "midpoint"
-    max_bytes: float = float(2**30)
-    tolerance: float = 0.01
-
     label: ClassVar[str] = "grid filter"
     belief: ClassVar[type] = GridBelief
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.grid, Mapping):
-            raise ValueError(
-                f"GridFilter(grid={type(self.grid).__name__}): give a dict from node to (low, high, cells) "
-                "or an array of points"
-            )
-        cells = CELLS if self.cells is None else self.cells
-        if isinstance(cells, bool) or not isinstance(cells, (int, np.integer)) or cells < 2:
-            raise ValueError(f"GridFilter(cells={cells!r}): give a number of cells, 2 or more")
-        check_rule(self.quadrature)
-        for what in ("max_bytes", "tolerance"):
-            if not getattr(self, what) > 0:
-                raise ValueError(
-                    f"GridFilter({what}={getattr(self, what)!r}): give a number above 0"
-                )
 
     # ---- what it can do ---------------------------------------------------------------------
 
@@ -353,22 +340,6 @@ class GridFilter(FilterEngine):
         )  # fmt: skip
 
     # ---- private -------------------------------------------------------------------------------
-
-    def model_on_grid(
-        self,
-        slices: Slices,
-        static: Mapping[str, np.ndarray],
-        logs: bool = False,
-        axis: tuple[str, Axis] | None = None,
-    ) -> GridModel:
-        """The template on its grid; ``axis`` is a node's that was found."""
-        cells = CELLS if self.cells is None else self.cells
-        axes = read_axes(slices, self.grid, cells, self.quadrature)
-        if axis is not None:
-            name, own = axis
-            missing = {n: why for n, why in axes.missing.items() if n != name}
-            axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
-        return GridModel(slices, axes, static, self.max_bytes, logs)
 
     def _start(self, problem: SeriesProblem) -> tuple[GridMover, list[Cells] | None]:
         """What moves beliefs, and the beliefs of all slices where a search for the grid left them."""

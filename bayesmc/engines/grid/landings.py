@@ -16,8 +16,7 @@ import bayesmc.distributions as families
 from bayesmc.dbn import Row
 from bayesmc.distributions import Affine, Distribution, Mixture, Truncated
 from bayesmc.distributions.adapt import ScipyUnivariate
-from bayesmc.engines.grid.axes import Axis
-from bayesmc.engines.grid.lattice import Lattice
+from bayesmc.engines.grid.axes import Axis, Lattice
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel, ends_of
@@ -248,8 +247,6 @@ class Landings:
         axis = self._axis(before.placed)
         if axis is None or self.lattice.line.kind == "integers":
             return low, high
-        if before.placed.scalars[axis].size != self.mover.model.axes.of[self.name][0].size:
-            return low, high  # a belief on a narrower lattice does not tell how it ends on this one
         if before.placed.scalars[axis].size != self.mover.model.axes.of[self.name][0].size:
             return low, high  # a belief on a narrower lattice does not tell how it ends on this one
         share = self._shares(before)

@@ -4,49 +4,18 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem, Slices
+from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import quiet
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
-from bayesmc.engines.grid.axes import Axis
-from bayesmc.engines.grid.lattice import line_of
-from bayesmc.engines.grid.record import GridPosterior
+from bayesmc.engines.grid.axes import Axis, line_of
+from bayesmc.engines.grid.options import GridOptions, known_static
+from bayesmc.engines.grid.posterior import GridPosterior
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
-
-
-class Options(Protocol):
-    """What a search reads of a filter: its options (see ``GridFilter``), and a template on a grid."""
-
-    @property
-    def grid(self) -> Mapping[str, Any]: ...
-
-    @property
-    def cells(self) -> int | None: ...
-
-    @property
-    def quadrature(self) -> str: ...
-
-    @property
-    def max_bytes(self) -> float: ...
-
-    @property
-    def tolerance(self) -> float: ...
-
-    def model_on_grid(
-        self,
-        slices: Slices,
-        static: Mapping[str, np.ndarray],
-        logs: bool = False,
-        axis: tuple[str, Axis] | None = None,
-    ) -> GridModel:
-        """The template on its grid; ``axis`` is a node's that was found."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -55,10 +24,10 @@ class GridSearch:
 
     Parameters
     ----------
-    options : Options
+    options : GridOptions
     """
 
-    options: Options
+    options: GridOptions
 
     def why_not(self, problem: SeriesProblem) -> str | None:
         """Why no grid is taken unasked: it is where a slice has one hidden number and its error is small."""
@@ -170,8 +139,3 @@ def _numbers(problem: SeriesProblem, model: GridModel) -> list[str]:
         for n in problem.hidden
         if n in model.own and n not in model.leaves and problem.model[n].domain is None
     ]
-
-
-def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:
-    """Values of the static nodes."""
-    return {n: o.value for n, o in problem.series.static.items()}

@@ -24,7 +24,17 @@ from bayesmc.engines.filtering import (
 from bayesmc.engines.kalman.covariances import rows_of
 from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.levels import why_not_matched
-from bayesmc.engines.kalman.passes import Filtered, State, backward, forward
+from bayesmc.engines.kalman.passes import (
+    Expected,
+    Filtered,
+    Memory,
+    RowTaker,
+    State,
+    backward,
+    contradicts,
+    forward,
+    impossible_row,
+)
 from bayesmc.engines.kalman.posterior import (
     GaussianBelief,
     GaussianSeries,
@@ -32,7 +42,6 @@ from bayesmc.engines.kalman.posterior import (
     smooth_answers,
 )
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
-from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker, contradicts, impossible_row
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.linalg.square_root import multiplied

@@ -18,9 +18,8 @@ from bayesmc.engines.kalman.data import Pattern, SeriesData
 from bayesmc.engines.kalman.filter import GaussianFilter, KalmanFilter
 from bayesmc.engines.kalman.levels import Level, Made, Plan, expected_slice, why_not_matched
 from bayesmc.engines.kalman.means import Innovations
-from bayesmc.engines.kalman.passes import Filtered, State, Turns
+from bayesmc.engines.kalman.passes import Expected, Filtered, Memory, RowTaker, State, Taken, Turns
 from bayesmc.engines.kalman.posterior import GaussianSeries, filter_answers
-from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout, Moments
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.linalg.square_root import multiplied, turned

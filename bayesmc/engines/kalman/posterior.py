@@ -13,9 +13,8 @@ from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.filtering import Queries, refuse_forecast
 from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.means import Innovations
-from bayesmc.engines.kalman.passes import Filtered, Smoothed
+from bayesmc.engines.kalman.passes import Filtered, RowTaker, Smoothed, Taken
 from bayesmc.engines.kalman.queries import Spreads, View, expectation, on_circle, quantiles
-from bayesmc.engines.kalman.rows import RowTaker, Taken
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode

@@ -1,18 +1,70 @@
-"""Why a grid cannot answer, found before any large table exists."""
+"""Options of a grid filter and the template on the grid that they give; why a grid cannot answer."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
-from bayesmc.dbn import SeriesProblem
+import numpy as np
+
+from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import quiet
+from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError
 from bayesmc.factors.named import largest
 from bayesmc.network.reading import nodes_read
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """The options of ``GridFilter``, which says what they are."""
+
+    grid: Mapping[str, Any] = field(default_factory=dict)
+    cells: int | None = None
+    quadrature: str = "midpoint"
+    max_bytes: float = float(2**30)
+    tolerance: float = 0.01
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, Mapping):
+            raise ValueError(
+                f"GridFilter(grid={type(self.grid).__name__}): give a dict from node to (low, high, cells) "
+                "or an array of points"
+            )
+        cells = CELLS if self.cells is None else self.cells
+        if isinstance(cells, bool) or not isinstance(cells, (int, np.integer)) or cells < 2:
+            raise ValueError(f"GridFilter(cells={cells!r}): give a number of cells, 2 or more")
+        check_rule(self.quadrature)
+        for what in ("max_bytes", "tolerance"):
+            if not getattr(self, what) > 0:
+                raise ValueError(
+                    f"GridFilter({what}={getattr(self, what)!r}): give a number above 0"
+                )
+
+    def model_on_grid(
+        self,
+        slices: Slices,
+        static: Mapping[str, np.ndarray],
+        logs: bool = False,
+        axis: tuple[str, Axis] | None = None,
+    ) -> GridModel:
+        """The template on its grid; ``axis`` is a node's that was found."""
+        cells = CELLS if self.cells is None else self.cells
+        axes = read_axes(slices, self.grid, cells, self.quadrature)
+        if axis is not None:
+            name, own = axis
+            missing = {n: why for n, why in axes.missing.items() if n != name}
+            axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
+        return GridModel(slices, axes, static, self.max_bytes, logs)
+
+
+def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:
+    """Values of the static nodes."""
+    return {n: o.value for n, o in problem.series.static.items()}
 
 
 def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str | None:

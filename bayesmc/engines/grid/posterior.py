@@ -1,14 +1,18 @@
-"""What a run on a grid keeps: answers about every slice, with densities unless told otherwise."""
+"""What a grid filter says: of every slice of a run, of one slice as its rows come in, and as draws."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem, Slices
+from bayesmc.categorical import pick
+from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices
 from bayesmc.engines.averages import as_event, naming
+from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import Answers as Seen
 from bayesmc.engines.filtering import (
@@ -20,7 +24,10 @@ from bayesmc.engines.filtering import (
 )
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
+from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel
+from bayesmc.engines.particles.particles import along_plates
+from bayesmc.engines.particles.predictive import Draws
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
@@ -240,6 +247,81 @@ class GridPosterior(SeriesPosterior):
         return kept[name]
 
 
+class GridBelief(SliceBelief):
+    """Probabilities of cells of one slice.
+
+    Attributes
+    ----------
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far; one for each element of plates filtered separately.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import GridFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    >>> engine = GridFilter({"x": (-8.0, 8.0, 200)})
+    >>> belief = engine.step(engine.start(dbn), {"y": 0.8})
+    >>> belief.t, float(belief.mean("x").round(4)), belief.density("x").shape
+    (0, 0.64, (200,))
+    """
+
+    def __init__(
+        self,
+        dbn: DynamicBayesNet | None,
+        static: Mapping[str, Any],
+        mover: GridMover | None = None,
+        cells: Cells | None = None,
+        before: Cells | None = None,
+        log_marginal_likelihood: Any = 0.0,
+        inputs: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        self.dbn, self.static, self.mover = dbn, dict(static), mover
+        self.cells, self.before = cells, before
+        self.inputs = dict(inputs or {})
+        self.log_marginal_likelihood = log_marginal_likelihood
+        self.t = -1 if cells is None else cells.placed.row.t
+        #: what rows are read against; None before the first
+        self.slices: Slices | None = None if mover is None else mover.model.slices
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        if self.t >= 0:
+            _ = self._posterior  # it goes along
+        return {**self.__dict__, "dbn": None, "mover": None}
+
+    def density(self, name: str) -> np.ndarray:
+        """Density at the points of the grid, shape ``(*plates, *cells)``; NaN where the node is seen."""
+        return self._posterior.density(name)[0]
+
+    def grid(self, name: str) -> Any:
+        """The points of a node's grid; of a vector a tuple, one per component."""
+        return self._posterior.grid(name)
+
+    def __repr__(self) -> str:
+        if self.cells is None:
+            return "GridBelief(nothing absorbed yet)"
+        return f"GridBelief(t={self.t}, cells {self.cells.placed.shape})"
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _answered(self) -> GridPosterior:
+        assert self.cells is not None and self.mover is not None
+        model = self.mover.model
+        record = GridRecord(model, model.slices.dynamic, 1, {}, True)
+        record.add(0, answers_of(self.mover, self.before, self.cells, self.cells.probs))
+        return record.posterior(None, "filter", None)
+
+
+def draws_of(model: GridModel, cells: Cells | None) -> Draws | None:
+    """Draws from a belief, of the nodes that the next slice reads; None before slice 0."""
+    return None if cells is None else partial(_drawn, model, cells)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -259,3 +341,37 @@ def _check_kept(name: str, shape: tuple[int, ...], max_bytes: float) -> None:
             "raise max_bytes=",
             int(count),
         )
+
+
+def _drawn(
+    model: GridModel, cells: Cells, rng: np.random.Generator, count: int
+) -> dict[str, np.ndarray]:
+    """Values of so many draws, first axis, of each node; without that axis where it is seen."""
+    at = _positions(cells, model.lead, rng, count)
+    return {n: _taken(model, cells.placed, n, at) for n in model.slices.interface}
+
+
+def _positions(
+    cells: Cells, lead: tuple[int, ...], rng: np.random.Generator, count: int
+) -> tuple[np.ndarray, ...]:
+    """Cells in proportion to their probabilities: along every axis positions, shape (count, *lead)."""
+    shape = cells.placed.shape
+    if not shape:
+        return ()
+    probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(math.prod(shape), -1)
+    flat = pick(probs, rng.random((probs.shape[1], count)).T)
+    return tuple(np.unravel_index(flat.reshape(count, *lead), shape))
+
+
+def _taken(model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]) -> np.ndarray:
+    """A node's values at cells; elements of plates that are filtered separately have cells of their own."""
+    node, value = model.slices.later[name], placed.values[name]
+    batch = value.ndim - len(node.value_shape)
+    axes = [k for k in range(batch) if value.shape[k] > 1]
+    if not axes:
+        return value.reshape(value.shape[batch:])
+    sizes = [value.shape[k] for k in axes]
+    index = np.ravel_multi_index([at[k] for k in axes], sizes)
+    each = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
+    each = each.reshape(-1, *node.value_shape)
+    return along_plates(each, index, node.plates, model.apart) if model.apart else each[index]
