@@ -22,14 +22,13 @@ from bayesmc.engines.filtering import (
     quiet,
 )
 from bayesmc.engines.kalman.covariances import rows_of
-from bayesmc.engines.kalman.data import Pattern, SeriesData
+from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.levels import why_not_matched
 from bayesmc.engines.kalman.passes import (
+    Ahead,
     Expected,
     Filtered,
-    Memory,
     RowTaker,
-    State,
     backward,
     contradicts,
     forward,
@@ -182,18 +181,11 @@ class GaussianFilter(FilterEngine):
     # ---- for the families ----------------------------------------------------------------------
 
     def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
-        """See ``rows.Family``."""
+        """See ``passes.Family``."""
         raise NotImplementedError
 
-    def expected(
-        self,
-        layout: Layout,
-        values: Mapping[str, np.ndarray],
-        state: State,
-        pattern: Pattern,
-        memory: Memory,
-    ) -> Expected:
-        """See ``rows.Family``."""
+    def expected(self, ahead: Ahead) -> Expected:
+        """See ``passes.Family``."""
         raise NotImplementedError
 
     def _own_refusal(self, problem: SeriesProblem, data: SeriesData) -> str | None:
@@ -317,14 +309,8 @@ class KalmanFilter(GaussianFilter):
             problem.cache["kalman matrices"] = (*found, None)[:2]
         return problem.cache["kalman matrices"]
 
-    def expected(
-        self,
-        layout: Layout,
-        values: Mapping[str, np.ndarray],
-        state: State,
-        pattern: Pattern,
-        memory: Memory,
-    ) -> Expected:
+    def expected(self, ahead: Ahead) -> Expected:
+        layout, values, pattern, memory = ahead.layout, ahead.values, ahead.pattern, ahead.memory
         timeless = memory(("timeless", layout), lambda: not reads_time(layout))
 
         def read() -> Linear:
@@ -337,11 +323,11 @@ class KalmanFilter(GaussianFilter):
 
         whole = timeless and pattern.given is None  # what is seen in part may differ in every row
         found = memory(("chosen", layout), choose) if whole else choose()
-        mean = found.offset + multiplied(found.moves, state.mean)
-        rows = rows_of(found.moves, found.noise, state.factor, pattern.absent)
+        mean = found.offset + multiplied(found.moves, ahead.mean)
+        rows = rows_of(found.moves, found.noise, ahead.factor, pattern.absent)
 
         def terms() -> np.ndarray:
-            return np.abs(found.offset) + multiplied(np.abs(found.moves), np.abs(state.mean))
+            return np.abs(found.offset) + multiplied(np.abs(found.moves), np.abs(ahead.mean))
 
         return Expected(mean, rows, terms)
 

@@ -9,17 +9,16 @@ normals, as the Kalman filter has them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.kalman.covariances import without_absent
-from bayesmc.engines.kalman.data import Pattern
-from bayesmc.engines.kalman.passes import State
+from bayesmc.engines.kalman.passes import Ahead
 from bayesmc.engines.kalman.reading import is_affine, typical_sizes
 from bayesmc.engines.kalman.slices import Layout, Moments, covariance_root, put_noise
 from bayesmc.errors import BayesmcError, TraceError
@@ -148,32 +147,19 @@ class Made(NamedTuple):
     fresh: np.ndarray
 
 
-class Rule(Protocol):
-    """How a level is made linear."""
-
-    def __call__(self, level: Level, mean: np.ndarray, rows: np.ndarray) -> Made:
-        """``mean``, shape (*lead, c), and ``rows``, shape (*lead, c, k), are of the numbers that it reads."""
-        ...
+#: makes a level linear, given mean ``(*lead, c)`` and rows ``(*lead, c, k)`` of the numbers that it reads
+Rule = Callable[["Level", np.ndarray, np.ndarray], Made]
 
 
-def expected_slice(
-    layout: Layout,
-    values: Mapping[str, np.ndarray],
-    state: State,
-    pattern: Pattern,
-    rule: Rule,
-    plan: Plan,
-) -> tuple[np.ndarray, np.ndarray]:
+def expected_slice(ahead: Ahead, rule: Rule, plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the numbers that a pattern chooses, and their coefficients of the noise."""
+    layout, pattern = ahead.layout, ahead.pattern
     n, total = layout.n_prev, layout.n_prev + layout.p + layout.n
     lead = layout.lead
     mean, rows = np.zeros((*lead, total)), np.zeros((*lead, total, n))
-    mean[..., :n], rows[..., :n, :] = state.mean, state.factor
-    known = dict(values)
-    for name in layout.computed:
-        known[name] = layout.model.evaluate(name, known)[0]
+    mean[..., :n], rows[..., :n, :] = ahead.mean, ahead.factor
     for part in plan.levels:
-        level = Level(layout, part, known)
+        level = Level(layout, part, ahead.values)
         made = rule(level, mean[..., part.reads], rows[..., part.reads, :])
         rows = np.concatenate([rows, np.zeros((*lead, total, made.fresh.shape[-1]))], axis=-1)
         mean[..., part.places] = made.mean

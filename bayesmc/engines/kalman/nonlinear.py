@@ -14,11 +14,11 @@ import numpy as np
 
 from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Asked, pass_slices
-from bayesmc.engines.kalman.data import Pattern, SeriesData
+from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.filter import GaussianFilter, KalmanFilter
 from bayesmc.engines.kalman.levels import Level, Made, Plan, expected_slice, why_not_matched
 from bayesmc.engines.kalman.means import Innovations
-from bayesmc.engines.kalman.passes import Expected, Filtered, Memory, RowTaker, State, Taken, Turns
+from bayesmc.engines.kalman.passes import Ahead, Expected, Filtered, RowTaker, Taken, Turns
 from bayesmc.engines.kalman.posterior import GaussianSeries, filter_answers
 from bayesmc.engines.kalman.slices import Layout, Moments
 from bayesmc.errors import ParameterError, UnsupportedError
@@ -58,21 +58,15 @@ class NonlinearFilter(GaussianFilter):
         return super().most_likely(problem, seed, progress)
 
     def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
-        """See ``rows.Family``."""
+        """See ``passes.Family``."""
         why = why_not_matched(layout)
         return None if why is None else f"{why}; use ParticleFilter"
 
-    def expected(
-        self,
-        layout: Layout,
-        values: Mapping[str, np.ndarray],
-        state: State,
-        pattern: Pattern,
-        memory: Memory,
-    ) -> Expected:
-        """See ``rows.Family``."""
-        plan = memory(("plan", layout), lambda: Plan(layout, values))
-        return Expected(*expected_slice(layout, values, state, pattern, self.made_linear, plan))
+    def expected(self, ahead: Ahead) -> Expected:
+        """See ``passes.Family``."""
+        layout = ahead.layout
+        plan = ahead.memory(("plan", layout), lambda: Plan(layout, ahead.values))
+        return Expected(*expected_slice(ahead, self.made_linear, plan))
 
     def _no_mode(self, problem: SeriesProblem) -> str | None:
         """Why smoothed means are not the most likely trajectory, or None."""

@@ -40,13 +40,6 @@ from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityErr
 from bayesmc.linalg.square_root import Conditioned, condition, multiplied, turned
 
 
-class State(NamedTuple):
-    """What is known of the numbers that the next slice reads: ``mean + factor @ (independent normals)``."""
-
-    mean: np.ndarray
-    factor: np.ndarray
-
-
 class Turns(NamedTuple):
     """What carries a smoother from a slice to the one before, for each kind of slice, and each slice.
 
@@ -114,11 +107,6 @@ def forward(
     factors = _factors(data, chosen, covariances)
     which, increments = covariances.which, found.increments
     return Filtered(found.means, factors, which, increments, turns, found.innovations)
-
-
-def start_state(layout: Layout) -> State:
-    """Before slice 0 there is nothing."""
-    return State(np.zeros((*layout.lead, 0)), np.zeros((0, 0)))
 
 
 class Smoothed(NamedTuple):
@@ -201,25 +189,6 @@ class Expected(NamedTuple):
     terms: Callable[[], np.ndarray] | None = None
 
 
-class Family(Protocol):
-    """What a filter says of a slice by itself."""
-
-    def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
-        """Why it is refused, or None."""
-        ...
-
-    def expected(
-        self,
-        layout: Layout,
-        values: Mapping[str, np.ndarray],
-        state: State,
-        pattern: Pattern,
-        memory: Memory,
-    ) -> Expected:
-        """What a row is compared with."""
-        ...
-
-
 class Memory:
     """What was worked out for rows of the same kind before; bounded, since patterns may be many."""
 
@@ -233,6 +202,39 @@ class Memory:
                 self._kept.pop(next(iter(self._kept)))
             self._kept[key] = make()
         return self._kept[key]
+
+
+class Ahead(NamedTuple):
+    """A slice whose row is still to be taken in.
+
+    Attributes
+    ----------
+    layout : Layout
+    values : dict
+        Of the nodes that are known.
+    mean : ndarray, shape (*lead, n_prev)
+        Of the numbers of the slice before: ``mean + factor @ (independent normals)``.
+    factor : ndarray, shape ([*lead], n_prev, n_prev)
+    pattern : Pattern
+    memory : Memory
+    """
+
+    layout: Layout
+    values: Mapping[str, np.ndarray]
+    mean: np.ndarray
+    factor: np.ndarray
+    pattern: Pattern
+    memory: Memory
+
+
+class Family(Protocol):
+    """What a filter says of a slice by itself."""
+
+    def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
+        """Why it is refused, or None."""
+
+    def expected(self, ahead: Ahead) -> Expected:
+        """What a row is compared with."""
 
 
 class Taken(NamedTuple):
@@ -284,16 +286,17 @@ class RowTaker:
         if why is not None:
             raise UnsupportedError(f"{type(self.family).__name__}: {why}")
         if before is None:
-            state = start_state(layout)
+            carried = np.zeros((*layout.lead, 0)), np.zeros((0, 0))
         else:
             c = before.layout.carried
-            state = State(before.mean[..., :c], before.factor[..., :c, :c])
+            carried = before.mean[..., :c], before.factor[..., :c, :c]
         given, pattern = self._pattern(layout, row)
         target = stacked(layout, {n: row.seen[n].value for n in layout.seen}, ())
         if given is not None:
             places = pattern.observed[layout.p :] - layout.p
             target = np.concatenate([target, given[..., places]], axis=-1)
-        mean, rows, terms = self.family.expected(layout, values, state, pattern, self.memory)
+        ahead = Ahead(layout, values, *carried, pattern, self.memory)
+        mean, rows, terms = self.family.expected(ahead)
         made = condition(rows, len(pattern.observed), layout.n_prev if turning else None)
         angles = _angles(layout, pattern)
         after, eta, log = absorbed(layout, pattern, made, mean, target, given, angles, terms)
