@@ -60,6 +60,11 @@ class Cells:
     increment: np.ndarray
     mass: np.ndarray
 
+    def shares(self, name: str) -> np.ndarray | None:
+        """Probabilities of the points of a node of one number, (n, *apart); None where it has none."""
+        axis = self.placed.axis(name)
+        return None if axis is None else self.placed.marginal(self.probs, axis)
+
 
 class GridMover:
     """Moves beliefs over a grid from slice to slice.
@@ -256,8 +261,7 @@ class GridMover:
             node = self.model.slices.first[name]
             if node.is_discrete or name in now.row.seen or scalar.size < 3:
                 continue
-            others = tuple(j for j in range(len(now.scalars)) if j != k)
-            top = float(probs.sum(axis=others).max())
+            top = float(now.marginal(probs, k).max())
             # the error of a sum for a normal density whose highest cell has this probability
             error = 2 * np.exp(-np.pi / top**2)
             if error > self.tolerance:
