@@ -18,7 +18,7 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.beliefs import refuse_unbound, slices_like
+from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
 from bayesmc.errors import (
     BayesmcError,
     EvidenceError,
@@ -278,6 +278,8 @@ class FilterEngine:
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> Any:
         """A family's belief before the first row."""
+        if issubclass(self.belief, SliceBelief):
+            return self.belief(dbn, static)
         raise self._cannot("go row by row")
 
     def _absorbed(self, belief: Any, slices: Slices, row: Row) -> Any:

@@ -111,7 +111,9 @@ def test_draws_from_cells_are_draws_from_the_belief() -> None:
     dbn, engine = pairs(), bmc.GridFilter({"x": (-6.0, 6.0, 100)})
     belief = engine.step(engine.start(dbn), {"y": [3.0, 0.5, -1.0], "n": [2, 0, 1]})
     with quiet():
-        drawn = draws_of(belief.mover.model, belief.cells)(np.random.default_rng(5), 4000)
+        drawn = draws_of(belief.state.mover.model, belief.state.cells)(
+            np.random.default_rng(5), 4000
+        )
     for name, mean, std in (
         ("x", belief.mean("x"), belief.std("x")),
         ("on", belief.mean("on"), belief.std("on")),

@@ -6,16 +6,15 @@ Options, refusals and the calls; tables of slices are made in ``slices``, passed
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
-from bayesmc.engines.discrete.posterior import DiscreteBelief, DiscretePosterior, Held, window
+from bayesmc.engines.discrete.posterior import DiscreteBelief, DiscretePosterior, window
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.discrete.states import path_values, rows_compared
@@ -189,23 +188,17 @@ class DiscreteFilter(FilterEngine):
         assert path is not None
         return path_values(run, path, problem.hidden)
 
-    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> DiscreteBelief:
-        return DiscreteBelief(dbn, dict(static))
-
     def _bound(
         self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> DiscreteBelief:
-        held = belief.held
-        plan = DiscreteSlices(
-            slices, plates_apart(slices), frozenset(), read_static(slices, belief.static)
-        )
-        run = Run(plan, held.series, belief.t, held.before)
+        static = read_static(slices, belief.static)
+        plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)
+        run = Run(plan, belief.state.series, belief.t, belief.state.before)
         run.forward()  # the slice once more, from the beliefs before it
-        return DiscreteBelief(dbn, belief.static, belief.t, belief.log_marginal_likelihood, run)
+        return belief.bound(dbn, slices, run)
 
     def _absorbed(self, belief: DiscreteBelief, slices: Slices, row: Row) -> DiscreteBelief:
-        t, run = belief.t + 1, belief.run
-        assert not isinstance(run, Held)
+        t, run = belief.t + 1, belief.state
         if run is None:
             static = read_static(slices, belief.static)
             plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)
@@ -221,10 +214,7 @@ class DiscreteFilter(FilterEngine):
         before = None if run is None else [p.log_belief[-1] for p in run.passed]
         after = Run(plan, series, t, before)
         increment = after.forward()[0].reshape(plan.reader.lead)
-        total = belief.log_marginal_likelihood + increment
-        return DiscreteBelief(
-            belief.dbn, belief.static, t, total if np.ndim(total) else float(total), after
-        )
+        return belief.after(slices, row, increment, after)
 
     # ---- private -------------------------------------------------------------------------------
 

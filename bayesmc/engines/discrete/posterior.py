@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Row, Series, Slices
+from bayesmc.dbn import Row, Series, Slices
 from bayesmc.engines.averages import as_event
 from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.discrete.answers import SliceAnswers
-from bayesmc.engines.discrete.run import Run
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import Observed
 from bayesmc.results import SeriesPosterior
@@ -88,23 +86,20 @@ class DiscretePosterior(SeriesPosterior):
 
 
 class Held(NamedTuple):
-    """What a belief goes on with once it has its functions again.
+    """What a belief goes on with once it has its functions again; what it says of a ``Run`` is the same.
 
     Attributes
     ----------
-    slices : Slices
     series : Series
         The last rows.
     before : list of ndarray or None
         Logs of the beliefs in the slice before, by chain.
     """
 
-    slices: Slices
     series: Series
     before: Sequence[np.ndarray] | None
 
 
-@dataclass(frozen=True, eq=False)
 class DiscreteBelief(SliceBelief):
     """Probabilities of the nodes of one slice.
 
@@ -128,43 +123,17 @@ class DiscreteBelief(SliceBelief):
     (0, [0.182, 0.818])
     """
 
-    dbn: DynamicBayesNet | None = field(repr=False)
-    static: Mapping[str, Any] = field(repr=False)
-    t: int = -1
-    log_marginal_likelihood: Any = 0.0
-    run: Run | Held | None = field(default=None, repr=False)
-
     def __getstate__(self) -> dict[str, Any]:
         """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
         if self.dbn is not None and not self.dbn.template.has_functions:
             return {**self.__dict__}  # tables alone travel
-        if self.run is None:
-            return {**self.__dict__, "dbn": None}
-        return {**self.__dict__, "dbn": None, "run": self.held, "_posterior": self._posterior}
+        return super().__getstate__()
 
-    @property
-    def held(self) -> Held:
-        """The last rows, and the beliefs before them."""
-        if isinstance(self.run, Held):
-            return self.run
-        assert self.run is not None
-        return Held(self.run.plan.slices, self.run.series, self.run.before)
-
-    @property
-    def slices(self) -> Slices | None:
-        """What rows are read against; None before the first."""
-        return None if self.run is None else self.held.slices
-
-    @property
-    def inputs(self) -> dict[str, np.ndarray]:
-        """Inputs of the slice."""
-        if self.run is None:
-            return {}
-        return {n: v[-1] for n, v in self.held.series.inputs.items()}
+    def _without_functions(self) -> Held:
+        return Held(self.state.series, self.state.before)
 
     def _answered(self) -> SeriesPosterior:
-        assert isinstance(self.run, Run)
-        answers = SliceAnswers(self.run)
+        answers = SliceAnswers(self.state)
         slices = answers.plan.slices
         found = answers.of(slices.dynamic)
         return DiscretePosterior(

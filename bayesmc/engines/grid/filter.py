@@ -32,6 +32,7 @@ from bayesmc.engines.grid.posterior import (
     GridBelief,
     GridPosterior,
     GridRecord,
+    GridState,
     answers_of,
     draws_of,
 )
@@ -306,12 +307,8 @@ class GridFilter(GridOptions, FilterEngine):
 
     # ---- one slice at a time ----------------------------------------------------------------
 
-    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
-        return GridBelief(dbn, static)
-
     def _bound(self, belief: GridBelief, dbn: DynamicBayesNet, slices: Slices) -> GridBelief:
-        cells = belief.cells
-        assert cells is not None
+        cells = belief.state.cells
         with quiet():
             model = self.model_on_grid(slices, read_static(slices, belief.static))
             placed = model.place(cells.placed.row)
@@ -320,24 +317,17 @@ class GridFilter(GridOptions, FilterEngine):
                 "GridFilter().start: the belief lies on another grid; go on with the engine that it was "
                 "started with"
             )
-        return GridBelief(
-            dbn, belief.static, GridMover(model, self.tolerance), cells, belief.before,
-            belief.log_marginal_likelihood, belief.inputs,
-        )  # fmt: skip
+        mover = GridMover(model, self.tolerance)
+        return belief.bound(dbn, slices, belief.state._replace(mover=mover))
 
     def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
-        mover = belief.mover
+        mover, before, _ = belief.state or (None, None, None)
         with quiet():
             if mover is None:
                 model = self.model_on_grid(slices, read_static(slices, belief.static))
                 mover = GridMover(model, self.tolerance)
-            cells = mover.move(belief.cells, row)
-        total = belief.log_marginal_likelihood + cells.increment
-        return GridBelief(
-            belief.dbn, belief.static, mover, cells, belief.cells,
-            total if np.ndim(total) else float(total),
-            {n: row.inputs[n] for n in slices.template.inputs},
-        )  # fmt: skip
+            cells = mover.move(before, row)
+        return belief.after(slices, row, cells.increment, GridState(mover, cells, before))
 
     # ---- private -------------------------------------------------------------------------------
 

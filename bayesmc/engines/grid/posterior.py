@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.categorical import pick
-from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices
+from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.averages import as_event, naming
 from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.exact.exact import readable_bytes
@@ -247,6 +247,14 @@ class GridPosterior(SeriesPosterior):
         return kept[name]
 
 
+class GridState(NamedTuple):
+    """What a belief goes on with: what moves it (None out of a pickle), its cells, and those before."""
+
+    mover: GridMover | None
+    cells: Cells
+    before: Cells | None
+
+
 class GridBelief(SliceBelief):
     """Probabilities of cells of one slice.
 
@@ -270,30 +278,6 @@ class GridBelief(SliceBelief):
     (0, 0.64, (200,))
     """
 
-    def __init__(
-        self,
-        dbn: DynamicBayesNet | None,
-        static: Mapping[str, Any],
-        mover: GridMover | None = None,
-        cells: Cells | None = None,
-        before: Cells | None = None,
-        log_marginal_likelihood: Any = 0.0,
-        inputs: Mapping[str, np.ndarray] | None = None,
-    ) -> None:
-        self.dbn, self.static, self.mover = dbn, dict(static), mover
-        self.cells, self.before = cells, before
-        self.inputs = dict(inputs or {})
-        self.log_marginal_likelihood = log_marginal_likelihood
-        self.t = -1 if cells is None else cells.placed.row.t
-        #: what rows are read against; None before the first
-        self.slices: Slices | None = None if mover is None else mover.model.slices
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
-        if self.t >= 0:
-            _ = self._posterior  # it goes along
-        return {**self.__dict__, "dbn": None, "mover": None}
-
     def density(self, name: str) -> np.ndarray:
         """Density at the points of the grid, shape ``(*plates, *cells)``; NaN where the node is seen."""
         return self._posterior.density(name)[0]
@@ -302,18 +286,16 @@ class GridBelief(SliceBelief):
         """The points of a node's grid; of a vector a tuple, one per component."""
         return self._posterior.grid(name)
 
-    def __repr__(self) -> str:
-        if self.cells is None:
-            return "GridBelief(nothing absorbed yet)"
-        return f"GridBelief(t={self.t}, cells {self.cells.placed.shape})"
-
     # ---- private -------------------------------------------------------------------------------
 
+    def _without_functions(self) -> GridState:
+        return self.state._replace(mover=None)
+
     def _answered(self) -> GridPosterior:
-        assert self.cells is not None and self.mover is not None
-        model = self.mover.model
+        mover, cells, before = self.state
+        model = mover.model
         record = GridRecord(model, model.slices.dynamic, 1, {}, True)
-        record.add(0, answers_of(self.mover, self.before, self.cells, self.cells.probs))
+        record.add(0, answers_of(mover, before, cells, cells.probs))
         return record.posterior(None, "filter", None)
 
 

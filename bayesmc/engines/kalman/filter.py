@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from bayesmc.engines.kalman.passes import (
 from bayesmc.engines.kalman.posterior import (
     GaussianBelief,
     GaussianSeries,
+    GaussianState,
     filter_answers,
     smooth_answers,
 )
@@ -149,34 +150,22 @@ class GaussianFilter(FilterEngine):
         found = self.smooth(problem, seed, progress=progress)
         return {n: found.mean(n) for n in self._data(problem).layouts[0].rows}
 
-    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GaussianBelief:
-        return GaussianBelief(dbn, static)
-
     def _bound(
         self, belief: GaussianBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> GaussianBelief:
-        taken = belief.taken
-        assert taken is not None
+        taken = belief.state.taken
         old = taken.layout
         layout = Layout(slices, old.apart, old.first, old.before, old.unknown)
         taker = RowTaker(self, slices, read_static(slices, belief.static))
-        return GaussianBelief(
-            dbn, belief.static, belief.t, taker, taken._replace(layout=layout),
-            belief.log_marginal_likelihood, belief.inputs,
-        )  # fmt: skip
+        return belief.bound(dbn, slices, GaussianState(taker, taken._replace(layout=layout)))
 
     def _absorbed(self, belief: GaussianBelief, slices: Slices, row: Row) -> GaussianBelief:
-        taker = belief.taker
+        taker, before = belief.state or (None, None)
         if taker is None:
             taker = RowTaker(self, slices, read_static(slices, belief.static))
         with quiet():
-            taken = taker.take(row, belief.taken)
-        total = belief.log_marginal_likelihood + taken.log_density
-        return GaussianBelief(
-            belief.dbn, belief.static, belief.t + 1, taker, taken,
-            total if np.ndim(total) else float(total),
-            {n: row.inputs[n] for n in slices.template.inputs},
-        )  # fmt: skip
+            taken = taker.take(row, before)
+        return belief.after(slices, row, taken.log_density, GaussianState(taker, taken))
 
     # ---- for the families ----------------------------------------------------------------------
 

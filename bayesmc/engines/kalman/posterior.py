@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, SeriesProblem, Slices
+from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.averages import naming
 from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.filtering import Queries, refuse_forecast
@@ -157,6 +157,13 @@ class GaussianSeries(SeriesPosterior):
         return super()._node(name)
 
 
+class GaussianState(NamedTuple):
+    """What a belief goes on with: what takes rows in (None out of a pickle), and the last one taken in."""
+
+    taker: RowTaker | None
+    taken: Taken
+
+
 class GaussianBelief(SliceBelief):
     """A Gaussian belief about one slice, as ``start`` and ``step`` of the Kalman filters give it.
 
@@ -180,32 +187,6 @@ class GaussianBelief(SliceBelief):
     (0, 0.64, 0.2)
     """
 
-    def __init__(
-        self,
-        dbn: DynamicBayesNet | None,
-        static: Mapping[str, Any],
-        t: int = -1,
-        taker: RowTaker | None = None,
-        taken: Taken | None = None,
-        log_marginal_likelihood: Any = 0.0,
-        inputs: Mapping[str, np.ndarray] | None = None,
-    ) -> None:
-        self.dbn, self.static, self.t = dbn, dict(static), t
-        self.taker, self.taken = taker, taken
-        self.log_marginal_likelihood = log_marginal_likelihood
-        self.inputs = dict(inputs or {})
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
-        state = {**self.__dict__, "dbn": None, "taker": None}
-        state.pop("_posterior", None)
-        return state
-
-    @property
-    def slices(self) -> Slices | None:
-        """What rows are read against; None before the first."""
-        return None if self.taken is None else self.taken.layout.slices
-
     @property
     def layout(self) -> Layout:
         """Where the numbers stand."""
@@ -219,21 +200,17 @@ class GaussianBelief(SliceBelief):
     def _of_functions(self) -> GaussianSeries:
         return self._posterior  # what is averaged is numbers: an unpickled belief has them, too
 
-    def _answered(self) -> GaussianSeries:
-        assert self.taken is not None
-        layout = self.taken.layout
-        spreads = Spreads(self.taken.factor[None], np.zeros(1, dtype=np.intp))
-        nodes = layout.slices.first
-        known = {
-            n: np.broadcast_to(v, nodes[n].value_shape)[None] for n, v in self.taken.known.items()
-        }
-        view = View(layout, self.taken.mean[None], spreads, known)
-        return _series(view, None, "filter", None, self.t)
+    def _without_functions(self) -> GaussianState:
+        return self.state._replace(taker=None)
 
-    def __repr__(self) -> str:
-        if self.taken is None:
-            return "GaussianBelief(nothing absorbed yet)"
-        return f"GaussianBelief(t={self.t}, {', '.join(self.names)})"
+    def _answered(self) -> GaussianSeries:
+        taken = self.state.taken
+        layout = taken.layout
+        spreads = Spreads(taken.factor[None], np.zeros(1, dtype=np.intp))
+        nodes = layout.slices.first
+        known = {n: np.broadcast_to(v, nodes[n].value_shape)[None] for n, v in taken.known.items()}
+        view = View(layout, taken.mean[None], spreads, known)
+        return _series(view, None, "filter", None, self.t)
 
 
 def filter_answers(
