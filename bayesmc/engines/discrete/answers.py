@@ -17,7 +17,7 @@ from bayesmc.engines.discrete.run import Run, bad_parameters
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
 from bayesmc.engines.filtering import Answers, Queries, quiet
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
-from bayesmc.factors.named import connected, log_product
+from bayesmc.factors.named import choices_of
 from bayesmc.network import CompiledNode
 from bayesmc.network.reading import nodes_read
 from bayesmc.results.posterior import circular_variance
@@ -326,28 +326,13 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
     plan = run.plan
     chain = plan.chains[number]
     for start, stop in run.stretches(plan.widest(chain) * run.sequences):
-        rows = plan.rows(run.series, start, stop)
-        pieces = run.pieces(number, rows)
-        for group in connected(chain.inside, [p.scope for p in pieces]):
-            members = [p for p in pieces if set(group) & set(p.scope)]
-            border = tuple(dict.fromkeys(v for p in members for v in p.scope if v not in group))
-            sizes = tuple(plan.cards[v] for v in group)
-            entries = math.prod(map(float, (*sizes, *(plan.cards[v] for v in border))))
-            if entries > BLOCK_ENTRIES:
-                raise BudgetError(
-                    f"most_likely: {len(group)} hidden nodes of a slice have {entries:.3g} joint states that "
-                    "meet in one density; observe more of them",
-                    int(min(8 * entries, 2**62)),
-                )
-            table = log_product(members, (*border, *group), plan.cards)
-            table = table.reshape(*table.shape[: 2 + len(border)], -1)
-            here = np.arange(rows.count)[:, None] if len(table) > 1 else 0
-            there = np.arange(run.sequences) if table.shape[1] > 1 else 0
-            at = [_on_path(states, v, start - run.first, stop - run.first) for v in border]
-            best = table[(here, there, *at)].argmax(axis=-1)
-            best = np.broadcast_to(best, (rows.count, run.sequences))
-            for variable, state in zip(group, unravelled(best, sizes), strict=True):
-                states[variable][start - run.first : stop - run.first] = state
+        pieces = run.pieces(number, plan.rows(run.series, start, stop))
+        border = [v for v in (*chain.before, *chain.state) if any(v in p.scope for p in pieces)]
+        known = {v: _on_path(states, v, start - run.first, stop - run.first) for v in border}
+        for choice in reversed(choices_of(pieces, border, plan.cards)):
+            known.update(choice.look_up(known))
+        for variable in chain.inside:
+            states[variable][start - run.first : stop - run.first] = known[variable]
 
 
 def _on_path(

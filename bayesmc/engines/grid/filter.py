@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -35,11 +34,10 @@ from bayesmc.engines.grid.posterior import (
     GridState,
     answers_of,
     draws_of,
+    values_at,
 )
 from bayesmc.engines.grid.search import GridSearch
 from bayesmc.engines.grid.slice import same_points
-from bayesmc.engines.grid.sources import Label
-from bayesmc.engines.grid.tables import GridModel
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
@@ -301,7 +299,7 @@ class GridFilter(GridOptions, FilterEngine):
             node = problem.model[name]
             if name not in model.own or name in model.leaves:
                 continue
-            values = [_chosen(model, name, row, at) for row, at in zip(rows, path, strict=True)]
+            values = [values_at(model, placed, name, at)[0] for placed, at in path]
             found[name] = np.array(node.decode(np.stack(values)), subok=True)
         return found
 
@@ -387,27 +385,3 @@ def _looks(problem: SeriesProblem, mover: GridMover) -> Replicates:
     """What holds rows against those that the grid expects; the same draws always, as of all it answers."""
     plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
     return Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK))
-
-
-def _chosen(
-    model: GridModel, name: str, row: Any, positions: Mapping[Label, np.ndarray]
-) -> np.ndarray:
-    """Stored values of a node at chosen positions, or as seen."""
-    placed = model.place(row)
-    node = model.slices.first[name]
-    value = placed.values[name]
-    batch = value.ndim - len(node.value_shape)
-    if not batch:
-        return value
-    apart = model.apart
-    full = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
-    out = np.empty(node.value_shape, dtype=value.dtype)
-    for element in np.ndindex(*model.lead):
-        at = tuple(
-            int(positions[s.label][element]) if value.shape[k] > 1 else 0
-            for k, s in enumerate(placed.scalars)
-        )
-        where = dict(zip(apart, element, strict=True))
-        plates = tuple(where.get(p, slice(None)) for p in node.plates)
-        out[plates] = full[at][plates]
-    return out

@@ -146,8 +146,10 @@ class GridMover:
         ratio = np.divide(smoothed, after.predicted, out=np.zeros(some.shape), where=some)
         return [*self._moving(cells, now, factors), Named((*now.labels, *self.model.apart), ratio)]
 
-    def best(self, rows: Sequence[Row], advance: Any) -> list[dict[Label, np.ndarray]]:
-        """The most likely positions of all scalars, slice by slice: label -> positions, shape (*apart,)."""
+    def best(
+        self, rows: Sequence[Row], advance: Any
+    ) -> list[tuple[Placed, tuple[np.ndarray, ...]]]:
+        """The most likely cell of every slice: positions along its axes, shape ``(1, *apart)``."""
         model, lead = self.model, self.model.lead
         elements = list(np.ndindex(*lead))
         value: list[Named] = []
@@ -175,7 +177,10 @@ class GridMover:
             advance()
         path = _traced(value, history, placed, elements, lead)
         self._check_path(path, placed)
-        return path
+        return [
+            (now, tuple(at[s.label][None] for s in now.scalars))
+            for now, at in zip(placed, path, strict=True)
+        ]
 
     # ---- private -------------------------------------------------------------------------------
 

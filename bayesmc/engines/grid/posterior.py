@@ -304,6 +304,26 @@ def draws_of(model: GridModel, cells: Cells | None) -> Draws | None:
     return None if cells is None else partial(_drawn, model, cells)
 
 
+def values_at(
+    model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """A node's values at cells, whose positions along every axis have shape ``(count, *apart)``.
+
+    Elements of plates that are filtered separately have cells of their own; where the node is seen the first
+    axis may be 1.
+    """
+    node, value = model.slices.later[name], placed.values[name]
+    batch = value.ndim - len(node.value_shape)
+    axes = [k for k in range(batch) if value.shape[k] > 1]
+    each = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
+    each = each.reshape(-1, *node.value_shape)
+    if not axes:
+        return each
+    sizes = [value.shape[k] for k in axes]
+    index = np.ravel_multi_index([at[k] for k in axes], sizes)
+    return along_plates(each, index, node.plates, model.apart) if model.apart else each[index]
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -330,7 +350,8 @@ def _drawn(
 ) -> dict[str, np.ndarray]:
     """Values of so many draws, first axis, of each node; without that axis where it is seen."""
     at = _positions(cells, model.lead, rng, count)
-    return {n: _taken(model, cells.placed, n, at) for n in model.slices.interface}
+    found = {n: values_at(model, cells.placed, n, at) for n in model.slices.interface}
+    return {n: v[0] if len(v) == 1 else v for n, v in found.items()}
 
 
 def _positions(
@@ -343,17 +364,3 @@ def _positions(
     probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(math.prod(shape), -1)
     flat = pick(probs, rng.random((probs.shape[1], count)).T)
     return tuple(np.unravel_index(flat.reshape(count, *lead), shape))
-
-
-def _taken(model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]) -> np.ndarray:
-    """A node's values at cells; elements of plates that are filtered separately have cells of their own."""
-    node, value = model.slices.later[name], placed.values[name]
-    batch = value.ndim - len(node.value_shape)
-    axes = [k for k in range(batch) if value.shape[k] > 1]
-    if not axes:
-        return value.reshape(value.shape[batch:])
-    sizes = [value.shape[k] for k in axes]
-    index = np.ravel_multi_index([at[k] for k in axes], sizes)
-    each = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
-    each = each.reshape(-1, *node.value_shape)
-    return along_plates(each, index, node.plates, model.apart) if model.apart else each[index]
