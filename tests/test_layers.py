@@ -50,8 +50,6 @@ DEPTH = {
 LONG_MODULES = {
     "dbn/slices.py",
     "dbn/template.py",
-    "engines/grid/answers.py",
-    "engines/grid/filter.py",
     "engines/mcmc/chains.py",
     "engines/particles/linearisation.py",
     "expression/functions.py",

@@ -211,7 +211,7 @@ class DiscreteFilter(FilterEngine):
         reason = why_unreadable(plan, series, last=True)
         if reason is not None:
             raise UnsupportedError(_words(reason))
-        before = None if run is None else [p.log_belief[-1] for p in run.passed]
+        before = None if run is None else [p.logs(slice(-1, None))[0] for p in run.passed]
         after = Run(plan, series, t, before)
         increment = after.forward()[0].reshape(plan.reader.lead)
         return belief.after(slices, row, increment, after)

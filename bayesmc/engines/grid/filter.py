@@ -20,13 +20,6 @@ from bayesmc.engines.filtering import (
     quiet,
 )
 from bayesmc.engines.grid.moves import Cells, GridMover
-from bayesmc.engines.grid.options import (
-    GridOptions,
-    known_static,
-    too_large,
-    unread,
-    without_density,
-)
 from bayesmc.engines.grid.posterior import (
     GridBelief,
     GridPosterior,
@@ -36,7 +29,14 @@ from bayesmc.engines.grid.posterior import (
     draws_of,
     values_at,
 )
-from bayesmc.engines.grid.search import GridSearch
+from bayesmc.engines.grid.search import (
+    GridOptions,
+    GridSearch,
+    known_static,
+    too_large,
+    unread,
+    without_density,
+)
 from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
