@@ -202,7 +202,7 @@ class DiscreteFilter(FilterEngine):
         if run is None:
             static = read_static(slices, belief.static)
             plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)
-            error = self._too_large(plan, 1)
+            error = size_refusal(plan, 1, self.max_states, self.max_bytes)
             if error is not None:
                 raise error
         else:
@@ -277,7 +277,7 @@ class DiscreteFilter(FilterEngine):
             return UnsupportedError(_words(str(error)))
         if reason is not None:
             return UnsupportedError(_words(reason))
-        too_large = self._too_large(plan, problem.steps)
+        too_large = size_refusal(plan, problem.steps, self.max_states, self.max_bytes)
         if too_large is not None:
             return too_large
         try:
@@ -288,14 +288,6 @@ class DiscreteFilter(FilterEngine):
                 f"and one of them fails there: {error}; use ParticleFilter(particles)"
             )
         return None
-
-    def _too_large(self, plan: DiscreteSlices, steps: int) -> BudgetError | None:
-        found = size_refusal(plan, steps, int(self.max_states), float(self.max_bytes))
-        if found is None:
-            return None
-        return BudgetError(
-            f"DiscreteFilter: {found[0]}; use ParticleFilter(particles)", int(min(found[1], 2**62))
-        )
 
     def _plan(self, problem: SeriesProblem, leaves: bool = True) -> DiscreteSlices:
         key = f"discrete slices {leaves}"

@@ -7,14 +7,13 @@ ones are made block by block while a block is in cache. Those that do not change
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.grid.axes import Axes
+from bayesmc.dbn import PREVIOUS, Row
 from bayesmc.engines.grid.slice import GridSlices, Placed, Values, sizes_by_label
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.errors import BudgetError, ParameterError
@@ -56,16 +55,10 @@ class GridModel(GridSlices):
     With ``logs`` all tables are log densities.
     """
 
-    def __init__(
-        self,
-        slices: Slices,
-        axes: Axes,
-        static: Mapping[str, np.ndarray],
-        max_bytes: float,
-        logs: bool = False,
-    ) -> None:
-        super().__init__(slices, axes, static, max_bytes, logs)
-        self._kept: dict[Any, Factor] = {}
+    @cached_property
+    def _kept(self) -> dict[Any, Factor]:
+        """Tables that do not change."""
+        return {}
 
     def factors(self, before: Placed | None, now: Placed) -> list[Factor]:
         """Every density of a slice over its scalars and those of the slice before, parents first."""

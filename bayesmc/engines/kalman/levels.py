@@ -302,14 +302,15 @@ class Level:
         batch = points.shape[:1]
         if part.followed is not None:
             results = zip(part.followed.nodes, part.followed(values), strict=True)
-            ordered = [layout.moments_of(node, result, batch) for node, result in results]
+            ordered = [layout.moments(node, result, batch) for node, result in results]
             return np.concatenate([m.mean for m in ordered], axis=-1), ordered
         found = {}
         for name in part.order:
             if name in layout.silent:
                 values[name] = layout.model.evaluate(name, values)[0]
                 continue
-            made = layout.moments(name, values, batch)
+            result, own = layout.model.evaluate(name, values)
+            made = layout.moments(layout.model[name], result, batch, own)
             if name in part.nodes:
                 found[name] = made
             if not layout.model[name].is_stochastic:
