@@ -227,14 +227,10 @@ class GridPosterior(SeriesPosterior):
     def last(self, steps: int, kind: str) -> GridPosterior:
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
-        cut = super().last(steps, kind)
-        found = GridPosterior(
-            self.model, self.engine, kind, None, self._grids,
-            {n: v[-steps:] for n, v in self._densities.items()},
-            tables=cut._tables, means=cut._means, variances=cut._variances, queries=cut.queries,
-            steps=steps, start=cut.start,
-        )  # fmt: skip
-        found.queries_mcse = cut.queries_mcse
+        found = object.__new__(GridPosterior)
+        found.__dict__.update(super().last(steps, kind).__dict__)
+        found._grids = self._grids
+        found._densities = {n: v[-steps:] for n, v in self._densities.items()}
         found.answers = None if self.answers is None else self.answers[-steps:]
         return found
 

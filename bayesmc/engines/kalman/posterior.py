@@ -143,9 +143,9 @@ class GaussianSeries(SeriesPosterior):
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
-        found = self.__copy__()
+        found = object.__new__(GaussianSeries)
         found.__dict__.update(super().last(steps, kind).__dict__)
-        found.view, found.normalised, found.predictive = self.view.last(steps), None, None
+        found.view = self.view.last(steps)
         return found
 
     def _node(self, name: str) -> CompiledNode:
