@@ -61,6 +61,10 @@ class Match(Verdict):
         return [f"  {remark}" for remark in self.remarks]
 
 
+class NothingToCompare(ValueError):
+    """The two answers know no hidden node in common, and not both of them the evidence."""
+
+
 def compare(
     posterior: Any,
     exact: Any,
@@ -275,7 +279,7 @@ def _match(
     table.settle()
     remarks = _compare_joint(table, posterior, exact, chosen, draws, rng, alpha) if draws else []
     if not table.comparisons and not table.skipped and not remarks:
-        raise ValueError(f"{test}: there is nothing to compare; name nodes that both know")
+        raise NothingToCompare(f"{test}: there is nothing to compare; name nodes that both know")
     of_nodes = len(table.comparisons) - of_evidence
     return counted(Match(test, alpha, table.comparisons, table.skipped, tuple(remarks), of_nodes))
 
