@@ -27,8 +27,8 @@ from bayesmc.errors import (
 )
 from bayesmc.network import pose
 from bayesmc.testing import compare, session
-from bayesmc.testing.posteriors.matching import NothingToCompare
 from bayesmc.testing.posteriors.matrix import KINDS, matrix_case
+from bayesmc.testing.verdict import NothingToCompare
 
 ALPHA = 1e-3
 SHIFT = session.seed()

@@ -34,7 +34,7 @@ from bayesmc.testing.posteriors.figures import (
 )
 from bayesmc.testing.posteriors.samples import Draws, energy_comparison
 from bayesmc.testing.posteriors.slices import SlicePosterior
-from bayesmc.testing.verdict import Verdict, check_level, counted
+from bayesmc.testing.verdict import NothingToCompare, Verdict, check_level, counted
 
 #: rows of a joint sample below which it is not judged
 _MIN_ROWS = 30
@@ -59,10 +59,6 @@ class Match(Verdict):
 
     def _remarks(self) -> list[str]:
         return [f"  {remark}" for remark in self.remarks]
-
-
-class NothingToCompare(ValueError):
-    """The two answers know no hidden node in common, and not both of them the evidence."""
 
 
 def compare(

@@ -20,8 +20,8 @@ from bayesmc.testing.makers.gaussians import gaussian_evidence, random_gaussian_
 from bayesmc.testing.makers.nets import random_net
 from bayesmc.testing.makers.observing import random_evidence
 from bayesmc.testing.oracles.enumeration import enumerate_posterior
-from bayesmc.testing.posteriors.matching import NothingToCompare, compare
-from bayesmc.testing.verdict import Verdict, counted, uncounted
+from bayesmc.testing.posteriors.matching import compare
+from bayesmc.testing.verdict import NothingToCompare, Verdict, counted, uncounted
 
 #: kinds of nets: options of ``random_net``, of "gaussian" those of ``random_gaussian_net``
 KINDS: dict[str, dict[str, Any]] = {
