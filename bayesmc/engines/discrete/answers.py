@@ -224,7 +224,7 @@ class SliceAnswers:
         for number in {self.plan.chain_of(v) for v in scope}:
             chain = self.plan.chains[number]
             plain = set(scope) <= set(chain.state)
-            entries = max(entries, float(chain.size) if plain else self.plan.widest(chain))
+            entries = max(entries, float(chain.size) if plain else self.plan.widest[number])
         return self.run.stretches(entries * self.run.sequences)
 
     def _cut(self, term: Term, more: float) -> list[tuple[int, int]]:
@@ -232,8 +232,8 @@ class SliceAnswers:
         entries = max(more, math.prod(map(float, self.reader.cards(term))))
         for _, name in (*term.alone, *term.whole):
             for element in range(self.reader.elements(name)):
-                chain = self.plan.chains[self.plan.chain_of((0, name, element))]
-                entries = max(entries, self.plan.widest(chain))
+                number = self.plan.chain_of((0, name, element))
+                entries = max(entries, self.plan.widest[number])
         return self.run.stretches(entries * self.run.sequences)
 
     def _check_question(self, term: Term) -> None:
@@ -325,7 +325,7 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
     """The best states of the variables of a slice that no other slice reads, given those that some do."""
     plan = run.plan
     chain = plan.chains[number]
-    for start, stop in run.stretches(plan.widest(chain) * run.sequences):
+    for start, stop in run.stretches(plan.widest[number] * run.sequences):
         pieces = run.pieces(number, plan.rows(run.series, start, stop))
         border = [v for v in (*chain.before, *chain.state) if any(v in p.scope for p in pieces)]
         known = {v: _on_path(states, v, start - run.first, stop - run.first) for v in border}

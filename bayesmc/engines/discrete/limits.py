@@ -44,12 +44,11 @@ def size_refusal(
     """Why the tables would be too large; None where they are not."""
     sequences = plan.reader.sequences
     total = 0.0
-    for chain in plan.chains:
+    for chain, widest in zip(plan.chains, plan.widest, strict=True):
         names = ", ".join(dict.fromkeys(n for _, n, _ in chain.state))
         if chain.size > max_states:
             why = f"the joint state of {names} has {chain.size:.3g} values, above max_states={max_states}"
             return _too_large(why, 8.0 * chain.size)
-        widest = plan.widest(chain)
         total += 8.0 * (4.0 * widest + 3.0 * steps * sequences * chain.size)
         if total > max_bytes:
             why = (

@@ -154,7 +154,7 @@ class Run:
     # ---- private ----------------------------------------------------------------------------
 
     def _stretches(self, number: int | None) -> list[tuple[int, int]]:
-        entries = self.sequences if number is None else self.plan.row_entries(number)
+        entries = self.sequences if number is None else self.plan.row_entries[number]
         return self.stretches(float(entries))
 
     def _is_of(self, piece: Piece, number: int) -> bool:
