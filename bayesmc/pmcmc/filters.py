@@ -17,8 +17,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.particles import Layout, Particles, Selection, along_plates
-from bayesmc.engines.particles.smc import SMCStep
+from bayesmc.engines.particles.smc import Layout, Particles, Selection, SMCStep, along_plates
 from bayesmc.network.forward import Pass, Step
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic

@@ -26,7 +26,7 @@ import numpy as np
 from scipy.special import ndtri
 
 from bayesmc.dbn import PREVIOUS
-from bayesmc.engines.particles.particles import Particles, Selection
+from bayesmc.engines.particles.smc import Particles, Selection
 from bayesmc.pmcmc.filters import ChainStep, Filter
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic

@@ -11,8 +11,8 @@ from bayesmc.categorical import pick
 from bayesmc.engines.grid.moves import Cells
 from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.particles.particles import along_plates
 from bayesmc.engines.particles.predictive import Draws
+from bayesmc.engines.particles.smc import along_plates
 
 
 def draws_of(model: GridModel, cells: Cells | None) -> Draws | None:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.particles import Layout, Particles
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import circular_variance
 

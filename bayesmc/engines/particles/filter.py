@@ -14,6 +14,7 @@ from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
@@ -370,7 +371,8 @@ class ParticleFilter(FilterEngine):
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with quiet():
             now = step(belief.now, row, rng)
-            families = tracker.after_one(belief.families, belief.now, now, row)
+            block = Block(step.layout, [now], room=tracker.room)
+            families = tracker.after(belief.families, belief.now, block, [row])[0]
         if self.particles is None:
             warn_of_a_lonely_step(belief.now, belief.families, now)
         total = belief.log_marginal_likelihood + now.increment

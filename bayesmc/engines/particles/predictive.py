@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, SeriesProblem
-from bayesmc.engines.particles.particles import Particles, along_plates
+from bayesmc.engines.particles.smc import Particles, along_plates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Observed

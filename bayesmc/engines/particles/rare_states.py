@@ -12,12 +12,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.particles import Particles
+from bayesmc.engines.particles.genealogy import Scouts
+from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model
@@ -32,24 +33,6 @@ STATES = 16
 NODES = 4
 #: particles below which a state is rare
 RARE = 4
-
-
-class Scouts(NamedTuple):
-    """Those who are where no particle is.
-
-    Attributes
-    ----------
-    values : dict
-        All nodes of the slice, shape ``(scouts, *plates, *event)``.
-    log_weights : ndarray, shape (scouts,)
-        Relative to those of all particles together.
-    share : float
-        The sum of their weights, less that of the particles in such states.
-    """
-
-    values: dict[str, np.ndarray]
-    log_weights: np.ndarray
-    share: float
 
 
 class Scouting:

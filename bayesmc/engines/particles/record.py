@@ -11,19 +11,11 @@ import numpy as np
 from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.averages import naming
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
-from bayesmc.engines.particles import coalescence
+from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.errors import function_errors, node_errors
+from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.genealogy import Families, evidence_error
-from bayesmc.engines.particles.particles import Layout, Particles
-from bayesmc.engines.particles.queries import (
-    at_scouts,
-    covariance,
-    evaluated,
-    expectation,
-    probability,
-    quantiles,
-)
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
@@ -126,6 +118,7 @@ class Record:
         slices = [w.particles for w in waiting]
         block = Block(self.layout, slices, room=self._room)
         families = self._followed(waiting, block)
+        by = ByFamily(block, families) if families else None
         rows: Rows = {what: {} for what in _KINDS}
         for node in self._nodes:
             name = node.name
@@ -133,17 +126,17 @@ class Record:
                 rows["tables"][name] = block.table(node)
             else:
                 rows["means"][name], rows["variances"][name] = block.mean_and_variance(node)
-            if families:
-                rows["errors"][name] = node_errors(block, families, node)
+            if by is not None:
+                rows["errors"][name] = node_errors(by, block, node)
         for name, function in self.asked.items():
             values = [w.values[name] for w in waiting]
             mean = block.weighted(block.turned(values))
             rows["queries"][name] = mean.reshape(len(values), *values[0].shape[1:])
-            if families:
+            if by is not None:
                 model = self.problem.model
                 pairs = zip(slices, families, strict=True)
                 there = [at_scouts(self.layout, p, f, model, function) for p, f in pairs]
-                rows["query errors"][name] = function_errors(block, families, values, there)
+                rows["query errors"][name] = function_errors(by, block, values, there)
         rows["filter"] = _diagnosed(slices, self.layout.lead)
         return Written(
             rows, families if self.keep else families[-1:], slices if self.keep else slices[-1:]
@@ -156,7 +149,7 @@ class Record:
         steps: int | None = None,
         predictive: Predictive | None = None,
         filtered: FilteredParticles | None = None,
-        sharing: coalescence.Sharing | None = None,
+        sharing: Variances | None = None,
     ) -> FilteredParticles:
         """The answers of all slices, or of the first so many; with the figures of a filter, or those here."""
         self.write()
@@ -174,7 +167,7 @@ class Record:
         if self.keep:
             particles = [p for w in self._written for p in w.particles]
             known = [f for w in self._written for f in w.families]
-            held = Held(self.layout, particles[:k], known[:k], sharing)
+            held = Answers(self.layout, self.problem.model, particles[:k], known[:k], sharing)
         return FilteredParticles(
             self.problem.model,
             engine,
@@ -193,7 +186,7 @@ class Record:
         )
 
     def smoothed(
-        self, engine: Any, sharing: coalescence.Sharing, filtered: FilteredParticles
+        self, engine: Any, sharing: Variances, filtered: FilteredParticles
     ) -> FilteredParticles:
         """The answers of trajectories, with their errors: infinite where the filter's are."""
         self.write()
@@ -202,12 +195,12 @@ class Record:
         block, model = Block(self.layout, slices, whole=True), self.problem.model
         rows = self._written[0].rows  # of all slices at once
         for node in self._nodes:
-            errors = coalescence.node_errors(sharing, block, node)
+            errors = node_errors(sharing, block, node)
             lost = np.isinf(filtered.mean_errors[node.name])
             rows["errors"][node.name] = np.where(lost, np.inf, errors)
         for name, function in self.asked.items():
             values = [evaluated(self.layout, p, model, function) for p in slices]
-            rows["query errors"][name] = coalescence.function_errors(sharing, np.stack(values))
+            rows["query errors"][name] = function_errors(sharing, block, values, [])
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
     # ---- private -------------------------------------------------------------------------------
@@ -232,16 +225,6 @@ class Record:
         names = {n: None for w in self._written for n in w.rows[what]}
         pieces = {n: [w.rows[what][n] for w in self._written if n in w.rows[what]] for n in names}
         return first_slices({n: np.concatenate(rows) for n, rows in pieces.items()}, steps)
-
-
-class Held(NamedTuple):
-    """The particles of all slices, and what their errors are told by."""
-
-    layout: Layout
-    particles: list[Particles]
-    families: list[Families]
-    #: of trajectories that were drawn backwards
-    sharing: coalescence.Sharing | None = None
 
 
 class FilteredParticles(SeriesPosterior):
@@ -282,7 +265,7 @@ class FilteredParticles(SeriesPosterior):
         diagnostics: Mapping[str, np.ndarray],
         errors: tuple[Any, Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
         predictive: Predictive | None = None,
-        held: Held | None = None,
+        held: Answers | None = None,
     ) -> None:
         super().__init__(model, engine, kind, diagnostics["increments"], **answers)
         self.log_marginal_likelihood_mcse, self.mean_errors, mcse = errors
@@ -301,16 +284,7 @@ class FilteredParticles(SeriesPosterior):
         """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
         if not callable(what):
             return super().mcse(what)
-        held = self._kept("mcse of a function")
-        values = [evaluated(held.layout, p, self.model, what) for p in held.particles]
-        if held.sharing is not None:
-            return coalescence.function_errors(held.sharing, np.stack(values))
-        rows = []
-        for own, families, value in zip(held.particles, held.families, values, strict=True):
-            there = at_scouts(held.layout, own, families, self.model, what)
-            block = Block(held.layout, [own])
-            rows.append(function_errors(block, [families], [value], [there])[0])
-        return np.stack(rows)
+        return self._kept("mcse of a function").mcse(what)
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
@@ -348,32 +322,23 @@ class FilteredParticles(SeriesPosterior):
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Means of a function of nodes of a slice, time first; see ``ParticleBelief.expectation``."""
-        held = self._kept("expectation")
-        return np.stack([expectation(held.layout, p, self.model, function) for p in held.particles])
+        return self._kept("expectation").expectation(function)
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probabilities of an event (a function that returns booleans), time first."""
-        held = self._kept("probability")
-        return np.stack([probability(held.layout, p, self.model, function) for p in held.particles])
+        return self._kept("probability").probability(function)
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
         held = self._kept("quantile")
-        node = self._node(name)
-        rows = [quantiles(held.layout, p, node, p.values[name], q) for p in held.particles]
-        return np.stack(rows)
+        return held.quantile(self._node(name).name, q)
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""
         held = self._kept("cov")
-        nodes = [self._node(name) for name in names]
-        rows = [
-            covariance(held.layout, p, [(n, p.values[n.name]) for n in nodes])
-            for p in held.particles
-        ]
-        return np.stack(rows)
+        return held.cov(*(self._node(name).name for name in names))
 
-    def _alike(self, what: str) -> Held:
+    def _alike(self, what: str) -> Answers:
         """What is held, where each slice has as many particles."""
         held = self._kept(what)
         if any(len(p.weights) != held.layout.particles for p in held.particles):
@@ -382,7 +347,7 @@ class FilteredParticles(SeriesPosterior):
             )
         return held
 
-    def _kept(self, what: str) -> Held:
+    def _kept(self, what: str) -> Answers:
         if self.held is None:
             raise self._not_kept(what)
         return self.held

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.particles import Particles, Selection
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.smc import Particles, Selection
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import Propose
 from bayesmc.engines.slice_steps import SlicePlan, check_target

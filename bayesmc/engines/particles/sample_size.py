@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.particles.genealogy import Families
-from bayesmc.engines.particles.particles import Particles
 from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.engines.particles.smc import Particles
 from bayesmc.errors import LowEssWarning
 
 #: particles of a filter that is not told how many, at least, and at most

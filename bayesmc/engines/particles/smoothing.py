@@ -18,9 +18,9 @@ from bayesmc.engines.particles.backward import TRAJECTORIES, Backward, lagged
 from bayesmc.engines.particles.coalescence import Sharing
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import Families
-from bayesmc.engines.particles.particles import Particles
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.record import FilteredParticles, Record
+from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
