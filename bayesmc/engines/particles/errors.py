@@ -37,10 +37,9 @@ class Variances:
     worth: np.ndarray
 
     def variances(self, off: np.ndarray, weighted: np.ndarray | None = None) -> np.ndarray:
-        """Variances of means, shape ``(slices, elements, numbers)``.
+        """Variances of means from which values lie off by so much, the last axis summed over.
 
-        ``off`` is by how much values lie off them, with an axis of particles last; ``weighted`` that times
-        the weights, where it is known.
+        ``weighted`` are these times the weights, where they are known.
         """
         raise NotImplementedError
 
@@ -80,8 +79,7 @@ class ByFamily(Variances):
             self.young = at, family_sums(weights[self.few], at) / total[self.few]
 
     def variances(self, off: np.ndarray, weighted: np.ndarray | None = None) -> np.ndarray:
-        if weighted is None:
-            weighted = off * self.block.weights[:, :, None]
+        weighted = off * self.block.weights[:, :, None] if weighted is None else weighted
         weighted = weighted.reshape(-1, *off.shape[2:])
         bounds, shares = self.old
         found = _by_shares(family_sums(weighted, bounds) / self.total, shares)

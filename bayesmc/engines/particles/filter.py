@@ -14,7 +14,6 @@ from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
@@ -48,12 +47,12 @@ from bayesmc.engines.particles.sample_size import (
     uncertain,
     warn_of_a_lonely_step,
 )
+from bayesmc.engines.particles.smc import quiet
 from bayesmc.engines.particles.smoothing import (
     Backwards,
     backwards,
     by_lag,
     filtered_by,
-    quiet,
     seen_in_full,
     static_of,
 )
@@ -371,8 +370,7 @@ class ParticleFilter(FilterEngine):
         rng = stream(belief.seed, Purpose.FILTER) if chance is None else resumed(chance)
         with quiet():
             now = step(belief.now, row, rng)
-            block = Block(step.layout, [now], room=tracker.room)
-            families = tracker.after(belief.families, belief.now, block, [row])[0]
+            families = tracker.after_one(belief.families, belief.now, now, row)
         if self.particles is None:
             warn_of_a_lonely_step(belief.now, belief.families, now)
         total = belief.log_marginal_likelihood + now.increment

@@ -12,7 +12,7 @@ from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.averages import naming
 from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
-from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.blocks import NUMBERS, Block, alike
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
 from bayesmc.engines.particles.genealogy import Families, evidence_error
 from bayesmc.engines.particles.smc import Layout, Particles
@@ -22,8 +22,8 @@ from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
-#: slices that are written together, at most, and numbers of all their particles: what costs is calling NumPy
-TOGETHER, NUMBERS = 100, 1 << 16
+#: slices that are written together, at most
+TOGETHER = 100
 
 
 class Waiting(NamedTuple):
@@ -88,7 +88,7 @@ class Record:
         for name, function in self.asked.items():
             with naming(name):
                 values[name] = evaluated(self.layout, particles, self.problem.model, function)
-        if self._waiting and not self._fits(particles):
+        if self._waiting and not alike(self._waiting[-1].particles, particles):
             self.write()
         self._waiting.append(Waiting(k, particles, row, families, values))
         if len(self._waiting) >= self.together:
@@ -204,14 +204,6 @@ class Record:
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
     # ---- private -------------------------------------------------------------------------------
-
-    def _fits(self, particles: Particles) -> bool:
-        """Whether a slice can be written with those that wait: laid out alike, and none drawn anew."""
-        last = self._waiting[-1].particles
-        if len(particles.weights) != len(last.weights):
-            return False
-        ranks, alike = ([v.ndim for v in p.values.values()] for p in (particles, last))
-        return ranks == alike and last.rejuvenated is False and particles.rejuvenated is False
 
     def _followed(self, waiting: Sequence[Waiting], block: Block) -> list[Families]:
         """The families of slices that wait."""

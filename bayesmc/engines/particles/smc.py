@@ -13,13 +13,15 @@ weights); Chopin and Papaspiliopoulos (2020), An introduction to sequential Mont
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Slices
+from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.particles.recovery import Averages
 from bayesmc.network import CompiledNode
 from bayesmc.network.forward import Pass, Step
@@ -385,6 +387,13 @@ def along_plates(
         for axis in range(1, ndim)
     ]
     return value[(first, *rest)]
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Bad parameters are marked, and weights of zero are no matter."""
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -12,7 +11,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.filtering import Queries, pass_slices
 from bayesmc.engines.particles.backward import TRAJECTORIES, Backward, lagged
 from bayesmc.engines.particles.coalescence import Sharing
@@ -20,7 +18,7 @@ from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import Families
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.record import FilteredParticles, Record
-from bayesmc.engines.particles.smc import Particles
+from bayesmc.engines.particles.smc import Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
@@ -131,10 +129,3 @@ def static_of(problem: SeriesProblem) -> dict[str, np.ndarray]:
 def seen_in_full(problem: SeriesProblem) -> set[str]:
     """Nodes that are seen in full in all slices."""
     return {n for n, o in problem.series.observed.items() if o.mask is None}
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Bad parameters are marked, and weights of zero are no matter."""
-    with marking_invalid(), np.errstate(all="ignore"):
-        yield

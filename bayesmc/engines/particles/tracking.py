@@ -101,6 +101,19 @@ class Tracker:
             earlier = now
         return found
 
+    def after_one(
+        self, families: Families | None, earlier: Particles | None, now: Particles, row: Row
+    ) -> Families:
+        """The same in one slice."""
+        compass, drift = self.compass, None if families is None else families.drift
+        if compass is not None and compass.is_alone:
+            drift = compass.after_one(drift, earlier, now)
+            return self._followed(families, earlier, now, row, drift)
+        block = Block(self.layout, [now], room=self.room)
+        return self.after(families, earlier, block, [row])[0]
+
+    # ---- private -------------------------------------------------------------------------------
+
     def _followed(
         self,
         families: Families | None,
@@ -109,25 +122,31 @@ class Tracker:
         row: Row,
         drift: Drift | None,
     ) -> Families:
-        missing: Any = ~np.asarray(rested(now))
         gained: Any = 0.0
         if families is None or earlier is None:
             families = begun(now, self.layout)
         else:
             families, gained = followed(families, earlier, now, self.steady)
-        if drift is not None and drift.largest > SEEMS:
-            doubted = families.doubted > now.t - LONGEST
-            missing = missing | (drift.worst > drift.limit) | ((drift.worst > SEEMS) & doubted)
-        scouts = None
+        missing, scouts = self._missing(families, now, drift), None
         if self.scouting.nodes:
             scouts = self.scouting.after(families.scouts, earlier, now, row)
             missing = missing | (scouts is not None and scouts.share > LEFT_OUT)
-        missing = missing | np.isinf(gained)
-        settled = families.settled + gained
-        if missing.any():
-            settled = np.where(missing, np.inf, settled)
-        lost = self.sight.after(families.lost, missing, now)
-        return families._replace(settled=settled, lost=lost, scouts=scouts, drift=drift)
+        lost = families.lost
+        if missing is not False or type(gained) is not float:
+            missing = missing | np.isinf(gained)
+            settled = np.where(missing, np.inf, families.settled + gained)
+            families = families._replace(settled=settled)
+        if missing is not False or lost is not None:
+            lost = self.sight.after(lost, np.asarray(missing), now)
+        return families._replace(lost=lost, scouts=scouts, drift=drift)
+
+    def _missing(self, families: Families, now: Particles, drift: Drift | None) -> Any:
+        """Whether a slice rests on next to none of its particles, or rows go on pulling the same way."""
+        missing: Any = ~enough if isinstance(enough := rested(now), np.ndarray) else not enough
+        if drift is not None and drift.largest > SEEMS:
+            doubted = families.doubted > now.t - LONGEST
+            missing = missing | (drift.worst > drift.limit) | ((drift.worst > SEEMS) & doubted)
+        return missing
 
 
 class Sight:
@@ -229,6 +248,9 @@ class Compass:
         self.counts = [math.prod(n.value_shape) // elements for n in self.nodes]
         every = max(sum(math.prod(n.value_shape) for n in self.nodes), 1)
         self.limit = math.sqrt(IS**2 + 2.0 * math.log(every))
+        #: there is one number, without plates
+        self.is_alone = not layout.lead and self.counts == [1]
+        self.even = np.ones(layout.particles)
 
     def after(
         self, drift: Drift | None, earlier: Particles | None, block: Block
@@ -254,6 +276,31 @@ class Compass:
         largest, worst = worst.max(axis=-1).tolist(), worst.reshape(-1, *self.layout.lead)
         return [Drift(steps[:, k], worst[k], most, self.limit) for k, most in enumerate(largest)]
 
+    def after_one(
+        self, drift: Drift | None, earlier: Particles | None, now: Particles
+    ) -> Drift | None:
+        """The same of one number in one slice, by itself: there NumPy's calls are what costs."""
+        if now.rejuvenated is not False:
+            return None
+        moved, variance, worst = 0.0, 0.0, 0.0
+        if drift is not None:
+            moved, variance = drift.moves.ravel().tolist()
+            moved, variance, worst = FADING * moved, FADING**2 * variance, KEPT * drift.largest
+        values, n = now.values[self.nodes[0].name].reshape(-1), len(now.weights)
+        if len(values) == n:  # not the same for all particles
+            prior, total = self.even[:n], float(n)
+            if earlier is not None and not now.resampled and len(earlier.weights) == n:
+                prior, total = earlier.weights, earlier.total
+            off = values - float(prior.dot(values)) / total
+            shift, squares = float(now.weights.dot(off)) / now.total, off * off
+            wide = float(prior.dot(squares)) / total
+            if wide > 0.0:
+                left = float(now.weights.dot(squares)) / now.total - shift * shift
+                moved += shift / math.sqrt(wide)
+                variance += max(1.0 - left / wide, 0.0)
+        worst = max(worst, abs(moved) / math.sqrt(variance + _LEAST))
+        return Drift(np.array([moved, variance]).reshape(2, 1, 1), worst, worst, self.limit)
+
 
 # ---- private ------------------------------------------------------------------------------------
 
@@ -272,15 +319,14 @@ def _moves(
     if moments is None:  # the same for all particles
         return np.zeros((2, len(block.slices), block.elements, count))
     off, n = moments.off, block.particles
-    shift, wide = np.add.reduce(off, axis=-1) / n, np.vecdot(off, off) / n
-    for k, now in enumerate(
-        block.slices
-    ):  # particles bring weights along where they are not resampled
+    shift, wide = np.add.reduce(off, -1) / n, np.vecdot(off, off) / n
+    for k, now in enumerate(block.slices):  # where particles bring weights along
         if now.resampled is not True and earlier is not None and len(earlier.weights) == n:
             weights, total = earlier.weights.reshape(n, -1).T, np.reshape(earlier.total, (-1, 1))
-            part, anew = weights[:, None] * off[k], np.reshape(now.resampled, (-1, 1))
-            shift[k] = np.where(anew, shift[k], np.add.reduce(part, axis=-1) / total)
-            wide[k] = np.where(anew, wide[k], np.vecdot(part, off[k]) / total)
+            own = ~np.reshape(now.resampled, (-1, 1))
+            part = weights[:, None] * off[k]
+            np.copyto(shift[k], np.add.reduce(part, -1) / total, where=own)
+            np.copyto(wide[k], np.vecdot(part, off[k]) / total, where=own)
         earlier = now
     wide = wide - shift**2
     found = np.empty((2, *wide.shape))
