@@ -48,8 +48,6 @@ DEPTH = {
 
 #: modules above 450 lines
 LONG_MODULES = {
-    "dbn/slices.py",
-    "dbn/template.py",
     "engines/grid/answers.py",
     "engines/grid/filter.py",
     "engines/mcmc/chains.py",

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from bayesmc.dbn.series import Series
+from bayesmc.dbn.series import Series, read_series
 from bayesmc.dbn.slices import Slices
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.errors import BayesmcError, ModelError
@@ -80,5 +80,5 @@ def pose_series(
     except BayesmcError:  # with stand-ins for inputs; the data may do better, or say it better
         links = {}
     dbn = dbn.with_links(links) if links else dbn
-    slices, series = dbn.read(observations, inputs, ahead=ahead)
+    slices, series = read_series(dbn, observations, inputs, ahead=ahead)
     return SeriesProblem(dbn.copy(), slices, series)
