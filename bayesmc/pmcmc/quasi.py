@@ -20,6 +20,7 @@ ch. 17 (shifted lattices).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -91,11 +92,7 @@ class QuasiFilter(Filter):
     best = 0.7  # variance falls so fast that more particles cost less than chains that stand still
 
     def __init__(self, trellis: Trellis, particles: int, chosen: bool, key: str) -> None:
-        super().__init__(trellis, particles, chosen)
-        self.key = key
-
-    def step_for(self, values: Values, chains: int) -> QuasiStep:
-        return QuasiStep(self.trellis, self.particles, values, chains, self.key)
+        super().__init__(trellis, particles, chosen, partial(QuasiStep, key=key))
 
 
 class Even(np.random.Generator):
