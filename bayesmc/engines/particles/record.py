@@ -1,24 +1,35 @@
-"""What a run keeps of its particles: answers of constant size, or the particles themselves."""
+"""The run of a filter over a series, and what it keeps: answers of constant size, or the particles."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.averages import naming
-from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
+from bayesmc.engines.filtering import (
+    Queries,
+    first_slices,
+    observed_answers,
+    pass_slices,
+    refuse_forecast,
+)
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
 from bayesmc.engines.particles.blocks import NUMBERS, Block, alike
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
+from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import Families, evidence_error
-from bayesmc.engines.particles.smc import Layout, Particles
+from bayesmc.engines.particles.predictive import Replicates
+from bayesmc.engines.particles.smc import Layout, Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
+from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
@@ -343,6 +354,47 @@ class FilteredParticles(SeriesPosterior):
         if self.held is None:
             raise self._not_kept(what)
         return self.held
+
+
+def filtered_by(
+    engine: Any,
+    step: FilterStep,
+    problem: SeriesProblem,
+    seed: np.random.SeedSequence,
+    keep: bool,
+    queries: Queries,
+    progress: bool | None,
+    unit: int = 0,
+    look_back: Callable[[int, Particles, Families], None] | None = None,
+) -> FilteredParticles:
+    """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
+
+    Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows.
+    """
+    record = Record(problem, step.layout, queries, keep, Tracker(step))
+    rng, rows = stream(seed, Purpose.FILTER, unit), problem.series
+    check = stream(seed, Purpose.CHECK, unit)
+    looks = Replicates(problem, step.plan, check) if unit == 0 else None
+    now: Particles | None = None
+
+    def move(k: int) -> None:
+        nonlocal now
+        row, old = rows.row(k), now
+        if looks is not None:
+            looks.look(k, old, row)
+        now = step(old, row, rng)
+        record.add(k, now, row)
+        if look_back is not None:
+            record.write()
+            assert record.families is not None
+            look_back(k, now, record.families)
+        if old is not None and not keep and look_back is None and record.is_written:
+            step.recycle(old)
+
+    with Progress(problem.steps, engine.label, progress) as bar, quiet():
+        so_far = partial(record.posterior, engine, "filter")
+        pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
+        return record.posterior(engine, predictive=None if looks is None else looks.found())
 
 
 # ---- private ------------------------------------------------------------------------------------
