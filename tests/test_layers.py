@@ -51,7 +51,6 @@ LONG_MODULES = {
     "engines/grid/answers.py",
     "engines/grid/filter.py",
     "engines/mcmc/chains.py",
-    "engines/particles/linearisation.py",
     "expression/functions.py",
     "expression/graph.py",
     "kernels/labels.py",
