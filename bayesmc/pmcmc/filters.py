@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.engines.particles.smc import Layout, Particles, Selection, SMCStep, along_plates
 from bayesmc.network.forward import Pass, Step
 from bayesmc.pmcmc.trellis import Slice, Trellis
@@ -225,9 +226,7 @@ def picked(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     >>> picked(log, np.random.default_rng(0)).tolist()
     [0, 1]
     """
-    edges = np.cumsum(np.exp(log - log.max(axis=0)), axis=0)
-    point = (1.0 - rng.random(log.shape[1:])) * edges[-1]
-    return (edges < point).sum(axis=0)
+    return pick(np.exp(log - log.max(axis=0)), rng.random(log.shape[1:]))
 
 
 def independent(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:

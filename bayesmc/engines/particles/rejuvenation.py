@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.dbn import PREVIOUS, Row, Slices
 from bayesmc.engines.particles.recovery import Recovery
 from bayesmc.engines.particles.smc import Particles, Selection
@@ -145,9 +146,7 @@ class Injection:
     ) -> np.ndarray:
         """Positions in the slice before, for what looks at that."""
         if self._looks_back:
-            sums = np.cumsum(earlier.weights)
-            found = np.searchsorted(sums, rng.random(lost.size) * sums[-1], side="right")
-            return np.minimum(found, len(sums) - 1)
+            return pick(earlier.weights, rng.random(lost.size))
         return lost if selection.ancestors is None else selection.ancestors[lost]
 
     def _begun(
