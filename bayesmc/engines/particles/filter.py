@@ -23,11 +23,10 @@ from bayesmc.engines.particles.options import (
     NOT_SMOOTHED,
     START,
     TOLERANCE,
-    check_budget,
     check_choice,
     check_count,
     check_kind,
-    check_threshold,
+    check_numbers,
     check_together,
     collapsed,
     described,
@@ -186,8 +185,7 @@ class ParticleFilter(FilterEngine):
     def __post_init__(self) -> None:
         if self.particles is not None:
             check_count("particles", self.particles, "such as 10_000")
-        check_budget(self.tolerance, self.budget)
-        check_threshold(self.ess_threshold)
+        check_numbers(self)
         scheme_of(self.resampling)
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
         check_kind("adapt", self.adapt, KLD)

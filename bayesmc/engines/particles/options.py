@@ -77,26 +77,23 @@ def check_count(option: str, given: Any, what: str, call: str = "ParticleFilter"
         )
 
 
-def check_budget(tolerance: Any, budget: Any) -> None:
-    """What a number of particles is chosen by."""
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance > 0:
-        raise ValueError(
-            f"ParticleFilter(tolerance={tolerance!r}): give an error of the log evidence above 0, such as "
-            "0.5"
-        )
-    if isinstance(budget, bool) or not isinstance(budget, (int, np.integer)) or budget < 1:
-        raise ValueError(
-            f"ParticleFilter(budget={budget!r}): give a number of particles times slices, such as 30_000_000"
-        )
-
-
-def check_threshold(given: Any) -> None:
-    """A share of the particles."""
-    if isinstance(given, bool) or not isinstance(given, (int, float)) or not given >= 0:
-        raise ValueError(
-            f"ParticleFilter(ess_threshold={given!r}): give a share of the particles, 0 (never resample) "
-            "to 1 (always)"
-        )
+def check_numbers(engine: Any) -> None:
+    """Options that are one number."""
+    whole, real = (int, np.integer), (int, float)
+    share = "a share of the particles, 0 (never resample) to 1 (always)"
+    for option, kinds, is_good, what in (
+        ("tolerance", real, lambda x: x > 0, "an error of the log evidence above 0, such as 0.5"),
+        (
+            "budget",
+            whole,
+            lambda x: x >= 1,
+            "a number of particles times slices, such as 30_000_000",
+        ),
+        ("ess_threshold", real, lambda x: x >= 0, share),
+    ):
+        given = getattr(engine, option)
+        if isinstance(given, bool) or not isinstance(given, kinds) or not is_good(given):
+            raise ValueError(f"ParticleFilter({option}={given!r}): give {what}")
 
 
 def check_choice(

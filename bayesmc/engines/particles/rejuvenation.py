@@ -22,7 +22,7 @@ from bayesmc.engines.proposing import Propose
 from bayesmc.engines.slice_steps import SlicePlan, check_target
 from bayesmc.errors import ModelError
 from bayesmc.kernels.proposal import Key, Proposal, blaming, names_of
-from bayesmc.network import Model, Observed
+from bayesmc.network import Model
 from bayesmc.network.forward import Pass, Step, summed
 
 
@@ -214,15 +214,7 @@ def start_weights(selection: Selection, lost: np.ndarray) -> np.ndarray:
 class Aimed(Propose):
     """Draws from a proposal for a given density, which may be narrower than the node's support."""
 
-    def __init__(
-        self,
-        model: Model,
-        observed: Mapping[str, Observed],
-        proposal: Proposal,
-        apart: tuple[str, ...] = (),
-    ) -> None:
-        super().__init__(model, observed, proposal, apart)
-        self._compared = set(proposal.names)
+    warns = False
 
 
 class Unweighed(Aimed):

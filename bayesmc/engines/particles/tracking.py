@@ -74,7 +74,8 @@ class Tracker:
         self.layout = step.layout
         nodes = [step.slices.later[n] for n in step.slices.interface]
         self.sight = Sight(nodes, step.layout)
-        self.scouting = Scouting(step.slices, step.plan)
+        finite = any(step.slices.later[n].domain for n in step.slices.stochastic)
+        self.scouting = Scouting(step.slices, step.plan) if finite else None
         blind = step.plan.guided or step.first_stage is not None or step.injection is not None
         compass = Compass(nodes, step.layout)
         self.compass = compass if compass.nodes and not blind else None
@@ -128,7 +129,7 @@ class Tracker:
         else:
             families, gained = followed(families, earlier, now, self.steady)
         missing, scouts = self._missing(families, now, drift), None
-        if self.scouting.nodes:
+        if self.scouting is not None and self.scouting.nodes:
             scouts = self.scouting.after(families.scouts, earlier, now, row)
             missing = missing | (scouts is not None and scouts.share > LEFT_OUT)
         lost = families.lost
