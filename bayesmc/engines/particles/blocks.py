@@ -234,5 +234,7 @@ def alike(one: Particles, other: Particles) -> bool:
     """Whether two slices can stand side by side: laid out alike, and none drawn anew."""
     if len(one.weights) != len(other.weights) or one.rejuvenated is not False:
         return False
-    ranks = (own.ndim == other.values[n].ndim for n, own in one.values.items())
-    return other.rejuvenated is False and all(ranks)
+    for name, own in one.values.items():
+        if own.ndim != other.values[name].ndim:
+            return False
+    return other.rejuvenated is False
