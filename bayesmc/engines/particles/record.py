@@ -318,6 +318,13 @@ class FilteredParticles(SeriesPosterior):
             rows.append(np.broadcast_to(np.where(p.rejuvenated, -1, found), shape))
         return np.stack(rows)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        state = super().__getstate__()
+        if self.held is not None:
+            state["held"] = self.held._replace(model=state["model"])
+        return state
+
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
