@@ -33,8 +33,8 @@ from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
-#: slices that are written together, at most
-TOGETHER = 100
+#: slices that are written together, at most, and those that are though half as many would stay in cache
+TOGETHER, FEW = 100, 6
 
 
 class Waiting(NamedTuple):
@@ -85,7 +85,8 @@ class Record:
         self.problem, self.layout, self.asked, self.tracker = problem, layout, queries, tracker
         self._nodes = [problem.model[n] for n in problem.hidden]
         numbers = sum(max(1, math.prod(n.value_shape)) for n in self._nodes) or 1
-        self.together = max(1, min(TOGETHER, NUMBERS // (layout.particles * numbers)))
+        many = NUMBERS // (layout.particles * numbers)
+        self.together = min(TOGETHER, max(1, many // 2, min(FEW, many)))
         self._waiting: list[Waiting] = []
         self._written: list[Written] = []
         self._room: dict[Any, np.ndarray] = {}
