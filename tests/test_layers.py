@@ -48,10 +48,7 @@ DEPTH = {
 
 #: modules above 450 lines
 LONG_MODULES = {
-    "dbn/slices.py",
-    "dbn/template.py",
     "engines/mcmc/chains.py",
-    "engines/particles/linearisation.py",
     "expression/functions.py",
     "expression/graph.py",
     "kernels/labels.py",

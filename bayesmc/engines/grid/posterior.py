@@ -26,8 +26,8 @@ from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel
-from bayesmc.engines.particles.particles import along_plates
 from bayesmc.engines.particles.predictive import Draws
+from bayesmc.engines.particles.smc import along_plates
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
