@@ -36,7 +36,7 @@ passes
 distributions
 expression
 linalg
-resampling | gaussian | diagnostics | markov | tracing | plates | states | randomness | progress
+resampling | gaussian | diagnostics | markov | plates | states | randomness | progress
 categorical
 errors | shapes
 """
@@ -54,8 +54,6 @@ LONG_MODULES = {
     "engines/grid/filter.py",
     "engines/mcmc/chains.py",
     "engines/particles/linearisation.py",
-    "expression/functions.py",
-    "expression/graph.py",
     "kernels/labels.py",
     "network/compile.py",
     "network/factor_graph.py",

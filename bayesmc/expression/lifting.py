@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from scipy import special
 
-from bayesmc.expression.array import TracedArray
+from bayesmc.expression.array import TracedArray, TracedCall, is_traced
 from bayesmc.expression.changing import is_left, is_open, names_in
+from bayesmc.expression.composed import COMPOSED
 from bayesmc.expression.functions import expression_of, of_function
 from bayesmc.expression.graph import constant
-from bayesmc.tracing.standin import TracedCall, is_traced
 
 #: modules of which some functions are replaced
 _REPLACED = frozenset(("numpy", "scipy"))
@@ -28,17 +28,6 @@ _REPLACED = frozenset(("numpy", "scipy"))
 def lifted(function: types.FunctionType) -> types.FunctionType:
     """A copy of a function, and of those that it calls, in which captured arrays are stand-ins."""
     return _lifted_function(function, {})
-
-
-def log_sum_exp(a: Any, axis: Any = None, b: Any = None, keepdims: bool = False) -> Any:
-    """``log(sum(b * exp(a)))`` in the log domain, of arrays or what stands for them."""
-    top = np.max(a, axis=axis, keepdims=True)
-    top = np.where(np.isfinite(top), top, 0.0)
-    terms = np.exp(a - top) if b is None else b * np.exp(a - top)
-    found = np.log(np.sum(terms, axis=axis, keepdims=True)) + top
-    if keepdims:
-        return found
-    return np.sum(found, axis=axis)  # of one
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -121,24 +110,12 @@ def _is_copy(original: Callable[..., Any], args: tuple[Any, ...]) -> bool:
     return copies and is_traced(list(args)) and not any(isinstance(a, TracedCall) for a in args)
 
 
-def _softmax(x: Any, axis: Any = None) -> Any:
-    shifted = np.exp(x - np.max(x, axis=axis, keepdims=True))
-    return shifted / np.sum(shifted, axis=axis, keepdims=True)
-
-
-def _log_softmax(x: Any, axis: Any = None) -> Any:
-    off = x - np.max(x, axis=axis, keepdims=True)
-    return off - np.log(np.sum(np.exp(off), axis=axis, keepdims=True))
-
-
 _INSTEAD: dict[Any, Callable[..., Any]] = {
     original: _if_traced(original, rule)
     for original, rule in (
         (np.take, lambda *args, **kwargs: TracedArray(of_function(np.take, args, kwargs))),
         (np.float64, lambda x: _array(x, float)),
-        (special.logsumexp, log_sum_exp),
-        (special.softmax, _softmax),
-        (special.log_softmax, _log_softmax),
+        *((f, COMPOSED[f]) for f in (special.logsumexp, special.softmax, special.log_softmax)),
     )
 } | {
     original: _made(original)

@@ -10,12 +10,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import TraceError
-from bayesmc.expression.array import TracedArray, refusals
+from bayesmc.expression.array import TracedArray, TracedCall, is_traced, refusals
 from bayesmc.expression.changing import tells_time_or_chance
 from bayesmc.expression.graph import Expression, as_expression
 from bayesmc.expression.lifting import lifted
 from bayesmc.plates import PlateArray
-from bayesmc.tracing.standin import TracedCall, is_traced
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from bayesmc.errors import (
     PlateError,
     QueryError,
 )
-from bayesmc.network.declared_plates import DeclaredPlates
+from bayesmc.network.declaring import DeclaredPlates
 from bayesmc.network.evidence import Observed, read_evidence, read_inputs
 from bayesmc.network.factor_batch import read_factor, variable_declaration
 from bayesmc.network.factor_scope import factor_scopes, hidden_elements

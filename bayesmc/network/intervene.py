@@ -11,8 +11,7 @@ from bayesmc.errors import EvidenceError
 from bayesmc.network.evidence import store
 from bayesmc.network.labelled import by_label
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.network.node import Declaration
-from bayesmc.network.ordering import ancestors
+from bayesmc.network.node import Declaration, ancestors
 from bayesmc.shapes import owned
 
 

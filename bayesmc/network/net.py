@@ -17,8 +17,8 @@ from bayesmc.errors import (
     UnknownNodeError,
 )
 from bayesmc.network.captured import captured
-from bayesmc.network.declared_plates import DeclaredPlates
 from bayesmc.network.declaring import (
+    DeclaredPlates,
     Parents,
     declared,
     declared_function,

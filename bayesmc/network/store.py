@@ -17,8 +17,7 @@ from bayesmc.errors import (
 from bayesmc.network.captured import check_captured
 from bayesmc.network.compile import compile_model
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Potential
-from bayesmc.network.ordering import topological_order
+from bayesmc.network.node import Declaration, Potential, topological_order
 from bayesmc.network.validate import validate_model
 from bayesmc.shapes import owned, unused_sizes
 

@@ -49,8 +49,7 @@ from bayesmc.passes.arithmetic import (
     tidy,
 )
 from bayesmc.passes.branches import branches_up
-from bayesmc.passes.reads import NOTHING, element_read, matrix_function
-from bayesmc.passes.sinking import reads, sunk
+from bayesmc.passes.reads import NOTHING, element_read, matrix_function, reads, sunk
 
 #: powers p of ``x**p``, and the two logarithms
 Feature = float | str

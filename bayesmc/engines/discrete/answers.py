@@ -20,7 +20,7 @@ from bayesmc.engines.filtering import Answers, Queries
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.factors.named import connected, log_product
 from bayesmc.network import CompiledNode
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import circular_variance
 from bayesmc.shapes import padded, unravelled
 

@@ -12,7 +12,7 @@ from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError
 from bayesmc.factors.named import largest
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 
 
 def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str | None:

@@ -22,7 +22,7 @@ from bayesmc.engines.kalman.posterior import GaussianBelief, GaussianSeries
 from bayesmc.engines.kalman.rows import Expected, Memory, RowTaker
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import UnsupportedError
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.progress import Progress
 from bayesmc.results.predictive import warn_of_misfit
 

@@ -19,7 +19,7 @@ from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.slice_steps import plates_apart, summed
 from bayesmc.network import Observed
-from bayesmc.network.rounding import point_log_density
+from bayesmc.network.noiseless import point_log_density
 
 
 @dataclass(frozen=True, eq=False)
