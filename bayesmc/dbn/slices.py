@@ -338,8 +338,8 @@ class SliceStore:
                 template = replace(
                     template, later=settled(template.later), first=settled(template.first)
                 )
-            self._one = ModelStore(template.name, template.slice_zero(), {}, template.plates.labels)
-            self._two = ModelStore(template.name, template.two_slices(), {}, template.plates.labels)
+            self._one = ModelStore(template.name, template.slice_zero(), {}, template.plates)
+            self._two = ModelStore(template.name, template.two_slices(), {}, template.plates)
         return self._one, self._two
 
     def _stand_ins(self, sizes: Mapping[str, int | None]) -> dict[str, np.ndarray]:

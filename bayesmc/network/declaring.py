@@ -13,7 +13,7 @@ from bayesmc.distributions import Distribution, as_distribution
 from bayesmc.errors import ModelError, PlateError, did_you_mean
 from bayesmc.network.captured import captured
 from bayesmc.network.evidence import plate_sizes
-from bayesmc.network.node import Declaration, bind, checked_rows, plain_states
+from bayesmc.network.node import Declaration, Potential, bind, checked_rows, plain_states
 
 Parents = Sequence[str] | Mapping[str, str] | None
 
@@ -80,6 +80,14 @@ def declared_function(
     labels = None if states is None else plain_states(states)
     around = captured(function)
     return Declaration(name, "function", names, plates, labels, bound, vectorize, captured=around)
+
+
+def declared_potential(
+    name: str, function: Callable[..., Any], parents: Parents, plates: tuple[str, ...]
+) -> Potential:
+    """A log factor by a function of nodes."""
+    names, bound = bind(name, function, parents)
+    return Potential(name, names, bound, plates, captured=captured(function))
 
 
 def declared_table(
@@ -216,6 +224,10 @@ class DeclaredPlates:
         if len(set(names)) != len(names):
             raise PlateError(f"{what}: plates={names} names a plate twice")
         return names
+
+    def fitting(self, sizes: Mapping[str, int]) -> dict[str, tuple[Any, ...]]:
+        """Labels of plates that have the size they were declared with."""
+        return {p: names for p, names in self.labels.items() if len(names) == sizes[p]}
 
     def only(self, names: Collection[str]) -> DeclaredPlates:
         """Those of some names."""

@@ -14,16 +14,15 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, BroadcastError, ModelError
-from bayesmc.network.compile import entry
+from bayesmc.network.calling import call, to_mix
 from bayesmc.network.model import (
     CompiledNode,
     Model,
     arguments_of,
-    call,
     potential_shape,
-    to_mix,
 )
 from bayesmc.network.node import Declaration
+from bayesmc.network.probing import entry
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, masks, nearly_equal
 from bayesmc.states import as_numbers

@@ -7,7 +7,6 @@ every draw comes from the next member of an ensemble are taken over blocks of on
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from types import MappingProxyType
@@ -16,21 +15,12 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import UnsupportedError
-from bayesmc.network import CompiledNode, Model, Problem
+from bayesmc.network import Problem
 from bayesmc.results.checkpoint import Checkpoint
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.relabelling import ordered, symmetries
-from bayesmc.results.sums import Sums, SumsPosterior
-
-#: batch means kept per chain, once there are as many; twice as many are merged in pairs
-_BATCHES = 16
-#: draws that summaries take in at once
-_BUFFER = 32
-#: numbers that the buffers of all nodes may hold together
-_BUFFER_ELEMENTS = 1 << 21
-#: numbers that the batch means of one node may take; a larger node has no errors in summaries
-_BATCH_ELEMENTS = 1 << 22
+from bayesmc.results.sums import RunningChains, SumsPosterior
 
 
 class _Chains(Posterior):
@@ -320,147 +310,4 @@ class ChainsSums(_Chains, SumsPosterior):
         return {**state, "_running": self._running.with_model(state["model"])}
 
 
-class RunningChains:
-    """Sums and batch means of chains, of constant size.
-
-    Draws are taken in by the buffer, and a buffer always holds the same number of them, so that what is
-    summed does not depend on where a run was cut.
-
-    Parameters
-    ----------
-    model : Model
-    names : tuple of str
-    chains, ensemble : int
-    """
-
-    def __init__(self, model: Model, names: tuple[str, ...], chains: int, ensemble: int) -> None:
-        self.chains = chains
-        self.ensemble = ensemble
-        self.draws = 0
-        self._sums = Sums(model, names)
-        self._pending = 0
-        self._buffers: dict[str, np.ndarray] = {}
-        self._constant: dict[str, np.ndarray] = {}
-        self._means: dict[str, _BatchMeans] = {}
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self._sums.names
-
-    def add(self, values: Mapping[str, np.ndarray]) -> None:
-        """Take in one draw of every chain, ``(chain, *plates, *event)``, or without chains if constant."""
-        if not self.draws:
-            self._prepare(values)
-        at = self._pending
-        for name, buffer in self._buffers.items():
-            buffer[at] = values[name]
-        self.draws += 1
-        self._pending += 1
-        if self._pending == self._size:
-            self._empty()
-
-    def total(self) -> Sums:
-        """The sums over all draws so far, for reading only."""
-        if not self._pending:
-            return self._sums
-        model = self._sums.model
-        sums = copy.deepcopy(self._sums, {id(model): model})
-        self._add_to(sums)
-        return sums
-
-    def is_batched(self, name: str) -> bool:
-        """Whether batch means are kept: not of constants, nor of nodes of very many numbers."""
-        return name in self._means
-
-    def batch_means(self, name: str) -> np.ndarray | None:
-        """Means of equal batches, shape ``(batch, chain, figures...)``; None where there are none."""
-        means = self._means.get(name)
-        return None if means is None else means.values
-
-    def with_model(self, model: Model) -> RunningChains:
-        """The same for another compilation of the same net, independent of this one."""
-        return copy.deepcopy(self, {id(self._sums.model): model})
-
-    def _prepare(self, values: Mapping[str, np.ndarray]) -> None:
-        """Decide from the first draw what is constant, and how many draws make a buffer."""
-        moving = {}
-        for name in self.names:
-            node = self._sums.model[name]
-            if values[name].ndim == len(node.value_shape):
-                self._constant[name] = np.array(values[name])
-            else:
-                moving[name] = node
-        numbers = self.chains * sum(math.prod(node.value_shape) for node in moving.values())
-        draws = min(_BUFFER, max(1, _BUFFER_ELEMENTS // max(numbers, 1)))
-        self._size = self.ensemble * max(1, draws // self.ensemble)
-        for name, node in moving.items():
-            dtype = stored_dtype(node, values[name])
-            shape = (self._size, self.chains, *node.value_shape)
-            self._buffers[name] = np.empty(shape, dtype=dtype)
-            width = math.prod(_figures(node, values[name][None]).shape[2:])
-            if 2 * _BATCHES * self.chains * width <= _BATCH_ELEMENTS:
-                self._means[name] = _BatchMeans()
-
-    def _empty(self) -> None:
-        self._add_to(self._sums)
-        for name, means in self._means.items():
-            means.add(_figures(self._sums.model[name], self._buffers[name]).mean(axis=0))
-        self._pending = 0
-
-    def _add_to(self, sums: Sums) -> None:
-        count = self._pending * self.chains
-        values = {
-            n: b[: self._pending].reshape(count, *b.shape[2:]) for n, b in self._buffers.items()
-        }
-        sums.add({**self._constant, **values}, 0.0, count)
-
-
-def stored_dtype(node: CompiledNode, values: np.ndarray) -> np.dtype:
-    """The type that draws of a node are kept in: the smallest for positions of a finite one."""
-    return values.dtype if node.domain is None else node.domain.dtype
-
-
 # ---- private ------------------------------------------------------------------------------------
-
-
-class _BatchMeans:
-    """Means of equally long batches; when there are too many, neighbours are merged."""
-
-    def __init__(self) -> None:
-        self._kept: list[np.ndarray] = []
-        self._length = 1
-        self._sum: Any = 0.0
-        self._count = 0
-
-    def add(self, mean: np.ndarray) -> None:
-        """Take in the mean of one more buffer, shape ``(chain, ...)``."""
-        self._sum = self._sum + mean
-        self._count += 1
-        if self._count < self._length:
-            return
-        self._kept.append(self._sum / self._length)
-        self._sum, self._count = 0.0, 0
-        if len(self._kept) == 2 * _BATCHES:
-            pairs = zip(self._kept[::2], self._kept[1::2], strict=True)
-            self._kept = [(a + b) / 2 for a, b in pairs]
-            self._length *= 2
-
-    @property
-    def values(self) -> np.ndarray | None:
-        return np.stack(self._kept) if self._kept else None
-
-
-def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
-    """What the answers about a node are means of, shape ``(draw, chain, ...)``.
-
-    With angles there are two: cosines and sines, for numbers that are none themselves and zero.
-    """
-    if node.domain is None:
-        if node.angles is None:
-            return draws
-        cosine, sine = np.cos(draws), np.sin(draws)
-        pair = np.where(node.angles, cosine, draws), np.where(node.angles, sine, 0.0)
-        return np.stack(pair, axis=2)
-    if node.domain.labels is None:
-        return np.take(np.asarray(node.domain.numbers, dtype=float), draws)
-    return (draws[..., None] == np.arange(node.domain.size)).astype(float)
