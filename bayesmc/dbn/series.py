@@ -19,7 +19,7 @@ from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network import Observed
 from bayesmc.network.evidence import observe, warn_of_doubts
-from bayesmc.network.labelled import by_label, refuse_backwards, refuse_crossed
+from bayesmc.network.labels import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
 from bayesmc.shapes import first_index, owned

@@ -28,7 +28,7 @@ from bayesmc.errors import (
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
 from bayesmc.network.declaring import DeclaredPlates
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, topological_order
 from bayesmc.network.store import ModelStore
 from bayesmc.shapes import owned

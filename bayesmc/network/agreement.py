@@ -12,7 +12,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import Expression, Program, rebuilt
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.shapes import Shape
+from bayesmc.shapes import Shape, nearly_equal
 
 #: how far an expression may be off what the function gives, relative to the largest entry
 _RTOL = 1e-11
@@ -166,15 +166,4 @@ def _alike(a: np.ndarray, b: np.ndarray, shape: Shape, own: int) -> bool:
 
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
-    if a.shape != b.shape:
-        return False
-    a, b = np.asarray(a), np.asarray(b)
-    if (a == b).all():
-        return True
-    if a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
-        return False
-    a, b = a.astype(float), b.astype(float)
-    scale = np.maximum(np.abs(a), np.abs(b))
-    largest = np.max(np.where(np.isfinite(scale), scale, 0.0), initial=0.0)
-    near = np.abs(a - b) <= _RTOL * (np.where(np.isfinite(scale), scale, 0.0) + 1e-3 * largest)
-    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
+    return nearly_equal(a, b, _RTOL, 1e-3 * _RTOL)

@@ -23,7 +23,7 @@ from bayesmc.errors import (
 )
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.calling import call
-from bayesmc.network.domain import Domain, domain_with_states, states_domain
+from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
     Model,

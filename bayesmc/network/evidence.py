@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
-from bayesmc.network.labelled import by_label, refuse_crossed
+from bayesmc.network.labels import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration
 from bayesmc.network.noiseless import observed_links

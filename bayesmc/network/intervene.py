@@ -10,7 +10,7 @@ import numpy as np
 
 from bayesmc.errors import EvidenceError, UnknownNodeError
 from bayesmc.network.evidence import plate_sizes, store
-from bayesmc.network.labelled import by_label
+from bayesmc.network.labels import by_label
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, ancestors
 from bayesmc.network.store import ModelStore, unknown

@@ -27,7 +27,7 @@ from bayesmc.errors import (
 )
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.calling import call
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from bayesmc.errors import CycleError, ModelError, ParameterError, QueryError, UnknownNodeError
 from bayesmc.network.captured import Captured
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.shapes import Shape, first_index
 
 

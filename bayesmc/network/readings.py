@@ -34,7 +34,7 @@ from bayesmc.expression import (
     trace,
 )
 from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.network.node import Numbered
 from bayesmc.passes.log_density import family_of
 from bayesmc.passes.templates import Template, template

@@ -34,9 +34,8 @@ from bayesmc.expression import (
     replaced,
     reshape,
 )
-from bayesmc.expression.functions import Repeated
+from bayesmc.expression.functions import Repeated, product
 from bayesmc.expression.graph import as_float
-from bayesmc.expression.products import product
 from bayesmc.passes.arithmetic import ONE, ZERO, add, is_all, tidy
 
 #: function -> the arguments in each of which it is linear
