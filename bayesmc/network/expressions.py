@@ -37,11 +37,10 @@ from bayesmc.network.agreement import (
 )
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
-from bayesmc.network.node import Numbered
+from bayesmc.network.node import Numbered, identity
 from bayesmc.network.readings import (
     Argument,
     Reading,
-    identity,
     numbers_of,
     read_function,
     read_table,

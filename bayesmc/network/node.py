@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import inspect
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -250,6 +251,23 @@ def _with_keywords(
         )
 
     return call
+
+
+def identity(function: Any) -> Hashable:
+    """Equal for one function: one object, or one code with the same things around it."""
+    if isinstance(function, Numbered):
+        return identity(function.func), function.places, function.number
+    if type(function) is not FunctionType:
+        return id(function)
+    keywords = function.__kwdefaults__ or {}
+    around = [*(function.__defaults__ or ()), *keywords, *keywords.values()]
+    for cell in function.__closure__ or ():
+        try:
+            around.append(cell.cell_contents)
+        except ValueError:  # not yet filled
+            return id(function)
+    inside = tuple(repr(v) if type(v) in (int, float, bool, str) else id(v) for v in around)
+    return function.__code__, id(function.__globals__), inside
 
 
 def nodes_read(function: Callable[..., Any]) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -169,23 +168,6 @@ def numbers_of(stored: Expression, domain: Domain) -> Expression:
     if domain.values is not None:
         return gather(constant(domain.values), stored)
     return elementwise(np.add, stored, domain.low) if domain.low else stored
-
-
-def identity(function: Any) -> Hashable:
-    """Equal for one function: one object, or one code with the same things around it."""
-    if isinstance(function, Numbered):
-        return identity(function.func), function.places, function.number
-    if type(function) is not FunctionType:
-        return id(function)
-    keywords = function.__kwdefaults__ or {}
-    around = [*(function.__defaults__ or ()), *keywords, *keywords.values()]
-    for cell in function.__closure__ or ():
-        try:
-            around.append(cell.cell_contents)
-        except ValueError:  # not yet filled
-            return id(function)
-    inside = tuple(repr(v) if type(v) in (int, float, bool, str) else id(v) for v in around)
-    return function.__code__, id(function.__globals__), inside
 
 
 def frame(traced: Any) -> Hashable:
