@@ -24,8 +24,7 @@ from bayesmc.errors import (
 )
 from bayesmc.network import BayesNet, Node
 from bayesmc.network.declaring import DeclaredPlates, Parents
-from bayesmc.network.node import Declaration
-from bayesmc.network.noiseless import without_noise
+from bayesmc.network.node import Declaration, without_noise
 from bayesmc.randomness import Purpose, seed_sequence, stream
 
 if TYPE_CHECKING:

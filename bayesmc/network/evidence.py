@@ -18,8 +18,7 @@ import numpy as np
 from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateError, did_you_mean
 from bayesmc.network.labels import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.network.node import Declaration
-from bayesmc.network.noiseless import observed_links
+from bayesmc.network.node import Declaration, observed_links
 from bayesmc.shapes import Shape, first_index
 
 _ARTICLE = {"deterministic": "a deterministic", "input": "an input", "fixed": "a fixed (do)"}

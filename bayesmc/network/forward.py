@@ -17,7 +17,7 @@ from bayesmc.distributions.components import completed, log_prob_of
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
-from bayesmc.network.noiseless import is_link
+from bayesmc.network.node import is_link
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape
 

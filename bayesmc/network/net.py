@@ -25,8 +25,7 @@ from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Node, Potential
-from bayesmc.network.noiseless import without_noise
+from bayesmc.network.node import Declaration, Node, Potential, without_noise
 from bayesmc.network.store import Declared, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape

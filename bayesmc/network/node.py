@@ -1,20 +1,24 @@
-"""Declarations: what a user wrote about one node, before anything is evaluated."""
+"""Declarations: what a user wrote about one node, and what can be told of it before anything is evaluated."""
 
 from __future__ import annotations
 
 import inspect
 from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import FunctionType
 from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions import MvNormal, Normal
 from bayesmc.errors import CycleError, ModelError, ParameterError, QueryError, UnknownNodeError
 from bayesmc.network.captured import Captured
 from bayesmc.network.labels import Domain
 from bayesmc.shapes import Shape, first_index
+
+#: what a function without noise is known by
+_MARK = "bayesmc_computes"
 
 
 @dataclass(frozen=True)
@@ -197,62 +201,6 @@ def plain_states(states: Sequence[Any]) -> tuple[Any, ...]:
     return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
 
 
-def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:
-    """Names of positional and of keyword-only arguments without default, and of ``*args``."""
-    positional: list[str] = []
-    keyword: list[str] = []
-    starred = ""
-    for argument in signature.parameters.values():
-        if argument.kind is argument.VAR_KEYWORD:
-            raise ModelError(
-                f"node {name!r}: **{argument.name} is refused, since argument names are the parents; "
-                "name the parents, or list them with parents="
-            )
-        if argument.kind is argument.VAR_POSITIONAL:
-            starred = argument.name
-        elif argument.default is argument.empty:
-            (keyword if argument.kind is argument.KEYWORD_ONLY else positional).append(
-                argument.name
-            )
-    return positional, keyword, starred
-
-
-def _defaults(signature: inspect.Signature) -> set[str]:
-    return {a.name for a in signature.parameters.values() if a.default is not a.empty}
-
-
-def _check_count(
-    name: str,
-    names: tuple[str, ...],
-    signature: inspect.Signature,
-    positional: list[str],
-    keyword: list[str],
-    starred: str,
-) -> None:
-    needed = len(positional) + len(keyword)
-    room = needed + len(_defaults(signature))
-    if len(names) < needed or (len(names) > room and not starred):
-        raise ModelError(
-            f"node {name!r}: parents= lists {len(names)} names, but the function takes "
-            f"{needed} arguments ({', '.join(positional + keyword)})"
-        )
-
-
-def _with_keywords(
-    function: Callable[..., Any], positional: int, keyword: list[str]
-) -> Callable[..., Any]:
-    """``function`` with its keyword-only arguments taken by position, after the others."""
-    if not keyword:
-        return function
-
-    def call(*values: Any) -> Any:
-        return function(
-            *values[:positional], **dict(zip(keyword, values[positional:], strict=True))
-        )
-
-    return call
-
-
 def identity(function: Any) -> Hashable:
     """Equal for one function: one object, or one code with the same things around it."""
     if isinstance(function, Numbered):
@@ -358,3 +306,100 @@ def ancestors(parents: Mapping[str, Sequence[str]], names: Iterable[str]) -> set
             found.add(name)
             todo.extend(parents[name])
     return found
+
+
+def observed_links(nodes: Any, evidence: Mapping[str, Any]) -> dict[str, int]:
+    """Observed nodes that are computed, and numbers or vectors of them: name -> event axes.
+
+    Parameters
+    ----------
+    nodes : mapping
+        Name -> something with ``kind``, ``is_discrete`` and ``event_shape``.
+    evidence : dict
+    """
+    found = {}
+    for name in (n for n, value in evidence.items() if n in nodes and value is not None):
+        node = nodes[name]
+        if node.kind == "deterministic" and not node.is_discrete and len(node.event_shape) < 2:
+            found[name] = len(node.event_shape)
+    return found
+
+
+def without_noise(declaration: Declaration, rank: int) -> Declaration:
+    """The node as one without noise about what its function returns, a value with ``rank`` event axes."""
+    function = declaration.function
+    assert function is not None
+
+    def link(*values: Any) -> Any:
+        value = function(*values)
+        if not rank:
+            return Normal(value, 0.0)
+        size = np.shape(value)[-1]
+        return MvNormal(value, np.zeros((size, size)))
+
+    link.__dict__[_MARK] = True
+    return replace(declaration, function=link)
+
+
+def is_link(declaration: Declaration) -> bool:
+    """Whether a node was computed before ``without_noise``."""
+    return _MARK in getattr(declaration.function, "__dict__", {})
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:
+    """Names of positional and of keyword-only arguments without default, and of ``*args``."""
+    positional: list[str] = []
+    keyword: list[str] = []
+    starred = ""
+    for argument in signature.parameters.values():
+        if argument.kind is argument.VAR_KEYWORD:
+            raise ModelError(
+                f"node {name!r}: **{argument.name} is refused, since argument names are the parents; "
+                "name the parents, or list them with parents="
+            )
+        if argument.kind is argument.VAR_POSITIONAL:
+            starred = argument.name
+        elif argument.default is argument.empty:
+            (keyword if argument.kind is argument.KEYWORD_ONLY else positional).append(
+                argument.name
+            )
+    return positional, keyword, starred
+
+
+def _defaults(signature: inspect.Signature) -> set[str]:
+    return {a.name for a in signature.parameters.values() if a.default is not a.empty}
+
+
+def _check_count(
+    name: str,
+    names: tuple[str, ...],
+    signature: inspect.Signature,
+    positional: list[str],
+    keyword: list[str],
+    starred: str,
+) -> None:
+    needed = len(positional) + len(keyword)
+    room = needed + len(_defaults(signature))
+    if len(names) < needed or (len(names) > room and not starred):
+        raise ModelError(
+            f"node {name!r}: parents= lists {len(names)} names, but the function takes "
+            f"{needed} arguments ({', '.join(positional + keyword)})"
+        )
+
+
+def _with_keywords(
+    function: Callable[..., Any], positional: int, keyword: list[str]
+) -> Callable[..., Any]:
+    """``function`` with its keyword-only arguments taken by position, after the others."""
+    if not keyword:
+        return function
+
+    def call(*values: Any) -> Any:
+        return function(
+            *values[:positional], **dict(zip(keyword, values[positional:], strict=True))
+        )
+
+    return call
