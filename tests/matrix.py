@@ -182,9 +182,10 @@ def rejected(answer: Answer, kind: str, seed: int, draw: int, observed: bool = T
     observed_nodes = pose(net, evidence).observed
     whole = {n for n, seen in observed_nodes.items() if seen.mask is None}
     hidden = {n for n, node in posterior.model.nodes.items() if node.is_stochastic} - whole
-    if not hidden and posterior.log_marginal_likelihood is None:
-        return ""  # nothing is left to say
-    match = compare(posterior, exact(kind, seed, observed), ALPHA)
+    truth = exact(kind, seed, observed)
+    if not hidden & set(truth.names) and posterior.log_marginal_likelihood is None:
+        return ""  # nothing is left to say, or no oracle knows it
+    match = compare(posterior, truth, ALPHA)
     if not match.rejected:
         return ""
     maker = "random_gaussian_net" if kind == "gaussian" else "random_net"

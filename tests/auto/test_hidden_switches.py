@@ -1,6 +1,6 @@
 """Switches above hidden numbers or many finite nodes: chains cross between states, or their errors say so.
 
-Answers may be off by 4.5 of their errors, which has a chance of 7e-6 in each of the twelve figures.
+Answers may be off by 4.5 of their errors, which has a chance of 7e-6 in each of the fourteen figures.
 """
 
 from __future__ import annotations
@@ -113,6 +113,12 @@ def answered(build: Callable[[], Question], **options: Any) -> tuple[np.ndarray,
 @pytest.mark.parametrize("build", ALL[1:])
 def test_chains_cross(build: Callable[[], Question]) -> None:
     off, error = answered(build, engine=QUICK)
+    assert (off < 4.5).all() and (error < 0.06).all()
+
+
+@pytest.mark.parametrize("build", [switch, class_of_items])
+def test_metropolis_crosses(build: Callable[[], Question]) -> None:
+    off, error = answered(build, engine=bmc.MetropolisHastings(draws=350, warmup=100, chains=8))
     assert (off < 4.5).all() and (error < 0.06).all()
 
 
