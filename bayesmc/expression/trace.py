@@ -77,7 +77,7 @@ class Frozen:
         return self.dist(*args, **kwds)
 
 
-def trace(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
+def trace(function: Callable[..., Any], arguments: Sequence[Any], is_steady: bool = False) -> Any:
     """What a function returns for stand-ins: an ``Expression``, a ``Family``, or what depends on none.
 
     Parameters
@@ -85,25 +85,28 @@ def trace(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:
     function : callable
     arguments : sequence
         ``TracedArray``, ``TracedStates``, ``PlateArray`` of these.
+    is_steady : bool
+        Whether it is known to give the same the next time, so that one call will do.
 
     Raises
     ------
     TraceError
         The function does what cannot be followed; the message says what.
     """
-    why = tells_time_or_chance(function)
+    why = None if is_steady else tells_time_or_chance(function)
     if why is not None:
         raise TraceError(why)
+    times = 1 if is_steady else 2
     try:
-        first, again = _called(function, arguments), _called(function, arguments)
+        found = [_called(function, arguments) for _ in range(times)]
     except TraceError:
         if not isinstance(function, types.FunctionType):
             raise
         function = lifted(function)
-        first, again = _called(function, arguments), _called(function, arguments)
-    if not same(first, again):
+        found = [_called(function, arguments) for _ in range(times)]
+    if not same(found[0], found[-1]):
         raise TraceError("two calls with the same arguments differ")
-    return first
+    return found[0]
 
 
 def expressions_of(traced: Any) -> Iterator[Expression]:

@@ -132,8 +132,11 @@ def read_function(
     arguments: Sequence[Argument],
     links: Sequence[tuple[str, Aligner]],
     open_number: bool = False,
+    is_steady: bool = False,
 ) -> Reading:
     """The reading of a function; of a ``Numbered`` one for all numbers, if asked for.
+
+    One that ``is_steady`` has been followed before, with other arguments.
 
     Raises
     ------
@@ -144,7 +147,7 @@ def read_function(
     if isinstance(function, Numbered):
         number: Any = TracedArray(leaf("number 0", (), int)) if open_number else function.number
         function, given = function.func, function.filled(given, number)
-    found = trace(function, given)
+    found = trace(function, given, is_steady)
     if isinstance(found, Density) and links:
         raise TraceError("its Density may read parents where that cannot be seen")
     return Reading(found)
