@@ -111,8 +111,11 @@ def masks(size: int) -> list[np.ndarray]:
     return [mask for bit in bits for mask in (bit, ~bit)]
 
 
-def nearly_equal(a: np.ndarray, b: np.ndarray) -> bool:
-    """Equal up to rounding (vectorised and scalar loops may differ in the last digits)."""
+def nearly_equal(a: np.ndarray, b: np.ndarray, rtol: float = _RTOL, atol: float = _ATOL) -> bool:
+    """Equal up to rounding (vectorised and scalar loops may differ in the last digits).
+
+    ``rtol`` is relative to each entry, ``atol`` to the largest.
+    """
     if a.shape != b.shape:
         return False
     if a is b or np.logical_and.reduce(a == b, axis=None):
@@ -121,5 +124,5 @@ def nearly_equal(a: np.ndarray, b: np.ndarray) -> bool:
         return False
     scale = np.maximum(np.abs(a), np.abs(b))
     scale = np.where(np.isfinite(scale), scale, 0.0)
-    near = np.abs(a - b) <= _RTOL * scale + _ATOL * scale.max(initial=0.0)
+    near = np.abs(a - b) <= rtol * scale + atol * scale.max(initial=0.0)
     return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())

@@ -14,7 +14,7 @@ from bayesmc.dbn.slices import Slices
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.errors import BayesmcError, ModelError
 from bayesmc.network import Model
-from bayesmc.network.noiseless import observed_links
+from bayesmc.network.node import observed_links
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,10 +27,9 @@ from bayesmc.errors import (
 )
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
-from bayesmc.network.declared_plates import DeclaredPlates
-from bayesmc.network.domain import Domain
-from bayesmc.network.node import Declaration
-from bayesmc.network.ordering import topological_order
+from bayesmc.network.declaring import DeclaredPlates
+from bayesmc.network.labels import Domain
+from bayesmc.network.node import Declaration, topological_order
 from bayesmc.network.store import ModelStore
 from bayesmc.shapes import owned
 
@@ -341,8 +340,8 @@ class SliceStore:
                 template = replace(
                     template, later=settled(template.later), first=settled(template.first)
                 )
-            self._one = ModelStore(template.name, template.slice_zero(), {}, template.plates.labels)
-            self._two = ModelStore(template.name, template.two_slices(), {}, template.plates.labels)
+            self._one = ModelStore(template.name, template.slice_zero(), {}, template.plates)
+            self._two = ModelStore(template.name, template.two_slices(), {}, template.plates)
         return self._one, self._two
 
     def _stand_ins(self, sizes: Mapping[str, int]) -> dict[str, np.ndarray]:

@@ -24,10 +24,8 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network import BayesNet, Node
-from bayesmc.network.declared_plates import DeclaredPlates
-from bayesmc.network.declaring import Parents
-from bayesmc.network.node import Declaration
-from bayesmc.network.noiseless import without_noise
+from bayesmc.network.declaring import DeclaredPlates, Parents
+from bayesmc.network.node import Declaration, without_noise
 from bayesmc.randomness import Purpose, seed_sequence, stream
 
 if TYPE_CHECKING:

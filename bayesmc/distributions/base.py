@@ -16,13 +16,12 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.distributions import faults
-from bayesmc.distributions.keywords import check_keywords, signature
-from bayesmc.distributions.reading import read_floats
+from bayesmc.distributions.parameters import check_keywords, read_floats, signature
 from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
+from bayesmc.expression.array import TracedCall, is_traced
 from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
-from bayesmc.tracing import TracedCall, is_traced
 
 _mark_invalid: ContextVar[bool] = ContextVar("mark_invalid", default=False)
 

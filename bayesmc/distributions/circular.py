@@ -14,6 +14,7 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions.base import Distribution, as_float, as_quantile
+from bayesmc.distributions.location_scale import LocationScale
 from bayesmc.distributions.support import Support
 from bayesmc.shapes import Shape
 
@@ -178,7 +179,7 @@ class VonMises(_Circular):
         return 1 / np.sqrt(np.maximum(self.concentration, 1.0))
 
 
-class WrappedNormal(_Circular):
+class WrappedNormal(_Circular, LocationScale):
     """Wrapped normal distribution: a normal number taken as an angle.
 
     Parameters
@@ -207,14 +208,6 @@ class WrappedNormal(_Circular):
     >>> float(heading.mean), float(heading.var)
     (3.0, 0.25)
     """
-
-    parameter_ndim = {"loc": 0, "scale": 0}
-
-    def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
-        loc, scale = as_float(loc), as_float(scale)
-        self._set_batch(loc.shape, scale.shape)
-        self.loc = self._finite("loc", loc)
-        self.scale = self._positive("scale", scale)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.standard_normal(shape))

@@ -20,7 +20,23 @@ _LOG_PI = np.log(np.pi)
 _HALF_LOG_HALF_PI = 0.5 * np.log(np.pi / 2)
 
 
-class Laplace(Distribution):
+class LocationScale(Distribution):
+    """A number moved by ``loc`` and stretched by ``scale``, and functions of one."""
+
+    parameter_ndim = {"loc": 0, "scale": 0}
+
+    def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
+        loc, scale = as_float(loc), as_float(scale)
+        self._set_batch(loc.shape, scale.shape)
+        self.loc = self._finite("loc", loc)
+        self.scale = self._positive("scale", scale)
+
+    @property
+    def support(self) -> Support:
+        return real
+
+
+class Laplace(LocationScale):
     """Laplace (double exponential) distribution, ``exp(-|x - loc| / scale) / (2 scale)``.
 
     Parameters
@@ -46,14 +62,6 @@ class Laplace(Distribution):
     (-2.3863, 8.0)
     """
 
-    parameter_ndim = {"loc": 0, "scale": 0}
-
-    def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
-        loc, scale = as_float(loc), as_float(scale)
-        self._set_batch(loc.shape, scale.shape)
-        self.loc = self._finite("loc", loc)
-        self.scale = self._positive("scale", scale)
-
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.laplace(size=shape))
         draws *= self.scale
@@ -75,10 +83,6 @@ class Laplace(Distribution):
     def var(self) -> np.ndarray:
         return np.broadcast_to(2 * self.scale**2, self.batch_shape)
 
-    @property
-    def support(self) -> Support:
-        return real
-
     def cdf(self, x: Any) -> np.ndarray:
         with np.errstate(over="ignore"):
             z = (np.asarray(x) - self.loc) / self.scale
@@ -93,7 +97,7 @@ class Laplace(Distribution):
         return self.loc + self.scale * z
 
 
-class Cauchy(Distribution):
+class Cauchy(LocationScale):
     """Cauchy distribution, ``1 / (1 + ((x - loc) / scale)**2)`` normalised.
 
     Parameters
@@ -120,14 +124,6 @@ class Cauchy(Distribution):
     (-2.531, 3.0)
     """
 
-    parameter_ndim = {"loc": 0, "scale": 0}
-
-    def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
-        loc, scale = as_float(loc), as_float(scale)
-        self._set_batch(loc.shape, scale.shape)
-        self.loc = self._finite("loc", loc)
-        self.scale = self._positive("scale", scale)
-
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.standard_cauchy(shape))
         draws *= self.scale
@@ -148,10 +144,6 @@ class Cauchy(Distribution):
     def var(self) -> np.ndarray:
         """NaN, for there is no mean."""
         return np.full(self.batch_shape, np.nan)
-
-    @property
-    def support(self) -> Support:
-        return real
 
     def cdf(self, x: Any) -> np.ndarray:
         with np.errstate(over="ignore"):

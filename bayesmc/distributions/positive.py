@@ -13,6 +13,7 @@ import numpy as np
 from scipy import special
 
 from bayesmc.distributions.base import Distribution, as_float, as_quantile
+from bayesmc.distributions.location_scale import LocationScale
 from bayesmc.distributions.support import Support, nonnegative, positive
 from bayesmc.shapes import Shape
 
@@ -22,7 +23,7 @@ _HALF_LOG_2PI = 0.5 * np.log(2 * np.pi)
 _UNDERFLOWS = 0.05  # a Gamma variate of smaller concentration can underflow to zero
 
 
-class LogNormal(Distribution):
+class LogNormal(LocationScale):
     """Log-normal distribution: ``exp`` of a normal number.
 
     Parameters
@@ -48,14 +49,6 @@ class LogNormal(Distribution):
     >>> float(dist.log_prob(1.0).round(4)), float(dist.mean.round(4)), float(dist.ppf(0.5))
     (-0.9189, 1.6487, 1.0)
     """
-
-    parameter_ndim = {"loc": 0, "scale": 0}
-
-    def __init__(self, loc: Any = 0.0, scale: Any = 1.0) -> None:
-        loc, scale = as_float(loc), as_float(scale)
-        self._set_batch(loc.shape, scale.shape)
-        self.loc = self._finite("loc", loc)
-        self.scale = self._positive("scale", scale)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.asarray(rng.standard_normal(shape))

@@ -36,7 +36,7 @@ from bayesmc.network.forward import (
     with_factors,
 )
 from bayesmc.network.model import fit, invalid_error
-from bayesmc.network.ordering import topological_order
+from bayesmc.network.node import topological_order
 from bayesmc.shapes import Shape
 
 

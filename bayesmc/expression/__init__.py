@@ -1,7 +1,14 @@
 """The expression graph of a function: tracer, nodes, evaluation and derivatives."""
 
-from bayesmc.expression.array import TracedArray, TracedStates, refusals, refused
-from bayesmc.expression.calls import as_one_call
+from bayesmc.expression.array import (
+    TracedArray,
+    TracedCall,
+    TracedStates,
+    as_one_call,
+    is_traced,
+    refusals,
+    refused,
+)
 from bayesmc.expression.evaluate import Program, evaluate
 from bayesmc.expression.graph import (
     Call,
@@ -41,6 +48,7 @@ __all__ = [
     "Program",
     "Reduction",
     "TracedArray",
+    "TracedCall",
     "TracedStates",
     "as_expression",
     "as_one_call",
@@ -52,6 +60,7 @@ __all__ = [
     "evaluate",
     "expressions_of",
     "gather",
+    "is_traced",
     "leaf",
     "mapped",
     "ordered",

@@ -7,29 +7,54 @@ Interception by ``__array_ufunc__`` and ``__array_function__``: NumPy enhancemen
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+import types
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import graph
-from bayesmc.expression.bounds import counted_from_end, within
-from bayesmc.expression.functions import applied, expression_of, of_function
+from bayesmc.expression.composed import COMPOSED, COMPOSED_OF_SEVERAL
+from bayesmc.expression.functions import applied, expression_of, of_function, repeated
 from bayesmc.expression.graph import Expression
+from bayesmc.expression.indexing import assigned, indexed, within
 from bayesmc.shapes import Shape
 from bayesmc.states import label_code
-from bayesmc.tracing.arraylike import SHAPE_FUNCTIONS, ArrayLike
-from bayesmc.tracing.standin import is_foreign, leaves
 
+#: functions of an array's shape alone
+_SHAPE_FUNCTIONS = frozenset((np.shape, np.ndim, np.size, np.zeros_like, np.ones_like))
 #: what was refused since tracing began: a function may swallow the error
 _REFUSED: ContextVar[list[str] | None] = ContextVar("refused", default=None)
 
 
-class TracedArray(ArrayLike):
+#: functions that move elements about, so that labels survive
+_KEEPING = frozenset(
+    (
+        np.stack, np.concatenate, np.vstack, np.hstack, np.broadcast_to, np.broadcast_arrays,
+        np.copy, np.reshape, np.ravel, np.transpose, np.squeeze, np.expand_dims, np.moveaxis,
+        np.swapaxes, np.repeat, np.tile, np.take, np.take_along_axis, np.flip, np.roll,
+        np.atleast_1d, np.atleast_2d, np.where,
+    )
+)  # fmt: skip
+
+
+def _method(function: Callable[..., Any]) -> Any:
+    """A NumPy function of an array as a method of it."""
+
+    def method(self: Any, *args: Any, **kwargs: Any) -> Any:
+        return function(self, *args, **kwargs)
+
+    return method
+
+
+class TracedArray(NDArrayOperatorsMixin):
     """Stands for one entry of an array; of a batch, functions do the same to every entry.
 
     Parameters
@@ -76,6 +101,14 @@ class TracedArray(ArrayLike):
     def dtype(self) -> np.dtype:
         return self.expression.dtype
 
+    @property
+    def T(self) -> Any:  # noqa: N802
+        return np.transpose(self)
+
+    @property
+    def mT(self) -> Any:  # noqa: N802
+        return np.matrix_transpose(self)
+
     def __len__(self) -> int:
         if not self.shape:
             raise TypeError("len() of unsized object")
@@ -87,7 +120,7 @@ class TracedArray(ArrayLike):
     # ---- what NumPy does to it -----------------------------------------------------------------
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **kwargs: Any) -> Any:
-        if any(is_foreign(x) for x in inputs):
+        if any(_is_foreign(x) for x in inputs):
             return NotImplemented
         (target,) = kwargs.pop("out", (None,))
         if method == "at" or (target is not None and not getattr(target, "_writable", False)):
@@ -102,23 +135,25 @@ class TracedArray(ArrayLike):
         return target
 
     def __array_function__(self, func: Any, types: Any, args: Any, kwargs: Any) -> Any:
-        every = leaves([args, list(kwargs.values())])
-        if any(is_foreign(x) for x in every):
+        every = _leaves([args, list(kwargs.values())])
+        if any(_is_foreign(x) for x in every):
             return NotImplemented
-        if func in SHAPE_FUNCTIONS:
+        if func in _SHAPE_FUNCTIONS:
             return func(*_shapes(args), **kwargs)
         if func is np.isin and isinstance(args[0], TracedStates):
             return args[0].isin(np.ravel(np.asarray(args[1], dtype=object)).tolist(), **kwargs)
+        if func in COMPOSED or func in COMPOSED_OF_SEVERAL:
+            return _composed(func, args, kwargs)
         result = _noted(of_function, func, args, kwargs)
         return _labelled(func, args, every, result)
 
     def __getitem__(self, key: Any) -> Any:
-        return TracedArray(_noted_plain(_indexed, self.expression, key))
+        return TracedArray(_noted_plain(indexed, self.expression, key))
 
     def __setitem__(self, key: Any, value: Any) -> None:
         if not self._writable:
             raise ValueError("assignment destination is read-only")
-        self.expression = _noted_plain(_assigned, self.expression, key, value)
+        self.expression = _noted_plain(lambda: assigned(self.expression, key, expression_of(value)))
 
     # ---- copies and other types ----------------------------------------------------------------
 
@@ -139,35 +174,26 @@ class TracedArray(ArrayLike):
     def astype(self, dtype: Any, *args: Any, **kwargs: Any) -> TracedArray:
         return TracedArray(_noted_plain(graph.cast, self.expression, dtype), True)
 
-    def clip(self, *args: Any, **kwargs: Any) -> Any:
-        return np.clip(self, *args, **kwargs)
+    # ---- methods of arrays that are NumPy functions --------------------------------------------
 
-    def std(self, *args: Any, **kwargs: Any) -> Any:
-        return np.std(self, *args, **kwargs)
+    def transpose(self, *axes: Any) -> Any:
+        order = axes[0] if len(axes) == 1 and not isinstance(axes[0], int) else axes or None
+        return np.transpose(self, order)
 
-    def var(self, *args: Any, **kwargs: Any) -> Any:
-        return np.var(self, *args, **kwargs)
+    def reshape(self, *shape: Any) -> Any:
+        wanted = shape[0] if len(shape) == 1 and not isinstance(shape[0], int) else shape
+        return np.reshape(self, wanted)
 
-    def max(self, *args: Any, **kwargs: Any) -> Any:
-        return np.max(self, *args, **kwargs)
+    def ravel(self) -> Any:
+        return self.reshape(-1)
 
-    def min(self, *args: Any, **kwargs: Any) -> Any:
-        return np.min(self, *args, **kwargs)
+    flatten = ravel
 
-    def prod(self, *args: Any, **kwargs: Any) -> Any:
-        return np.prod(self, *args, **kwargs)
-
-    def any(self, *args: Any, **kwargs: Any) -> Any:
-        return np.any(self, *args, **kwargs)
-
-    def all(self, *args: Any, **kwargs: Any) -> Any:
-        return np.all(self, *args, **kwargs)
-
-    def repeat(self, *args: Any, **kwargs: Any) -> Any:
-        return np.repeat(self, *args, **kwargs)
-
-    def round(self, *args: Any, **kwargs: Any) -> Any:
-        return np.round(self, *args, **kwargs)
+    sum, mean, prod, cumsum = (_method(f) for f in (np.sum, np.mean, np.prod, np.cumsum))
+    std, var, max, min = (_method(f) for f in (np.std, np.var, np.max, np.min))
+    any, all, clip, round = (_method(f) for f in (np.any, np.all, np.clip, np.round))
+    dot, take, repeat = (_method(f) for f in (np.dot, np.take, np.repeat))
+    squeeze, swapaxes = (_method(f) for f in (np.squeeze, np.swapaxes))
 
     # ---- what would show the numbers -----------------------------------------------------------
 
@@ -179,6 +205,12 @@ class TracedArray(ArrayLike):
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> np.ndarray:
         return np.array(self._known("a plain array"), dtype)
+
+    def __complex__(self) -> complex:
+        raise self._refuse("complex()")
+
+    def __contains__(self, item: Any) -> bool:
+        raise self._refuse("membership")
 
     def __bool__(self) -> bool:
         return bool(self._known("the truth (if, and, or, not)"))
@@ -226,6 +258,28 @@ class TracedStates(TracedArray):
         return TracedStates(self.expression, self.states)
 
 
+@dataclass(frozen=True, eq=False)
+class TracedCall:
+    """A call that was not made because an argument is a stand-in: what was called, and with what.
+
+    Attributes
+    ----------
+    function : callable
+    arguments : dict
+        By name, in the order of the signature.
+    """
+
+    function: Callable[..., Any]
+    arguments: dict[str, Any]
+
+
+def is_traced(value: Any) -> bool:
+    """Whether a value is a stand-in, or is a sequence that holds one."""
+    if isinstance(value, (list, tuple)):
+        return any(map(is_traced, value))
+    return isinstance(value, (TracedArray, TracedCall))
+
+
 @contextmanager
 def refusals() -> Iterator[list[str]]:
     """What is refused meanwhile."""
@@ -245,17 +299,49 @@ def refused(why: str) -> TraceError:
     return TraceError(why)
 
 
+def as_one_call(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of a frozen object that broadcasts over leading axes, to be called again as it stands.
+
+    Of stand-ins it makes one ``Call``, which has no derivative unless its result is of whole numbers;
+    of arrays it is the method.
+
+    Examples
+    --------
+    >>> from bayesmc.expression import TracedArray, as_one_call, leaf
+    >>> class Steps:
+    ...     @as_one_call
+    ...     def of(self, x):
+    ...         return (x > 0).astype(int) if x.any() else 0 * x.astype(int)
+    >>> Steps().of(TracedArray(leaf("x", (3,)))).expression
+    <Call of (3,)>
+    """
+
+    @functools.wraps(method)
+    def called(self: Any, *args: Any) -> Any:
+        if any(isinstance(a, TracedArray) for a in args):
+            # two bound methods are equal where they are of one object
+            return TracedArray(repeated(types.MethodType(method, self), args, {}))
+        return method(self, *args)
+
+    return called
+
+
 # ---- private ------------------------------------------------------------------------------------
 
-#: functions that move elements about, so that labels survive
-_KEEPING = frozenset(
-    (
-        np.stack, np.concatenate, np.vstack, np.hstack, np.broadcast_to, np.broadcast_arrays,
-        np.copy, np.reshape, np.ravel, np.transpose, np.squeeze, np.expand_dims, np.moveaxis,
-        np.swapaxes, np.repeat, np.tile, np.take, np.take_along_axis, np.flip, np.roll,
-        np.atleast_1d, np.atleast_2d, np.where,
-    )
-)  # fmt: skip
+
+def _leaves(value: Any) -> list[Any]:
+    """What lists and tuples hold, however deep."""
+    if isinstance(value, (list, tuple)):
+        return [leaf for v in value for leaf in _leaves(v)]
+    return [value]
+
+
+def _is_foreign(value: Any) -> bool:
+    """Whether a value has rules of its own for NumPy, and is no plain array."""
+    if isinstance(value, np.ma.MaskedArray):
+        return True  # masked entries are not what was computed
+    known = isinstance(value, (np.ndarray, TracedArray, np.generic))
+    return not known and getattr(value, "__array_ufunc__", None) is not None
 
 
 def _noted(function: Any, *args: Any) -> Any:
@@ -268,6 +354,17 @@ def _noted_plain(function: Any, *args: Any) -> Any:
         return function(*args)
     except TraceError as error:
         raise refused(str(error)) from error
+
+
+def _composed(func: Any, args: Any, kwargs: dict[str, Any]) -> Any:
+    """What a function makes that is said in terms of others."""
+    try:
+        if func in COMPOSED_OF_SEVERAL:
+            return COMPOSED_OF_SEVERAL[func](*args, **kwargs)
+        first, *rest = args
+        return COMPOSED[func](TracedArray(expression_of(first)), *rest, **kwargs)
+    except (TypeError, ValueError) as error:
+        raise refused(f"np.{func.__name__}: {error}") from error
 
 
 def _wrapped(result: Any) -> Any:
@@ -326,7 +423,7 @@ def _labelled(func: Any, args: Any, every: list[Any], result: Any) -> Any:
     if func not in _KEEPING or not any(isinstance(x, TracedStates) for x in every):
         return result
     joins = func in (np.stack, np.concatenate, np.vstack, np.hstack)
-    moved = leaves(args[0]) if joins else [args[0]]
+    moved = _leaves(args[0]) if joins else [args[0]]
     if func in (np.where, np.broadcast_arrays):
         moved = list(args[1:] if func is np.where else args)
     states = {x.states for x in moved if isinstance(x, TracedStates)}
@@ -336,59 +433,3 @@ def _labelled(func: Any, args: Any, every: list[Any], result: Any) -> Any:
     if isinstance(result, (list, tuple)):
         return type(result)(TracedStates(r, labels) for r in result)
     return TracedStates(result, labels)
-
-
-def _indexed(value: Expression, key: Any) -> Expression:
-    """``value[key]``."""
-    keys = [_plain_key(k) for k in (key if isinstance(key, tuple) else (key,))]
-    if not any(isinstance(k, Expression) for k in keys):
-        at = np.arange(value.size).reshape(value.shape)[tuple(keys)]
-        return graph.pick([value], at)
-    if not isinstance(value, graph.Constant):
-        raise TraceError(
-            "an array that varies is indexed by one that varies: gather along a plate, or use "
-            "np.take_along_axis"
-        )
-    computed = [n for n, k in enumerate(keys) if isinstance(k, Expression)]
-    lead = keys[: computed[-1] + 1]
-    if any(not isinstance(k, (Expression, int, np.integer)) for k in lead):
-        raise TraceError("a computed index stands behind a slice")
-    rows: Any = 0
-    for n, k in enumerate(lead):
-        size = value.shape[n]
-        at = graph.as_expression(k)
-        if at.dtype.kind != "i":
-            raise TraceError("an index that is not a whole number")
-        at = within(counted_from_end(at, size), size)
-        rows = graph.elementwise(np.add, graph.elementwise(np.multiply, rows, size), at)
-    rest = value.shape[len(lead) :]
-    table = graph.reshape(value, (-1, *rest)) if value.size else value
-    found = graph.gather(table, rows)
-    left = tuple(keys[len(lead) :])
-    if not left:
-        return found
-    at = np.arange(found.size).reshape(found.shape)
-    return graph.pick([found], at[(slice(None),) * len(rows.shape) + left])
-
-
-def _assigned(value: Expression, key: Any, new: Any) -> Expression:
-    """The array after ``value[key] = new``."""
-    keys = tuple(_plain_key(k) for k in (key if isinstance(key, tuple) else (key,)))
-    if any(isinstance(k, Expression) for k in keys):
-        raise TraceError("an array is written to at places that vary")
-    at = np.arange(value.size).reshape(value.shape)
-    places = at[keys]
-    given = graph.broadcast(graph.cast(expression_of(new), value.dtype), places.shape)
-    at = at.copy()
-    at[keys] = value.size + np.arange(given.size).reshape(given.shape)
-    return graph.pick([value, given], at)
-
-
-def _plain_key(key: Any) -> Any:
-    """A key as NumPy takes it, or the expression that it is."""
-    if isinstance(key, TracedArray):
-        known = key.expression
-        return known.value if isinstance(known, graph.Constant) else known
-    if isinstance(key, list) and any(isinstance(k, TracedArray) for k in leaves(key)):
-        raise TraceError("an index is a list that varies")
-    return key

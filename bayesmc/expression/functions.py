@@ -6,8 +6,8 @@ the place of the elements, and what comes out says which element stands where.
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Hashable, Mapping
+import string
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,9 +15,8 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import graph
-from bayesmc.expression.bounds import counted_from_end, within
 from bayesmc.expression.graph import Expression
-from bayesmc.expression.products import PRODUCTS, einsum, product
+from bayesmc.expression.indexing import counted_from_end, within
 
 #: functions that move the elements of their first argument about (an array, or a sequence of arrays)
 _MOVERS = frozenset(
@@ -39,6 +38,15 @@ _REDUCERS: Mapping[Any, np.ufunc] = {
 _SHOWING = frozenset(
     (np.apply_along_axis, np.apply_over_axes, np.piecewise, np.save, np.savez, np.savetxt)
 )
+
+
+#: products of the last axes -> how many of each operand's axes take part
+PRODUCTS: dict[Any, tuple[int, int]] = {
+    np.matmul: (2, 2),
+    np.vecdot: (1, 1),
+    np.matvec: (2, 1),
+    np.vecmat: (1, 2),
+}
 
 
 def applied(ufunc: Any, method: str, inputs: Any, kwargs: dict[str, Any]) -> Any:
@@ -148,6 +156,50 @@ def repeated(function: Any, args: Any, kwargs: dict[str, Any]) -> Any:
     )
 
 
+def product(ufunc: Any, first: Expression, second: Expression) -> Expression:
+    """``np.matmul``, ``np.vecdot``, ``np.matvec`` or ``np.vecmat`` of two expressions."""
+    cores = list(PRODUCTS[ufunc])
+    for k, node in enumerate((first, second)):
+        if not node.shape:
+            raise TraceError(f"np.{ufunc.__name__} of a scalar")
+        if ufunc is np.matmul:
+            cores[k] = min(len(node.shape), 2)
+        elif len(node.shape) < cores[k]:
+            raise TraceError(f"np.{ufunc.__name__} of a vector where a matrix belongs")
+    left, right = {1: "j", 2: "ij"}[cores[0]], {1: "j", 2: "jk"}[cores[1]]
+    lead = max(len(first.shape) - cores[0], len(second.shape) - cores[1])
+    names = [c for c in string.ascii_letters if c not in "ijk"][:lead]
+    own = [names[lead - (len(n.shape) - c) :] for n, c in zip((first, second), cores, strict=True)]
+    out = [*names, *(c for c in left + right if c != "j")]
+    return _summed([[*own[0], *left], [*own[1], *right]], [first, second], out)
+
+
+def einsum(spec: Any, *operands: Any) -> Expression:
+    """``np.einsum`` with a string that names every axis."""
+    nodes = [graph.as_expression(getattr(x, "expression", x)) for x in operands]
+    if not isinstance(spec, str):
+        raise TraceError("np.einsum without a string of axes")
+    given = spec.replace(" ", "").split("->")
+    terms = given[0].split(",")
+    ndim = max(len(n.shape) - len(t.replace("...", "")) for n, t in zip(nodes, terms, strict=True))
+    free = [c for c in string.ascii_uppercase if c not in spec][: max(ndim, 0)]
+    named = []
+    for node, term in zip(nodes, terms, strict=True):
+        count = len(node.shape) - len(term.replace("...", ""))
+        if count < 0 or (count and "..." not in term):
+            raise TraceError(f"np.einsum({spec!r}) of shape {node.shape}")
+        before, dots, after = term.partition("...")
+        named.append([*before, *(free[len(free) - count :] if dots else ()), *after])
+    if len(given) > 1:
+        before, dots, after = given[1].partition("...")
+        out = [*before, *(free if dots else ()), *after]
+    else:
+        flat = [c for t in named for c in t]
+        once = sorted(c for c in set(flat) if flat.count(c) == 1 and c not in free)
+        out = [*(free if "..." in spec else ()), *once]
+    return _summed(named, nodes, out)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -254,41 +306,6 @@ def _where(condition: Any, a: Any, b: Any) -> Expression:
     return graph.elementwise(np.where, *map(expression_of, (condition, a, b)))
 
 
-def _select(conditions: Any, choices: Any, default: Any = 0) -> Expression:
-    found = expression_of(default)
-    for condition, choice in reversed(list(zip(conditions, choices, strict=True))):
-        found = _where(condition, choice, found)
-    return found
-
-
-def _clip(a: Any, a_min: Any = None, a_max: Any = None, *, min: Any = None, max: Any = None) -> Any:
-    found = expression_of(a)
-    for bound, ufunc in (
-        (a_min if min is None else min, np.maximum),
-        (a_max if max is None else max, np.minimum),
-    ):
-        if bound is not None:
-            found = graph.elementwise(ufunc, found, expression_of(bound))
-    return found
-
-
-def _mean(a: Any, axis: Any = None, *, keepdims: bool = False) -> Expression:
-    node = expression_of(a)
-    total = _reduced(np.add, node, axis, keepdims=keepdims)
-    return graph.elementwise(np.divide, total, node.size // max(total.size, 1))
-
-
-def _var(a: Any, axis: Any = None, *, ddof: int = 0, keepdims: bool = False) -> Expression:
-    node = expression_of(a)
-    off = graph.elementwise(np.subtract, node, _mean(node, axis, keepdims=True))
-    total = _reduced(np.add, graph.elementwise(np.multiply, off, off), axis, keepdims=keepdims)
-    return graph.elementwise(np.divide, total, node.size // max(total.size, 1) - ddof)
-
-
-def _std(a: Any, axis: Any = None, *, ddof: int = 0, keepdims: bool = False) -> Expression:
-    return graph.elementwise(np.sqrt, _var(a, axis, ddof=ddof, keepdims=keepdims))
-
-
 def _norm(x: Any, ord: Any = None, axis: Any = None, keepdims: bool = False) -> Any:
     node = expression_of(x)
     vector = isinstance(axis, int) or (axis is None and len(node.shape) == 1)
@@ -331,17 +348,6 @@ def _sort(a: Any, axis: Any = -1, kind: Any = None) -> Expression:
     return _take_along_axis(node, order, axis)
 
 
-def _isin(element: Any, test_elements: Any, *, invert: bool = False) -> Expression:
-    node = expression_of(element)
-    same = [graph.elementwise(np.equal, node, v) for v in np.ravel(test_elements)]
-    found = functools.reduce(
-        functools.partial(graph.elementwise, np.logical_or),
-        same,
-        graph.broadcast(graph.constant(False), node.shape),
-    )
-    return graph.elementwise(np.logical_not, found) if invert else found
-
-
 def _dot(a: Any, b: Any) -> Expression:
     first, second = expression_of(a), expression_of(b)
     if not (first.shape and second.shape):
@@ -351,68 +357,10 @@ def _dot(a: Any, b: Any) -> Expression:
     return product(np.matmul, first, second)
 
 
-def _outer(a: Any, b: Any) -> Expression:
-    first, second = expression_of(a), expression_of(b)
-    column = graph.reshape(first, (first.size, 1))
-    return graph.elementwise(np.multiply, column, graph.reshape(second, (1, second.size)))
-
-
 def _broadcast_arrays(*args: Any) -> tuple[Expression, ...]:
     nodes = [expression_of(a) for a in args]
     shape = np.broadcast_shapes(*(n.shape for n in nodes))
     return tuple(graph.broadcast(n, shape) for n in nodes)
-
-
-def _diff(a: Any, n: int = 1, axis: int = -1) -> Expression:
-    node = expression_of(a)
-    for _ in range(n):
-        size = node.shape[axis]
-        later, sooner = (_take(node, range(k, size - 1 + k), axis) for k in (1, 0))
-        node = graph.elementwise(np.subtract, later, sooner)
-    return node
-
-
-def _full_like(a: Any, fill_value: Any) -> Expression:
-    return graph.broadcast(expression_of(fill_value), expression_of(a).shape)
-
-
-def _masked(keep: Callable[..., np.ndarray]) -> Callable[..., Expression]:
-    def rule(m: Any, k: int = 0) -> Expression:
-        node = expression_of(m)
-        return _where(keep(np.ones(node.shape[-2:]), k).astype(bool), node, 0)
-
-    return rule
-
-
-def _diag(v: Any, k: int = 0) -> Expression:
-    node = expression_of(v)
-    if len(node.shape) == 2:
-        return _moved(np.diagonal, (node, k), {})
-    if k:
-        raise TraceError("np.diag off the diagonal")
-    return graph.elementwise(np.multiply, graph.reshape(node, (*node.shape, 1)), np.eye(node.size))
-
-
-def _polyval(p: Any, x: Any) -> Expression:
-    found, at = expression_of(0.0), expression_of(x)
-    for coefficient in p:
-        scaled = graph.elementwise(np.multiply, found, at)
-        found = graph.elementwise(np.add, scaled, expression_of(coefficient))
-    return found
-
-
-def _nan_to_num(
-    x: Any, copy: bool = True, nan: float = 0.0, posinf: Any = None, neginf: Any = None
-) -> Expression:
-    info = np.finfo(float)
-    found = expression_of(x)
-    for bad, number in (
-        (graph.elementwise(np.isnan, found), nan),
-        (graph.elementwise(np.equal, found, np.inf), info.max if posinf is None else posinf),
-        (graph.elementwise(np.equal, found, -np.inf), info.min if neginf is None else neginf),
-    ):
-        found = _where(bad, number, found)
-    return found
 
 
 def _round(a: Any, decimals: int = 0) -> Any:
@@ -422,37 +370,41 @@ def _round(a: Any, decimals: int = 0) -> Any:
     return node if node.dtype.kind == "i" else graph.elementwise(np.rint, node)
 
 
-def _sinc(x: Any) -> Expression:
-    node = graph.elementwise(np.multiply, expression_of(x), np.pi)
-    ratio = graph.elementwise(np.divide, graph.elementwise(np.sin, node), node)
-    return _where(graph.elementwise(np.equal, node, 0.0), 1.0, ratio)
-
-
-def _copied(a: Any, *args: Any, **kwargs: Any) -> Expression:
-    return expression_of(a)
-
-
 _RULES: Mapping[Any, Callable[..., Any]] = {
-    np.where: _where, np.select: _select, np.clip: _clip, np.mean: _mean, np.var: _var, np.std: _std,
-    np.linalg.norm: _norm, np.isin: _isin, np.take: _take, np.take_along_axis: _take_along_axis,
-    np.einsum: einsum, np.dot: _dot, np.outer: _outer, np.broadcast_arrays: _broadcast_arrays,
+    np.where: _where, np.linalg.norm: _norm, np.take: _take, np.take_along_axis: _take_along_axis,
+    np.einsum: einsum, np.dot: _dot, np.broadcast_arrays: _broadcast_arrays, np.sort: _sort,
     np.inner: lambda a, b: product(np.vecdot, expression_of(a), expression_of(b)),
-    np.sort: _sort, np.diff: _diff, np.full_like: _full_like, np.triu: _masked(np.triu),
-    np.tril: _masked(np.tril), np.diag: _diag, np.polyval: _polyval, np.nan_to_num: _nan_to_num,
-    np.round: _round,
-    np.around: _round, np.sinc: _sinc, np.copy: _copied,
-    np.average: lambda a, axis=None, weights=None: _average(a, axis, weights),
-    np.ptp: lambda a, axis=None: graph.elementwise(
-        np.subtract, _reduced(np.maximum, a, axis), _reduced(np.minimum, a, axis)
-    ),
+    np.round: _round, np.around: _round,
 }  # fmt: skip
 
 
-def _average(a: Any, axis: Any, weights: Any) -> Any:
-    if weights is None:
-        return _mean(a, axis)
-    node, by = expression_of(a), expression_of(weights)
-    if by.shape != node.shape:
-        raise TraceError("np.average with weights of another shape")
-    total = _reduced(np.add, graph.elementwise(np.multiply, node, by), axis)
-    return graph.elementwise(np.divide, total, _reduced(np.add, by, axis))
+def _summed(
+    terms: Sequence[Sequence[str]], nodes: Sequence[Expression], out: Sequence[str]
+) -> Expression:
+    """The product of operands whose axes have names, summed over those that are not in ``out``."""
+    sizes: dict[str, int] = {}
+    for term, node in zip(terms, nodes, strict=True):
+        for name, size in zip(term, node.shape, strict=True):
+            if sizes.get(name, 1) != size and size != 1 and sizes.get(name, 1) != 1:
+                raise TraceError(f"a product of axes of sizes {sizes[name]} and {size}")
+            sizes[name] = max(sizes.get(name, 1), size) if size else 0
+    order = [*out, *sorted(set(sizes) - set(out))]
+    found: Expression | None = None
+    for term, node in zip(terms, nodes, strict=True):
+        part = _aligned(node, term, order)
+        found = part if found is None else graph.elementwise(np.multiply, found, part)
+    assert found is not None
+    whole = tuple(sizes[c] for c in order)
+    if found.shape != whole:
+        found = graph.broadcast(found, whole)
+    return graph.reduction(np.add, found, range(len(out), len(order)))
+
+
+def _aligned(node: Expression, term: Sequence[str], order: Sequence[str]) -> Expression:
+    """An operand with its axes in order, of size 1 where it has none; repeated ones are the diagonal."""
+    at = np.arange(node.size).reshape(node.shape)
+    kept = [c for c in order if c in term]
+    numbers = {c: k for k, c in enumerate(order)}
+    at = np.einsum(at, [numbers[c] for c in term], [numbers[c] for c in kept])
+    shape = iter(at.shape)
+    return graph.pick([node], at.reshape([next(shape) if c in kept else 1 for c in order]))

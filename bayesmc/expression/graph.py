@@ -54,7 +54,11 @@ class Expression:
     @property
     def detail(self) -> str:
         """What it does, in a word."""
-        return ""
+        if isinstance(self, (Pick, Gather)):
+            return ""
+        if isinstance(self, Constant):
+            return np.array2string(self.value, threshold=4, precision=4)
+        return getattr(self.content[0], "__name__", "") or str(self.content[0])
 
     def with_operands(self, operands: Sequence[Expression]) -> Expression:
         """The same operation on others of the same shapes."""
@@ -79,10 +83,6 @@ class Leaf(Expression):
     name: str
     states: int | None
 
-    @property
-    def detail(self) -> str:
-        return self.name
-
 
 class Constant(Expression):
     """A value that is known."""
@@ -90,20 +90,12 @@ class Constant(Expression):
     __slots__ = ("value",)
     value: np.ndarray
 
-    @property
-    def detail(self) -> str:
-        return np.array2string(self.value, threshold=4, precision=4)
-
 
 class Elementwise(Expression):
     """A function of the operands' elements, which broadcast: a ufunc, ``np.where``, or a cast."""
 
     __slots__ = ("function",)
     function: Callable[..., np.ndarray]
-
-    @property
-    def detail(self) -> str:
-        return self.function.__name__
 
     def with_operands(self, operands: Sequence[Expression]) -> Expression:
         return elementwise(self.function, *operands)
@@ -143,10 +135,6 @@ class Reduction(Expression):
     ufunc: np.ufunc
     axes: tuple[int, ...]
 
-    @property
-    def detail(self) -> str:
-        return f"{self.ufunc.__name__} {self.axes}"
-
     def with_operands(self, operands: Sequence[Expression]) -> Expression:
         return reduction(self.ufunc, operands[0], self.axes)
 
@@ -156,10 +144,6 @@ class Call(Expression):
 
     __slots__ = ("call",)
     call: Any
-
-    @property
-    def detail(self) -> str:
-        return str(self.call)
 
     def with_operands(self, operands: Sequence[Expression]) -> Expression:
         return call(self.call, operands)
@@ -251,7 +235,7 @@ def pick(operands: Sequence[Any], positions: Any) -> Expression:
         return constant(np.zeros(at.shape, np.result_type(*types)))
     if len(args) == 1:
         (arg,) = args
-        if at.shape == arg.shape and _counts_up(at):
+        if at.shape == arg.shape and (at.reshape(-1) == np.arange(at.size)).all():
             return arg
         if isinstance(arg, Pick):
             return pick(arg.operands, arg.positions.reshape(-1)[at])
@@ -446,11 +430,6 @@ def _dtype_of(function: Any, *dtypes: np.dtype) -> np.dtype:
         return _standard(np.asarray(function(*(np.zeros(0, d) for d in dtypes))).dtype)
     except TypeError as error:
         raise TraceError(str(error)) from error
-
-
-def _counts_up(at: np.ndarray) -> bool:
-    flat = at.reshape(-1)
-    return bool((flat == np.arange(flat.size)).all())
 
 
 def _used(

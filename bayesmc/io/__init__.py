@@ -19,7 +19,7 @@ from bayesmc.io.record import TableNode
 from bayesmc.io.tables import check_net, records
 from bayesmc.io.xmlbif import format_xmlbif, parse_xmlbif
 from bayesmc.network import BayesNet
-from bayesmc.network.ordering import topological_order
+from bayesmc.network.node import topological_order
 
 __all__ = ["from_pgmpy", "from_pyagrum", "read", "to_networkx", "write"]
 

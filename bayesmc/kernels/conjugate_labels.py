@@ -23,7 +23,7 @@ from bayesmc.expression import (
     reduction,
     reshape,
 )
-from bayesmc.expression.products import product
+from bayesmc.expression.functions import product
 from bayesmc.kernels.label_sums import LabelSums, label_sums, sums_by_label
 from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import add, divide, is_all, multiply, subtract

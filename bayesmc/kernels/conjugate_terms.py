@@ -25,8 +25,7 @@ from bayesmc.expression import (
 from bayesmc.passes.arithmetic import ONE, ZERO, add, is_all, multiply, tidied
 from bayesmc.passes.branches import branches_up
 from bayesmc.passes.features import Feature, statistics
-from bayesmc.passes.reads import element_read, same_along
-from bayesmc.passes.sinking import reads, sunk
+from bayesmc.passes.reads import element_read, reads, same_along, sunk
 from bayesmc.passes.totals import parts_of, total
 from bayesmc.structure.blanket import Blanket
 

@@ -25,7 +25,8 @@ from bayesmc.errors import (
 )
 from bayesmc.network import CompiledNode, Model
 from bayesmc.network.align import Aligner
-from bayesmc.network.model import arguments_of, call, fit
+from bayesmc.network.calling import call
+from bayesmc.network.model import arguments_of, fit
 from bayesmc.network.node import Declaration
 from bayesmc.shapes import Shape
 from bayesmc.structure.target import Values

@@ -26,7 +26,7 @@ from bayesmc.expression import (
     reduction,
     reshape,
 )
-from bayesmc.expression.products import product
+from bayesmc.expression.functions import product
 from bayesmc.expression.scalars import SmallProgram, upper_inverse
 from bayesmc.passes.arithmetic import add, divide, multiply, subtract
 from bayesmc.passes.sufficient import transposed

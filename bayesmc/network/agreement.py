@@ -12,7 +12,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import Expression, Program, rebuilt
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.shapes import Shape
+from bayesmc.shapes import Shape, nearly_equal
 
 #: how far an expression may be off what the function gives, relative to the largest entry
 _RTOL = 1e-11
@@ -47,10 +47,10 @@ class Probe(dict[str, np.ndarray]):
         return value
 
 
-#: unlike batch shapes: all of the probe, one row of it, one entry, mixed ranks
+#: unlike batch shapes: all of the probe, one entry, mixed ranks; that a function gives the same whatever
+#: the rank is for ``validate`` to see
 VARIANTS: tuple[Callable[[np.ndarray, int, int], np.ndarray], ...] = (
     lambda v, rank, _: v,
-    lambda v, rank, _: v[-1] if rank == 2 else v,
     lambda v, rank, _: v[(0,) * rank],
     lambda v, rank, k: (v, v[0], v[:, :1], v[0, 0])[k % 4] if rank == 2 else v,
 )
@@ -155,26 +155,15 @@ def _agree(node: CompiledNode | None, expected: Any, made: Any, shape: Shape) ->
     if type(expected) is not type(made):
         return False
     pairs = zip(expected.parameters(), made.parameters(), strict=True)
-    for (a, n), (b, m) in pairs:
-        if n != m:
-            return False
-        first = np.broadcast_to(a, shape + a.shape[a.ndim - n :] if n else shape)
-        second = np.broadcast_to(b, shape + b.shape[b.ndim - n :] if n else shape)
-        if not _near(first, second):
-            return False
-    return True
+    return all(n == m and _alike(a, b, shape, n) for (a, n), (b, m) in pairs)
+
+
+def _alike(a: np.ndarray, b: np.ndarray, shape: Shape, own: int) -> bool:
+    """Whether parameters are the same, whose last axes are their own and the others broadcast."""
+    if a.shape != b.shape:
+        a, b = (np.broadcast_to(x, (*shape, *x.shape[x.ndim - own :])) for x in (a, b))
+    return _near(a, b)
 
 
 def _near(a: np.ndarray, b: np.ndarray) -> bool:
-    if a.shape != b.shape:
-        return False
-    a, b = np.asarray(a), np.asarray(b)
-    if (a == b).all():
-        return True
-    if a.dtype.kind not in "fiub" or b.dtype.kind not in "fiub":
-        return False
-    a, b = a.astype(float), b.astype(float)
-    scale = np.maximum(np.abs(a), np.abs(b))
-    largest = np.max(np.where(np.isfinite(scale), scale, 0.0), initial=0.0)
-    near = np.abs(a - b) <= _RTOL * (np.where(np.isfinite(scale), scale, 0.0) + 1e-3 * largest)
-    return bool((near | (a == b) | (np.isnan(a) & np.isnan(b))).all())
+    return nearly_equal(a, b, _RTOL, 1e-3 * _RTOL)

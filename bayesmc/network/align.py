@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, read_only
 

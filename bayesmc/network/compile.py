@@ -12,8 +12,6 @@ import numpy as np
 from bayesmc.distributions import Density, Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.components import splits
-from bayesmc.distributions.support import Support
-from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import (
     BayesmcError,
     BroadcastError,
@@ -24,19 +22,24 @@ from bayesmc.errors import (
     StateError,
 )
 from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.domain import Domain, domain_with_states, states_domain
+from bayesmc.network.calling import call
+from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
     Model,
     arguments_of,
-    call,
     deterministic_fit,
     fit,
-    invalid_error,
     lookup,
 )
 from bayesmc.network.node import Declaration, Potential
-from bayesmc.network.probing import made_possible
+from bayesmc.network.probing import (
+    entry,
+    made_possible,
+    overflows,
+    reachable,
+    refuse_parameters,
+)
 from bayesmc.shapes import Shape, read_only, unused_sizes
 from bayesmc.states import StateArray
 
@@ -153,7 +156,7 @@ def _discover(
             declaration, links, plates, result, batch, shape, count, rng
         )
         if not possible:
-            _refuse_parameters(node, result, probe, batch)
+            refuse_parameters(node, result, probe, batch)
         return node, value
     return _discover_deterministic(
         declaration, links, plates, result, batch, probe, shape, possible
@@ -235,7 +238,7 @@ def _discover_stochastic(
         splits=splits(dist),
         reach=None if varies else support.at_most,
     )
-    value = _reachable(node, dist, shape, count, rng)
+    value = reachable(node, dist, shape, count, rng)
     return node, read_only(value)
 
 
@@ -244,77 +247,6 @@ def _is_noiseless(dist: Distribution, lead: Shape, batch: int) -> bool:
     if dist.noiseless is None:
         return False
     return bool(np.broadcast_to(dist.noiseless, lead).all(axis=tuple(range(batch))).any())
-
-
-def _refuse_parameters(
-    node: CompiledNode, dist: Distribution, probe: Mapping[str, np.ndarray], batch: Shape
-) -> None:
-    """Raise for parameters out of range, unless they over- or underflowed, as vague priors make them:
-    for some draws of the parents, or for all of those tried where the arithmetic says so itself (then they
-    may be NaN as well).
-    """
-    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch, noiseless=True)
-    if bad is None:
-        return
-    assert dist.invalid is not None and dist.problem is not None
-    full = np.broadcast_to(dist.invalid, batch + node.plate_shape).reshape(math.prod(batch), -1)
-    if dist.problem.is_overflow and not full.all(axis=0).any():
-        return
-    if not dist.problem.has_grown or not _overflows(
-        node.declaration, node.links, probe, batch + node.plate_shape
-    ):
-        raise bad
-
-
-def _overflows(
-    declaration: Declaration,
-    links: tuple[tuple[str, Aligner], ...],
-    probe: Mapping[str, np.ndarray],
-    lead: Shape,
-) -> bool:
-    """Whether a parent is infinite already, or the function's arithmetic over- or underflows on them."""
-    if any(np.isinf(probe[name].astype(float)).any() for name, _ in links):
-        return True
-    arguments, _ = arguments_of(links, probe)
-    try:
-        with np.errstate(over="raise", under="raise"):
-            call(declaration, arguments, lead, links)
-    except BayesmcError as error:
-        return isinstance(error.__cause__, FloatingPointError)
-    return False
-
-
-def _reachable(
-    node: CompiledNode, dist: Distribution, batch: Shape, count: int, rng: np.random.Generator
-) -> np.ndarray:
-    """Distinct values of positive density: states in turn for finite nodes, draws for all others."""
-    lead = batch + node.plate_shape
-    if node.domain is not None:
-        table = dist.probs_table
-        assert table is not None
-        possible = np.broadcast_to(table > 0, (*lead, node.domain.size))
-        rank = np.cumsum(possible, axis=-1)
-        turn = (np.arange(math.prod(lead)).reshape(lead) + count) % np.maximum(rank[..., -1], 1)
-        return np.argmax(rank > turn[..., None], axis=-1).astype(node.domain.dtype)
-    try:
-        return np.asarray(dist.sample_to(rng, lead))
-    except BayesmcError:
-        return _point_in(dist.support, lead, dist.event_shape, rng)
-
-
-def _point_in(support: Support, lead: Shape, event: Shape, rng: np.random.Generator) -> np.ndarray:
-    """Some points of a support, for densities that cannot be sampled from."""
-    shape = lead + event
-    if not support.is_discrete:
-        transform = transform_of(support, event)
-        free = rng.uniform(-1.0, 1.0, lead + transform.unconstrained_shape)
-        return np.broadcast_to(transform.constrain(free), shape)
-    low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
-    u = 0.2 + 0.6 * rng.random(shape)
-    with np.errstate(invalid="ignore"):
-        value = np.where(np.isfinite(low), low + u, np.where(np.isfinite(high), high - u, u))
-        value = np.where(np.isfinite(low) & np.isfinite(high), low + u * (high - low), value)
-    return np.broadcast_to(np.floor(value), shape)
 
 
 def _discover_deterministic(
@@ -334,7 +266,7 @@ def _discover_deterministic(
     full = batch + plates + event
     value = deterministic_fit(declaration, result, batch, plates, full)
     undefined = not possible and value.dtype.kind == "f" and np.isnan(value).any()
-    if undefined and not _overflows(declaration, links, probe, batch + plates):
+    if undefined and not overflows(declaration, links, probe, batch + plates):
         raise DensityError(
             f"node {declaration.name!r}: the function returns NaN on reachable values"
         )
@@ -451,23 +383,6 @@ def configurations(
         shape = (1,) * axis + (card,) + (1,) * (len(cards) - 1 - axis + link.trailing)
         values[parent] = np.arange(card).reshape(shape)
     return values
-
-
-def entry(
-    links: Sequence[tuple[str, Aligner]],
-    probe: Mapping[str, np.ndarray],
-    shape: Shape,
-    index: Shape,
-) -> dict[str, np.ndarray]:
-    """The parents' values at one entry of the probe's broadcast batch, without batch axes."""
-    picked = {}
-    for parent, link in links:
-        value = probe[parent]
-        batch = link.batch_shape(value)
-        own = index[len(shape) - len(batch) :]
-        at: tuple[Any, ...] = tuple(i if n > 1 else 0 for i, n in zip(own, batch, strict=True))
-        picked[parent] = value[(*at, Ellipsis)]  # an array still, also without axes
-    return picked
 
 
 def _check_table_parents(

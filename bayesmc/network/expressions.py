@@ -37,11 +37,10 @@ from bayesmc.network.agreement import (
 )
 from bayesmc.network.align import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
-from bayesmc.network.node import Numbered
+from bayesmc.network.node import Numbered, identity
 from bayesmc.network.readings import (
     Argument,
     Reading,
-    identity,
     numbers_of,
     read_function,
     read_table,
@@ -217,7 +216,9 @@ def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
         if declaration.probs is not None:
             reading = read_table(declaration.probs, arguments, links)
         else:
-            reading = read_function(declaration.function, arguments, links)
+            is_steady = isinstance(density(model, name), Followed)
+            function = declaration.function
+            reading = read_function(function, arguments, links, is_steady=is_steady)
         found = Followed(model, reading, parents, arguments).result
     except (BayesmcError, ValueError, IndexError) as error:
         raise TraceError(str(error)) from error

@@ -21,7 +21,7 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network.captured import captured
-from bayesmc.network.domain import Domain, domain_with_states
+from bayesmc.network.labels import Domain, domain_with_states
 from bayesmc.network.node import Declaration, Potential, bind, plain_states
 from bayesmc.shapes import Shape, as_shape, first_index, owned
 

@@ -21,7 +21,7 @@ from bayesmc.errors import (
     PlateError,
     QueryError,
 )
-from bayesmc.network.declared_plates import DeclaredPlates
+from bayesmc.network.declaring import DeclaredPlates
 from bayesmc.network.evidence import Observed, read_evidence, read_inputs
 from bayesmc.network.factor_batch import read_factor, variable_declaration
 from bayesmc.network.factor_scope import factor_scopes, hidden_elements
@@ -29,11 +29,10 @@ from bayesmc.network.forward import refuse_parts
 from bayesmc.network.full_conditional import full_conditional
 from bayesmc.network.graph_view import FactorRecord, GraphView, VariableRecord
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Potential
-from bayesmc.network.store import ModelStore
+from bayesmc.network.store import Declared
 
 
-class FactorGraph:
+class FactorGraph(Declared):
     """Variables and log factors: a density that is a product, known up to its constant.
 
     Parameters
@@ -76,11 +75,8 @@ class FactorGraph:
     def __init__(
         self, name: str | None = None, plates: Mapping[str, int | Sequence[Any]] | None = None
     ) -> None:
-        self._plates = DeclaredPlates.read("FactorGraph", name, plates, open_sizes=False)
-        self.name = name
-        self._declarations: dict[str, Declaration] = {}
-        self._potentials: dict[str, Potential] = {}
-        self._kept_store: ModelStore | None = None
+        read = DeclaredPlates.read("FactorGraph", name, plates, open_sizes=False)
+        super().__init__(name, read)
         self._kept_view: GraphView | None = None
         self._question: tuple[Any, Model, dict[str, Observed], dict[str, np.ndarray]] | None = None
 
@@ -209,9 +205,6 @@ class FactorGraph:
         self._changed()
 
     # ---- asking -----------------------------------------------------------------------------
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._declarations or name in self._potentials
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.variables)
@@ -416,29 +409,16 @@ class FactorGraph:
                 )
         return net, model, {**observed, **more}, given
 
-    def snapshot(self) -> FactorGraph:
-        """A copy that shares what is compiled already; what holds it never sees later declarations."""
-        other = FactorGraph(self.name)
-        other._declarations = dict(self._declarations)
-        other._potentials = dict(self._potentials)
-        other._plates = self._plates.copy()
-        other._kept_store = self._kept_store
+    def copy(self) -> FactorGraph:
+        other = super().copy()
         other._question = self._question
         return other
 
     # ---- private ----------------------------------------------------------------------------
 
     def _changed(self) -> None:
-        self._kept_store = None
+        super()._changed()
         self._kept_view = None
-
-    @property
-    def _store(self) -> ModelStore:
-        if self._kept_store is None:
-            self._kept_store = ModelStore(
-                self.name, self._declarations, self._potentials, self._plates.labels
-            )
-        return self._kept_store
 
     @property
     def _view(self) -> GraphView:
@@ -457,7 +437,6 @@ class FactorGraph:
             )
 
     def _refuse_name(self, what: str, name: Any) -> None:
-        if not isinstance(name, str) or not name:
-            raise ModelError(f"a {what}'s name is a non-empty string, not {name!r}")
+        super()._refuse_name(what, name)
         if name in self:
             raise DuplicateNodeError(f"{what} {name!r}: the name is declared already")

@@ -6,7 +6,7 @@ with some. A pass is a list of steps, one per node; engines may put faster steps
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ from bayesmc.distributions.components import completed, log_prob_of
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
-from bayesmc.network.noiseless import is_link
+from bayesmc.network.node import is_link
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape
 
@@ -286,6 +286,41 @@ def summed(log: np.ndarray, node: CompiledNode, apart: tuple[str, ...]) -> np.nd
     if order != sorted(order):
         total = total.transpose(*range(count), *(count + k for k in order))
     return total
+
+
+def drawn_anew(
+    model: Model, wanted: Collection[str], resized: Collection[str], new_inputs: bool
+) -> set[str]:
+    """Nodes that a prediction draws again: those wanted, in other plates, or computed from what changes."""
+    anew: set[str] = set()
+    changed: set[str] = set()
+    for name, node in model.nodes.items():
+        other = any(plate in resized for plate in node.plates)
+        if node.kind == "input":
+            changed |= {name} if new_inputs or other else set()
+        elif (
+            name in wanted
+            or other
+            or (not node.is_stochastic and (anew | changed) & set(node.parents))
+        ):
+            anew.add(name)
+    return anew
+
+
+def refuse_potentials(model: Model, wanted: Collection[str], what: str) -> None:
+    """Drawing a node anew from its parents would ignore a potential on it.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    for name, (potential, _) in model.potentials.items():
+        hit = [n for n in wanted if n in potential.parents]
+        if hit:
+            raise UnsupportedError(
+                f"{what}({hit[0]!r}): the potential {name!r} reweights it, which drawing it given its "
+                "parents would ignore"
+            )
 
 
 def refuse_parts(observed: Mapping[str, Observed], who: str) -> str | None:

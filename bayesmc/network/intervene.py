@@ -2,21 +2,41 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import EvidenceError
-from bayesmc.network.evidence import store
-from bayesmc.network.labelled import by_label
+from bayesmc.errors import EvidenceError, UnknownNodeError
+from bayesmc.network.evidence import plate_sizes, store
+from bayesmc.network.labels import by_label
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.network.node import Declaration
-from bayesmc.network.ordering import ancestors
+from bayesmc.network.node import Declaration, ancestors
+from bayesmc.network.store import ModelStore, unknown
 from bayesmc.shapes import owned
 
 
-def fixed(name: str, node: CompiledNode, value: Any, model: Model) -> Declaration:
+def intervened(
+    net: ModelStore, sizes: Mapping[str, int | None], values: Mapping[str, Any]
+) -> dict[str, Declaration]:
+    """The declarations of nodes fixed at values.
+
+    Raises
+    ------
+    UnknownNodeError, EvidenceError
+    """
+    for name in values:
+        if name not in net.declarations:
+            raise UnknownNodeError(f"do({name}=...): {unknown(net.declarations, name)}")
+    model = net.probe(plate_sizes(sizes, net.declarations, values))
+    return {name: _fixed(name, model[name], value, model) for name, value in values.items()}
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _fixed(name: str, node: CompiledNode, value: Any, model: Model) -> Declaration:
     """The declaration of ``node`` fixed at ``value``; what it cannot be is refused."""
     if node.kind == "input":
         raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")

@@ -11,7 +11,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, EvidenceError, UnsupportedError
 from bayesmc.network import forward
 from bayesmc.network.evidence import store
-from bayesmc.network.labelled import by_label
+from bayesmc.network.labels import by_label
 from bayesmc.network.model import CompiledNode, Model, invalid_error
 
 

@@ -9,7 +9,6 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -17,23 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Distribution, as_distribution
+from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support
 from bayesmc.errors import (
     BayesmcError,
     DensityError,
     ModelError,
     ParameterError,
-    PlateError,
     ShapeError,
 )
 from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.domain import Domain
-from bayesmc.network.elementwise import call_elementwise
+from bayesmc.network.calling import call
+from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, Node, Potential
-from bayesmc.plates import Gathered, PlateArray
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
-from bayesmc.states import StateArray
 
 #: configurations of finite parents up to which a deterministic node is tabulated
 _DETERMINISTIC_TABLE = 4096
@@ -302,55 +298,6 @@ def arguments_of(
     return arguments, batch
 
 
-def call(
-    declaration: Declaration,
-    arguments: Sequence[Any],
-    lead: Shape,
-    links: Sequence[tuple[str, Aligner]],
-    wants_array: bool = False,
-) -> Any:
-    """Call a node's function; what goes wrong inside names the node.
-
-    Returns a ``Distribution``, or an array for a deterministic node.
-    """
-    name = declaration.name
-    if declaration.probs is not None:
-        return _table_rows(declaration, arguments)
-    assert declaration.function is not None
-    try:
-        if declaration.vectorize:
-            result: Any = call_elementwise(
-                declaration.function, arguments, [link.event_ndim for _, link in links], lead
-            )
-        else:
-            result = declaration.function(*arguments)
-        if isinstance(result, Distribution):
-            if wants_array:
-                raise ModelError("a potential returns a log factor, not a distribution")
-            return result
-        wrapped = as_distribution(result)
-        if wrapped is not None:
-            return wrapped
-        if result is None:
-            raise ModelError("the function returns None; return a distribution or an array")
-        if isinstance(result, PlateArray):
-            raise result.ungathered()
-        array = result if isinstance(result, StateArray) else _as_array(result)
-        if array.dtype.kind not in "biuf":
-            raise ModelError(
-                f"the function returns {type(result).__name__}; return a distribution (of bayesmc, or "
-                "a frozen scipy.stats one), or an array of numbers for a deterministic node"
-            )
-        return array
-    except BayesmcError as error:
-        raise _renamed(error, f"node {name!r}: {_with_name(str(error), links)}") from error
-    except Exception as error:
-        own = _own_plate_reduced(declaration, error, links)
-        if own is not None:
-            raise PlateError(f"node {name!r}: {own}") from error
-        raise ModelError(f"node {name!r}: {_explain(error, arguments)}") from error
-
-
 def fit(declaration: Declaration, dist: Distribution, batch: Shape, plates: Shape) -> None:
     """Refuse a distribution whose batch goes beyond the batch of the parents and the plates."""
     if not broadcasts_to(dist.batch_shape, batch + plates):
@@ -373,14 +320,6 @@ def lookup(node: CompiledNode, values: Mapping[str, np.ndarray]) -> np.ndarray:
         index = (*index, *np.ix_(*(np.arange(n) for n in plates)))
     result = node.table[index] if index else node.table
     return read_only(np.asarray(result))
-
-
-def _as_array(result: Any) -> np.ndarray:
-    """What a function returned as an array; nested things of several lengths are one of objects."""
-    try:
-        return np.asarray(result)
-    except ValueError:
-        return np.empty(0, dtype=object)
 
 
 def invalid_error(
@@ -423,77 +362,3 @@ def deterministic_fit(
             "declare the axes that are elements with plates="
         )
     return read_only(np.broadcast_to(array, shape))
-
-
-def _table_rows(declaration: Declaration, arguments: Sequence[Any]) -> Distribution:
-    """The rows of a conditional probability table that the parents' positions pick."""
-    probs = declaration.probs
-    assert probs is not None
-    if not arguments:
-        return Categorical(probs)
-    rows: Any = 0
-    for card, positions in zip(probs.shape[:-1], arguments, strict=True):
-        rows = rows * card + positions.astype(np.intp)
-    return Categorical(Gathered(probs.reshape(-1, probs.shape[-1]), rows))
-
-
-def to_mix(declaration: Declaration, parents: Sequence[str], plate: str) -> str:
-    """The lines that mix the elements of a plate, for a node of that plate that does so itself."""
-    rest = tuple(p for p in declaration.plates if p != plate)
-    plates = f", plates={rest if len(rest) > 1 else rest[0]!r}" if rest else ""
-    parent = parents[0] if parents else "x"
-    total = f"{parent}_total"
-    others = ", ".join(dict.fromkeys([*parents, total]))
-    return (
-        "to mix elements (a mean, a cumulative sum), use an unplated deterministic node that reads the "
-        f"whole plate, net.add({total!r}, lambda {parent}: {parent}.sum({plate!r}){plates}), and read that: "
-        f"lambda {others}: ... in {declaration.name!r}"
-    )
-
-
-def _own_plate_reduced(
-    declaration: Declaration, error: Exception, links: Sequence[tuple[str, Aligner]]
-) -> str | None:
-    """What to write instead of ``x.sum("plate")`` on a plate of the node's own, if that is what failed."""
-    named = isinstance(error, TypeError) and "'str' object cannot be interpreted" in str(error)
-    shared = [
-        name
-        for name, link in links
-        if isinstance(link, Aligner) and link.trailing - link.event_ndim > len(link.foreign)
-    ]
-    if not (named and shared):
-        return None
-    plate = declaration.plates[0]
-    return (
-        f"{shared[0]!r} arrives as a plain array, element by element, since {plate!r} is a plate of the "
-        f"node itself, so .sum({plate!r}) has nothing to reduce; "
-        + to_mix(declaration, list(dict.fromkeys(n for n, _ in links)), plate)
-    )
-
-
-def _with_name(message: str, links: Sequence[tuple[str, Aligner]]) -> str:
-    """A message about ``v`` as one about the only parent that it can be."""
-    foreign = list(dict.fromkeys(n for n, link in links if link.foreign))
-    if len(foreign) != 1:
-        return message
-    return re.sub(r"\bv(?=\[index\]|\[i\]|\.sum\(|\.mean\(|\.array\b)", foreign[0], message)
-
-
-def _renamed(error: BayesmcError, message: str) -> BayesmcError:
-    """The same kind of error, carrying the same facts, with another message."""
-    copy = type(error).__new__(type(error))
-    copy.__dict__.update(error.__dict__)
-    copy.args = (message,)
-    return copy
-
-
-def _explain(error: Exception, arguments: Sequence[Any]) -> str:
-    hint = ""
-    if "matmul" in str(error):
-        hint = "; in a plate use np.matvec(A, v) or np.vecdot(x, v) instead of @"
-    if isinstance(error, ValueError) and "read-only" in str(error):
-        return "the function changes a parent in place; parents are read-only, so make a new array"
-    shapes = ", ".join(
-        str(a.array.shape if isinstance(a, PlateArray) else np.shape(a)) for a in arguments
-    )
-    return f"{type(error).__name__}: {error} (arguments of shapes {shapes or 'none'}){hint}"

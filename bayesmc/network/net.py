@@ -10,34 +10,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import (
-    DuplicateNodeError,
-    EvidenceError,
-    ModelError,
-    UnknownNodeError,
-)
-from bayesmc.network.captured import captured
-from bayesmc.network.declared_plates import DeclaredPlates
+from bayesmc.errors import DuplicateNodeError, EvidenceError, ModelError, UnknownNodeError
 from bayesmc.network.declaring import (
+    DeclaredPlates,
     Parents,
     declared,
     declared_function,
+    declared_potential,
     declared_table,
     settled_sizes,
 )
-from bayesmc.network.evidence import plate_sizes, read_inputs, read_question
+from bayesmc.network.evidence import read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
-from bayesmc.network.intervene import fixed
+from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model
-from bayesmc.network.node import (
-    Declaration,
-    Node,
-    Potential,
-    bind,
-)
-from bayesmc.network.noiseless import without_noise
-from bayesmc.network.store import ModelStore, check_parents, unknown
+from bayesmc.network.node import Declaration, Node, Potential, without_noise
+from bayesmc.network.store import Declared, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
 
@@ -45,7 +34,7 @@ if TYPE_CHECKING:
     import networkx
 
 
-class BayesNet:
+class BayesNet(Declared):
     """A hybrid Bayes net: nodes whose conditional densities are plain functions of their parents.
 
     Parameters
@@ -78,11 +67,7 @@ class BayesNet:
         name: str | None = None,
         plates: Mapping[str, int | Sequence[Any] | None] | None = None,
     ) -> None:
-        self._plates = DeclaredPlates.read("BayesNet", name, plates)
-        self.name = name
-        self._declarations: dict[str, Declaration] = {}
-        self._potentials: dict[str, Potential] = {}
-        self._kept_store: ModelStore | None = None
+        super().__init__(name, DeclaredPlates.read("BayesNet", name, plates))
 
     # ---- declaring --------------------------------------------------------------------------
 
@@ -213,16 +198,11 @@ class BayesNet:
         Without ``plates`` the function sees plated nodes as foreign and reduces them (``x.sum("point")``);
         with them it acts element by element and the elements are summed.
         """
-        names, bound = bind(name, function, parents)
+        within = self._plates.of(f"node {name!r}", plates)
+        found = declared_potential(name, function, parents, within)
         if name in self._declarations or name in self._potentials:
             raise DuplicateNodeError(f"potential {name!r}: the name is declared already")
-        self._potentials[name] = Potential(
-            name,
-            names,
-            bound,
-            self._plates.of(f"node {name!r}", plates),
-            captured=captured(function),
-        )
+        self._potentials[name] = found
         self._changed()
 
     def do(self, mapping: Mapping[str, Any] | None = None, /, **values: Any) -> BayesNet:
@@ -244,30 +224,9 @@ class BayesNet:
         """
         if mapping is not None and not isinstance(mapping, Mapping):
             raise EvidenceError(f"do({mapping!r}): give a dict, or name=value")
+        other = self.copy()
         chosen = {**(mapping or {}), **values}
-        for name in chosen:
-            if name not in self._declarations:
-                raise UnknownNodeError(f"do({name}=...): {unknown(self._declarations, name)}")
-        sizes = plate_sizes(self._plates.sizes, self._declarations, chosen)
-        model = self._store.probe(sizes)
-        other = self.copy()
-        for name, value in chosen.items():
-            other._declarations[name] = fixed(name, model[name], value, model)
-        other._changed()
-        return other
-
-    def copy(self) -> BayesNet:
-        """An independent net with the same declarations."""
-        other = BayesNet(self.name)
-        other._declarations = dict(self._declarations)
-        other._potentials = dict(self._potentials)
-        other._plates = self._plates.copy()
-        return other
-
-    def snapshot(self) -> BayesNet:
-        """A copy that shares what is compiled already; what holds it never sees later declarations."""
-        other = self.copy()
-        other._kept_store = self._store
+        other._declarations.update(intervened(self._store, self._plates.sizes, chosen))
         return other
 
     def with_links(self, links: Mapping[str, int]) -> BayesNet:
@@ -335,11 +294,11 @@ class BayesNet:
         import networkx
 
         graph = networkx.DiGraph(name=self.name or "")
-        for name, declaration in self._declarations.items():
-            graph.add_node(name, plates=declaration.plates, source=declaration.source)
-        for name, declaration in self._declarations.items():
-            check_parents(self._declarations, name, declaration.parents)
-            graph.add_edges_from((parent, name) for parent in declaration.parents)
+        for name, what in self._declarations.items():
+            graph.add_node(name, plates=what.plates, source=what.source)
+        for name, what in self._declarations.items():
+            check_parents(self._declarations, name, what.parents)
+            graph.add_edges_from((parent, name) for parent in what.parents)
         return graph
 
     def validate(self, inputs: Mapping[str, Any] | None = None) -> None:
@@ -356,9 +315,8 @@ class BayesNet:
         """
         if inputs is not None:
             self.model(inputs=inputs)
-            return
-        model = self._store.probe(self._plates.sizes)
-        self._store.validate(model)
+        else:
+            self._store.validate(self._store.probe(self._plates.sizes))
 
     def log_prob(
         self, values: Mapping[str, Any], *, inputs: Mapping[str, Any] | None = None
@@ -377,11 +335,10 @@ class BayesNet:
             )
         trimmed = {n: self._unbatched(n, v) for n, v in values.items() if n in self._declarations}
         model = self.model(trimmed, inputs)
-        strange = [n for n in values if n not in model.nodes]
-        if strange:
-            raise EvidenceError(f"log_prob: {unknown(self._declarations, strange[0])}")
-        given = read_inputs(self._declarations, model.sizes, inputs, self._fitting(model.sizes))
-        return joint_log_prob(model, values, given)
+        for name in values:
+            if name not in model.nodes:
+                raise EvidenceError(f"log_prob: {unknown(self._declarations, name)}")
+        return joint_log_prob(model, values, self._inputs(model.sizes, inputs))
 
     def sample(
         self,
@@ -414,7 +371,7 @@ class BayesNet:
         if isinstance(draws, bool) or not isinstance(draws, (int, np.integer)) or draws < 0:
             raise ValueError(f"sample(draws={draws!r}): draws is a number of draws, 0 or more")
         model = self.model(None, inputs, plates)
-        given = read_inputs(self._declarations, model.sizes, inputs, self._fitting(model.sizes))
+        given = self._inputs(model.sizes, inputs)
         return joint_sample(model, int(draws), stream(seed_sequence(rng), Purpose.SAMPLE), given)
 
     def model(
@@ -425,8 +382,7 @@ class BayesNet:
     ) -> Model:
         """The validated snapshot that engines run on, with plate sizes settled by the data."""
         settled = settled_sizes(self._plates, self._declarations, evidence, inputs, plates)
-        given = read_inputs(self._declarations, settled, inputs, self._fitting(settled))
-        model = self._store.model(settled, given)
+        model = self._store.model(settled, self._inputs(settled, inputs))
         self._store.validate(model)
         return model
 
@@ -459,8 +415,7 @@ class BayesNet:
 
     def _declare(self, declaration: Declaration, replace_: bool) -> None:
         name = declaration.name
-        if not isinstance(name, str) or not name:
-            raise ModelError(f"a node's name is a non-empty string, not {name!r}")
+        self._refuse_name("node", name)
         if (name in self._declarations and not replace_) or name in self._potentials:
             raise DuplicateNodeError(
                 f"node {name!r} is declared already; choose another name or pass replace=True"
@@ -468,20 +423,10 @@ class BayesNet:
         self._declarations[name] = declaration
         self._changed()
 
-    def _changed(self) -> None:
-        self._kept_store = None
-
-    @property
-    def _store(self) -> ModelStore:
-        if self._kept_store is None:
-            self._kept_store = ModelStore(
-                self.name, self._declarations, self._potentials, self._plates.labels
-            )
-        return self._kept_store
-
-    def _fitting(self, sizes: Mapping[str, int]) -> dict[str, tuple[Any, ...]]:
-        """Labels of plates that have the size they were declared with."""
-        return {p: names for p, names in self._plates.labels.items() if len(names) == sizes[p]}
+    def _inputs(
+        self, sizes: Mapping[str, int], inputs: Mapping[str, Any] | None
+    ) -> dict[str, np.ndarray]:
+        return read_inputs(self._declarations, sizes, inputs, self._plates.fitting(sizes))
 
     def _unbatched(self, name: str, value: Any) -> Any:
         """A stand-in with the value's plate axes in front, for reading plate sizes off it."""

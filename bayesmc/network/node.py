@@ -1,18 +1,24 @@
-"""Declarations: what a user wrote about one node, before anything is evaluated."""
+"""Declarations: what a user wrote about one node, and what can be told of it before anything is evaluated."""
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
+from dataclasses import dataclass, field, replace
+from types import FunctionType
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import ModelError, ParameterError
+from bayesmc.distributions import MvNormal, Normal
+from bayesmc.errors import CycleError, ModelError, ParameterError, QueryError, UnknownNodeError
 from bayesmc.network.captured import Captured
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.shapes import Shape, first_index
+
+#: what a function without noise is known by
+_MARK = "bayesmc_computes"
 
 
 @dataclass(frozen=True)
@@ -193,6 +199,154 @@ def plain_states(states: Sequence[Any]) -> tuple[Any, ...]:
     if isinstance(states, (str, Set)) or not isinstance(states, (Sequence, np.ndarray)):
         raise ModelError(f"states={states!r}: give a list or tuple, in the order of the support")
     return tuple(s.item() if isinstance(s, np.generic) else s for s in states)
+
+
+def identity(function: Any) -> Hashable:
+    """Equal for one function: one object, or one code with the same things around it."""
+    if isinstance(function, Numbered):
+        return identity(function.func), function.places, function.number
+    if type(function) is not FunctionType:
+        return id(function)
+    keywords = function.__kwdefaults__ or {}
+    around = [*(function.__defaults__ or ()), *keywords, *keywords.values()]
+    for cell in function.__closure__ or ():
+        try:
+            around.append(cell.cell_contents)
+        except ValueError:  # not yet filled
+            return id(function)
+    inside = tuple(repr(v) if type(v) in (int, float, bool, str) else id(v) for v in around)
+    return function.__code__, id(function.__globals__), inside
+
+
+def nodes_read(function: Callable[..., Any]) -> tuple[str, ...]:
+    """Nodes that a query reads, in the order of its arguments.
+
+    Arguments with a default are none, as for the functions of nodes.
+
+    Parameters
+    ----------
+    function : callable
+        Of nodes, by the names of its arguments.
+
+    Raises
+    ------
+    UnknownNodeError
+        ``*args`` and ``**kwargs`` name no node.
+    QueryError
+        The arguments cannot be read, as of some built-in functions.
+
+    Examples
+    --------
+    >>> nodes_read(lambda x, y, c=0.3: x + y > c)
+    ('x', 'y')
+    """
+    try:
+        parameters = inspect.signature(function).parameters.values()
+    except (TypeError, ValueError):
+        raise QueryError(
+            f"query: the arguments of {function!r} cannot be read; write a function whose arguments are "
+            "named like nodes"
+        ) from None
+    wanted = [p for p in parameters if p.default is p.empty]
+    for p in wanted:
+        if p.kind in (p.VAR_KEYWORD, p.VAR_POSITIONAL):
+            raise UnknownNodeError(f"query: the argument {p} names no node")
+    return tuple(p.name for p in wanted)
+
+
+def topological_order(parents: Mapping[str, Sequence[str]]) -> list[str]:
+    """Names with every parent before its children, otherwise as declared (Kahn 1962)."""
+    waiting = {name: len(set(above)) for name, above in parents.items()}
+    children: dict[str, list[str]] = {name: [] for name in parents}
+    for name, above in parents.items():
+        for parent in set(above):
+            children[parent].append(name)
+    ready = deque(name for name, count in waiting.items() if count == 0)
+    order = []
+    while ready:
+        name = ready.popleft()
+        order.append(name)
+        for child in children[name]:
+            waiting[child] -= 1
+            if waiting[child] == 0:
+                ready.append(child)
+    if len(order) < len(parents):
+        path = cycle_path(parents, [n for n in parents if waiting[n] > 0])
+        raise CycleError(
+            f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
+            "(for time, use a dynamic net with _prev arguments)",
+            path,
+        )
+    return order
+
+
+def cycle_path(parents: Mapping[str, Sequence[str]], among: Iterable[str]) -> list[str]:
+    """One directed cycle, parent before child, its first name repeated at the end."""
+    left = set(among)
+    name = next(iter(sorted(left)))
+    seen: dict[str, int] = {}
+    trail: list[str] = []
+    while name not in seen:
+        seen[name] = len(trail)
+        trail.append(name)
+        name = next(p for p in parents[name] if p in left)
+    cycle = trail[seen[name] :][::-1]
+    start = cycle.index(min(cycle))
+    cycle = cycle[start:] + cycle[:start]
+    return [*cycle, cycle[0]]
+
+
+def ancestors(parents: Mapping[str, Sequence[str]], names: Iterable[str]) -> set[str]:
+    """``names`` and everything above them."""
+    found: set[str] = set()
+    todo = list(names)
+    while todo:
+        name = todo.pop()
+        if name not in found:
+            found.add(name)
+            todo.extend(parents[name])
+    return found
+
+
+def observed_links(nodes: Any, evidence: Mapping[str, Any]) -> dict[str, int]:
+    """Observed nodes that are computed, and numbers or vectors of them: name -> event axes.
+
+    Parameters
+    ----------
+    nodes : mapping
+        Name -> something with ``kind``, ``is_discrete`` and ``event_shape``.
+    evidence : dict
+    """
+    found = {}
+    for name in (n for n, value in evidence.items() if n in nodes and value is not None):
+        node = nodes[name]
+        if node.kind == "deterministic" and not node.is_discrete and len(node.event_shape) < 2:
+            found[name] = len(node.event_shape)
+    return found
+
+
+def without_noise(declaration: Declaration, rank: int) -> Declaration:
+    """The node as one without noise about what its function returns, a value with ``rank`` event axes."""
+    function = declaration.function
+    assert function is not None
+
+    def link(*values: Any) -> Any:
+        value = function(*values)
+        if not rank:
+            return Normal(value, 0.0)
+        size = np.shape(value)[-1]
+        return MvNormal(value, np.zeros((size, size)))
+
+    link.__dict__[_MARK] = True
+    return replace(declaration, function=link)
+
+
+def is_link(declaration: Declaration) -> bool:
+    """Whether a node was computed before ``without_noise``."""
+    return _MARK in getattr(declaration.function, "__dict__", {})
+
+
+# ---- private ------------------------------------------------------------------------------------
 
 
 def _arguments(name: str, signature: inspect.Signature) -> tuple[list[str], list[str], str]:

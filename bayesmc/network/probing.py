@@ -6,16 +6,19 @@ all of them is the model's fault, and the caller raises it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.errors import BayesmcError
+from bayesmc.distributions.support import Support, is_half_line
+from bayesmc.distributions.transforms import transform_of
+from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network.align import Aligner
-from bayesmc.network.model import CompiledNode, Model, arguments_of, call
-from bayesmc.network.nearer import nearer
+from bayesmc.network.calling import call
+from bayesmc.network.model import CompiledNode, Model, arguments_of, invalid_error
 from bayesmc.network.node import Declaration
 from bayesmc.shapes import Shape, broadcasts_to, read_only
 
@@ -27,6 +30,12 @@ _DRAWS = 64
 _MOST = 16
 
 Links = tuple[tuple[str, Aligner], ...]
+
+
+#: the most that draws of a half line go from the middle
+_FROM_ZERO = 0.9
+#: supports that hold every point between two of theirs
+_CONVEX = ("real", "interval", "simplex", "real vector", "positive definite", "product")
 
 
 def made_possible(
@@ -85,6 +94,114 @@ def wrong_elements(result: Any, batch: Shape, plates: Shape) -> np.ndarray:
         return np.zeros(shape, dtype=bool)
     axes = tuple(range(len(shape), array.ndim))
     return np.broadcast_to(np.isnan(array).any(axis=axes), shape)
+
+
+def nearer(
+    dist: Distribution, draws: np.ndarray, spread: float, shape: Shape, event_ndim: int
+) -> np.ndarray:
+    """Draws moved towards the middle of a distribution, where the support holds what lies between.
+
+    Parameters
+    ----------
+    draws : ndarray, shape ``shape``
+    spread : float
+        How much of their distance to the middle is left, 0 to 1.
+    event_ndim : int
+        Number of the last axes that are one value's.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network.probing import nearer
+    >>> nearer(bmc.Normal(1.0, 100.0), np.array([-99.0, 201.0]), 0.01, (2,), 0).tolist()
+    [0.0, 3.0]
+    """
+    if dist.support.kind not in _CONVEX:
+        return draws
+    half_line = dist.support.kind == "interval" and is_half_line(dist.support)
+    if half_line:  # a vague scale is drawn at 1e-200 as likely as not, and a chain never comes back
+        spread = min(spread, _FROM_ZERO)
+    if spread == 1.0:
+        return draws
+    middle = _middle(dist, shape, half_line)
+    axes = tuple(range(len(shape) - event_ndim, len(shape)))
+    fine = np.isfinite(middle).all(axis=axes, keepdims=True)
+    moved = middle + max(spread, 1e-9) * (np.where(np.isfinite(draws), draws, middle) - middle)
+    return np.where(fine, moved, draws)
+
+
+def reachable(
+    node: CompiledNode, dist: Distribution, batch: Shape, count: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Distinct values of positive density: states in turn for finite nodes, draws for all others."""
+    lead = batch + node.plate_shape
+    if node.domain is not None:
+        table = dist.probs_table
+        assert table is not None
+        possible = np.broadcast_to(table > 0, (*lead, node.domain.size))
+        rank = np.cumsum(possible, axis=-1)
+        turn = (np.arange(math.prod(lead)).reshape(lead) + count) % np.maximum(rank[..., -1], 1)
+        return np.argmax(rank > turn[..., None], axis=-1).astype(node.domain.dtype)
+    try:
+        return np.asarray(dist.sample_to(rng, lead))
+    except BayesmcError:
+        return _point_in(dist.support, lead, dist.event_shape, rng)
+
+
+def refuse_parameters(
+    node: CompiledNode, dist: Distribution, probe: Mapping[str, np.ndarray], batch: Shape
+) -> None:
+    """Raise for parameters out of range, unless they over- or underflowed, as vague priors make them:
+    for some draws of the parents, or for all of those tried where the arithmetic says so itself (then they
+    may be NaN as well).
+    """
+    bad = invalid_error(node, dist, np.ones(batch, dtype=bool), batch, noiseless=True)
+    if bad is None:
+        return
+    assert dist.invalid is not None and dist.problem is not None
+    full = np.broadcast_to(dist.invalid, batch + node.plate_shape).reshape(math.prod(batch), -1)
+    if dist.problem.is_overflow and not full.all(axis=0).any():
+        return
+    if not dist.problem.has_grown or not overflows(
+        node.declaration, node.links, probe, batch + node.plate_shape
+    ):
+        raise bad
+
+
+def overflows(
+    declaration: Declaration,
+    links: Links,
+    probe: Mapping[str, np.ndarray],
+    lead: Shape,
+) -> bool:
+    """Whether a parent is infinite already, or the function's arithmetic over- or underflows on them."""
+    if any(np.isinf(probe[name].astype(float)).any() for name, _ in links):
+        return True
+    arguments, _ = arguments_of(links, probe)
+    try:
+        with np.errstate(over="raise", under="raise"):
+            call(declaration, arguments, lead, links)
+    except BayesmcError as error:
+        return isinstance(error.__cause__, FloatingPointError)
+    return False
+
+
+def entry(
+    links: Links,
+    probe: Mapping[str, np.ndarray],
+    shape: Shape,
+    index: Shape,
+) -> dict[str, np.ndarray]:
+    """The parents' values at one entry of the probe's broadcast batch, without batch axes."""
+    picked = {}
+    for parent, link in links:
+        value = probe[parent]
+        batch = link.batch_shape(value)
+        own = index[len(shape) - len(batch) :]
+        at: tuple[Any, ...] = tuple(i if n > 1 else 0 for i, n in zip(own, batch, strict=True))
+        picked[parent] = value[(*at, Ellipsis)]  # an array still, also without axes
+    return picked
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -198,3 +315,33 @@ def _replaced(
         elif node.kind == "deterministic":
             value, _ = model.evaluate(name, model.probe)
             model.probe[name] = read_only(np.broadcast_to(value, old.shape))
+
+
+def _middle(dist: Distribution, shape: Shape, half_line: bool) -> np.ndarray:
+    """The prior mean, else the median, else one above a half line's end; NaN where nothing is known."""
+    found = np.full(shape, dist.support.low + 1.0 if half_line else np.nan)
+    for question in (lambda: dist.ppf(0.5), lambda: dist.mean):
+        try:
+            answer = np.broadcast_to(question(), shape)
+        except (UnsupportedError, ValueError):
+            continue
+        sane = np.isfinite(answer)
+        if half_line:
+            sane &= (answer < 1e10) & (answer > 1e-10)
+        found = np.where(sane, answer, found)
+    return found
+
+
+def _point_in(support: Support, lead: Shape, event: Shape, rng: np.random.Generator) -> np.ndarray:
+    """Some points of a support, for densities that cannot be sampled from."""
+    shape = lead + event
+    if not support.is_discrete:
+        transform = transform_of(support, event)
+        free = rng.uniform(-1.0, 1.0, lead + transform.unconstrained_shape)
+        return np.broadcast_to(transform.constrain(free), shape)
+    low, high = np.asarray(support.low, dtype=float), np.asarray(support.high, dtype=float)
+    u = 0.2 + 0.6 * rng.random(shape)
+    with np.errstate(invalid="ignore"):
+        value = np.where(np.isfinite(low), low + u, np.where(np.isfinite(high), high - u, u))
+        value = np.where(np.isfinite(low) & np.isfinite(high), low + u * (high - low), value)
+    return np.broadcast_to(np.floor(value), shape)

@@ -9,11 +9,10 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import ModelError
-from bayesmc.network.evidence import Observed, read_question
+from bayesmc.network.evidence import Observed, read_question, warn_of_doubts
 from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.model import Model
 from bayesmc.network.net import BayesNet
-from bayesmc.network.plausible import warn_of_doubts
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,7 @@ from bayesmc.expression import (
     trace,
 )
 from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.network.node import Numbered
 from bayesmc.passes.log_density import family_of
 from bayesmc.passes.templates import Template, template
@@ -133,8 +132,11 @@ def read_function(
     arguments: Sequence[Argument],
     links: Sequence[tuple[str, Aligner]],
     open_number: bool = False,
+    is_steady: bool = False,
 ) -> Reading:
     """The reading of a function; of a ``Numbered`` one for all numbers, if asked for.
+
+    One that ``is_steady`` has been followed before, with other arguments.
 
     Raises
     ------
@@ -145,7 +147,7 @@ def read_function(
     if isinstance(function, Numbered):
         number: Any = TracedArray(leaf("number 0", (), int)) if open_number else function.number
         function, given = function.func, function.filled(given, number)
-    found = trace(function, given)
+    found = trace(function, given, is_steady)
     if isinstance(found, Density) and links:
         raise TraceError("its Density may read parents where that cannot be seen")
     return Reading(found)
@@ -169,23 +171,6 @@ def numbers_of(stored: Expression, domain: Domain) -> Expression:
     if domain.values is not None:
         return gather(constant(domain.values), stored)
     return elementwise(np.add, stored, domain.low) if domain.low else stored
-
-
-def identity(function: Any) -> Hashable:
-    """Equal for one function: one object, or one code with the same things around it."""
-    if isinstance(function, Numbered):
-        return identity(function.func), function.places, function.number
-    if type(function) is not FunctionType:
-        return id(function)
-    keywords = function.__kwdefaults__ or {}
-    around = [*(function.__defaults__ or ()), *keywords, *keywords.values()]
-    for cell in function.__closure__ or ():
-        try:
-            around.append(cell.cell_contents)
-        except ValueError:  # not yet filled
-            return id(function)
-    inside = tuple(repr(v) if type(v) in (int, float, bool, str) else id(v) for v in around)
-    return function.__code__, id(function.__globals__), inside
 
 
 def frame(traced: Any) -> Hashable:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from bayesmc.errors import (
 )
 from bayesmc.network.captured import check_captured
 from bayesmc.network.compile import compile_model
+from bayesmc.network.declaring import DeclaredPlates
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Potential
-from bayesmc.network.ordering import topological_order
+from bayesmc.network.node import Declaration, Potential, topological_order
 from bayesmc.network.validate import validate_model
 from bayesmc.shapes import owned, unused_sizes
 
@@ -26,6 +26,49 @@ from bayesmc.shapes import owned, unused_sizes
 _KEEP_INPUTS = 1 << 20
 #: compiled models kept for other plate sizes and inputs
 _KEEP_MODELS = 8
+
+
+class Declared:
+    """What a net and a factor graph are made of: plates, declarations, and the models compiled of them."""
+
+    def __init__(self, name: str | None, plates: DeclaredPlates) -> None:
+        self.name = name
+        self._plates = plates
+        self._declarations: dict[str, Declaration] = {}
+        self._potentials: dict[str, Potential] = {}
+        self._kept_store: ModelStore | None = None
+
+    def copy(self) -> Self:
+        """An independent one with the same declarations."""
+        other = type(self)(self.name)  # type: ignore[call-arg]
+        other._declarations = dict(self._declarations)
+        other._potentials = dict(self._potentials)
+        other._plates = self._plates.copy()
+        return other
+
+    def snapshot(self) -> Self:
+        """A copy that shares what is compiled already; what holds it never sees later declarations."""
+        other = self.copy()
+        other._kept_store = self._store
+        return other
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._declarations or name in self._potentials
+
+    def _refuse_name(self, what: str, name: Any) -> None:
+        if not isinstance(name, str) or not name:
+            raise ModelError(f"a {what}'s name is a non-empty string, not {name!r}")
+
+    def _changed(self) -> None:
+        self._kept_store = None
+
+    @property
+    def _store(self) -> ModelStore:
+        if self._kept_store is None:
+            self._kept_store = ModelStore(
+                self.name, self._declarations, self._potentials, self._plates
+            )
+        return self._kept_store
 
 
 class ModelStore:
@@ -39,12 +82,12 @@ class ModelStore:
         name: str | None,
         declarations: Mapping[str, Declaration],
         potentials: Mapping[str, Potential],
-        labels: Mapping[str, tuple[Any, ...]],
+        plates: DeclaredPlates,
     ) -> None:
         self.name = name
         self.declarations = dict(declarations)
         self.potentials = dict(potentials)
-        self.labels = dict(labels)
+        self.plates = plates.copy()
         self._models: dict[Any, Model] = {}
         self._valid = False
         self._around = [d for d in declarations.values() if d.captured]
@@ -102,7 +145,7 @@ class ModelStore:
         for name, potential in self.potentials.items():
             check_parents(self.declarations, name, potential.parents, "potential")
         order = topological_order({n: d.parents for n, d in self.declarations.items()})
-        labels = {p: names for p, names in self.labels.items() if len(names) == sizes[p]}
+        labels = self.plates.fitting(sizes)
         return compile_model(
             self.name, self.declarations, self.potentials, sizes, labels, inputs, order
         )

@@ -14,29 +14,30 @@ import numpy as np
 from bayesmc.distributions import Distribution
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, BroadcastError, ModelError
-from bayesmc.network.compile import entry
+from bayesmc.network.calling import call, to_mix
 from bayesmc.network.model import (
     CompiledNode,
     Model,
     arguments_of,
-    call,
     potential_shape,
-    to_mix,
 )
-from bayesmc.network.node import Declaration
+from bayesmc.network.node import Declaration, Numbered, identity
+from bayesmc.network.probing import entry
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, masks, nearly_equal
 from bayesmc.states import as_numbers
 
-#: nodes of one function that are checked, besides those whose parents' values are extreme
-_ALIKE = 12
+#: nodes of one function that are checked, the first and some among the others, besides those whose parents'
+#: values are extreme
+_ALIKE, _SPREAD = 10, 10
 
 
 def validate_model(model: Model) -> None:
     """Raise on the first node whose function breaks a rule.
 
     Of nodes that have one function and parents of the same kinds, as the slices of a template have, the
-    first few are checked, the last, and those whose parents' values are the largest and the smallest.
+    first few are checked, some later ones and the last, and those whose parents' values are the largest and
+    the smallest.
 
     Raises
     ------
@@ -66,7 +67,7 @@ def validate_model(model: Model) -> None:
 
 
 def _kind(model: Model, node: CompiledNode) -> Hashable:
-    """Equal for nodes with the very same function of parents whose values have the same shapes and states."""
+    """Equal for nodes with one function, of parents whose values have the same shapes and states."""
     parents: list[Hashable] = []
     for name in node.parents:
         parent = model[name]
@@ -77,14 +78,19 @@ def _kind(model: Model, node: CompiledNode) -> Hashable:
             states = domain.size, domain.low, values, domain.labels
         parents.append((parent.kind, parent.plates, parent.value_shape, parent.is_discrete, states))
     own = node.declaration
-    return id(own.function), own.vectorize, node.plates, node.value_shape, tuple(parents)
+    function = own.function
+    what = identity(function)
+    if isinstance(function, Numbered):  # a slice of a template, whose number may be any
+        what = identity(function.func), function.places
+    return what, own.vectorize, node.plates, node.value_shape, tuple(parents)
 
 
 def _unlike(model: Model, nodes: list[CompiledNode]) -> list[CompiledNode]:
-    """Nodes that stand for others with their function: the first, the last, and those at the extremes."""
+    """Nodes that stand for others with their function: the first, some later ones, those at the extremes."""
     if len(nodes) <= _ALIKE:
         return nodes
-    found = dict.fromkeys([*range(_ALIKE - 1), len(nodes) - 1])
+    spread = np.linspace(_ALIKE, len(nodes) - 1, _SPREAD).astype(int).tolist()
+    found = dict.fromkeys([*range(_ALIKE), *spread])
     for k in range(len(nodes[0].parents)):
         values = [np.asarray(model.probe[n.parents[k]]) for n in nodes]
         if not values[0].size or values[0].dtype.kind not in "fiub":

@@ -1,11 +1,13 @@
 """Arithmetic of expressions that knows 0 and 1, so that derivatives and coefficients stay small.
 
-A product with 0 is 0 here, whatever the other factor: these are coefficients, not values of a user's.
+A product with 0 is 0 here, whatever the other factor: these are coefficients, not values of a user's. Whoever
+reads sums of terms with coefficients has the linear part from here.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -13,12 +15,19 @@ from bayesmc.expression import (
     Constant,
     Elementwise,
     Expression,
+    Gather,
+    Pick,
+    Reduction,
     as_expression,
     broadcast,
     cast,
     elementwise,
+    gather,
     ordered,
+    pick,
+    reduction,
 )
+from bayesmc.expression.graph import CASTS
 
 ZERO, ONE = as_expression(0.0), as_expression(1.0)
 
@@ -103,3 +112,63 @@ def _filled(node: Expression, args: tuple[Expression, ...]) -> Expression:
     shape = np.broadcast_shapes(*(a.shape for a in args))
     real = node if node.dtype == float else cast(node, float)
     return broadcast(real, shape)
+
+
+class TermReader:
+    """Reads an expression as a sum of terms with coefficients that are free of what it is read in.
+
+    A subclass says what is free, what a term is, and what functions make of sums, element by element.
+    """
+
+    #: the term of what is free
+    one: ClassVar[Any]
+    #: function -> method
+    rules: ClassVar[Mapping[Any, Callable[[Any, Elementwise], dict[Any, Expression]]]]
+
+    def __init__(self) -> None:
+        self._found: dict[Expression, dict[Any, Expression]] = {}
+
+    def __call__(self, node: Expression) -> dict[Any, Expression]:
+        found = self._found.get(node)
+        if found is None:
+            found = self._found[node] = self._read(node)
+        return found
+
+    def is_free(self, node: Expression) -> bool:
+        raise NotImplementedError
+
+    def term(self, node: Expression) -> dict[Any, Expression]:
+        """What is a term by itself; all else is refused."""
+        raise NotImplementedError
+
+    def _read(self, node: Expression) -> dict[Any, Expression]:
+        if self.is_free(node):
+            return {self.one: node}
+        if isinstance(node, Reduction) and node.ufunc is np.add:
+            (operand,) = node.operands
+            whole = {f: broadcast(c, operand.shape) for f, c in self(operand).items()}
+            return {f: reduction(np.add, c, node.axes) for f, c in whole.items()}
+        if isinstance(node, Pick):
+            parts = [(self(a), a.shape) for a in node.operands]
+            return {
+                f: pick([broadcast(p.get(f, ZERO), shape) for p, shape in parts], node.positions)
+                for f in dict.fromkeys(f for p, _ in parts for f in p)
+            }
+        if isinstance(node, Gather) and self.is_free(node.rows):
+            whole = {f: broadcast(c, node.table.shape) for f, c in self(node.table).items()}
+            return {f: gather(c, node.rows) for f, c in whole.items()}
+        if isinstance(node, Elementwise):
+            rule = self.rules.get(node.function)
+            if rule is not None:
+                return rule(self, node)
+            if node.function in CASTS:
+                return self(node.operands[0])
+        return self.term(node)
+
+    def add(self, node: Elementwise) -> dict[Any, Expression]:
+        first, second = map(self, node.operands)
+        join = add if node.function is np.add else subtract
+        return {f: join(first.get(f, ZERO), second.get(f, ZERO)) for f in {**first, **second}}
+
+    def negative(self, node: Elementwise) -> dict[Any, Expression]:
+        return {f: multiply(c, -1.0) for f, c in self(node.operands[0]).items()}

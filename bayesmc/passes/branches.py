@@ -22,8 +22,8 @@ from bayesmc.expression import (
     ordered,
     pick,
 )
-from bayesmc.expression.bounds import bounds
 from bayesmc.expression.graph import CASTS
+from bayesmc.expression.indexing import bounds
 from bayesmc.passes.arithmetic import tidy
 from bayesmc.passes.reads import same_along
 

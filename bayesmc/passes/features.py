@@ -22,24 +22,19 @@ from bayesmc.expression import (
     Call,
     Elementwise,
     Expression,
-    Gather,
     Leaf,
     Pick,
-    Reduction,
     as_expression,
     broadcast,
     elementwise,
-    gather,
     leaf,
     ordered,
-    pick,
-    reduction,
     replaced,
 )
-from bayesmc.expression.graph import CASTS
 from bayesmc.passes.arithmetic import (
     ONE,
     ZERO,
+    TermReader,
     add,
     divide,
     is_all,
@@ -49,8 +44,7 @@ from bayesmc.passes.arithmetic import (
     tidy,
 )
 from bayesmc.passes.branches import branches_up
-from bayesmc.passes.reads import NOTHING, element_read, matrix_function
-from bayesmc.passes.sinking import reads, sunk
+from bayesmc.passes.reads import NOTHING, element_read, matrix_function, reads, sunk
 
 #: powers p of ``x**p``, and the two logarithms
 Feature = float | str
@@ -160,75 +154,33 @@ def own_numbers(own: Leaf, numbers: np.ndarray | None) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
-class _Reader:
+class _Reader(TermReader):
     """Features of expressions in one number."""
 
+    one = CONSTANT
+
     def __init__(self, name: str, strict: bool, is_share: bool) -> None:
+        super().__init__()
         self.name, self.strict, self.is_share = name, strict, is_share
         self.is_picked = False
-        self._found: dict[Expression, Features] = {}
 
-    def __call__(self, node: Expression) -> Features:
-        found = self._found.get(node)
-        if found is None:
-            found = self._found[node] = self._read(node)
-        return found
-
-    def _is_free(self, node: Expression) -> bool:
+    def is_free(self, node: Expression) -> bool:
         return self.name not in node.leaves
 
-    def _read(self, node: Expression) -> Features:
-        if self._is_free(node):
-            return {CONSTANT: node}
+    def term(self, node: Expression) -> Features:
         if isinstance(node, Leaf):
             return {1.0: ONE}
-        if isinstance(node, Reduction) and node.ufunc is np.add:
-            (operand,) = node.operands
-            inner = self(operand)
-            return {
-                f: reduction(np.add, broadcast(c, operand.shape), node.axes)
-                for f, c in inner.items()
-            }
-        if isinstance(node, Pick):
-            parts = [self(a) for a in node.operands]
-            return {
-                f: pick(
-                    [
-                        broadcast(p.get(f, ZERO), a.shape)
-                        for p, a in zip(parts, node.operands, strict=True)
-                    ],
-                    node.positions,
-                )
-                for f in dict.fromkeys(f for p in parts for f in p)
-            }
-        if isinstance(node, Gather) and self._is_free(node.rows):
-            inner = self(node.table)
-            return {f: gather(broadcast(c, node.table.shape), node.rows) for f, c in inner.items()}
         if isinstance(node, Call):
             return self.matrices(node)
-        if isinstance(node, Elementwise):
-            rule = _RULES.get(node.function)
-            if rule is not None:
-                return rule(self, node)
-            if node.function in CASTS:
-                return self(node.operands[0])
         raise TraceError(f"{node.detail or type(node).__name__} of it is no feature")
 
     # ---- element by element ------------------------------------------------------------------------
 
-    def add(self, node: Elementwise) -> Features:
-        first, second = map(self, node.operands)
-        join = add if node.function is np.add else subtract
-        return {f: join(first.get(f, ZERO), second.get(f, ZERO)) for f in {**first, **second}}
-
-    def negative(self, node: Elementwise) -> Features:
-        return {f: multiply(c, -1.0) for f, c in self(node.operands[0]).items()}
-
     def multiply(self, node: Elementwise) -> Features:
         first, second = node.operands
-        if self._is_free(first):
+        if self.is_free(first):
             return {f: multiply(c, first) for f, c in self(second).items()}
-        if self._is_free(second):
+        if self.is_free(second):
             return {f: multiply(c, second) for f, c in self(first).items()}
         if first is second:
             return _square(_powers(self(first)))
@@ -236,7 +188,7 @@ class _Reader:
 
     def divide(self, node: Elementwise) -> Features:
         first, second = node.operands
-        if self._is_free(second):
+        if self.is_free(second):
             return {f: divide(c, second) for f, c in self(first).items()}
         below = self.each(self(second), lambda c: divide(1.0, c), lambda p, c: (-p, divide(1.0, c)))
         return _product(_powers(self(first)), below)
@@ -335,7 +287,7 @@ class _Reader:
 
     def xlogy(self, node: Elementwise) -> Features:
         weight, inside = node.operands
-        if not self._is_free(weight):
+        if not self.is_free(weight):
             raise TraceError(f"{node.detail} of it is no feature")
         plain = np.log if node.function is special.xlogy else np.log1p
         inner = self(elementwise(plain, inside))
@@ -345,10 +297,10 @@ class _Reader:
         condition, first, second = node.operands
         if is_all(second, -np.inf):  # a support: its bounds are the family's affair
             return self(first)
-        if not self._is_free(condition):
+        if not self.is_free(condition):
             raise TraceError("a branch on it is no feature")
         one, other = self(first), self(second)
-        free = [a for a in (first, second) if self._is_free(a)]
+        free = [a for a in (first, second) if self.is_free(a)]
         self.is_picked = self.is_picked or (len(free) == 1 and not is_all(free[0], 0))
         return {
             f: tidy(np.where, condition, one.get(f, ZERO), other.get(f, ZERO))
@@ -403,7 +355,7 @@ def _product(first: Features, second: Features) -> Features:
     return found
 
 
-_RULES: dict[Any, Any] = {
+_Reader.rules = {
     np.add: _Reader.add, np.subtract: _Reader.add, np.negative: _Reader.negative,
     np.multiply: _Reader.multiply, np.divide: _Reader.divide, np.square: _Reader.square,
     np.power: _Reader.power, np.float_power: _Reader.power, np.sqrt: _Reader.root,

@@ -23,7 +23,7 @@ from scipy import special
 from bayesmc import distributions as d
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression, Family, TracedArray, as_expression, trace
-from bayesmc.expression.lifting import log_sum_exp
+from bayesmc.expression.composed import log_sum_exp
 
 _LOG_2PI = math.log(2 * math.pi)
 

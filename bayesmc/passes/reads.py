@@ -6,7 +6,7 @@ broadcasting. Where two of them meet in one entry there is no answer, unless the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -30,12 +30,14 @@ from bayesmc.expression import (
     replaced,
     reshape,
 )
-from bayesmc.passes.sinking import reads, sunk
 
 #: functions of whole matrices: their batch axes are all but the last two
 _OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det", "upper_inverse"))
 #: what an entry reads that reads no element
 NOTHING = as_expression(-1)
+
+
+Select = Callable[[Expression], Expression]
 
 
 def element_read(root: Expression, name: str, numbers: np.ndarray | Expression) -> Expression:
@@ -137,6 +139,28 @@ def matrix_function(node: Call) -> str:
     """What the function of a call is called."""
     function = getattr(node.call, "function", node.call)
     return getattr(function, "__name__", "")
+
+
+def sunk(root: Expression, name: str) -> Expression:
+    """The expression with all choices of elements that concern a leaf as near to it as they can be.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import TracedArray, leaf, trace
+    >>> from bayesmc.passes.reads import sunk
+    >>> x = TracedArray(leaf("x", (3,)))
+    >>> found = trace(lambda x: np.exp(2 * x)[..., 1], [x])
+    >>> found, sunk(found, "x")
+    (<Pick ()>, <Elementwise exp ()>)
+    """
+    found: dict[Expression, Expression] = {}
+    for node in ordered(root):
+        operands = [found[a] for a in node.operands]
+        same = all(a is b for a, b in zip(operands, node.operands, strict=True))
+        made = node if same else node.with_operands(operands)
+        found[node] = _sunk(made, name)
+    return found[root]
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -276,3 +300,46 @@ def _along_picked(at: Pick, axes: Sequence[int]) -> Expression | None:
         return None
     any_of = np.where(most < 0, at.positions.min(axis=tuple(axes), keepdims=True), most)
     return pick(at.operands, np.squeeze(any_of, tuple(axes)))
+
+
+def _sunk(node: Expression, name: str) -> Expression:
+    if name not in node.leaves or not isinstance(node, (Pick, Gather)):
+        return node
+    first = node.operands[0]
+    if not isinstance(first, Elementwise) or (isinstance(node, Pick) and len(node.operands) > 1):
+        return node
+    if isinstance(node, Gather) and name in node.rows.leaves:
+        return node
+
+    def select(part: Expression) -> Expression:
+        whole = broadcast(part, first.shape)
+        if isinstance(node, Pick):
+            return pick([whole], node.positions)
+        assert isinstance(node, Gather)
+        return gather(whole, node.rows)
+
+    made = first.with_operands([_sunk(select(a), name) for a in first.operands])
+    return broadcast(made, node.shape)
+
+
+def reads(root: Expression, name: str) -> list[Expression]:
+    """The expressions through which a leaf comes in: itself, or elements chosen from it.
+
+    After ``sunk``; the leaf itself, or a pick or gather of it that reads nothing else.
+    """
+    found: dict[Expression, None] = {}
+    chosen: dict[Expression, bool] = {}
+    for node in ordered(root):
+        if isinstance(node, Leaf):
+            chosen[node] = node.name == name
+        elif isinstance(node, Pick):
+            chosen[node] = all(chosen[a] for a in node.operands)
+        elif isinstance(node, Gather):
+            chosen[node] = chosen[node.table] and name not in node.rows.leaves
+        else:
+            chosen[node] = False
+        if not chosen[node]:
+            found.update(dict.fromkeys(a for a in node.operands if chosen[a]))
+    if chosen[root]:
+        found[root] = None
+    return list(found)

@@ -26,8 +26,6 @@ from bayesmc.expression import (
     Elementwise,
     Expression,
     Family,
-    Pick,
-    Reduction,
     as_expression,
     broadcast,
     call,
@@ -41,9 +39,8 @@ from bayesmc.expression import (
     replaced,
     reshape,
 )
-from bayesmc.expression.graph import CASTS
 from bayesmc.expression.scalars import upper_inverse
-from bayesmc.passes.arithmetic import ONE, ZERO, add, divide, is_all, multiply, subtract
+from bayesmc.passes.arithmetic import ONE, ZERO, TermReader, add, divide, is_all, multiply, subtract
 from bayesmc.passes.log_density import log_density
 from bayesmc.shapes import Shape
 
@@ -188,49 +185,24 @@ def _off_one(probs: Expression) -> Expression:
     return elementwise(np.where, elementwise(np.less_equal, off, _SUM), 0.0, np.nan)
 
 
-class _Reader:
+class _Reader(TermReader):
     """Splits expressions of one number and parameters into statistics and coefficients."""
 
+    one = ONE
+
     def __init__(self, value: Expression, log_centre: float) -> None:
+        super().__init__()
         self.value, self.log_centre = value, as_expression(float(log_centre))
-        self._found: dict[Expression, Form] = {}
 
-    def __call__(self, node: Expression) -> Form:
-        found = self._found.get(node)
-        if found is None:
-            found = self._found[node] = self._read(node)
-        return found
+    def is_free(self, node: Expression) -> bool:
+        return VALUE not in node.leaves
 
-    def _read(self, node: Expression) -> Form:
-        if VALUE not in node.leaves:
-            return {ONE: node}
-        if isinstance(node, Pick) and len(node.operands) == 1:
-            (operand,) = node.operands
-            inner = self(operand).items()
-            return {f: pick([broadcast(c, operand.shape)], node.positions) for f, c in inner}
-        if isinstance(node, Reduction) and node.ufunc is np.add:
-            (operand,) = node.operands
-            inner = self(operand).items()
-            return {f: reduction(np.add, broadcast(c, operand.shape), node.axes) for f, c in inner}
-        if isinstance(node, Elementwise):
-            rule = _RULES.get(node.function)
-            if rule is not None:
-                return rule(self, node)
-            if node.function in CASTS:
-                return self(node.operands[0])
+    def term(self, node: Expression) -> Form:
         if node.leaves == {VALUE} and not node.shape and not isinstance(node, Call):
             return {node: ONE}
         raise TraceError(
             f"{node.detail or type(node).__name__} keeps value and parameters together"
         )
-
-    def add(self, node: Elementwise) -> Form:
-        first, second = map(self, node.operands)
-        join = add if node.function is np.add else subtract
-        return {f: join(first.get(f, ZERO), second.get(f, ZERO)) for f in {**first, **second}}
-
-    def negative(self, node: Elementwise) -> Form:
-        return {f: multiply(c, -1.0) for f, c in self(node.operands[0]).items()}
 
     def multiply(self, node: Elementwise) -> Form:
         return _product(*map(self, node.operands))
@@ -310,7 +282,7 @@ def _times(f: Expression, g: Expression) -> Expression:
     return elementwise(np.multiply, f, g)
 
 
-_RULES: dict[Any, Any] = {
+_Reader.rules = {
     np.add: _Reader.add, np.subtract: _Reader.add, np.negative: _Reader.negative,
     np.multiply: _Reader.multiply, np.divide: _Reader.divide, np.square: _Reader.square,
     np.log: _Reader.log, np.log1p: _Reader.log, special.xlogy: _Reader.xlogy,

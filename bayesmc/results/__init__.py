@@ -1,11 +1,12 @@
 """Results: posteriors that answer the same queries whatever made them."""
 
-from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint, RunningChains
+from bayesmc.results.chains import ChainsPosterior, ChainsSums, Checkpoint
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import Posterior
+from bayesmc.results.running import Sums
 from bayesmc.results.series import SeriesPosterior
-from bayesmc.results.sums import Sums, SumsPosterior
+from bayesmc.results.sums import RunningChains, SumsPosterior
 from bayesmc.results.table import Summary
 
 __all__ = [

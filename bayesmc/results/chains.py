@@ -9,28 +9,20 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import UnsupportedError
-from bayesmc.network import CompiledNode, Model, Problem
-from bayesmc.results.checkpoint import Checkpoint
+from bayesmc.distributions import marking_invalid
+from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.network import CompiledNode, Model, Observed, Problem
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.posterior import Posterior
 from bayesmc.results.relabelling import ordered, symmetries
-from bayesmc.results.sums import Sums, SumsPosterior
-
-#: batch means kept per chain, once there are as many; twice as many are merged in pairs
-_BATCHES = 16
-#: draws that summaries take in at once
-_BUFFER = 32
-#: numbers that the buffers of all nodes may hold together
-_BUFFER_ELEMENTS = 1 << 21
-#: numbers that the batch means of one node may take; a larger node has no errors in summaries
-_BATCH_ELEMENTS = 1 << 22
+from bayesmc.results.sums import RunningChains, SumsPosterior
 
 
 class _Chains(Posterior):
@@ -320,147 +312,100 @@ class ChainsSums(_Chains, SumsPosterior):
         return {**state, "_running": self._running.with_model(state["model"])}
 
 
-class RunningChains:
-    """Sums and batch means of chains, of constant size.
-
-    Draws are taken in by the buffer, and a buffer always holds the same number of them, so that what is
-    summed does not depend on where a run was cut.
-
-    Parameters
-    ----------
-    model : Model
-    names : tuple of str
-    chains, ensemble : int
-    """
-
-    def __init__(self, model: Model, names: tuple[str, ...], chains: int, ensemble: int) -> None:
-        self.chains = chains
-        self.ensemble = ensemble
-        self.draws = 0
-        self._sums = Sums(model, names)
-        self._pending = 0
-        self._buffers: dict[str, np.ndarray] = {}
-        self._constant: dict[str, np.ndarray] = {}
-        self._means: dict[str, _BatchMeans] = {}
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self._sums.names
-
-    def add(self, values: Mapping[str, np.ndarray]) -> None:
-        """Take in one draw of every chain, ``(chain, *plates, *event)``, or without chains if constant."""
-        if not self.draws:
-            self._prepare(values)
-        at = self._pending
-        for name, buffer in self._buffers.items():
-            buffer[at] = values[name]
-        self.draws += 1
-        self._pending += 1
-        if self._pending == self._size:
-            self._empty()
-
-    def total(self) -> Sums:
-        """The sums over all draws so far, for reading only."""
-        if not self._pending:
-            return self._sums
-        model = self._sums.model
-        sums = copy.deepcopy(self._sums, {id(model): model})
-        self._add_to(sums)
-        return sums
-
-    def is_batched(self, name: str) -> bool:
-        """Whether batch means are kept: not of constants, nor of nodes of very many numbers."""
-        return name in self._means
-
-    def batch_means(self, name: str) -> np.ndarray | None:
-        """Means of equal batches, shape ``(batch, chain, figures...)``; None where there are none."""
-        means = self._means.get(name)
-        return None if means is None else means.values
-
-    def with_model(self, model: Model) -> RunningChains:
-        """The same for another compilation of the same net, independent of this one."""
-        return copy.deepcopy(self, {id(self._sums.model): model})
-
-    def _prepare(self, values: Mapping[str, np.ndarray]) -> None:
-        """Decide from the first draw what is constant, and how many draws make a buffer."""
-        moving = {}
-        for name in self.names:
-            node = self._sums.model[name]
-            if values[name].ndim == len(node.value_shape):
-                self._constant[name] = np.array(values[name])
-            else:
-                moving[name] = node
-        numbers = self.chains * sum(math.prod(node.value_shape) for node in moving.values())
-        draws = min(_BUFFER, max(1, _BUFFER_ELEMENTS // max(numbers, 1)))
-        self._size = self.ensemble * max(1, draws // self.ensemble)
-        for name, node in moving.items():
-            dtype = stored_dtype(node, values[name])
-            shape = (self._size, self.chains, *node.value_shape)
-            self._buffers[name] = np.empty(shape, dtype=dtype)
-            width = math.prod(_figures(node, values[name][None]).shape[2:])
-            if 2 * _BATCHES * self.chains * width <= _BATCH_ELEMENTS:
-                self._means[name] = _BatchMeans()
-
-    def _empty(self) -> None:
-        self._add_to(self._sums)
-        for name, means in self._means.items():
-            means.add(_figures(self._sums.model[name], self._buffers[name]).mean(axis=0))
-        self._pending = 0
-
-    def _add_to(self, sums: Sums) -> None:
-        count = self._pending * self.chains
-        values = {
-            n: b[: self._pending].reshape(count, *b.shape[2:]) for n, b in self._buffers.items()
-        }
-        sums.add({**self._constant, **values}, 0.0, count)
-
-
-def stored_dtype(node: CompiledNode, values: np.ndarray) -> np.dtype:
-    """The type that draws of a node are kept in: the smallest for positions of a finite one."""
-    return values.dtype if node.domain is None else node.domain.dtype
-
-
 # ---- private ------------------------------------------------------------------------------------
 
 
-class _BatchMeans:
-    """Means of equally long batches; when there are too many, neighbours are merged."""
+@dataclass(frozen=True, eq=False)
+class Checkpoint:
+    """Where chains stand after their last kept draw, to go on from.
 
-    def __init__(self) -> None:
-        self._kept: list[np.ndarray] = []
-        self._length = 1
-        self._sum: Any = 0.0
-        self._count = 0
-
-    def add(self, mean: np.ndarray) -> None:
-        """Take in the mean of one more buffer, shape ``(chain, ...)``."""
-        self._sum = self._sum + mean
-        self._count += 1
-        if self._count < self._length:
-            return
-        self._kept.append(self._sum / self._length)
-        self._sum, self._count = 0.0, 0
-        if len(self._kept) == 2 * _BATCHES:
-            pairs = zip(self._kept[::2], self._kept[1::2], strict=True)
-            self._kept = [(a + b) / 2 for a, b in pairs]
-            self._length *= 2
-
-    @property
-    def values(self) -> np.ndarray | None:
-        return np.stack(self._kept) if self._kept else None
-
-
-def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
-    """What the answers about a node are means of, shape ``(draw, chain, ...)``.
-
-    With angles there are two: cosines and sines, for numbers that are none themselves and zero.
+    Attributes
+    ----------
+    state : dict
+        The sampler's state.
+    generator : dict
+        State of the bit generator.
+    values : dict
+        Stored values of the last draw.
+    observed : dict
+        The evidence, as stored.
+    densities : dict or None
+        Node or potential -> its log density at ``values`` (a deterministic node's sum) when the draws
+        were made, so that a function that says something else by now is noticed.
     """
-    if node.domain is None:
-        if node.angles is None:
-            return draws
-        cosine, sine = np.cos(draws), np.sin(draws)
-        pair = np.where(node.angles, cosine, draws), np.where(node.angles, sine, 0.0)
-        return np.stack(pair, axis=2)
-    if node.domain.labels is None:
-        return np.take(np.asarray(node.domain.numbers, dtype=float), draws)
-    return (draws[..., None] == np.arange(node.domain.size)).astype(float)
+
+    state: Mapping[str, Any]
+    generator: Mapping[str, Any]
+    values: Mapping[str, np.ndarray]
+    observed: Mapping[str, Observed]
+    densities: Mapping[str, float] | None = None
+
+    def noted(self, problem: Problem) -> Checkpoint:
+        """The same with its densities under a problem, if they are not known."""
+        if self.densities is not None:
+            return self
+        return replace(self, densities=noted_densities(problem, self.values))
+
+    def fits(self, model: Model, problem: Problem) -> bool:
+        """Whether it belongs to this question, though the functions of its ``model`` are lost."""
+        if list(model.nodes) != list(problem.model.nodes) or model.sizes != problem.model.sizes:
+            return False
+        if any(outline(node) != outline(problem.model[n]) for n, node in model.nodes.items()):
+            return False
+        seen = problem.observed
+        if self.observed.keys() != seen.keys() or not all(
+            np.array_equal(o.value, seen[n].value) and np.array_equal(o.mask, seen[n].mask)  # type: ignore[arg-type]
+            for n, o in self.observed.items()
+        ):
+            return False
+        return (
+            self.densities is not None
+            and other_density(problem, self.values, self.densities) is None
+        )
+
+
+def outline(node: CompiledNode) -> tuple[Any, ...]:
+    """What can be compared of a node whose function is lost."""
+    arrays = (node.declaration.probs, node.declaration.value)
+    tables = tuple(None if a is None else (a.shape, a.tobytes()) for a in arrays)
+    states = None if node.domain is None else node.domain.states
+    return (node.kind, node.parents, node.plates, node.value_shape, states, *tables)
+
+
+def log_densities(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Log density of every node and potential at some draws, summed; a deterministic node's values."""
+    model = problem.model
+    at = {**problem.inputs, **values}
+    found = {name: float(np.sum(value)) for name, value in problem.inputs.items()}
+    with marking_invalid(), np.errstate(all="ignore"):
+        for name, node in model.nodes.items():
+            if node.is_stochastic and node.declaration.source in ("function", "table"):
+                given, _ = model.evaluate(name, at)
+                found[name] = float(np.sum(model.log_density(name, given, at[name])))
+            elif node.kind == "deterministic":
+                found[name] = float(np.sum(model.evaluate(name, at)[0], dtype=float))
+        for name in model.potentials:
+            found[f"potential {name}"] = float(np.sum(model.potential(name, at)))
+    return found
+
+
+def noted_densities(problem: Problem, values: Mapping[str, np.ndarray]) -> dict[str, float] | None:
+    """``log_densities``, to be held against later; None where a draw has none, at a pole for one."""
+    try:
+        return log_densities(problem, values)
+    except BayesmcError:
+        return None
+
+
+def other_density(
+    problem: Problem, values: Mapping[str, np.ndarray], densities: Mapping[str, float]
+) -> str | None:
+    """The first node or potential whose log density at some draws is another than was noted."""
+    now = noted_densities(problem, values) or {}
+    for name in dict.fromkeys([*densities, *now]):
+        if name not in now or name not in densities:
+            return name
+        a, b = densities[name], now[name]
+        if not (a == b or (a != a and b != b) or math.isclose(a, b, rel_tol=1e-9, abs_tol=1e-9)):
+            return name
+    return None

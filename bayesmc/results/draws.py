@@ -15,9 +15,8 @@ import numpy as np
 
 from bayesmc import diagnostics
 from bayesmc.distributions import marking_invalid
-from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import UnknownNodeError, UnsupportedError
-from bayesmc.network import Model, Problem, forward, read_inputs
+from bayesmc.network import Problem, forward, read_inputs
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.resampling import systematic
 from bayesmc.results.datatree import datatree
@@ -26,6 +25,7 @@ from bayesmc.results.posterior import (
     Plates,
     Posterior,
     circular_variance,
+    near,
     quantile_levels,
     whole_draws,
 )
@@ -47,11 +47,6 @@ class DrawsPosterior(Posterior):
         Which weighted draw each was resampled from; copies of one draw count once in errors.
     streams : int
         Random streams used so far, so that ``resume`` takes fresh ones.
-
-    Attributes
-    ----------
-    independent, ancestors, streams
-        As given.
     """
 
     #: members that a chain's draws come from in turn; 1 for an ordinary chain
@@ -132,22 +127,18 @@ class DrawsPosterior(Posterior):
         blocks = [self._uncut(name, "cov").reshape(*self._shape, -1) for name in names]
         flat = np.concatenate(blocks, axis=-1)
         flat = (flat - self._average(flat)).reshape(-1, flat.shape[-1])
-        weights = (
-            np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
-        )
-        matrix = (flat * weights[:, None]).T @ flat
+        matrix = (flat * self._flat_weights()[:, None]).T @ flat
         return matrix[0, 0] if matrix.size == 1 else matrix
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         values = self._uncut(name, "quantile")
         flat = values.reshape((math.prod(self._shape), *values.shape[2:]))
         levels = quantile_levels(name, q)
-        if self.weights is not None:
-            weights = self.weights.ravel()
-            return np.quantile(flat, levels, axis=0, weights=weights, method="inverted_cdf")
-        if self.model[name].is_discrete:  # between two states lies no value
-            return np.quantile(flat, levels, axis=0, method="inverted_cdf")
-        return np.quantile(flat, levels, axis=0)
+        weights = None if self.weights is None else self.weights.ravel()
+        # between two states lies no value, and none is known between weighted draws
+        stays = weights is not None or self.model[name].is_discrete
+        method: Any = "inverted_cdf" if stays else "linear"
+        return np.quantile(flat, levels, axis=0, weights=weights, method=method)
 
     def probabilities(self, *names: str) -> np.ndarray:
         if not names:
@@ -233,17 +224,12 @@ class DrawsPosterior(Posterior):
         draws = self._full(name, "marginal")
         flat = draws.reshape((math.prod(self._shape), *draws.shape[2:]))
         flat = flat[(slice(None), *(index if isinstance(index, tuple) else (index,)))]
-        weights = (
-            np.full(len(flat), 1 / len(flat)) if self.weights is None else self.weights.ravel()
-        )
-        return Marginal(name, flat, weights)
+        return Marginal(name, flat, self._flat_weights())
 
     def resample(self, draws: int | None = None, rng: Any = None) -> DrawsPosterior:
         count = math.prod(self._shape) if draws is None else whole_draws(draws)
         generator = stream(seed_sequence(rng), Purpose.RESAMPLE)
-        total = math.prod(self._shape)
-        weights = np.full(total, 1 / total) if self.weights is None else self.weights.ravel()
-        picked = generator.permutation(systematic(weights, count, generator))
+        picked = generator.permutation(systematic(self._flat_weights(), count, generator))
         chain, draw = np.divmod(picked, self._shape[1])
         stored = {
             name: values
@@ -301,37 +287,23 @@ class DrawsPosterior(Posterior):
         plates: Mapping[str, int],
         rng: np.random.Generator,
     ) -> DrawsPosterior:
-        sizes = {**self.model.sizes, **plates}
         given = problem.inputs if inputs is None else inputs
-        model = problem.net.model(None, given, sizes)
-        _refuse_potentials(model, wanted)
+        model = problem.net.model(None, given, {**self.model.sizes, **plates})
+        forward.refuse_potentials(model, wanted, "predict")
         declarations = {n: c.declaration for n, c in model.nodes.items()}
-        known = read_inputs(declarations, sizes, given, model.labels)
-        values: dict[str, np.ndarray] = {}
-        anew: set[str] = set()
-        steps: list[forward.Step] = []
-        for name, node in model.nodes.items():
-            if node.kind == "input":
-                values[name] = known[name]
-                changed = inputs is not None or any(p in plates for p in node.plates)
-                anew |= {name} if changed else set()
-            elif name in wanted or any(p in plates for p in node.plates):
-                anew.add(name)
-                steps.append(forward.step_for(model, node, {}))
-            elif not node.is_stochastic and anew & set(node.parents):
-                anew.add(name)
-                steps.append(forward.step_for(model, node, {}))
-            elif name in self._stored:
-                values[name] = self._of(name)
-        missing = {p for n in anew for p in model[n].parents} - anew - set(values)
+        known = read_inputs(declarations, model.sizes, given, model.labels)
+        anew = forward.drawn_anew(model, wanted, set(plates), inputs is not None)
+        values = {n: self._of(n) for n in model.nodes if n not in anew and n in self._stored}
+        missing = {p for n in anew for p in model[n].parents} - anew - {*values, *known}
         if missing:
             self._of(min(missing))  # says that it was not kept
-        kept = [n for n in model.nodes if n not in anew]
-        refused = forward.refuse_unsampled(model, kept, "predict")
+        refused = forward.refuse_unsampled(model, set(model.nodes) - anew, "predict")
         if refused:
             raise UnsupportedError(refused)
+        steps = [forward.step_for(model, node, {}) for n, node in model.nodes.items() if n in anew]
+        start = forward.Pass(rng, self._shape, {**values, **known})
         with marking_invalid(), np.errstate(all="ignore"):
-            drawn = forward.run(steps, forward.Pass(rng, self._shape, values)).values
+            drawn = forward.run(steps, start).values
         stored = {n: _chained(drawn[n], len(model[n].value_shape)) for n in drawn}
         new = Problem(problem.net, model, {}, dict(known))
         return DrawsPosterior(
@@ -434,6 +406,12 @@ class DrawsPosterior(Posterior):
         angles = self.model.nodes[name].angles
         return values if angles is None else np.where(angles, near(values, self.mean(name)), values)
 
+    def _flat_weights(self) -> np.ndarray:
+        if self.weights is not None:
+            return self.weights.ravel()
+        total = math.prod(self._shape)
+        return np.full(total, 1 / total)
+
     def _average(self, values: np.ndarray) -> np.ndarray:
         if values.shape[:2] == (1, 1):
             return np.asarray(values[0, 0], dtype=float)
@@ -463,23 +441,7 @@ class DrawsPosterior(Posterior):
         return np.where(node.angles, turned, values)
 
 
-def near(angles: np.ndarray, mean: Any) -> np.ndarray:
-    """Angles within half a turn of their mean: what needs an order needs a cut, best opposite the mean."""
-    return mean + wrap_angle(angles - mean)
-
-
 def _chained(values: np.ndarray, trailing: int) -> np.ndarray:
     """Values with exactly two batch axes."""
     missing = 2 - (values.ndim - trailing)
     return values.reshape((1,) * missing + values.shape) if missing > 0 else values
-
-
-def _refuse_potentials(model: Model, wanted: Sequence[str]) -> None:
-    """Drawing a node anew from its parents would ignore a potential on it."""
-    for name, (potential, _) in model.potentials.items():
-        hit = [n for n in wanted if n in potential.parents]
-        if hit:
-            raise UnsupportedError(
-                f"predict({hit[0]!r}): the potential {name!r} reweights it, which drawing it given its "
-                "parents would ignore"
-            )

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.circular import wrap_angle
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError, did_you_mean
 from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.captured import check_captured
@@ -363,6 +364,11 @@ def table_variance(table: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Variances of numbers under tables of probabilities, shape ``table.shape[:-1]``."""
     centred = numbers - (table @ numbers)[..., None]
     return (table * centred**2).sum(axis=-1)
+
+
+def near(angles: np.ndarray, mean: Any) -> np.ndarray:
+    """Angles within half a turn of their mean: what needs an order needs a cut, best opposite the mean."""
+    return mean + wrap_angle(angles - mean)
 
 
 def circular_variance(cosine: Any, sine: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ from bayesmc.errors import (
 )
 from bayesmc.network import Model
 from bayesmc.network.align import Aligner
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, broadcasts_to, masks, nearly_equal, unused_sizes
 from bayesmc.states import StateArray, as_numbers

@@ -13,6 +13,10 @@ from typing import Any
 import numpy as np
 
 from bayesmc import diagnostics
+from bayesmc.network import Model
+
+#: joint states up to which scalar finite nodes share one histogram, so that it stays in cache
+_GROUP_STATES = 2048
 
 
 class JointCounts:
@@ -194,3 +198,121 @@ class Tail:
 
     def _needed(self) -> int:
         return 5 * diagnostics.tail_length(4 * self.draws)
+
+
+class Sums:
+    """Running weighted sums over chunks of draws, of constant size.
+
+    Scalar finite nodes are counted jointly in groups, one histogram for several nodes; plated ones
+    state by state; angles by their turns, also those among a vector's numbers; all other numbers by
+    the first two powers of their centred values.
+    """
+
+    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
+        self.model = model
+        self.names = names
+        self.draws = 0
+        self.top = -np.inf
+        self.weight = np.zeros(2)
+        self.tail = Tail()
+        self._groups: list[JointCounts] | None = None
+        self._single: dict[str, PlateCounts | Moments] = {}
+        self._turned: dict[str, Turns] = {}
+        self._constant: dict[str, np.ndarray] = {}
+
+    def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
+        """Take in one chunk of ``draws`` draws with their log weights (a scalar: all equal)."""
+        log_weight = np.asarray(log_weight, dtype=float)
+        highest = float(log_weight.max())
+        heavier = highest > self.top
+        if heavier:
+            self._rescale(highest)
+        self.draws += draws
+        self.tail.add(log_weight, draws)
+        if self._groups is None:
+            self._groups = self._sort(values)
+        with np.errstate(all="ignore"):  # draws of weight zero may hold anything
+            weights = np.empty((2, draws))
+            np.exp(log_weight - (self.top if self.top > -np.inf else 0.0), out=weights[0])
+            np.multiply(weights[0], weights[0], out=weights[1])
+            for group in self._groups:
+                group.add(values, weights)
+            for name, kept in self._single.items():
+                if heavier and isinstance(kept, Moments):
+                    kept.move(values[name], weights[0], self.weight)
+                kept.add(values[name], weights)
+            for name, turned in self._turned.items():
+                turned.add(values[name], weights)
+        self.weight += weights[0].sum(), weights[0] @ weights[0]
+
+    @property
+    def constant(self) -> frozenset[str]:
+        """Nodes whose value was no part of the sampling."""
+        return frozenset(self._constant)
+
+    def counts(self, name: str) -> np.ndarray:
+        """Weight of each state of a finite node by w and by w**2, shape ``(2, *plates, states)``."""
+        node = self.model[name]
+        assert node.domain is not None
+        if name in self._constant:
+            one_hot = np.eye(node.domain.size)[self._constant[name].astype(np.intp)]
+            return self.weight.reshape((2,) + (1,) * one_hot.ndim) * one_hot
+        kept = self._single.get(name)
+        if isinstance(kept, PlateCounts):
+            return kept.table.reshape((2, *node.plate_shape, node.domain.size))
+        return next(g for g in self._groups or () if name in g.names).counts(name)
+
+    def powers(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A centre and the sums of the first two powers around it, each ``(2, *plates, *event)``."""
+        shape = self.model[name].value_shape
+        if name in self._constant:
+            zero = np.zeros((2, *shape))
+            return self._constant[name].astype(float), zero, zero
+        kept = self._single[name]
+        assert isinstance(kept, Moments)
+        first, second = kept.first.reshape((2, *shape)), kept.second.reshape((2, *shape))
+        return kept.centre.reshape(shape), first, second
+
+    def turns(self, name: str) -> np.ndarray:
+        """Sums of cos, sin, cos^2, cos sin, sin^2 of angles, shape ``(2, 5, *plates, *event)``; zero
+        where a vector's numbers are none.
+        """
+        shape = self.model[name].value_shape
+        if name in self._constant:
+            figures = np.stack(turns(self._constant[name]))
+            return self.weight.reshape((2,) + (1,) * figures.ndim) * figures
+        kept = self._turned[name]
+        full = np.zeros((2, 5, math.prod(shape)))
+        full[..., kept.places] = kept.sums
+        return full.reshape((2, 5, *shape))
+
+    def _sort(self, values: Mapping[str, np.ndarray]) -> list[JointCounts]:
+        """Decide from the first chunk how each node is summed."""
+        groups: list[JointCounts] = []
+        for name in self.names:
+            node, value = self.model[name], values[name]
+            size = math.prod(node.value_shape)
+            if value.ndim == len(node.value_shape):
+                self._constant[name] = value
+            elif node.domain is None:
+                angles = node.angles
+                if angles is None or not angles.all():
+                    self._single[name] = Moments(size) if node.value_shape else ScalarMoments()
+                if angles is not None:
+                    self._turned[name] = Turns(np.broadcast_to(angles, node.value_shape).ravel())
+            elif node.plates:
+                self._single[name] = PlateCounts(size, node.domain.size)
+            elif groups and groups[-1].size * node.domain.size <= _GROUP_STATES:
+                groups[-1] = groups[-1].with_node(name, node.domain.size)
+            else:
+                groups.append(JointCounts((name,), (node.domain.size,)))
+        return groups
+
+    def _rescale(self, highest: float) -> None:
+        """Take ``highest`` as the log weight that counts as one."""
+        if self.weight[0]:
+            scale = np.exp(np.array([1.0, 2.0]) * (self.top - highest))
+            self.weight *= scale
+            for kept in [*(self._groups or ()), *self._single.values(), *self._turned.values()]:
+                kept.rescale(scale)
+        self.top = highest

@@ -17,139 +17,19 @@ from bayesmc import diagnostics
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results.posterior import Posterior, circular_variance, table_variance
-from bayesmc.results.running import (
-    JointCounts,
-    Moments,
-    PlateCounts,
-    ScalarMoments,
-    Tail,
-    Turns,
-    turns,
-)
+from bayesmc.results.running import Sums
 from bayesmc.results.shares import steps
 
 #: share of a variance that is rounding
 _NONE = 1e-20
-#: joint states up to which scalar finite nodes share one histogram, so that it stays in cache
-_GROUP_STATES = 2048
-
-
-class Sums:
-    """Running weighted sums over chunks of draws, of constant size.
-
-    Scalar finite nodes are counted jointly in groups, one histogram for several nodes; plated ones
-    state by state; angles by their turns, also those among a vector's numbers; all other numbers by
-    the first two powers of their centred values.
-    """
-
-    def __init__(self, model: Model, names: tuple[str, ...]) -> None:
-        self.model = model
-        self.names = names
-        self.draws = 0
-        self.top = -np.inf
-        self.weight = np.zeros(2)
-        self.tail = Tail()
-        self._groups: list[JointCounts] | None = None
-        self._single: dict[str, PlateCounts | Moments] = {}
-        self._turned: dict[str, Turns] = {}
-        self._constant: dict[str, np.ndarray] = {}
-
-    def add(self, values: Mapping[str, np.ndarray], log_weight: Any, draws: int) -> None:
-        """Take in one chunk of ``draws`` draws with their log weights (a scalar: all equal)."""
-        log_weight = np.asarray(log_weight, dtype=float)
-        highest = float(log_weight.max())
-        heavier = highest > self.top
-        if heavier:
-            self._rescale(highest)
-        self.draws += draws
-        self.tail.add(log_weight, draws)
-        if self._groups is None:
-            self._groups = self._sort(values)
-        with np.errstate(all="ignore"):  # draws of weight zero may hold anything
-            weights = np.empty((2, draws))
-            np.exp(log_weight - (self.top if self.top > -np.inf else 0.0), out=weights[0])
-            np.multiply(weights[0], weights[0], out=weights[1])
-            for group in self._groups:
-                group.add(values, weights)
-            for name, kept in self._single.items():
-                if heavier and isinstance(kept, Moments):
-                    kept.move(values[name], weights[0], self.weight)
-                kept.add(values[name], weights)
-            for name, turned in self._turned.items():
-                turned.add(values[name], weights)
-        self.weight += weights[0].sum(), weights[0] @ weights[0]
-
-    @property
-    def constant(self) -> frozenset[str]:
-        """Nodes whose value was no part of the sampling."""
-        return frozenset(self._constant)
-
-    def counts(self, name: str) -> np.ndarray:
-        """Weight of each state of a finite node by w and by w**2, shape ``(2, *plates, states)``."""
-        node = self.model[name]
-        assert node.domain is not None
-        if name in self._constant:
-            one_hot = np.eye(node.domain.size)[self._constant[name].astype(np.intp)]
-            return self.weight.reshape((2,) + (1,) * one_hot.ndim) * one_hot
-        kept = self._single.get(name)
-        if isinstance(kept, PlateCounts):
-            return kept.table.reshape((2, *node.plate_shape, node.domain.size))
-        return next(g for g in self._groups or () if name in g.names).counts(name)
-
-    def powers(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A centre and the sums of the first two powers around it, each ``(2, *plates, *event)``."""
-        shape = self.model[name].value_shape
-        if name in self._constant:
-            zero = np.zeros((2, *shape))
-            return self._constant[name].astype(float), zero, zero
-        kept = self._single[name]
-        assert isinstance(kept, Moments)
-        first, second = kept.first.reshape((2, *shape)), kept.second.reshape((2, *shape))
-        return kept.centre.reshape(shape), first, second
-
-    def turns(self, name: str) -> np.ndarray:
-        """Sums of cos, sin, cos^2, cos sin, sin^2 of angles, shape ``(2, 5, *plates, *event)``; zero
-        where a vector's numbers are none.
-        """
-        shape = self.model[name].value_shape
-        if name in self._constant:
-            figures = np.stack(turns(self._constant[name]))
-            return self.weight.reshape((2,) + (1,) * figures.ndim) * figures
-        kept = self._turned[name]
-        full = np.zeros((2, 5, math.prod(shape)))
-        full[..., kept.places] = kept.sums
-        return full.reshape((2, 5, *shape))
-
-    def _sort(self, values: Mapping[str, np.ndarray]) -> list[JointCounts]:
-        """Decide from the first chunk how each node is summed."""
-        groups: list[JointCounts] = []
-        for name in self.names:
-            node, value = self.model[name], values[name]
-            size = math.prod(node.value_shape)
-            if value.ndim == len(node.value_shape):
-                self._constant[name] = value
-            elif node.domain is None:
-                angles = node.angles
-                if angles is None or not angles.all():
-                    self._single[name] = Moments(size) if node.value_shape else ScalarMoments()
-                if angles is not None:
-                    self._turned[name] = Turns(np.broadcast_to(angles, node.value_shape).ravel())
-            elif node.plates:
-                self._single[name] = PlateCounts(size, node.domain.size)
-            elif groups and groups[-1].size * node.domain.size <= _GROUP_STATES:
-                groups[-1] = groups[-1].with_node(name, node.domain.size)
-            else:
-                groups.append(JointCounts((name,), (node.domain.size,)))
-        return groups
-
-    def _rescale(self, highest: float) -> None:
-        """Take ``highest`` as the log weight that counts as one."""
-        if self.weight[0]:
-            scale = np.exp(np.array([1.0, 2.0]) * (self.top - highest))
-            self.weight *= scale
-            for kept in [*(self._groups or ()), *self._single.values(), *self._turned.values()]:
-                kept.rescale(scale)
-        self.top = highest
+#: batch means kept per chain, once there are as many; twice as many are merged in pairs
+_BATCHES = 16
+#: draws that summaries take in at once
+_BUFFER = 32
+#: numbers that the buffers of all nodes may hold together
+_BUFFER_ELEMENTS = 1 << 21
+#: numbers that the batch means of one node may take; a larger node has no errors in summaries
+_BATCH_ELEMENTS = 1 << 22
 
 
 class SumsPosterior(Posterior):
@@ -309,6 +189,106 @@ class SumsPosterior(Posterior):
         return 'call infer with keep="draws"'
 
 
+class RunningChains:
+    """Sums and batch means of chains, of constant size.
+
+    Draws are taken in by the buffer, and a buffer always holds the same number of them, so that what is
+    summed does not depend on where a run was cut.
+
+    Parameters
+    ----------
+    model : Model
+    names : tuple of str
+    chains, ensemble : int
+    """
+
+    def __init__(self, model: Model, names: tuple[str, ...], chains: int, ensemble: int) -> None:
+        self.chains = chains
+        self.ensemble = ensemble
+        self.draws = 0
+        self._sums = Sums(model, names)
+        self._pending = 0
+        self._buffers: dict[str, np.ndarray] = {}
+        self._constant: dict[str, np.ndarray] = {}
+        self._means: dict[str, _BatchMeans] = {}
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self._sums.names
+
+    def add(self, values: Mapping[str, np.ndarray]) -> None:
+        """Take in one draw of every chain, ``(chain, *plates, *event)``, or without chains if constant."""
+        if not self.draws:
+            self._prepare(values)
+        at = self._pending
+        for name, buffer in self._buffers.items():
+            buffer[at] = values[name]
+        self.draws += 1
+        self._pending += 1
+        if self._pending == self._size:
+            self._empty()
+
+    def total(self) -> Sums:
+        """The sums over all draws so far, for reading only."""
+        if not self._pending:
+            return self._sums
+        model = self._sums.model
+        sums = copy.deepcopy(self._sums, {id(model): model})
+        self._add_to(sums)
+        return sums
+
+    def is_batched(self, name: str) -> bool:
+        """Whether batch means are kept: not of constants, nor of nodes of very many numbers."""
+        return name in self._means
+
+    def batch_means(self, name: str) -> np.ndarray | None:
+        """Means of equal batches, shape ``(batch, chain, figures...)``; None where there are none."""
+        means = self._means.get(name)
+        return None if means is None else means.values
+
+    def with_model(self, model: Model) -> RunningChains:
+        """The same for another compilation of the same net, independent of this one."""
+        return copy.deepcopy(self, {id(self._sums.model): model})
+
+    def _prepare(self, values: Mapping[str, np.ndarray]) -> None:
+        """Decide from the first draw what is constant, and how many draws make a buffer."""
+        moving = {}
+        for name in self.names:
+            node = self._sums.model[name]
+            if values[name].ndim == len(node.value_shape):
+                self._constant[name] = np.array(values[name])
+            else:
+                moving[name] = node
+        numbers = self.chains * sum(math.prod(node.value_shape) for node in moving.values())
+        draws = min(_BUFFER, max(1, _BUFFER_ELEMENTS // max(numbers, 1)))
+        self._size = self.ensemble * max(1, draws // self.ensemble)
+        for name, node in moving.items():
+            dtype = stored_dtype(node, values[name])
+            shape = (self._size, self.chains, *node.value_shape)
+            self._buffers[name] = np.empty(shape, dtype=dtype)
+            width = math.prod(_figures(node, values[name][None]).shape[2:])
+            if 2 * _BATCHES * self.chains * width <= _BATCH_ELEMENTS:
+                self._means[name] = _BatchMeans()
+
+    def _empty(self) -> None:
+        self._add_to(self._sums)
+        for name, means in self._means.items():
+            means.add(_figures(self._sums.model[name], self._buffers[name]).mean(axis=0))
+        self._pending = 0
+
+    def _add_to(self, sums: Sums) -> None:
+        count = self._pending * self.chains
+        values = {
+            n: b[: self._pending].reshape(count, *b.shape[2:]) for n, b in self._buffers.items()
+        }
+        sums.add({**self._constant, **values}, 0.0, count)
+
+
+def stored_dtype(node: CompiledNode, values: np.ndarray) -> np.dtype:
+    """The type that draws of a node are kept in: the smallest for positions of a finite one."""
+    return values.dtype if node.domain is None else node.domain.dtype
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -319,3 +299,46 @@ def _by_kind(
     if node.angles is None:
         return plain()
     return turned() if node.angles.all() else np.where(node.angles, turned(), plain())
+
+
+class _BatchMeans:
+    """Means of equally long batches; when there are too many, neighbours are merged."""
+
+    def __init__(self) -> None:
+        self._kept: list[np.ndarray] = []
+        self._length = 1
+        self._sum: Any = 0.0
+        self._count = 0
+
+    def add(self, mean: np.ndarray) -> None:
+        """Take in the mean of one more buffer, shape ``(chain, ...)``."""
+        self._sum = self._sum + mean
+        self._count += 1
+        if self._count < self._length:
+            return
+        self._kept.append(self._sum / self._length)
+        self._sum, self._count = 0.0, 0
+        if len(self._kept) == 2 * _BATCHES:
+            pairs = zip(self._kept[::2], self._kept[1::2], strict=True)
+            self._kept = [(a + b) / 2 for a, b in pairs]
+            self._length *= 2
+
+    @property
+    def values(self) -> np.ndarray | None:
+        return np.stack(self._kept) if self._kept else None
+
+
+def _figures(node: CompiledNode, draws: np.ndarray) -> np.ndarray:
+    """What the answers about a node are means of, shape ``(draw, chain, ...)``.
+
+    With angles there are two: cosines and sines, for numbers that are none themselves and zero.
+    """
+    if node.domain is None:
+        if node.angles is None:
+            return draws
+        cosine, sine = np.cos(draws), np.sin(draws)
+        pair = np.where(node.angles, cosine, draws), np.where(node.angles, sine, 0.0)
+        return np.stack(pair, axis=2)
+    if node.domain.labels is None:
+        return np.take(np.asarray(node.domain.numbers, dtype=float), draws)
+    return (draws[..., None] == np.arange(node.domain.size)).astype(float)

@@ -248,7 +248,7 @@ class RangeAndBearing(AndAngle):
     """A range and a bearing side by side; rows whose columns are swapped do not pass unnoticed."""
 
     def doubt(self, values: np.ndarray) -> str | None:
-        """What is strange about rows, shape (..., 2), or None; ``network.plausible`` asks.
+        """What is strange about rows, shape (..., 2), or None; ``network.evidence`` asks.
 
         Ranges are hardly ever negative, and bearings are as often as not: rows of which it is the other way
         round are swapped.

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions.base import as_float
+from bayesmc.expression import is_traced
 from bayesmc.robotics.poses import as_poses, joined_pose, sin_cos, turned_back
-from bayesmc.tracing import is_traced
 
 #: of ``sin(a) / a`` in powers of the square, highest first and without the first; to rounding up to a = 0.5
 _SERIES = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in range(6, 0, -1))

@@ -15,7 +15,7 @@ from bayesmc.factors import FactorLike, LogTable
 from bayesmc.network import Model, Observed
 from bayesmc.network.model import potential_shape
 from bayesmc.network.node import Potential
-from bayesmc.network.rounding import point_log_density
+from bayesmc.network.noiseless import point_log_density
 from bayesmc.shapes import Shape
 from bayesmc.structure.tables import (
     TABLE_ENTRIES,

@@ -30,7 +30,8 @@ from bayesmc.expression import (
 )
 from bayesmc.network import CompiledNode
 from bayesmc.network.expressions import Followed, density
-from bayesmc.network.readings import Reading, identity, with_axes
+from bayesmc.network.node import identity
+from bayesmc.network.readings import Reading, with_axes
 from bayesmc.passes.templates import stacked_rows
 from bayesmc.shapes import Shape, broadcast_shapes
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.auto.like_lines import together
+from bayesmc.auto.explanation import together
 
 
 def walk() -> bmc.DynamicBayesNet:

@@ -862,6 +862,59 @@ def test_events_have_no_favourite_unit(unit: float) -> None:
     assert above == pytest.approx(0.15865525393145707)
 
 
+AFFINE = {
+    "cumsum": lambda x, k: np.cumsum(x, axis=-1),
+    "chosen": lambda x, k: np.choose(k[..., None], [x, 2 * x]),
+    "where": lambda x, k: np.where((k == 1)[..., None], x, -x),
+    "average": lambda x, k: np.average(x, axis=-1, weights=[1.0, 2.0, 3.0]),
+    "looked up": lambda x, k: x * np.array([1.0, 5.0])[k][..., None],
+    "einsum": lambda x, k: np.einsum("...i,ij->...j", x, np.arange(6.0).reshape(3, 2)),
+    "solved": lambda x, k: np.linalg.solve(2 * np.eye(3), x[..., None])[..., 0],
+}
+EVENTS = {
+    "sum": lambda x, k: x.sum(axis=-1) > 2.5,
+    "opposite": lambda x, k: ~(x[..., 1] <= 0.2),
+    "and": lambda x, k: (x[..., 0] > 0) & (k == 1),
+    "or": lambda x, k: (x[..., 0] > 0) | (k == 1),
+    "part": lambda x, k: (x > 0.3)[..., 2],
+    "sums": lambda x, k: np.cumsum(x, axis=-1) >= 1,
+}
+
+
+def _switched() -> Any:
+    net = bmc.BayesNet()
+    net.add("k", bmc.Categorical([0.3, 0.7]))
+    net.add("x", lambda k: bmc.MvNormal(np.stack([k, 0.0 * k, 2.0 - k], -1), np.eye(3)))
+    net.add("y", lambda x: bmc.Normal(x[..., 0], 1.0))
+    return bmc.infer(net, {"y": 0.4}, engine=EXACT)
+
+
+@pytest.mark.parametrize("what", [*AFFINE, *EVENTS])
+def test_functions_and_events_of_switched_vectors(what: str) -> None:
+    posterior = _switched()
+    drawn = posterior.resample(200_000, rng=1)
+    if what in AFFINE:
+        found, about = (p.expectation(AFFINE[what]) for p in (posterior, drawn))
+    else:
+        found, about = (p.probability(EVENTS[what]) for p in (posterior, drawn))
+    np.testing.assert_allclose(found, about, atol=0.06 if what == "looked up" else 0.03)
+
+
+@pytest.mark.parametrize(
+    ("function", "why"),
+    [
+        (lambda x: (x[..., 0] > 0) & (x[..., 0] < 1), "bitwise_and is no comparison"),
+        (lambda x: (x > 0).any(axis=-1), "no comparison"),
+        (lambda x: x[..., 0] ** 2 > 1, "np.power is not affine"),
+        (lambda x: np.exp(x[..., 0]) > x[..., 1], "np.exp is not affine"),
+        (lambda x: (x[..., 0] > 0) if float(x.sum()) else (x[..., 0] < 0), "mixes draws|only NumPy|query"),
+    ],
+)  # fmt: skip
+def test_other_events_are_refused(function: Any, why: str) -> None:
+    with pytest.raises((UnsupportedError, bmc.errors.QueryError), match=why):
+        _switched().probability(function)
+
+
 def test_unseen_switches_of_others_do_not_matter() -> None:
     """A chain of 40 switches that nothing observed depends on is too much only for who asks for its end."""
     net = bmc.BayesNet()

@@ -18,7 +18,7 @@ from bayesmc.expression import (
     pick,
     trace,
 )
-from bayesmc.expression.products import product
+from bayesmc.expression.functions import product
 from bayesmc.expression.scalars import SmallProgram, upper_inverse
 
 RNG = np.random.default_rng(3)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import bayesmc as bmc
 from bayesmc.network.align import Aligner
-from bayesmc.network.domain import Domain
+from bayesmc.network.labels import Domain
 from bayesmc.plates import PlateArray
 from bayesmc.testing import session
 

@@ -700,3 +700,25 @@ def test_scopes_are_sound_for_random_functions() -> None:
     i, j = np.indices((6, 2))
     expected = {tuple((4 * j + key[i]).ravel()) for key in (school, second)}
     assert columns == expected
+
+
+def test_what_cannot_be_followed_reads_what_it_receives() -> None:
+    """Aligned elements of parents, all of what it gathers or what others compute for it."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("a", bmc.Normal(0.0, 1.0), plates="i")
+    net.add("s", lambda a: a.sum("i"))
+    net.add("alone", lambda a: bmc.Normal(float(a), 1.0), plates="i", vectorize=True)
+    net.add("both", lambda a, s: bmc.Normal(float(a + s), 1.0), plates="i", vectorize=True)
+    scopes = {s.name: s for s in factor_scopes(net.model(), {}, {})}
+    (column,) = scopes["alone"].reads["a"].columns
+    np.testing.assert_array_equal(column, np.arange(3))
+    assert scopes["both"].reads["a"].columns is None
+
+
+def test_numbers_of_states_that_are_gathered_are_those_elements() -> None:
+    net = bmc.BayesNet(plates={"k": 4, "i": 3})
+    net.add("s", bmc.Bernoulli(0.5), plates="k", states=(-1, 1))
+    at = np.array([0, 1, 2])
+    net.add("y", lambda s: bmc.Normal(s[at] * s[at + 1], 1.0), plates="i")
+    graph = net.to_factor_graph({"y": [0.1, 0.2, 0.3]})
+    assert graph.markov_blanket("s", 1) == {("s", (0,)), ("s", (2,))}

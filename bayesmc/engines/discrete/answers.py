@@ -19,7 +19,7 @@ from bayesmc.engines.filtering import Answers, Queries, quiet
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.factors.named import choices_of
 from bayesmc.network import CompiledNode
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import circular_variance
 from bayesmc.shapes import padded, unravelled
 

@@ -22,7 +22,7 @@ from bayesmc.engines.filtering import Asked, FilterEngine, Queries, observed_ans
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, UnsupportedError
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.progress import Progress
 from bayesmc.results.predictive import warn_of_misfit
 

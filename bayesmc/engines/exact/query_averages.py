@@ -1,7 +1,7 @@
 """Averages of a user's function under an exact posterior.
 
-Functions of finite nodes are averaged over their joint table. Of continuous nodes, functions that tracing
-proves affine are exact at the components' means, and an event that compares affine values is a normal
+Functions of finite nodes are averaged over their joint table. Of continuous nodes, functions whose expression
+is affine are exact at the components' means, and an event that compares affine values is a normal
 probability in every component; anything else is refused.
 """
 
@@ -16,17 +16,21 @@ from scipy import special
 
 from bayesmc.engines.exact.gaussian_answers import GaussianAnswers
 from bayesmc.engines.exact.table_answers import TableAnswers
-from bayesmc.errors import BayesmcError, BudgetError, UnsupportedError
+from bayesmc.errors import BudgetError, TraceError, UnsupportedError
+from bayesmc.expression import Expression, Program, TracedArray, leaf, trace
 from bayesmc.factors.moments import Components
+from bayesmc.passes.affine import refuse_beyond_affine
+from bayesmc.passes.events import margin
 from bayesmc.results.query import Query
-from bayesmc.shapes import Shape
+from bayesmc.shapes import Shape, nearly_equal
 from bayesmc.structure import Variable, configure
-from bayesmc.tracing import Tracer
 
 #: configurations up to which a function is averaged over a joint table
 _ENTRIES = 1 << 22
 #: components of continuous nodes that an event may depend on
 _DIRECTIONS = 256
+#: share of the largest margin below which rounding decides whether an event is true
+_CLOSE = 1e-9
 
 
 def average(tables: TableAnswers, query: Query, events: bool) -> np.ndarray:
@@ -109,31 +113,60 @@ def _joint_average(
         means = {n: gaussian.values(n, found.mean, columns[n]) for n in continuous}
     count = len(weights)
     stored = _finite_values(tables, others, found, count)
-
-    def at(values: Mapping[str, np.ndarray]) -> dict[str, Any]:
-        return {**stored, **{n: Tracer(v, [n]) for n, v in values.items()}}
-
     # with the checks that it acts draw by draw
     plain = query({**stored, **means}, (count,))
     if events:
         _check_boolean(plain)
     try:
-        result = query.raw(at(means))
-    except BayesmcError as error:
-        raise _beyond(continuous, str(error.__cause__ or error)) from error
-    if not isinstance(result, Tracer):
-        return np.tensordot(weights, plain.astype(float), axes=1)
-    if result.is_affine and not events:
+        followed = _followed(query, stored, means)
+        if not followed.leaves:
+            return np.tensordot(weights, plain.astype(float), axes=1)
+        if events:
+            followed = margin(followed)
+        refuse_beyond_affine(followed, continuous)
+        program = Program([followed])
+        (value,) = program(means)
+        _hold_against(plain, query.fitted(value, (count,)), events)
+    except TraceError as error:
+        raise _beyond(continuous, str(error)) from error
+    if not events:
         return np.tensordot(weights, plain, axes=1)
-    if result.margin is None or found is None:
-        raise _beyond(continuous, f"after {result.reason}")
+    assert found is not None
 
-    def moved(blocks: np.ndarray) -> Tracer:
-        shifted = {n: gaussian.values(n, blocks, columns[n]) for n in continuous}
-        return query.raw(at(shifted)).margin
+    def exceeds(blocks: np.ndarray) -> np.ndarray:
+        (value,) = program({n: gaussian.values(n, blocks, columns[n]) for n in continuous})
+        return query.fitted(value, (count,))
 
-    chance = _chances(query, result.margin, found, moved, plain)
-    return np.tensordot(weights, chance, axes=1)
+    return np.tensordot(weights, _chances(exceeds, found, plain), axes=1)
+
+
+def _followed(
+    query: Query, stored: Mapping[str, np.ndarray], means: Mapping[str, np.ndarray]
+) -> Expression:
+    """What a function makes of all components' values at once, as an expression of the continuous ones."""
+    given = [TracedArray(leaf(name, value.shape)) for name, value in means.items()]
+
+    def asked(*values: Any) -> Any:
+        return query.raw({**stored, **dict(zip(means, values, strict=True))})
+
+    found = trace(asked, given)
+    if not isinstance(found, Expression):
+        raise TraceError(f"it returns {type(found).__name__}")
+    return found
+
+
+def _hold_against(plain: np.ndarray, found: np.ndarray, events: bool) -> None:
+    """Refuse what was read of a function where the function gives something else.
+
+    An event is true where its margin is above zero; at zero rounding may decide.
+    """
+    if events:
+        close = np.abs(found) <= _CLOSE * np.abs(found[np.isfinite(found)]).max(initial=0.0)
+        agrees = bool((close | (plain == (found > 0))).all())
+    else:
+        agrees = nearly_equal(plain, found)
+    if not agrees:
+        raise TraceError("what was read of it gives other values than the function")
 
 
 def covariance(
@@ -174,13 +207,9 @@ def covariance(
 
 
 def _chances(
-    query: Query,
-    margin: Tracer,
-    found: Components,
-    margin_at: Callable[[np.ndarray], Tracer],
-    plain: np.ndarray,
+    exceeds: Callable[[np.ndarray], np.ndarray], found: Components, plain: np.ndarray
 ) -> np.ndarray:
-    """In every component the probability that an affine margin of the blocks is positive."""
+    """In every component the probability that what is affine in the blocks exceeds zero."""
     count, width = found.mean.shape
     if width > _DIRECTIONS:
         raise BudgetError(
@@ -188,7 +217,7 @@ def _chances(
             "with resample(draws)",
             8 * count * width**2,
         )
-    centre = query.fitted(margin.example, (count,))
+    centre = exceeds(found.mean)
     spread = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
     scale = np.where(spread > 0, spread, 1.0)
     slopes = np.empty((width, *centre.shape))
@@ -196,7 +225,7 @@ def _chances(
         for k in range(width):
             moved = found.mean.copy()
             moved[:, k] += scale[:, k]
-            slopes[k] = query.fitted(margin_at(moved).example, (count,)) - centre
+            slopes[k] = exceeds(moved) - centre
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     unit = np.abs(slopes).max(axis=0, initial=0.0)  # the sign is all that counts, in any unit
     unit = np.where(unit > 0, unit, 1.0)

@@ -19,7 +19,7 @@ from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.factors.named import Named, aligned, contract
 from bayesmc.network import CompiledNode
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import circular_variance
 from bayesmc.shapes import padded
 

@@ -21,7 +21,7 @@ from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
 from bayesmc.factors.named import largest
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 
 
 @dataclass(frozen=True)

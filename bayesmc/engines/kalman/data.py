@@ -20,7 +20,7 @@ from bayesmc.engines.kalman.slices import Layout, always_unknown
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.network import Observed
 from bayesmc.network.forward import summed
-from bayesmc.network.rounding import point_log_density
+from bayesmc.network.noiseless import point_log_density
 
 
 @dataclass(frozen=True, eq=False)

@@ -45,7 +45,7 @@ from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.linalg.square_root import multiplied
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.progress import Progress
 from bayesmc.results.predictive import warn_of_misfit
 

@@ -17,7 +17,7 @@ from bayesmc.distributions.circular import wrap_angle
 from bayesmc.engines.averages import as_event, called, over_normal, over_normals
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import quantile_levels
 
 

@@ -39,7 +39,7 @@ from bayesmc.network import Model, Problem
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
-from bayesmc.results.chains import stored_dtype
+from bayesmc.results.sums import stored_dtype
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, picklable
 State = Mapping[str, Any]

@@ -16,7 +16,7 @@ import numpy as np
 from bayesmc import diagnostics
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results import ChainsPosterior, ChainsSums
-from bayesmc.results.draws import near
+from bayesmc.results.posterior import near
 from bayesmc.results.relabelling import ordered, pivot_of, symmetries
 
 #: R-hat above which chains disagree (Vehtari et al. 2021, sec. 5)

@@ -14,7 +14,7 @@ import numpy as np
 from bayesmc.network import Observed, Problem
 from bayesmc.network.captured import redeclared
 from bayesmc.network.sameness import same
-from bayesmc.results.checkpoint import noted_densities, other_density, outline
+from bayesmc.results.chains import noted_densities, other_density, outline
 
 
 def difference(

@@ -17,7 +17,7 @@ from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, largest_term, row
 from bayesmc.engines.mcmc.start_faults import fault_at, impossible, refuse_impossible
 from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError
 from bayesmc.network import CompiledNode
-from bayesmc.network.nearer import nearer
+from bayesmc.network.probing import nearer
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
 

@@ -14,7 +14,7 @@ from bayesmc.engines.particles.genealogy import Families
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import quantile_levels
 
 

@@ -23,7 +23,7 @@ from bayesmc.errors import LowEssWarning, ProposalWarning, UnknownNodeError, did
 from bayesmc.kernels.proposal import names_of
 from bayesmc.network import Observed
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
-from bayesmc.network.reading import nodes_read
+from bayesmc.network.node import nodes_read
 
 #: why some particles are not smoothed
 NOT_SMOOTHED = (

@@ -24,7 +24,7 @@ from bayesmc.network.forward import Pass, Step, run
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import DrawsPosterior, Posterior, Sums, SumsPosterior
-from bayesmc.results.checkpoint import noted_densities
+from bayesmc.results.chains import noted_densities
 
 #: share of the draws above which weights are even: they have a heavy tail only if the largest one counts
 _EVEN = 0.5

@@ -1,12 +1,15 @@
-"""Parameters under names that a family does not have: what it takes, and which was meant."""
+"""Parameters as users write them: names that a family does not have, and numbers that are none."""
 
 from __future__ import annotations
 
 import functools
 import inspect
 from collections.abc import Iterable, KeysView
+from typing import Any
 
-from bayesmc.errors import did_you_mean
+import numpy as np
+
+from bayesmc.errors import BayesmcError, ParameterError, did_you_mean
 
 #: another name -> what it is called here, or how to say it: the first that a family takes
 _OTHERWISE: dict[str, tuple[tuple[str, str], ...]] = {
@@ -42,14 +45,14 @@ _OTHERWISE: dict[str, tuple[tuple[str, str], ...]] = {
 }
 
 
+#: families -> the names that their constructors are known to take
+_KNOWN: dict[type, frozenset[str]] = {}
+
+
 @functools.cache
 def signature(family: type) -> inspect.Signature:
     """The parameters of a family's constructor."""
     return inspect.signature(family)
-
-
-#: families -> the names that their constructors are known to take
-_KNOWN: dict[type, frozenset[str]] = {}
 
 
 def check_keywords(family: type, keywords: KeysView[str]) -> None:
@@ -80,6 +83,36 @@ def check_keywords(family: type, keywords: KeysView[str]) -> None:
             raise TypeError(
                 f"{family.__name__} has no parameter {keyword!r}{meant}; it takes {', '.join(parameters)}"
             )
+
+
+def read_floats(value: Any) -> np.ndarray:
+    """A parameter as a float array; text is no number even where it could be read as one.
+
+    Raises
+    ------
+    ParameterError
+    """
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError) as error:
+        if isinstance(error, BayesmcError):
+            raise
+        raise ParameterError(f"a distribution's parameter is {value!r}, not numbers") from error
+    if type(value) is not float and type(value) is not int and _holds_text(value):
+        raise ParameterError(
+            f"a distribution's parameter is {value!r}, which is text, not numbers; give {numbers.tolist()}"
+        )
+    return numbers
+
+
+def _holds_text(value: Any) -> bool:
+    if isinstance(value, (str, bytes)):
+        return True
+    if isinstance(value, np.ndarray):
+        return value.dtype.kind in "SU" or (
+            value.dtype.kind == "O" and any(map(_holds_text, value.flat))
+        )
+    return isinstance(value, (list, tuple)) and any(map(_holds_text, value))
 
 
 # ---- private ------------------------------------------------------------------------------------

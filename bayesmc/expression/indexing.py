@@ -1,4 +1,4 @@
-"""Between which whole numbers an index lies, as far as its expression tells."""
+"""What an index picks, and between which whole numbers it lies, as far as its expression tells."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.errors import TraceError
 from bayesmc.expression.graph import (
     Constant,
     Elementwise,
@@ -13,8 +14,14 @@ from bayesmc.expression.graph import (
     Gather,
     Leaf,
     Pick,
+    as_expression,
+    broadcast,
+    cast,
     elementwise,
+    gather,
     ordered,
+    pick,
+    reshape,
 )
 
 Bounds = tuple[int, int]
@@ -30,7 +37,7 @@ def bounds(root: Expression) -> Bounds | None:
     --------
     >>> import numpy as np
     >>> from bayesmc.expression import elementwise, leaf
-    >>> from bayesmc.expression.bounds import bounds
+    >>> from bayesmc.expression.indexing import bounds
     >>> bounds(elementwise(np.subtract, leaf("die", (), int, states=6), 1))
     (-1, 4)
     """
@@ -58,7 +65,67 @@ def counted_from_end(index: Expression, size: int) -> Expression:
     return elementwise(np.add, index, back)
 
 
+def indexed(value: Expression, key: Any) -> Expression:
+    """``value[key]``."""
+    keys = [_plain_key(k) for k in (key if isinstance(key, tuple) else (key,))]
+    if not any(isinstance(k, Expression) for k in keys):
+        at = np.arange(value.size).reshape(value.shape)[tuple(keys)]
+        return pick([value], at)
+    if not isinstance(value, Constant):
+        raise TraceError(
+            "an array that varies is indexed by one that varies: gather along a plate, or use "
+            "np.take_along_axis"
+        )
+    computed = [n for n, k in enumerate(keys) if isinstance(k, Expression)]
+    lead = keys[: computed[-1] + 1]
+    if any(not isinstance(k, (Expression, int, np.integer)) for k in lead):
+        raise TraceError("a computed index stands behind a slice")
+    rows: Any = 0
+    for n, k in enumerate(lead):
+        size = value.shape[n]
+        at = as_expression(k)
+        if at.dtype.kind != "i":
+            raise TraceError("an index that is not a whole number")
+        at = within(counted_from_end(at, size), size)
+        rows = elementwise(np.add, elementwise(np.multiply, rows, size), at)
+    rest = value.shape[len(lead) :]
+    table = reshape(value, (-1, *rest)) if value.size else value
+    found = gather(table, rows)
+    left = tuple(keys[len(lead) :])
+    if not left:
+        return found
+    at = np.arange(found.size).reshape(found.shape)
+    return pick([found], at[(slice(None),) * len(rows.shape) + left])
+
+
+def assigned(value: Expression, key: Any, new: Expression) -> Expression:
+    """The array after ``value[key] = new``."""
+    keys = tuple(_plain_key(k) for k in (key if isinstance(key, tuple) else (key,)))
+    if any(isinstance(k, Expression) for k in keys):
+        raise TraceError("an array is written to at places that vary")
+    at = np.arange(value.size).reshape(value.shape)
+    places = at[keys]
+    given = broadcast(cast(new, value.dtype), places.shape)
+    at = at.copy()
+    at[keys] = value.size + np.arange(given.size).reshape(given.shape)
+    return pick([value, given], at)
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _plain_key(key: Any) -> Any:
+    """A key as NumPy takes it, or the expression that it is."""
+    if isinstance(key, list) and _holds_expressions(key):
+        raise TraceError("an index is a list that varies")
+    known = getattr(key, "expression", key)
+    return known.value if isinstance(known, Constant) else known
+
+
+def _holds_expressions(value: Any) -> bool:
+    if isinstance(value, list):
+        return any(map(_holds_expressions, value))
+    return hasattr(value, "expression")
 
 
 def _bounds(node: Expression, inner: list[Bounds | None]) -> Bounds | None:
