@@ -63,7 +63,6 @@ LONG_MODULES = {
     "network/net.py",
     "results/chains.py",
     "results/draws.py",
-    "structure/target.py",
     "testing/oracles/answers.py",
     "testing/posteriors/calibration.py",
 }
@@ -73,8 +72,6 @@ LONG_FUNCTIONS: set[str] = set()
 TYPE_CIRCLES = {
     "engines.discrete.rows engines.discrete.terms",
     "factors.calibrated factors.cliquetree",
-    "kernels.conjugate_children kernels.conjugate_matching kernels.conjugate_picks",
-    "structure.like_functions structure.like_links structure.target",
 }
 
 HEAVY = ("scipy.stats", "networkx", "arviz_stats", "arviz_base", "matplotlib", "hypothesis",

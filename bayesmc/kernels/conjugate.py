@@ -20,18 +20,17 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.errors import DensityError, UnsupportedError
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, check_ratio
 from bayesmc.kernels.conjugate_families import (
     Bounds,
+    Form,
     Naturals,
 )
-from bayesmc.kernels.conjugate_forms import Form
 from bayesmc.kernels.conjugate_naturals import form_of
 from bayesmc.kernels.slice import slice_move
-from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.joint_values import JointValues
-from bayesmc.structure.like_children import with_like_children
+from bayesmc.structure.like_terms import with_like_children
+from bayesmc.structure.programs import JointValues
 from bayesmc.structure.target import Values
 
 

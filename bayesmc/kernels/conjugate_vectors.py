@@ -1,7 +1,8 @@
-"""What a term adds to the natural parameters of a vector that enters a mean, or of a covariance.
+"""What children add to the natural parameters of a vector that enters a mean, or of a covariance.
 
 A mean that is affine in a vector makes the log density a quadratic form in it; a covariance that is a
-multiple of a matrix makes it that of an inverse Wishart.
+multiple of a matrix makes it that of an inverse Wishart. Of children that are summed by label the same is
+said of the sums (``label_sums``).
 
 References
 ----------
@@ -25,21 +26,26 @@ from bayesmc.expression import (
     as_expression,
     broadcast,
     call,
+    constant,
     elementwise,
     pick,
     reduction,
     reshape,
     substituted,
 )
+from bayesmc.expression.products import product
 from bayesmc.kernels.conjugate_children import Child
 from bayesmc.kernels.conjugate_terms import Moving
+from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.passes.affine import affine
-from bayesmc.passes.arithmetic import ONE, divide, subtract
+from bayesmc.passes.arithmetic import ONE, add, divide, is_all, multiply, subtract
 from bayesmc.passes.derivatives import tangent
 from bayesmc.passes.features import alone, statistics
 from bayesmc.passes.reads import element_read, same_along
+from bayesmc.passes.sufficient import precision_of, transposed
 from bayesmc.passes.totals import total
 from bayesmc.shapes import Shape
+from bayesmc.structure.blanket import Blanket
 
 
 def mean_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
@@ -108,6 +114,83 @@ def covariance_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
     off = subtract(value, broadcast(parameters["loc"], value.shape))
     scaled = divide(off, reshape(elementwise(np.sqrt, times), (*child.shape, 1)))
     return entries.total(broadcast(ONE, child.shape)), entries.outer(scaled, scaled)
+
+
+def mean_by_label(sums: LabelSums, blanket: Blanket) -> tuple[Expression, Expression]:
+    """Precision and linear term of a vector in which the mean is affine.
+
+    Raises
+    ------
+    TraceError
+        It is not in the mean alone, or not so.
+    """
+    if sums.family.make is not MvNormal or sums.repeats != 1:
+        raise TraceError("they are no normal vectors")
+    node, value_shape = blanket.name, blanket.node.value_shape
+    plates = len(blanket.node.plate_shape)
+    labels, d = sums.states, len(sums.centre)
+    loc = broadcast(as_expression(sums.family.parameters["loc"]), (*sums.shape, d))
+    form = affine(reshape(loc, (labels, d)), [node])
+    if node in _precision_leaves(sums):
+        raise TraceError("it is not in the mean alone")
+    read = form.reads[node]
+    at = _known(read.at)
+    event, shape = value_shape[plates:], value_shape[:plates]
+    own = int(np.prod(event, dtype=int))
+    element = at // own
+    if (element != element[:, :1, :1]).any():
+        raise TraceError("several elements are read")
+    hot = constant((at[..., None] % own == np.arange(own)).astype(float))
+    slope = reduction(np.add, multiply(reshape(read.gain, (*read.gain.shape, 1)), hot), (2,))
+    precision, _ = precision_of(sums.family, sums.shape)
+    precision = reshape(precision, (labels, d, d))
+    count, first, _ = _moments(sums)
+    total = add(first, multiply(count, subtract(sums.centre, form.offset)))
+    linear = product(np.matvec, precision, total)
+    if not (isinstance(slope, Constant) and is_all(subtract(slope, np.eye(d, own)), 0)):
+        linear = product(np.matvec, transposed(slope), linear)
+        precision = product(np.matmul, product(np.matmul, transposed(slope), precision), slope)
+    precision = multiply(reshape(count, (labels, 1, 1)), precision)
+    if not event:
+        precision, linear = reshape(precision, (labels,)), reshape(linear, (labels,))
+    at = element[:, 0, 0]
+    return (
+        _collected(precision, at, shape, 2 * len(event)),
+        _collected(linear, at, shape, len(event)),
+    )
+
+
+def covariance_by_label(sums: LabelSums, blanket: Blanket) -> tuple[Expression, Expression]:
+    """Degrees of freedom and scale of a node of which the covariance is a multiple.
+
+    Raises
+    ------
+    TraceError
+        It is not the covariance alone, or not so.
+    """
+    if sums.family.make is not MvNormal or sums.repeats != 1:
+        raise TraceError("they are no normal vectors")
+    node, shape = blanket.name, blanket.node.plate_shape
+    labels, d = sums.states, len(sums.centre)
+    cov = sums.family.parameters.get("cov")
+    if cov is None or node in as_expression(sums.family.parameters["loc"]).leaves:
+        raise TraceError("it is not the covariance alone")
+    form = affine(reshape(broadcast(cov, (*sums.shape, d, d)), (labels, d, d)), [node])
+    read = form.reads[node]
+    at = _known(read.at)
+    block = np.arange(d * d).reshape(d, d)
+    element = at[:, 0, 0, 0] // (d * d)
+    fits = read.gain.shape[-1] == 1 and is_all(form.offset, 0)
+    if not fits or (at[..., 0] != element[:, None, None] * d * d + block).any():
+        raise TraceError("the covariance is no multiple of it")
+    gain = reshape(read.gain, (labels, d, d))
+    scatter = _about_loc(sums)
+    if not is_all(gain, 1):
+        if not isinstance(gain, Constant) or (gain.value != gain.value[:, :1, :1]).any():
+            raise TraceError("the covariance is no multiple of it")
+        scatter = divide(scatter, gain)
+    count = reshape(sums.column(0, 1), (labels,))
+    return _collected(count, element, shape, 0), _collected(scatter, element, shape, 2)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -262,3 +345,59 @@ def _product(first: Expression, second: Expression) -> Expression:
 def _transposed(matrix: Expression) -> Expression:
     found: Any = np.matrix_transpose(TracedArray(matrix))
     return found.expression
+
+
+def _known(at: Expression) -> np.ndarray:
+    """Positions that do not depend on the state."""
+    if not isinstance(at, Constant):
+        raise TraceError("which element is read varies")
+    return at.value
+
+
+def _collected(
+    parts: Expression, at: np.ndarray, shape: tuple[int, ...], event_ndim: int
+) -> Expression:
+    """Sums of entries ``(*entries, *event)`` over those at each element of a node."""
+    size = int(np.prod(shape, dtype=int))
+    event = parts.shape[len(parts.shape) - event_ndim :]
+    flat = reshape(parts, (at.size, *event))
+    if not np.array_equal(at.ravel(), np.arange(size)):
+        hot = (at.ravel() == np.arange(size)[:, None]).astype(float)
+        wide = constant(hot.reshape(hot.shape + (1,) * event_ndim))
+        flat = reduction(np.add, multiply(wide, flat), (1,))
+    return reshape(flat, (*shape, *event))
+
+
+def _moments(sums: LabelSums) -> tuple[Expression, Expression, Expression | None]:
+    """How many, their sum about the centre and the products', by label."""
+    d = len(sums.centre)
+    rows = sums.leaf.shape[1]
+    count, first = sums.column(0, 1), sums.column(1, d)
+    if rows == 1 + d:
+        return count, first, None
+    if rows != 1 + d + d * (d + 1) // 2:
+        raise TraceError("some products have no coefficient")
+    i, j = np.tril_indices(d)
+    place = np.empty((d, d), dtype=np.intp)
+    place[i, j] = place[j, i] = 1 + d + np.arange(len(i))
+    at = np.arange(sums.leaf.size).reshape(sums.leaf.shape)
+    return count, first, pick([sums.leaf], at[:, place])
+
+
+def _precision_leaves(sums: LabelSums) -> frozenset[str]:
+    """What the covariance depends on."""
+    given = [v for k, v in sums.family.parameters.items() if k != "loc"]
+    return frozenset().union(*(v.leaves for v in given if isinstance(v, Expression)))
+
+
+def _about_loc(sums: LabelSums) -> Expression:
+    """Scatter matrices about the mean, (labels, d, d)."""
+    labels, d = sums.states, len(sums.centre)
+    count, first, second = _moments(sums)
+    if second is None:
+        raise TraceError("the covariance is known")
+    loc = broadcast(as_expression(sums.family.parameters["loc"]), (*sums.shape, d))
+    off = subtract(reshape(loc, (labels, d)), sums.centre)
+    half = subtract(first, multiply(multiply(0.5, count), off))
+    cross = multiply(reshape(off, (labels, d, 1)), reshape(half, (labels, 1, d)))
+    return subtract(second, add(cross, transposed(cross)))

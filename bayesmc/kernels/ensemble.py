@@ -31,8 +31,7 @@ from bayesmc.errors import BayesmcError
 from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import Block, accepted, instead
-from bayesmc.kernels.parts import Part, angles_of, parts_of
-from bayesmc.kernels.random_walk import counted, finite, walked
+from bayesmc.kernels.random_walk import Part, angles_of, counted, finite, parts_of, walked
 from bayesmc.kernels.tempering import MixtureOfT, fitted_mixture
 from bayesmc.structure.target import Target, Values
 

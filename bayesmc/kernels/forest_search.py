@@ -13,7 +13,7 @@ import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.kernels.conditionals import FiniteTerms
+from bayesmc.kernels.enumerate import FiniteTerms
 from bayesmc.kernels.forest_block import ForestBlock, members_of
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_terms import FEWEST
@@ -46,7 +46,7 @@ def forest_blocks(
     --------
     >>> import numpy as np
     >>> import bayesmc as bmc
-    >>> from bayesmc.kernels.conditionals import FiniteTerms
+    >>> from bayesmc.kernels.enumerate import FiniteTerms
     >>> from bayesmc.kernels.forest_search import forest_blocks
     >>> from bayesmc.network import pose
     >>> from bayesmc.structure.blanket import Blanket

@@ -23,12 +23,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import DensityError
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, check_ratio
 from bayesmc.kernels.gaussian_layout import BlockSums, Factor, Layout, factored, solved
 from bayesmc.kernels.gaussian_order import Components
 from bayesmc.kernels.gaussian_rows import NormalRows
 from bayesmc.kernels.gaussian_terms import NormalTerms
-from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.target import Target, Values
 
 #: components that one dense matrix may have, and how far from the diagonal a band may reach

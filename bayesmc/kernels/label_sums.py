@@ -9,6 +9,7 @@ sums stand in the state beside the labels that they belong to.
 from __future__ import annotations
 
 import math
+from functools import cached_property
 
 import numpy as np
 
@@ -243,6 +244,38 @@ class LabelSums:
                 raise TraceError("what was read of it gives other values than the function")
 
 
+class Counts:
+    """How often each of a label's states came, from sums that somebody takes by it where there are any.
+
+    Attributes
+    ----------
+    leaf : Leaf, shape (states,)
+        What stands for them.
+    sums : LabelSums or None
+        That somebody takes by the label.
+    """
+
+    def __init__(self, target: Target, label: str) -> None:
+        self.target, self.label = target, label
+        domain = target.model[label].domain
+        assert domain is not None
+        self.leaf = leaf(f"counts of {label}", (domain.size,))
+
+    def placed(self, values: Values) -> Values:
+        """A state with the counts beside it."""
+        if self.sums is not None:
+            return {**values, self.leaf.name: self.sums.sums(values)[..., 0]}
+        label = values[self.label]
+        ones = np.ones((1, label[0].size))
+        found = sums_by_label(label.reshape(len(label), -1), ones, self.leaf.size)
+        return {**values, self.leaf.name: found[..., 0]}
+
+    @cached_property
+    def sums(self) -> LabelSums | None:
+        """Looked up at the first step, when all kernels have been made."""
+        return _counted(self.target, self.label)
+
+
 def label_sums(target: Target, term: Term, label: str) -> LabelSums | None:
     """A term by a label, where the label is all that its plates have to do with what is hidden.
 
@@ -300,6 +333,15 @@ def sums_by_label(label: np.ndarray, statistics: np.ndarray, states: int) -> np.
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _counted(target: Target, label: str) -> LabelSums | None:
+    """Sums by this very label that count all its elements, if somebody takes any."""
+    for term in target.terms.values():
+        sums = term.summaries.get(label)
+        if sums is not None and sums.ones == 1 and term.mask is None:
+            return sums
+    return None
 
 
 def _found(target: Target, term: Term, label: str) -> LabelSums | None:

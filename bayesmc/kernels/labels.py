@@ -30,10 +30,9 @@ from bayesmc.expression import (
     reshape,
 )
 from bayesmc.expression.scalars import SmallProgram
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, check_ratio
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.label_sums import IMPOSSIBLE, LabelSums, label_sums
-from bayesmc.kernels.verify import check_ratio
 from bayesmc.network.expressions import Opaque, density_at
 from bayesmc.passes.arithmetic import add, multiply, subtract
 from bayesmc.passes.sufficient import log_probabilities

@@ -14,8 +14,14 @@ import numpy as np
 from bayesmc.categorical import edges
 from bayesmc.errors import ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import Conditional, FiniteTerms, conditional_of
-from bayesmc.kernels.joint_states import MOST_STATES, JointStates, RowSums
+from bayesmc.kernels.enumerate import (
+    MOST_STATES,
+    Conditional,
+    FiniteTerms,
+    JointStates,
+    RowSums,
+    conditional_of,
+)
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
 

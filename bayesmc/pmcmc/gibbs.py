@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 from bayesmc.engines.base import Treatment
-from bayesmc.engines.mcmc.gibbs_plan import Plan, plan_of
+from bayesmc.engines.mcmc.gibbs import Plan, plan_of
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.network import Problem

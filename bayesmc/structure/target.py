@@ -23,10 +23,8 @@ from bayesmc.network.expressions import Followed, Opaque, density, log_density_o
 from bayesmc.network.model import invalid_error
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
-from bayesmc.structure.like_functions import Signatures, StackedFunction
-from bayesmc.structure.like_links import FEWEST, LinkSteps
+from bayesmc.structure.like_functions import FEWEST, LinkSteps, Signatures, StackedFunction, Values
 
-Values = dict[str, np.ndarray]
 #: rows of the states on which functions are compared
 _STATES = 6
 

@@ -13,11 +13,11 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.errors import ConvergenceWarning, ParameterError, ZeroProbabilityError
 from bayesmc.kernels.forest import Forest
 from bayesmc.kernels.forest_block import ForestBlock
-from bayesmc.kernels.forest_sites import SiteForest
+from bayesmc.kernels.lattice import SiteForest
 from bayesmc.network import pose
 from bayesmc.structure.target import Target
 from bayesmc.testing import invariant, session

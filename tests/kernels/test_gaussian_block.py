@@ -15,7 +15,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_order, gaussian_rows
 from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks

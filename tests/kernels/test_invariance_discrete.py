@@ -16,9 +16,8 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.kernels.base import Kernel
-from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.enumerate import Enumerate, JointStates, RowSums
 from bayesmc.kernels.forest_block import ForestBlock
-from bayesmc.kernels.joint_states import JointStates, RowSums
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import SiteCounts, SiteSums, lattice_kernel
@@ -273,7 +272,7 @@ def joint(kind: type[Kernel], terms: slice = slice(None), power: float = 1.0) ->
 
 
 def _around(target: Target) -> Any:
-    from bayesmc.kernels.conditionals import FiniteTerms
+    from bayesmc.kernels.enumerate import FiniteTerms
 
     return FiniteTerms(target).around(("z", "w"))
 

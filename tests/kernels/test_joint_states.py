@@ -11,9 +11,8 @@ from scipy import stats
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import UnsupportedError, ZeroProbabilityError
-from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
-from bayesmc.kernels.joint_states import JointStates, RowSums
+from bayesmc.kernels.enumerate import FiniteTerms, JointStates, RowSums
 from bayesmc.kernels.tables import TableSweep, joint_states
 from bayesmc.network import BayesNet, pose
 from bayesmc.structure.target import Target, Values, target_of

@@ -13,8 +13,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels import tables
-from bayesmc.kernels.conditionals import FiniteTerms, conditional_of
-from bayesmc.kernels.joint_states import RowSums
+from bayesmc.kernels.enumerate import FiniteTerms, RowSums, conditional_of
 from bayesmc.kernels.tables import TableSweep, table_kernel, table_kernels
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket

@@ -12,8 +12,7 @@ import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
 from bayesmc.network import pose
-from bayesmc.structure.like_functions import Slots
-from bayesmc.structure.like_links import LikeLinks, LinkSteps
+from bayesmc.structure.like_functions import LikeLinks, LinkSteps, Slots
 from bayesmc.structure.target import Target, Values, target_of
 from tests.structure.test_stacked import CHAINS, DATA, a_state
 
