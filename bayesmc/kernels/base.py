@@ -11,6 +11,8 @@ from bayesmc.structure.target import Values
 
 #: what a kernel keeps from step to step: arrays and numbers by name
 Memory = dict[str, Any]
+#: how far the log ratio may be from zero, relative to the sizes of the terms it is made of
+TOLERANCE = 1e-9
 
 
 class Kernel:
@@ -66,10 +68,6 @@ class Kernel:
     def acceptance(self, memory: Memory) -> np.ndarray | None:
         """Rate of accepted proposals per chain since the warmup; None where nothing is rejected."""
         return None
-
-
-#: how far the log ratio may be from zero, relative to the sizes of the terms it is made of
-TOLERANCE = 1e-9
 
 
 def check_ratio(

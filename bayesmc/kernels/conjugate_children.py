@@ -43,6 +43,13 @@ from bayesmc.structure.programs import like_roots, roots_of, template_of
 from bayesmc.structure.relation import with_known
 from bayesmc.structure.target import Target, Term, Values
 
+#: elements per label from which on sums by label pay
+_PER_LABEL = 4
+#: parameters that must be positive
+_POSITIVE = frozenset(
+    ("scale", "rate", "concentration", "concentration1", "concentration0", "df", "scale_diag")
+)
+
 
 @dataclass(frozen=True, eq=False)
 class Child:
@@ -121,14 +128,6 @@ def children_of(blanket: Blanket) -> list[Child] | Term:
 def apart(blanket: Blanket, child: Child) -> list[Child]:
     """Many like children one by one, or one entry by entry and not by label."""
     return [_alone(blanket, t) for t in child.terms]
-
-
-#: elements per label from which on sums by label pay
-_PER_LABEL = 4
-#: parameters that must be positive
-_POSITIVE = frozenset(
-    ("scale", "rate", "concentration", "concentration1", "concentration0", "df", "scale_diag")
-)
 
 
 def least_values(child: Child, name: str, model: Model) -> Iterator[Expression]:

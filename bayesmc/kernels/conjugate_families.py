@@ -38,9 +38,6 @@ from bayesmc.kernels.vector_draws import (
     DirichletDraw,
     InverseWishartDraw,
     NormalDraw,
-    gammas,
-    inverse_wishart_draw,
-    normal_draw,
 )
 from bayesmc.passes.arithmetic import multiply
 from bayesmc.passes.features import LOG, LOG1M, Feature
@@ -52,6 +49,8 @@ from bayesmc.structure.target import Values
 Naturals = tuple[np.ndarray, ...]
 #: lower and upper end of a truncated full conditional
 Bounds = tuple[Any, Any]
+#: numbers that are added up one by one
+_FEW = 64
 
 
 class Conditional:
@@ -89,17 +88,6 @@ class NormalConditional(Conditional):
         precision = -2.0 * square
         base = Normal(linear / precision, precision**-0.5)
         return base if bounds is None else Truncated(base, *bounds)
-
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        if bounds is not None:
-            return None
-        linear, square = naturals
-        precision = -2.0 * square
-        draw = linear / precision + rng.standard_normal(shape) / np.sqrt(precision)
-        # where a coefficient was lost the draw is no number, and the posterior says which
-        return draw if math.isfinite(draw.sum()) else None
 
 
 class GammaConditional(Conditional):
@@ -173,19 +161,6 @@ class DirichletConditional(Conditional):
     def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
         return Dirichlet(naturals[0] + 1.0)
 
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        counts = naturals[0] + 1.0
-        if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
-            return None
-        shape = shape + counts.shape[-1:]
-        draw = gammas(
-            rng, counts if counts.shape == shape else np.broadcast_to(counts, shape), shape
-        )
-        draw /= draw.sum(axis=-1, keepdims=True)
-        return draw
-
 
 class MvNormalConditional(Conditional):
     """``exp(h'x - x'Px / 2)`` of a vector."""
@@ -196,25 +171,12 @@ class MvNormalConditional(Conditional):
         mean = np.matvec(factor, np.vecmat(linear, factor))
         return MvNormal(mean, scale_tril=factor)
 
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        precision, linear = naturals
-        draw = normal_draw(rng, precision, linear, shape)
-        return draw if math.isfinite(draw.sum()) else None
-
 
 class InverseWishartConditional(Conditional):
     """``|x|^-(df + d + 1)/2 exp(-tr(S x^-1) / 2)``: inverse Wishart."""
 
     def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
         return InverseWishart(*naturals)
-
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        df, scale = naturals
-        return inverse_wishart_draw(rng, df, scale, shape)
 
 
 def family_of_features(found: Mapping[Feature, Any], low: float, high: float) -> Conditional | None:
@@ -277,10 +239,6 @@ class RootOf(Distribution):
         return interval(low, high, True, True)
 
 
-#: numbers that are added up one by one
-_FEW = 64
-
-
 class Form:
     """The full conditional of a class of elements.
 
@@ -310,14 +268,12 @@ class Form:
     ) -> None:
         self.family, self.words, self._placed = family, words, placed
         self._naturals, self._bounds, self._least = naturals, bounds, positive
-        self._positive = [child for _, child in positive]
-        roots = [*naturals, *bounds, *(e for e, _ in positive)]
-        self._program = SmallProgram(roots)
-        self._count, self._ends = len(naturals), len(naturals) + len(bounds)
+        roots = [*naturals, *bounds]
+        self._program, self._range = SmallProgram(roots), SmallProgram([e for e, _ in positive])
         self._ndims = [len(r.shape) for r in roots]
         self._kept: tuple[Naturals, Bounds | None] | None = None
-        self._draw = None if bounds or positive else _one_program(family, naturals)
-        if not any(r.leaves for r in roots):
+        self._draw = None if bounds else _one_program(family, naturals)
+        if not any(r.leaves for r in (*roots, *(e for e, _ in positive))):
             self._kept = self({})
 
     def reading(self, joint: JointValues) -> Form:
@@ -338,16 +294,12 @@ class Form:
         """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
         if self._kept is not None:
             return self._kept
-        values = self._with_placed(values)
         found = [
             a if a.ndim > n else a[None]
-            for a, n in zip(self._program(values), self._ndims, strict=True)
+            for a, n in zip(self._program(self._ready(values)), self._ndims, strict=True)
         ]
-        k, end = self._count, self._ends
-        for least, child in zip(found[end:], self._positive, strict=True):
-            if (least <= 0.0).any():
-                refuse(child, values)
-        return tuple(found[:k]), (found[k], found[k + 1]) if end > k else None
+        k = len(self._naturals)
+        return tuple(found[:k]), (found[k], found[k + 1]) if self._bounds else None
 
     def drawn(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray | None:
         """A draw by one program, where there is one and it is a number; else None.
@@ -359,7 +311,7 @@ class Form:
         """
         if self._draw is None:
             return None
-        found = self._draw(self._with_placed(values), rng, chains)
+        found = self._draw(self._ready(values), rng, chains)
         return found if found is None or _is_finite(found) else None
 
     def left(self, values: Values) -> Values:
@@ -374,9 +326,14 @@ class Form:
                 found |= sums.kept(state[sums.label], state[sums.key])
         return found
 
-    def _with_placed(self, values: Values) -> Values:
+    def _ready(self, values: Values) -> Values:
+        """The state with what is read beside it, parameters of children in their range."""
         for placed in self._placed:
             values = placed.placed(values)
+        if self._least:
+            for least, (_, child) in zip(self._range(values), self._least, strict=True):
+                if (least <= 0.0).any():
+                    refuse(child, values)
         return values
 
 

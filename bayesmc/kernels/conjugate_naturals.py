@@ -58,6 +58,13 @@ from bayesmc.passes.reads import same_along
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Term
 
+#: parameters of vectors -> how a node must enter them
+_OF_VECTORS: dict[tuple[Any, str], str] = {
+    (MvNormal, "loc"): "mean", (MvNormal, "cov"): "multiple", (MvNormal, "scale_tril"): "power",
+    (MvNormal, "scale_diag"): "power", (Categorical, "probs"): "shares",
+    (Multinomial, "probs"): "shares",
+}  # fmt: skip
+
 
 def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
     """The full conditional of some elements of a node, or in words why it has no closed form."""
@@ -72,14 +79,6 @@ def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
     if prior.base.make is InverseWishart:
         return _of_events(blanket, members, prior, InverseWishartConditional())
     return _of_numbers(blanket, members, prior)
-
-
-#: parameters of vectors -> how a node must enter them
-_OF_VECTORS: dict[tuple[Any, str], str] = {
-    (MvNormal, "loc"): "mean", (MvNormal, "cov"): "multiple", (MvNormal, "scale_tril"): "power",
-    (MvNormal, "scale_diag"): "power", (Categorical, "probs"): "shares",
-    (Multinomial, "probs"): "shares",
-}  # fmt: skip
 
 
 def why_not(blanket: Blanket, term: Term, prior: str) -> str:

@@ -25,6 +25,14 @@ from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.tables import configure, reads_of
 from bayesmc.structure.target import Target, Term, Values
 
+#: joint states of a block
+MOST_STATES = 1024
+#: entries up to which a term is tabulated
+_TERM_ENTRIES = 1 << 22
+#: configurations of a Markov blanket, and entries with the states, up to which a conditional is tabulated
+_CONFIGURATIONS = 1 << 16
+_ENTRIES = 1 << 20
+
 
 class Enumerate(Kernel):
     """Draws a finite node from its full conditional, all states tried."""
@@ -79,10 +87,6 @@ class Enumerate(Kernel):
         return np.where(impossible, -np.inf, log)
 
 
-#: joint states of a block
-MOST_STATES = 1024
-
-
 class JointStates(Kernel):
     """Draws a block from all its joint states, whatever the terms around it are.
 
@@ -91,11 +95,15 @@ class JointStates(Kernel):
     target : Target
     names : sequence of str
         As for `bayesmc.kernels.tables.joint_states`.
+    terms : FiniteTerms, optional
+        Of terms that are tables the log rows that the rest selects are summed; others are evaluated.
     """
 
     label = "enumerate jointly"
 
-    def __init__(self, target: Target, names: Sequence[str]) -> None:
+    def __init__(
+        self, target: Target, names: Sequence[str], terms: FiniteTerms | None = None
+    ) -> None:
         self.target = target
         self.names = tuple(names)
         nodes = [target.model[n] for n in names]
@@ -113,33 +121,45 @@ class JointStates(Kernel):
         self.states = np.indices(cards).reshape(len(cards), -1)
         self.dtypes = [d.dtype for d in domains if d is not None]
         self.match = f"{self.states.shape[1]} joint states of {', '.join(names)}"
-        self.terms: list[tuple[Term, Relation | None]] = []
+        self.parts: list[tuple[Term | _Rows, Relation | None]] = []
         for term in target.terms_of(self.names):
-            relations = [
-                relation_of(target, n, term)
-                for n in names
-                if n != term.name and _enters(target, n, term)
-            ]
-            if self.plates and any(r.kind != "aligned" for r in relations):
-                raise UnsupportedError(
-                    f"{term.name!r} reads {list(names)} across elements of {self.plates}; their blocks "
-                    "cannot be drawn one by one"
-                )
-            self.terms.append((term, None if term.name in names else relations[0]))
+            table = None if terms is None else terms.of(term)
+            rows = term if table is None else _Rows(target.model, table, self.names, self.states)
+            self.parts.append((rows, self._relation(term)))
+        #: terms that are no tables
+        self.evaluated = [part for part, _ in self.parts if isinstance(part, Term)]
+        if len(self.names) == 1 and not self.evaluated:
+            self.label, self.match = "enumerate", "sum of tabulated log rows"
+
+    def _relation(self, term: Term) -> Relation | None:
+        """How a term reads the block, element by element; None of a density of the block itself."""
+        entering = [n for n in self.names if n != term.name and _enters(self.target, n, term)]
+        relations = [relation_of(self.target, n, term) for n in entering]
+        if self.plates and any(r.kind != "aligned" for r in relations):
+            raise UnsupportedError(
+                f"{term.name!r} reads {list(self.names)} across elements of {self.plates}; their blocks "
+                "cannot be drawn one by one"
+            )
+        return None if term.name in self.names else relations[0]
 
     def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Log full conditional of the joint states up to a constant, shape ``(states, chains, *plates)``."""
-        now = values[self.names[0]]
-        state = dict(values)
-        axes = (1,) * now.ndim
-        for name, codes, dtype in zip(self.names, self.states, self.dtypes, strict=True):
-            state[name] = codes.astype(dtype).reshape(-1, *axes)
-        self.target.refresh(state, self.names)
-        total = np.zeros((self.states.shape[1], *now.shape))
-        for term, relation in self.terms:
-            log = term.log(state)
-            total = total + (log if relation is None else relation.collect(log, term.shape))
+        total = np.zeros((self.states.shape[1], *values[self.names[0]].shape))
+        state = self._everywhere(values, total.ndim - 1) if self.evaluated else {}
+        for part, relation in self.parts:
+            log = part(values) if isinstance(part, _Rows) else part.log(state)
+            total += (
+                log if relation is None or not part.shape else relation.collect(log, part.shape)
+            )
         return self._with_seen(total)
+
+    def _everywhere(self, values: Mapping[str, np.ndarray], ndim: int) -> Values:
+        """The state with the block at all its joint states."""
+        state = dict(values)
+        for name, codes, dtype in zip(self.names, self.states, self.dtypes, strict=True):
+            state[name] = codes.astype(dtype).reshape(-1, *(1,) * ndim)
+        self.target.refresh(state, self.names)
+        return state
 
     def _with_seen(self, total: np.ndarray) -> np.ndarray:
         """What was seen of the elements leaves no other state."""
@@ -158,42 +178,6 @@ class JointStates(Kernel):
         drawn = pick_log(log, rng.random(log.shape[1:]), f"nodes {list(self.names)}")
         moved = zip(self.names, self.states, self.dtypes, strict=True)
         return {n: codes[drawn].astype(dtype) for n, codes, dtype in moved}, memory
-
-
-class RowSums(JointStates):
-    """As `JointStates`, where all terms are tables: the log rows that the rest selects are summed.
-
-    Parameters
-    ----------
-    around : sequence of FiniteTerm
-        All terms that the block enters.
-    """
-
-    def __init__(self, target: Target, names: Sequence[str], around: Sequence[FiniteTerm]) -> None:
-        super().__init__(target, names)
-        if len(self.names) == 1:
-            self.label, self.match = "enumerate", "sum of tabulated log rows"
-        relations = {term.name: relation for term, relation in self.terms}
-        self.parts = [
-            (_Rows(target.model, table, self.names, self.states), relations[table.term.name])
-            for table in around
-        ]
-
-    def log_density(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
-        total = np.zeros((self.states.shape[1], *values[self.names[0]].shape))
-        for rows, relation in self.parts:
-            log = rows(values)
-            total += (
-                log if relation is None or not rows.shape else relation.collect(log, rows.shape)
-            )
-        return self._with_seen(total)
-
-
-#: entries up to which a term is tabulated
-_TERM_ENTRIES = 1 << 22
-#: configurations of a Markov blanket, and entries with the states, up to which a conditional is tabulated
-_CONFIGURATIONS = 1 << 16
-_ENTRIES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,6 +29,9 @@ from bayesmc.structure.programs import FEWEST, JointValues
 from bayesmc.structure.relation import Relation
 from bayesmc.structure.target import Target, Term, Values
 
+#: axes of candidates, one for each colour
+COLOURS = 2
+
 
 class ForestBlock(Kernel):
     """Draws finite nodes jointly, no factor reading more than two of them, and these making no cycle.
@@ -197,10 +200,6 @@ def members_of(target: Target, names: Sequence[str]) -> dict[str, tuple[str, ...
             read |= above.get(name, {})
         members[term.name] = tuple(read)
     return members
-
-
-#: axes of candidates, one for each colour
-COLOURS = 2
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.expression import Constant, Expression, Gather
-from bayesmc.kernels.gaussian_layout import BlockSums, Layout
-from bayesmc.kernels.gaussian_order import Components, Meeting
+from bayesmc.kernels.gaussian_layout import BlockSums, Components, Layout, Meeting
 from bayesmc.kernels.gaussian_terms import NormalTerm
 from bayesmc.linalg.patterns import cholesky
 from bayesmc.passes.affine import Read, affine

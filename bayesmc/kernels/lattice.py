@@ -28,6 +28,8 @@ from bayesmc.structure.target import Values
 _HIGH, _LOW = 8, 32
 #: log factors gathered at once
 _GATHERED = 1 << 22
+#: entries of tables, for one chain
+_ENTRIES = 1 << 21
 
 
 def lattice_kernel(blanket: Blanket) -> Kernel | None:
@@ -229,10 +231,6 @@ class SiteCounts(_Lattice):
             whole = (bits.ravel()[at].astype(np.uint64) << np.uint64(_LOW)) | low
             new.ravel()[at] = (whole >= self.edges[:, rows.ravel()[at]]).sum(axis=0)
         return new
-
-
-#: entries of tables, for one chain
-_ENTRIES = 1 << 21
 
 
 def site_forest(blanket: Blanket) -> SiteForest | None:

@@ -27,6 +27,8 @@ from bayesmc.structure.target import Target, Values
 
 #: free numbers beyond these are at a bound as far as floating point can tell
 _FAR = 700.0
+#: numbers that are few enough for a mixture to be fitted to them
+_FEW = 6
 
 
 class AdaptiveWalk(Kernel):
@@ -209,10 +211,6 @@ def picked(
 def counted(memory: Memory, share: np.ndarray) -> Memory:
     """The memory with one more step, of which each chain accepted a share."""
     return {**memory, "accepted": memory["accepted"] + share, "moves": memory["moves"] + 1}
-
-
-#: numbers that are few enough for a mixture to be fitted to them
-_FEW = 6
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,16 @@ from bayesmc.structure.target import Target, Term
 
 #: entries up to which a batch is tabulated
 _ENTRIES = 1 << 24
+#: codes are bytes
+_CODES = 256
+#: rows of the table of full conditionals (kinds of sites times codes)
+_ROWS = 1 << 20
+_STATES = 8
+_COLOURS = 8
+#: share of the sites that must have a neighbour at a distance for it to be a shift
+_COMMON = 1 / 16
+#: share of the neighbours that shifts must reach
+_REACHED = 3 / 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,18 +102,6 @@ def sites_of(blanket: Blanket) -> Sites | None:
         for k in range(domain.size):
             single[k] += np.bincount(read.index[0], log[k], blanket.size)
     return Sites(single, tuple(batches))
-
-
-#: codes are bytes
-_CODES = 256
-#: rows of the table of full conditionals (kinds of sites times codes)
-_ROWS = 1 << 20
-_STATES = 8
-_COLOURS = 8
-#: share of the sites that must have a neighbour at a distance for it to be a shift
-_COMMON = 1 / 16
-#: share of the neighbours that shifts must reach
-_REACHED = 3 / 4
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,7 +19,6 @@ from bayesmc.kernels.enumerate import (
     Conditional,
     FiniteTerms,
     JointStates,
-    RowSums,
     conditional_of,
 )
 from bayesmc.structure.blanket import Blanket
@@ -74,8 +73,7 @@ def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None
     conditional = conditional_of(terms, names)
     if conditional is not None and conditional.states <= MOST_STATES:
         return TableSweep(target, (conditional,))
-    around = terms.around(names)
-    return JointStates(target, names) if around is None else RowSums(target, names, around)
+    return JointStates(target, names, terms)
 
 
 def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
@@ -96,7 +94,7 @@ def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel |
     around = terms.around((blanket.name,))
     if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
         return None
-    return RowSums(blanket.target, (blanket.name,), around)
+    return JointStates(blanket.target, (blanket.name,), terms)
 
 
 def table_kernels(

@@ -16,6 +16,9 @@ from bayesmc.shapes import Shape
 from bayesmc.structure.relation import Relation, relation_of
 from bayesmc.structure.target import Target, Term, Values
 
+#: components up to which two colours are tried first
+_COMPONENTS = 1000
+
 
 @dataclass(frozen=True, eq=False)
 class Child:
@@ -165,10 +168,6 @@ class Blanket:
         place: Any = (Ellipsis, members, *(slice(None),) * len(self.event_shape))
         full[place] = candidate
         return full.reshape(lead + self.node.value_shape)
-
-
-#: components up to which two colours are tried first
-_COMPONENTS = 1000
 
 
 def colours(count: int, edges: np.ndarray) -> list[np.ndarray]:

@@ -37,6 +37,10 @@ from bayesmc.shapes import Shape, broadcast_shapes
 
 #: stored values by node
 Values = dict[str, np.ndarray]
+#: links that are worth a group
+FEWEST = 4
+#: elements of one link from which on arrays, not calls, take the time
+_LARGE = 512
 
 
 class Facts(Protocol):
@@ -250,12 +254,6 @@ def value_key(node: CompiledNode) -> Hashable:
     return node.plates, node.event_shape, node.is_discrete, node.domain and node.domain.key
 
 
-#: links that are worth a group
-FEWEST = 4
-#: elements of one link from which on arrays, not calls, take the time
-_LARGE = 512
-
-
 class LinkSteps:
     """Deterministic nodes that are recomputed together, parents first.
 
@@ -325,7 +323,7 @@ class LikeLinks:
         self.names = tuple(names)
         found = [target.signatures.of(n) for n in names]
         signatures = [s for s in found if s is not None]
-        self._evaluated = as_one(signatures) or partial(target.model.evaluate, names[0])
+        self.evaluate = as_one(signatures) or partial(target.model.evaluate, names[0])
         scopes = [s.scope[:-1] for s in signatures]  # the last is the link itself
         sources = {name: tuple(s[i] for s in scopes) for i, name in enumerate(scopes[0])}
         self.slots = Slots(target, sources, len(names))
@@ -333,7 +331,7 @@ class LikeLinks:
     def computed(self, values: Values) -> Values:
         """Values of all, each with the batch of the parents of all."""
         try:
-            found, batch = self._evaluated(self.slots.gathered(values))
+            found, batch = self.evaluate(self.slots.gathered(values))
         except BayesmcError:
             for name in self.names:  # the group knows the first one's name only
                 self.target.model.evaluate(name, values)

@@ -24,6 +24,8 @@ from bayesmc.structure.target import Target, Term, Values
 
 #: terms that are worth a group
 FEWEST = 4
+#: the plate that stands for a group
+GROUP = "\0group"
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,10 +185,6 @@ def repeated(scope: Sequence[str]) -> tuple[int, ...]:
     return tuple(scope.index(n) for n in scope)
 
 
-#: the plate that stands for a group
-GROUP = "\0group"
-
-
 class GroupedBlanket(Blanket):
     """A blanket whose like children are evaluated as one; its answers are those of the single blanket."""
 
@@ -251,28 +249,16 @@ def with_like_children(blanket: Blanket) -> Blanket:
     ... )
     True
     """
-    found = [as_one_child(blanket, c) for c in like_children(blanket, blanket.children)]
+    found = [as_one_child(blanket, c) for c in like_children(blanket)]
     groups = [group for group in found if group is not None]
     return GroupedBlanket(blanket, groups) if groups else blanket
 
 
-def like_children(
-    blanket: Blanket,
-    children: Sequence[Child],
-    also: Callable[[Child], Hashable] | None = None,
-) -> list[list[Child]]:
-    """Children by what they are and how they depend on the node, where there are many.
-
-    Parameters
-    ----------
-    also : callable, optional
-        What else must be equal within a group.
-    """
-    if len(children) < FEWEST:
-        return []
+def like_children(blanket: Blanket) -> list[list[Child]]:
+    """Children by what they are and how they depend on the node, where there are many."""
     signatures = blanket.target.signatures
     groups: dict[Hashable, list[Child]] = {}
-    for child in children:
+    for child in blanket.children if len(blanket.children) >= FEWEST else ():
         signature = signatures.of(child.term.name)
         if signature is None:
             continue
@@ -281,8 +267,7 @@ def like_children(
         # the node, and what follows from it, in the same places
         reached = tuple(n == blanket.name or n in blanket.path for n in scope)
         how = (relation.kind, relation.coupled, relation.term_plates)
-        more = None if also is None else also(child)
-        key = (signature.key, reached, repeated(scope), source, how, len(relation.rows), more)
+        key = (signature.key, reached, repeated(scope), source, how, len(relation.rows))
         groups.setdefault(key, []).append(child)
     return [g for g in groups.values() if len(g) >= FEWEST]
 

@@ -28,6 +28,9 @@ from bayesmc.passes.templates import Stacked, Template, stacked_rows, template
 from bayesmc.structure.like_functions import Slots
 from bayesmc.structure.target import Target, Term, Values
 
+#: nodes from which on it pays
+FEWEST = 16
+
 
 def family_read(term: Term) -> Any:
     """What the function of a node that was followed computes; a known distribution as its family, if any."""
@@ -165,10 +168,6 @@ class StateProgram:
         """In the order of the expressions."""
         a, b = iter(still), iter(moving or [None] * len(self._is_known))
         return [next(a) if known else next(b) for known in self._is_known]
-
-
-#: nodes from which on it pays
-FEWEST = 16
 
 
 class JointValues:

@@ -302,32 +302,11 @@ class Target:
             return None
         return values
 
-    def example(self, names: Iterable[str]) -> Values:
-        """One reachable value of some chain nodes, and of what else is needed for what follows from them."""
-        wanted = dict.fromkeys(names)
-        for link in self.below(wanted):
-            wanted |= dict.fromkeys(self._ancestors(link))
-        state: Values = dict(self.known)
-        for name in wanted:
-            rows = np.asarray(self.model.probe[name])
-            state[name] = rows.reshape((-1, *self.model[name].value_shape))[:1]
-        for link in self.links:
-            if all(p in state for p in self.model[link].parents):
-                state[link], _ = self.model.evaluate(link, state)
-        return state
-
-    def _ancestors(self, link: str) -> Iterable[str]:
-        """Chain nodes that a deterministic node is computed from."""
-        todo, seen = [link], {link}
-        while todo:
-            for parent in self.model[todo.pop()].parents:
-                if parent in seen or self.is_known(parent):
-                    continue
-                seen.add(parent)
-                if self.model[parent].is_stochastic:
-                    yield parent
-                else:
-                    todo.append(parent)
+    @property
+    def first_state(self) -> Values:
+        """The first of the reachable values, shape ``(1, *plates, *event)``."""
+        assert self.states is not None
+        return {n: v if self.is_known(n) else v[:1] for n, v in self.states.items()}
 
     def terms_of(self, names: Iterable[str]) -> tuple[Term, ...]:
         """The terms that some chain nodes enter, directly or through deterministic nodes."""

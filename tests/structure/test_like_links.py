@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -175,7 +176,7 @@ def test_the_wrong_neighbours_are_noticed() -> None:
     turned = {**sources, "x[0]": (*sources["x[0]"][1:], "x[0]")}
     for wrong in (
         {"slots": Slots(target, turned, 7)},
-        {"function": None},
+        {"evaluate": functools.partial(target.model.evaluate, group.names[0])},
     ):
         right = dict(vars(group))
         vars(group).update(wrong)

@@ -43,6 +43,11 @@ from bayesmc.structure.like_terms import with_like_children
 from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
+#: components that move together along learnt directions, at most
+_FACTOR_SIZE = 24
+#: supports that are boxes: every number on its own
+_BOXES = ("real", "interval", "circle", "real vector", "product", "integers")
+
 
 @dataclass(frozen=True)
 class Gibbs(ChainEngine):
@@ -123,12 +128,6 @@ class Gibbs(ChainEngine):
     def sampler(self, problem: Problem) -> SweepSampler:
         plan = plan_of(problem, self.debug)
         return SweepSampler(plan.target, plan.kernels)
-
-
-#: components that move together along learnt directions, at most
-_FACTOR_SIZE = 24
-#: supports that are boxes: every number on its own
-_BOXES = ("real", "interval", "circle", "real vector", "product", "integers")
 
 
 @dataclass(frozen=True, eq=False)
@@ -276,7 +275,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     kernels.sort(key=lambda k: (not isinstance(k, Labels), -max(order[n] for n in k.names)))
     slow = [n for k in kernels if _is_slice(k) for n in k.names]
     moved = set(names)
-    kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
+    if slow:
+        kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets)
     if slow and may_be_drawn_anew(target, names):
         kernels.append(BlockWalk(target, names, anew=1.0))
@@ -322,11 +322,17 @@ def _finite(
     if not names:
         return [], ()
     kernels: list[Kernel] = []
+    for name in names:
+        kernel = _mixture_label(target, blankets[name], debug)
+        kernels += [] if kernel is None else [kernel]
+    names = [n for n in names if all(n not in k.names for k in kernels)]
+    if not names:
+        return kernels, ()
     lattices: dict[str, Kernel] = {}
     for name in names:
-        kernel = site_forest(blankets[name]) or lattice_kernel(blankets[name])
-        if kernel is not None:
-            lattices[name] = kernel
+        sites = site_forest(blankets[name]) or lattice_kernel(blankets[name])
+        if sites is not None:
+            lattices[name] = sites
     kernels += lattices.values()
     tight = tuple(n for n, k in lattices.items() if getattr(k, "constrained", False))
     if len(lattices) == len(names):
@@ -347,8 +353,8 @@ def _finite(
             kernels.append(joint_states(target, block, terms))
         elif (kernel := table_kernel(blankets[block[0]], terms)) is not None:
             kernels.append(kernel)
-        elif (kernel := label_kernel(blankets[block[0]], debug)) is not None:
-            kernels.append(kernel)
+        elif (labels := label_kernel(blankets[block[0]], debug)) is not None:
+            kernels.append(labels)
         else:
             alone.append(block[0])
     groups, alone = stacks(target, blankets, alone, forms)
@@ -356,6 +362,15 @@ def _finite(
     kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
     tied = deterministic_constraints(target, [*joined, *blocks], terms)
     return kernels, (*tight, *(n for n in tied if n in blankets))
+
+
+def _mixture_label(target: Target, blanket: Blanket, debug: bool) -> Labels | None:
+    """The kernel of a label of hidden components that no other finite node governs: nothing else fits it."""
+    above = () if blanket.own is None else target.hidden_above(blanket.own)
+    if any(target.model[n].domain is not None for n in above if n != blanket.name):
+        return None
+    found = label_kernel(blanket, debug)
+    return None if found is None or not all(t.is_asked for t in found.terms) else found
 
 
 def _numbers(

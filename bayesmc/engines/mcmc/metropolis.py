@@ -30,6 +30,12 @@ from bayesmc.structure.target import Target, Values, target_of
 
 #: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
 _FIRST_RESCUE = 16
+#: numbers beyond which continuous nodes no longer move as one block
+LARGEST_BLOCK = 200
+#: members of an ensemble, least and most
+_LEAST, _MOST = 8, 64
+#: numbers that one evaluation of all terms may take, for all members of all ensembles together
+_ELEMENTS = 2e7
 
 
 @dataclass(frozen=True, repr=False)
@@ -250,14 +256,6 @@ class MetropolisSampler(SweepSampler):
         ]
         values = {n: v[flat] for n, v in state["values"].items()}
         return {**state, "values": values, "memory": memory}
-
-
-#: numbers beyond which continuous nodes no longer move as one block
-LARGEST_BLOCK = 200
-#: members of an ensemble, least and most
-_LEAST, _MOST = 8, 64
-#: numbers that one evaluation of all terms may take, for all members of all ensembles together
-_ELEMENTS = 2e7
 
 
 @dataclass(frozen=True, eq=False)
