@@ -288,7 +288,7 @@ def _event_added(
     if child.sums is not None:
         try:
             short = mean_by_label if is_mean else covariance_by_label
-            return short(child.sums, blanket), False, [child.sums]
+            return short(child.sums, of), False, [child.sums]
         except TraceError:
             (child,) = apart(blanket, child)
     whole = mean_added if is_mean else covariance_added

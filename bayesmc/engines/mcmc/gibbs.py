@@ -323,8 +323,8 @@ def _finite(
         return [], ()
     kernels: list[Kernel] = []
     for name in names:
-        kernel = _mixture_label(target, blankets[name], debug)
-        kernels += [] if kernel is None else [kernel]
+        mixture = _mixture_label(target, blankets[name], debug)
+        kernels += [] if mixture is None else [mixture]
     names = [n for n in names if all(n not in k.names for k in kernels)]
     if not names:
         return kernels, ()
