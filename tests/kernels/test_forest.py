@@ -368,6 +368,22 @@ def sites(pairs: list[tuple[int, int]]) -> bmc.FactorGraph:
     return graph
 
 
+def test_tables_of_one_shape_are_not_of_a_kind() -> None:
+    """Nodes of different tables move fast one by one, as many as there are; those of one table as one."""
+
+    def kernels(alike: bool) -> set[str]:
+        net = bmc.BayesNet()
+        net.table("s[0]", probs=[0.5, 0.5])
+        for t in range(1, 12):
+            stay = 0.9 if alike else 0.9 - 0.01 * t
+            rows = [[stay, 1 - stay], [1 - stay, stay]]
+            net.table(f"s[{t}]", parents=[f"s[{t - 1}]"], probs=rows)
+        return {type(k).__name__ for k in plan_of(pose(net, {"s[11]": 1})).kernels}
+
+    assert kernels(True) == {"ForestBlock"}
+    assert kernels(False) == {"TableSweep"}
+
+
 def test_sites_of_a_factor_graph() -> None:
     """Trees of sites are drawn at once, and right; a ring is left to other kernels."""
     tree, ring = sites([(1, 0), (1, 2), (3, 1)]), sites([(0, 1), (1, 2), (2, 3), (3, 0)])
