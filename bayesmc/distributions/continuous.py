@@ -317,7 +317,7 @@ class Gamma(Distribution):
         a, scale = self.concentration, 1.0 / self.rate
         y = x / scale
         density = special.xlogy(a - 1.0, y) - y - special.gammaln(a) - np.log(scale)
-        return np.where((x < 0) | (x == np.inf), -np.inf, density)
+        return np.where((x < 0) | (y == np.inf), -np.inf, density)
 
     @property
     def mean(self) -> np.ndarray:

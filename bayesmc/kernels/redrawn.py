@@ -1,10 +1,10 @@
-"""A finite node moved together with the numbers that depend on it, which are drawn anew.
+"""A finite node moved together with what depends on it, numbers or many finite nodes, which is drawn anew.
 
 Tried state by state, a switch ``s`` waits for a number ``m`` below it that fits another state, and ``m``
 waits for ``s``: both may stand still for ever, in every chain, and look certain. Here a new state is
 proposed, or the old one again, the numbers are drawn from their densities given it, and the likelihood of
 what depends on either decides. How often numbers are drawn anew says what a state that was never seen may
-weigh.
+weigh. The elements of a finite node in plates hold one above them in the same way, all together.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.densities import accepted, instead
+from bayesmc.network.model import CompiledNode
 from bayesmc.structure.blanket import Blanket, Child
 from bayesmc.structure.target import Target, Values
 
@@ -169,14 +170,18 @@ class Redrawn(Kernel):
         return np.broadcast_to(total, state[self.names[0]].shape)
 
 
-def redrawn_kernels(target: Target, blankets: Mapping[str, Blanket]) -> list[Kernel]:
-    """The kernels for all finite nodes with hidden numbers below them.
+def redrawn_kernels(
+    target: Target, blankets: Mapping[str, Blanket], joined: Collection[Kernel] = ()
+) -> list[Kernel]:
+    """The kernels for all finite nodes that may wait for what is hidden below them.
 
     Parameters
     ----------
     target : Target
     blankets : dict
         Of the nodes that are to be moved.
+    joined : sequence of Kernel
+        Others that there are: what one of them moves together does not wait.
 
     Examples
     --------
@@ -195,7 +200,9 @@ def redrawn_kernels(target: Target, blankets: Mapping[str, Blanket]) -> list[Ker
     [('on', 'level')]
     """
     groups = []
-    for name in waiting(target):
+    for name, children in waiting(target).items():
+        if any({name, *children} <= set(kernel.names) for kernel in joined):
+            continue
         for below in _drawn_with(target, name):
             if blankets.keys() >= {name, *below}:
                 group = _grouped(target, blankets, (name, *below))
@@ -208,15 +215,17 @@ def redrawn_kernels(target: Target, blankets: Mapping[str, Blanket]) -> list[Ker
 
 
 def waiting(target: Target) -> dict[str, tuple[str, ...]]:
-    """Finite nodes of the chain with hidden numbers below them, which are named."""
+    """Finite nodes of the chain with hidden numbers below them, or several elements, which are named."""
     found: dict[str, tuple[str, ...]] = {}
     for child in target.chain:
         term = target.terms.get(child)
-        if target.model[child].domain is not None or term is None:
+        if term is None:
             continue
         for name in target.hidden_above(term):
-            domain = target.model[name].domain
-            if domain is not None and domain.size > 1:
+            above = target.model[name]
+            if above.domain is None or above.domain.size < 2:
+                continue
+            if target.model[child].domain is None or _is_one_of_many(above, target.model[child]):
                 found[name] = (*found.get(name, ()), child)
     return found
 
@@ -247,8 +256,13 @@ def renewals(
 # ---- private ------------------------------------------------------------------------------------
 
 
+def _is_one_of_many(above: CompiledNode, child: CompiledNode) -> bool:
+    """Whether many elements of a finite child hang on one of a node's."""
+    return set(above.plates) < set(child.plates)
+
+
 def _drawn_with(target: Target, name: str) -> list[tuple[str, ...]]:
-    """What may be drawn anew with a node: its children that are numbers, and all that is hidden below it."""
+    """What may be drawn anew with a node: its children that hold it, and all that is hidden below it."""
     children = waiting(target)[name]
     below = {name}
     for other in target.chain:

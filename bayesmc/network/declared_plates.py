@@ -58,7 +58,7 @@ class DeclaredPlates:
                 labels[plate] = tuple(size)
         return cls(owner, sizes, labels)
 
-    def of(self, what: str, plates: str | Sequence[str]) -> tuple[str, ...]:
+    def of(self, what: str, plates: str | Sequence[str] | None) -> tuple[str, ...]:
         """The plates that a declaration names, as a tuple.
 
         Raises
@@ -66,7 +66,7 @@ class DeclaredPlates:
         PlateError
             One is not declared, or named twice.
         """
-        names = (plates,) if isinstance(plates, str) else tuple(plates)
+        names = (plates,) if isinstance(plates, str) else tuple(plates or ())
         for plate in names:
             if plate not in self.sizes:
                 raise PlateError(

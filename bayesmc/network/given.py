@@ -9,11 +9,20 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression, Family, Program, constant, expressions_of
+from bayesmc.expression import (
+    Expression,
+    Family,
+    Program,
+    as_expression,
+    broadcast,
+    constant,
+    expressions_of,
+)
 from bayesmc.network.agreement import Probe, deterministic_above, hold_against
 from bayesmc.network.expressions import stored_leaf
 from bayesmc.network.model import Model
 from bayesmc.network.readings import Argument, read_function
+from bayesmc.shapes import broadcast_shapes
 
 
 def read_given(model: Model, name: str, values: Mapping[str, np.ndarray]) -> Any:
@@ -76,7 +85,8 @@ def _read(model: Model, name: str, known: Mapping[str, np.ndarray]) -> Any:
         elif above.kind != "deterministic":
             stored = stored_leaf(model, above)
         elif above.domain is None:
-            stored = _read(model, parent, known)
+            found = as_expression(_read(model, parent, known))
+            stored = broadcast(found, broadcast_shapes(found.shape, above.value_shape))
         else:
             raise TraceError(f"node {parent!r} takes finitely many values")
         states = None if above.domain is None else above.domain.size

@@ -1,6 +1,6 @@
-"""Switches above hidden numbers: chains cross between their states, or their errors say they may not.
+"""Switches above hidden numbers or many finite nodes: chains cross between states, or their errors say so.
 
-Answers may be off by 4.5 of their errors, which has a chance of 7e-6 in each of the ten figures.
+Answers may be off by 4.5 of their errors, which has a chance of 7e-6 in each of the fourteen figures.
 """
 
 from __future__ import annotations
@@ -74,6 +74,21 @@ def spikes() -> Question:
     return net, {"y": y}, "z", np.array([joint[1].sum(), joint[:, 1].sum()])
 
 
+def class_of_items() -> Question:
+    """A class above the hidden answers to eight items, of which only the number is seen, roughly."""
+    items = 8
+    net = bmc.BayesNet(plates={"i": items})
+    net.add("c", bmc.Bernoulli(0.4))
+    net.add("right", lambda c: bmc.Bernoulli(np.where(c == 1, 0.97, 0.05)), plates="i")
+    net.add("y", lambda right: bmc.Normal(right.sum(), 4.0))
+    counts = np.arange(items + 1)
+    like = stats.norm.pdf(5.0, counts, 4.0)
+    joint = [
+        p * (like * stats.binom.pmf(counts, items, q)).sum() for p, q in ((0.6, 0.05), (0.4, 0.97))
+    ]
+    return net, {"y": 5.0}, "c", np.array(joint[1] / sum(joint))
+
+
 def _evidence(centre: float, sd: float, y: float) -> float:
     at = np.linspace(centre - 9 * sd, centre + 9 * sd, 4001)
     return float(np.trapezoid(stats.norm.pdf(at, centre, sd) * stats.t.pdf(y - at, 3), at))
@@ -84,7 +99,7 @@ def _share(prior: list[float], centres: list[float], sd: float, y: float) -> flo
     return float(joint[1] / joint.sum())
 
 
-ALL = [switch, devices, outliers, spikes]
+ALL = [switch, devices, outliers, spikes, class_of_items]
 
 
 def answered(build: Callable[[], Question], **options: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -101,18 +116,24 @@ def test_chains_cross(build: Callable[[], Question]) -> None:
     assert (off < 4.5).all() and (error < 0.06).all()
 
 
+@pytest.mark.parametrize("build", [switch, class_of_items])
+def test_metropolis_crosses(build: Callable[[], Question]) -> None:
+    off, error = answered(build, engine=bmc.MetropolisHastings(draws=350, warmup=100, chains=8))
+    assert (off < 4.5).all() and (error < 0.06).all()
+
+
 def test_the_default_answers() -> None:
     off, error = answered(switch)
     assert off < 4.5 and error < 0.03
 
 
 @pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
-@pytest.mark.parametrize("build", [switch, outliers])
+@pytest.mark.parametrize("build", [switch, outliers, class_of_items])
 def test_without_joint_moves_they_do_not(
     build: Callable[[], Question], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The negative control; and what never moved is not held for known."""
-    monkeypatch.setattr(gibbs, "redrawn_kernels", lambda target, blankets: [])
+    monkeypatch.setattr(gibbs, "redrawn_kernels", lambda *_: [])
     off, error = answered(build, engine=QUICK)
     assert error.max() > 0.2 and (off < 4.5).all()
 

@@ -176,6 +176,7 @@ def test_boundaries_equal_scipys(
 
 def test_outside_is_minus_infinity_where_scipy_gives_nan() -> None:
     assert d.Gamma(3.0, 1.0).log_prob(np.inf) == -np.inf
+    assert d.Gamma(2.0, 2.0).log_prob(1e308) == -np.inf  # twice that is no number
     assert d.Poisson(3.0).log_prob(np.inf) == -np.inf
     assert d.InverseGamma(3.0, 1.0).log_prob(0.0) == -np.inf
     assert d.InverseGamma(3.0, 1e100).log_prob(1e-300) == -np.inf

@@ -82,10 +82,23 @@ def of_all_below() -> Model:
     return Model(net, ("y",))
 
 
+ROWS = np.array([[0.6, 0.3, 0.1], [0.1, 0.2, 0.7]])
+
+
+def of_many_states() -> Model:
+    """A switch above finite nodes that only their number is seen of."""
+    net = bmc.BayesNet(plates={"i": 4})
+    net.add("z", bmc.Bernoulli(0.1))
+    net.add("w", lambda z: bmc.Categorical(ROWS[z]), plates="i")
+    net.add("y", lambda w: bmc.Poisson(0.5 + w.sum()))
+    return Model(net, ("y",))
+
+
 CASES = {
     "elements": Case(of_elements(), redrawn(apart=True), {"careless": redrawn(Careless)}),
     "sums": Case(of_sums(), redrawn(apart=False), {"careless": redrawn(Careless)}, backwards),
     "all below": Case(of_all_below(), redrawn(), {"careless": redrawn(Careless)}),
+    "many states": Case(of_many_states(), redrawn(), {"careless": redrawn(Careless)}),
 }
 
 

@@ -52,6 +52,24 @@ def test_finite_parents_of_what_cannot_be_followed_are_enumerated() -> None:
     np.testing.assert_allclose(posterior.probabilities("s"), weights, atol=1e-12)
 
 
+def test_computed_parents_have_the_plates_of_their_node() -> None:
+    """Though the function that computes them knows no plates."""
+    net = bmc.BayesNet(plates={"k": 2, "i": 3})
+    net.add("s", bmc.Bernoulli(0.25), plates="i")
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("twice", lambda x: 2.0 * x, plates="k")
+    net.add("y", lambda twice, s: bmc.Normal(twice[[1, 0, 1]] + CURVE(s), 1.0), plates="i")
+    evidence = {"y": np.array([3.0, 2.5, 3.5])}
+    posterior = bmc.infer(net, evidence, engine=bmc.Exact())
+    states = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    off = evidence["y"] - CURVE(states)
+    var = 1.0 / (1.0 + 4.0 * 3)
+    log = np.log(np.where(states, 0.25, 0.75)).sum(-1) - 0.5 * (off**2).sum(-1)
+    mean = 2.0 * off.sum(-1) * var
+    weights = np.exp(log + 0.5 * mean**2 / var)
+    assert posterior.mean("x") == pytest.approx(weights @ mean / weights.sum(), abs=1e-12)
+
+
 def test_what_looks_at_hidden_numbers_is_refused() -> None:
     """Negative control: a branch on the hidden node itself."""
     net = branches()

@@ -277,7 +277,7 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     moved = set(names)
     if slow:
         kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
-    kernels += redrawn_kernels(target, blankets)
+    kernels += redrawn_kernels(target, blankets, kernels)
     if slow and may_be_drawn_anew(target, names):
         kernels.append(BlockWalk(target, names, anew=1.0))
     return Plan(problem, target, blankets, kernels, refusals, constraints)

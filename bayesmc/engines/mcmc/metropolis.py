@@ -22,6 +22,7 @@ from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew, parts_of
+from bayesmc.kernels.redrawn import Redrawn, redrawn_kernels
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled
 from bayesmc.network.sameness import same
@@ -285,6 +286,9 @@ class Plan:
             if self.problem.model[name].is_stochastic and self.target.seen(name) is None:
                 found[name] = "drawn forward: nothing observed depends on it"
         for kernel in self.kernels:
+            if isinstance(kernel, Redrawn):
+                found[kernel.names[0]] += f", then {kernel.label} {kernel.match}"
+                continue
             for name in kernel.names:
                 others = ", ".join(repr(n) for n in kernel.names if n != name)
                 how = f"{kernel.label}: {kernel.match}" if kernel.match else kernel.label
@@ -323,6 +327,7 @@ def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
             ensemble = _members(target, size, chains)
             anew = AFRESH if may_be_drawn_anew(target, continuous) else 0.0
             kernels.append(BlockWalk(target, continuous, ensemble, alone=not kernels, anew=anew))
+    kernels += redrawn_kernels(target, {n: Blanket(target, n) for n in rest}, kernels)
     return Plan(problem, target, kernels, ensemble, refusal)
 
 

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.special
 
 from bayesmc.dbn import DynamicBayesNet
 from bayesmc.dbn.unroll import indexed
@@ -26,12 +25,8 @@ from bayesmc.network.joint import node_log_prob
 from bayesmc.testing.oracles.conditional_gaussian import GaussianAnswer
 from bayesmc.testing.oracles.enumeration import Enumerated, averaged, enumerate_posterior
 from bayesmc.testing.oracles.linear import linear_posterior
-from bayesmc.testing.oracles.quadrature import (
-    Quadrature,
-    at_most,
-    check_rtol,
-    quadrature_posterior,
-)
+from bayesmc.testing.oracles.marginals import cdf, marginals, quantile
+from bayesmc.testing.oracles.quadrature import Quadrature, check_rtol, quadrature_posterior
 
 #: scalars over which a function is integrated under a Gaussian, and the points for each
 _MOST_SCALARS = 3
@@ -194,18 +189,18 @@ class ExactAnswer:
             return self.answer.cdf(name, points)
         shape = self.model[name].value_shape
         out = np.empty((*points.shape, *shape))
-        for at, part in _parts(self.answer, name):
+        for at, part in marginals(self.answer, name):
             place: Any = (..., *at)
-            out[place] = _mixture_cdf(part, points)
+            out[place] = cdf(part, points)
         return out
 
     def _quantile(self, name: str, levels: np.ndarray) -> np.ndarray:
         if isinstance(self.answer, Quadrature):
             return self.answer.quantile(name, levels)
         out = np.empty((*levels.shape, *self.model[name].value_shape))
-        for at, part in _parts(self.answer, name):
+        for at, part in marginals(self.answer, name):
             place: Any = (..., *at)
-            out[place] = _mixture_quantile(part, levels)
+            out[place] = quantile(part, levels)
         return out
 
 
@@ -354,54 +349,6 @@ def _enumerated(
         if node.is_stochastic and hidden and not node.is_discrete:
             raise UnsupportedError(f"the hidden node {name!r} is continuous")
     return enumerate_posterior(net, evidence, inputs)
-
-
-@dataclass(frozen=True, eq=False)
-class _Part:
-    """One number's posterior: weighted normals, some of them points."""
-
-    weights: np.ndarray
-    means: np.ndarray
-    scales: np.ndarray
-
-
-def _parts(answer: Enumerated | GaussianAnswer, name: str) -> list[tuple[tuple[int, ...], _Part]]:
-    """Each number of a node."""
-    shape = answer.model[name].value_shape
-    if isinstance(answer, Enumerated):
-        means = np.asarray(answer.values(name), dtype=float).reshape(len(answer.weights), -1)
-        scales = np.zeros(means.shape)
-        weights = answer.weights
-    else:
-        weights, means, covs = answer.mixture(name)
-        scales = np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
-    places = list(np.ndindex(shape))
-    return [(at, _Part(weights, means[:, k], scales[:, k])) for k, at in enumerate(places)]
-
-
-def _mixture_cdf(part: _Part, x: np.ndarray) -> np.ndarray:
-    points = part.scales <= 1e-12 * np.maximum(1.0, np.abs(part.means))
-    total = at_most(part.means[points], part.weights[points], x)
-    smooth = ~points
-    z = (x[..., None] - part.means[smooth]) / part.scales[smooth]
-    return np.asarray(total + scipy.special.ndtr(z) @ part.weights[smooth])
-
-
-def _mixture_quantile(part: _Part, levels: np.ndarray) -> np.ndarray:
-    """By bisection, to the last digits; what ends within rounding of a point is that point."""
-    low = np.full(levels.shape, (part.means - 40 * part.scales).min() - 1e-9)
-    high = np.full(levels.shape, (part.means + 40 * part.scales).max())
-    for _ in range(120):
-        middle = 0.5 * (low + high)
-        below = _mixture_cdf(part, middle) < levels * (1 - 1e-13)
-        low, high = np.where(below, middle, low), np.where(below, high, middle)
-    points = part.means[part.scales == 0.0]
-    if not points.size:
-        return high
-    nearest = points[np.abs(high[..., None] - points).argmin(axis=-1)]
-    return np.where(
-        np.abs(high - nearest) <= 1e-9 * np.maximum(1.0, np.abs(nearest)), nearest, high
-    )
 
 
 def _hermite(

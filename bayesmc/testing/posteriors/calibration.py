@@ -19,12 +19,13 @@ import numpy as np
 from bayesmc.auto import infer
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.engines.base import Engine
-from bayesmc.errors import BayesmcWarning, UnsupportedError, missing_extra
+from bayesmc.errors import BayesmcWarning, UnsupportedError
 from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results import Posterior
 from bayesmc.testing.kernels.joint import JointModel, NetJoint, Rows, check_sizes
 from bayesmc.testing.posteriors.bands import Uniformity, ecdf_band, ecdf_points, ecdf_uniformity
+from bayesmc.testing.posteriors.differences import Differences, draw_differences
 from bayesmc.testing.posteriors.quantities import Quantities
 from bayesmc.testing.posteriors.shares import Draws, posterior_draws, share_below, users_draws
 from bayesmc.testing.verdict import Comparison, Verdict, check_level, counted
@@ -34,11 +35,6 @@ _CALL = "simulation_based_calibration"
 _ROWS = 100_000
 #: effective weighted draws below which the uniform law of a rank is not to be relied upon
 _FEW = 50
-#: with one Axes for all: colours, line styles where those are used up, and statistics that a legend names
-_COLOURS, _STYLES, _NAMED = 10, ("-", "--", ":", "-."), 12
-#: colours of statistics that agree and that deviate, inches of a panel, panels in a row
-_PLAIN, _DEVIANT, _PANEL, _COLUMNS = "#2a6f97", "#c1440e", (2.8, 2.2), 4
-
 #: between the name of a statistic and the point, in words
 _SHARE = ": share of ranks up to "
 
@@ -111,51 +107,10 @@ class CalibrationResult(Verdict):
         MissingExtraError
             Without matplotlib (the extra ``plot``).
         """
-        names, together = list(self.ranks), ax is not None
-        axes = _panels(len(names)) if ax is None else np.array([ax] * len(names), dtype=object)
-        deviating = set(self.deviating)
-        difference, lines = self.ecdf_difference, {}
-        edges = np.concatenate([[0.0], self.points, [1.0]])
-        for one in dict.fromkeys(axes):
-            low, high = (np.pad(b - self.points, 1) for b in (self.low, self.high))
-            one.fill_between(edges, low, high, color="0.88", linewidth=0)
-            one.axhline(0.0, color="0.6", linewidth=0.8)
-            one.set_xlim(0.0, 1.0)
-            for side in ("top", "right"):
-                one.spines[side].set_visible(False)
-        # what deviates lies above the others
-        for name, one in sorted(zip(names, axes, strict=True), key=lambda n: n[0] in deviating):
-            off = name in deviating
-            colour, style = _DEVIANT if off else _PLAIN, "-"
-            if together:
-                more, which = divmod(names.index(name), _COLOURS)
-                colour, style = f"C{which}", _STYLES[more % len(_STYLES)]
-            (lines[name],) = one.plot(
-                edges, np.pad(difference[name], 1), color=colour, linestyle=style, label=name,
-                linewidth=(2.2 if off else 1.0) if together else 1.4,
-            )  # fmt: skip
-            if not together:
-                one.set_title(name, fontsize="small", color=colour if off else "black")
-        if together:
-            named = [n for n in names if n in deviating or len(names) <= _NAMED]
-            if named:
-                ax.legend([lines[n] for n in named], named, frameon=False, fontsize="small")
-        self._label(axes[0], together)
-        return axes
-
-    def _label(self, ax: Any, together: bool) -> None:
-        """Axes' labels, and the level of the band."""
-        count = len(self.ranks)
-        of = f"all {count} statistics together" if count > 1 else "the statistic"
-        title = f"band: {100 * (1 - self.alpha):.6g}% for {of}"
-        x, y = "share of the posterior below the truth", "ECDF difference"
-        if together:
-            ax.set(xlabel=x, ylabel=y)
-            ax.set_title(title, fontsize="medium")
-        else:
-            ax.figure.supxlabel(x, fontsize="medium")
-            ax.figure.supylabel(y, fontsize="medium")
-            ax.figure.suptitle(title, fontsize="medium")
+        band = self.points, self.low, self.high
+        return draw_differences(
+            Differences(self.ecdf_difference, *band, self.alpha, self.deviating), ax
+        )
 
     def _remarks(self) -> list[str]:
         lines = [
@@ -408,7 +363,7 @@ def _blocks(runs: Iterator[Draws]) -> Iterator[list[Draws]]:
         yield block
 
 
-# ---- in words and pictures ----------------------------------------------------------------------
+# ---- in words -----------------------------------------------------------------------------------
 
 
 def _comparison(name: str, found: Uniformity, count: int) -> Comparison:
@@ -437,20 +392,3 @@ def _in_words(ranks: np.ndarray, is_default: bool) -> str:
     if not is_default:
         width = "its values at the draws spread too " + ("little" if spread > 0 else "far")
     return f"{width} ({low + high:.0%} of truths in their outer fifth, not 20%)"
-
-
-def _panels(count: int) -> np.ndarray:
-    try:
-        from matplotlib import pyplot
-    except ImportError:
-        raise missing_extra("matplotlib", "plot") from None
-    columns = min(count, _COLUMNS)
-    rows = math.ceil(count / columns)
-    size = (max(_PANEL[0] * columns, 4.0), _PANEL[1] * rows + 0.4)
-    _, axes = pyplot.subplots(
-        rows, columns, figsize=size, layout="constrained", squeeze=False, sharex=True, sharey=True
-    )
-    for unused, above in zip(axes.ravel()[count:], axes.ravel()[count - columns :], strict=False):
-        unused.set_visible(False)
-        above.tick_params(labelbottom=True)
-    return np.asarray(axes.ravel()[:count])
