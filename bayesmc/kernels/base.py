@@ -67,7 +67,12 @@ class Kernel:
 
     def acceptance(self, memory: Memory) -> np.ndarray | None:
         """Rate of accepted proposals per chain since the warmup; None where nothing is rejected."""
-        return None
+        return memory["accepted"] / max(memory["moves"], 1) if "accepted" in memory else None
+
+
+def counted(memory: Memory, share: np.ndarray) -> Memory:
+    """The memory with one more step, of which each chain accepted a share."""
+    return {**memory, "accepted": memory["accepted"] + share, "moves": memory["moves"] + 1}
 
 
 def check_ratio(

@@ -110,7 +110,8 @@ def mean_by_label(sums: LabelSums, of: Moving) -> tuple[Expression, Expression]:
     count, first, _ = _moments(sums)
     off = add(first, multiply(count, subtract(sums.centre, offset)))
     linear = product(np.matvec, precision, off)
-    if not (isinstance(slope, Constant) and is_all(subtract(slope, np.eye(*slope.shape[1:])), 0)):
+    itself = np.eye(d, slope.shape[-1])
+    if not (isinstance(slope, Constant) and is_all(subtract(slope, itself), 0)):
         linear = product(np.matvec, transposed(slope), linear)
         precision = product(np.matmul, product(np.matmul, transposed(slope), precision), slope)
     entries = _Entries(at, of.count, None)

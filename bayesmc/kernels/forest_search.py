@@ -115,7 +115,9 @@ def _families(target: Target, names: Sequence[str]) -> dict[str, tuple[int, int]
     for name in names:
         signature = target.signatures.of(name) if name in target.terms else None
         table = target.model[name].declaration.probs
-        what = None if table is None else table.tobytes()  # tables of one shape are not of a kind yet
+        what = (
+            None if table is None else table.tobytes()
+        )  # tables of one shape are not of a kind yet
         key = ("alone", name) if signature is None else (signature.key, what)
         kinds.setdefault(key, []).append(name)
     return {n: (i, len(these)) for i, these in enumerate(kinds.values()) for n in these}

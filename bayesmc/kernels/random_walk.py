@@ -18,7 +18,7 @@ from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped, transform_of
 from bayesmc.errors import ShapeError
 from bayesmc.kernels.adaptation import Steps, chance, turning
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.densities import accepted, compare, instead
 from bayesmc.network import Model
 from bayesmc.shapes import Shape, broadcasts_to
@@ -145,9 +145,6 @@ class AdaptiveWalk(Kernel):
     def end_warmup(self, memory: Memory) -> Memory:
         return {**memory, "steps": self.steps.frozen(memory["steps"])}
 
-    def acceptance(self, memory: Memory) -> np.ndarray | None:
-        return memory["accepted"] / max(memory["moves"], 1)
-
     # ---- private -------------------------------------------------------------------------------
 
     def _transform(self, values: Values) -> Transform:
@@ -206,11 +203,6 @@ def picked(
     chains = len(value)
     flat = value.reshape(chains, blanket.size, *blanket.event_shape)
     return flat[:, members], log.reshape(chains, -1)[:, members]
-
-
-def counted(memory: Memory, share: np.ndarray) -> Memory:
-    """The memory with one more step, of which each chain accepted a share."""
-    return {**memory, "accepted": memory["accepted"] + share, "moves": memory["moves"] + 1}
 
 
 @dataclass(frozen=True)

@@ -13,10 +13,9 @@ import scipy.special
 
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.adaptation import chance
-from bayesmc.kernels.base import Memory
+from bayesmc.kernels.base import Memory, counted
 from bayesmc.kernels.densities import accepted, instead
 from bayesmc.kernels.ensemble import BlockWalk
-from bayesmc.kernels.random_walk import counted
 from bayesmc.pmcmc.filters import Filter
 from bayesmc.pmcmc.pilot import CANDIDATES, located, particles_for
 from bayesmc.resampling import systematic

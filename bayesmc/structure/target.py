@@ -188,7 +188,7 @@ class Target:
 
     def is_known(self, name: str) -> bool:
         """Whether a node's values never change (of a partly seen one in the chain they do)."""
-        return name in self.known and name not in self.chain
+        return name in self.known and name not in self._inside
 
     def hidden_above(self, term: Term) -> tuple[str, ...]:
         """Nodes of the chain that a term's function varies with, through deterministic ones, too."""
@@ -206,6 +206,11 @@ class Target:
         """Flat plate elements of a chain node that are hidden; None where all are."""
         seen = self.seen(name)
         return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
+
+    @cached_property
+    def _inside(self) -> frozenset[str]:
+        """The chain."""
+        return frozenset(self.chain)
 
     @cached_property
     def _order(self) -> dict[str, int]:
@@ -332,7 +337,7 @@ class Target:
 
 
 def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
-    """Chain, forward nodes, terms and constants of a posed problem.
+    """Chain, forward nodes, terms and constants of a posed problem, found once.
 
     Parameters
     ----------
@@ -340,6 +345,17 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
         Nodes that belong to the chain even where nothing observed depends on them; so do those whose
         density has no sampler.
     """
+    kept: dict[frozenset[str], Target] = problem.cache.setdefault("targets", {})
+    key = frozenset(also)
+    if key not in kept:
+        kept[key] = _target(problem, key)
+    return kept[key]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _target(problem: Problem, also: frozenset[str]) -> Target:
     model, observed = problem.model, problem.observed
     known: Values = dict(problem.inputs)
     varying: set[str] = set()
@@ -359,7 +375,7 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
         else:
             varying.add(name)
     unsampled = {n for n in varying if model[n].is_stochastic and model[n].unsampled}
-    wanted = _ancestors(model, observed, varying, unsampled | set(also))
+    wanted = _ancestors(model, observed, varying, unsampled | also)
     chain = tuple(
         n for n, node in model.nodes.items() if n in wanted and n in varying and node.is_stochastic
     )
@@ -375,9 +391,6 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
         if name in observed:  # its term reads what was seen; what is missing is masked
             known[name] = observed[name].value
     return Target(problem, chain, forward, known, terms, links)
-
-
-# ---- private ------------------------------------------------------------------------------------
 
 
 def _shown(name: str, value: np.ndarray) -> str:
