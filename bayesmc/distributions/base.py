@@ -60,6 +60,10 @@ class Distribution:
     #: batch elements without noise: they can be drawn, but their density is none; ``invalid``, too
     noiseless: np.ndarray | None = None
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        faults.check_form(cls)
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Any:
         """A new distribution; of traced parameters, a record of the call in its place."""
         if kwargs:
@@ -127,7 +131,7 @@ class Distribution:
     @property
     def support(self) -> Support:
         """Where the mass lies."""
-        raise NotImplementedError
+        raise faults.missing(self, "property support")
 
     @property
     def transform(self) -> Transform:
@@ -237,13 +241,15 @@ class Distribution:
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         """New writable draws, shape ``shape + event_shape``; the batch broadcasts to ``shape``."""
-        raise NotImplementedError
+        raise faults.missing(self, "method _sample(rng, shape)")
 
     def _log_prob(self, x: np.ndarray) -> np.ndarray:
         form = type(self).log_density
         if form is None:
-            raise NotImplementedError
-        return form(x, **{name: getattr(self, name) for name in self.parameter_ndim})
+            raise faults.missing(self, "log_density(x, **parameters)")
+        found = form(x, **{name: getattr(self, name) for name in self.parameter_ndim})
+        faults.check_form_shape(self, x, found)
+        return found
 
     # ---- what a family's constructor calls --------------------------------------------------
 

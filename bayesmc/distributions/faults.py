@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from typing import Any, Protocol
 
 import numpy as np
@@ -75,6 +76,51 @@ def mapped(dist: Asked, what: str, value: Any) -> np.ndarray:
         raise ShapeError(
             f"{dist._family}.{what}: the {noun} have shape {shape}, which {fault}"
         ) from error
+
+
+def missing(owner: Any, what: str) -> NotImplementedError:
+    """The error for a method that a class of one's own must have."""
+    return NotImplementedError(f"{type(owner).__name__} has no {what}; write one")
+
+
+def check_form(family: type) -> None:
+    """Raise where the ``log_density`` that a class is given cannot be called as a family's is.
+
+    Raises
+    ------
+    TypeError
+    """
+    form = family.__dict__.get("log_density")
+    if form is None:
+        return
+    name = f"{family.__name__}.log_density"
+    if not isinstance(form, staticmethod):
+        raise TypeError(f"{name}(x, **parameters) has no self; put @staticmethod above it")
+    _, *given = inspect.signature(form.__func__).parameters
+    wanted = list(getattr(family, "parameter_ndim", {}))
+    if set(given) != set(wanted):
+        raise TypeError(
+            f"{name}(x, {', '.join(given)}): parameter_ndim of {family.__name__} names "
+            f"{', '.join(wanted) or 'no parameters'}; name the same in both, as in "
+            f"parameter_ndim = {dict.fromkeys(given, 0)}"
+        )
+
+
+def check_form_shape(dist: Asked, x: np.ndarray, found: np.ndarray) -> None:
+    """Raise where a log density does not keep the axes of its values: a sum over all draws is no density.
+
+    Raises
+    ------
+    ShapeError
+    """
+    lead = x.shape[: x.ndim - len(dist.event_shape)]
+    wanted = np.broadcast_shapes(lead, dist.batch_shape)
+    if np.shape(found) != wanted:
+        raise ShapeError(
+            f"{dist._family}.log_density gives shape {np.shape(found)} for values of shape {x.shape} and "
+            f"parameters of batch shape {dist.batch_shape}, not {wanted}; work element by element, and sum "
+            f"over {'the axes of one value only (axis=-1)' if dist.event_shape else 'nothing'}"
+        )
 
 
 # ---- private ------------------------------------------------------------------------------------

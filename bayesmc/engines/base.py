@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.distributions.faults import missing
 from bayesmc.errors import BayesmcError
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
 from bayesmc.results import Posterior
@@ -61,11 +62,11 @@ class Engine:
 
     def refusal(self, problem: Problem) -> str | None:
         """Why this engine cannot answer a posed problem, or None."""
-        raise NotImplementedError
+        raise missing(self, "method refusal(problem)")
 
     def describe(self, problem: Problem) -> dict[str, str]:
         """What the engine does to each node."""
-        raise NotImplementedError
+        raise missing(self, "method describe(problem)")
 
     def table(self, problem: Problem) -> list[Treatment]:
         """What the engine does to each node, in columns; empty where ``describe`` says all."""
@@ -80,4 +81,4 @@ class Engine:
         resume: Posterior | None = None,
     ) -> Posterior:
         """Answer a posed problem, or raise the refusal."""
-        raise NotImplementedError
+        raise missing(self, "method run(problem, seed, keep, progress, resume)")

@@ -12,7 +12,20 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Dirichlet, Distribution, InverseWishart, Truncated, Uniform
+from bayesmc.distributions import (
+    Beta,
+    Dirichlet,
+    Distribution,
+    Exponential,
+    Gamma,
+    InverseGamma,
+    InverseWishart,
+    LogNormal,
+    Normal,
+    Truncated,
+    Uniform,
+    Weibull,
+)
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
     Constant,
@@ -172,6 +185,8 @@ class Prior:
     low, high : Expression
     is_bounded : bool
         Whether they cut off some of the base.
+    support : tuple of float
+        Of the base.
     """
 
     base: Family
@@ -179,11 +194,7 @@ class Prior:
     low: Expression
     high: Expression
     is_bounded: bool
-
-    @property
-    def support(self) -> tuple[float, float]:
-        """Of the base."""
-        return _SUPPORTS.get(getattr(self.base.make, "__name__", ""), (0.0, np.inf))
+    support: tuple[float, float]
 
     def ends(self, blanket: Blanket) -> tuple[float, float]:
         """The least and the largest value that it allows, as far as this is seen."""
@@ -219,7 +230,13 @@ def prior_of(blanket: Blanket) -> Prior:
         ends = [_known(blanket, family.parameters[k]) for k in ("low", "high")]
         low, high = elementwise(np.maximum, low, ends[0]), elementwise(np.minimum, high, ends[1])
         words, bounded = "Uniform", True
-    return Prior(family, words, low, high, bounded)
+    support = _SUPPORTS.get(family.make)
+    if support is None:
+        support = -np.inf, np.inf
+        if not blanket.event_shape:  # of numbers, what the distribution itself says
+            low, high = _own_bounds(blanket, low, high)
+            bounded = bounded or not (_is(low, -np.inf) and _is(high, np.inf))
+    return Prior(family, words, low, high, bounded, support)
 
 
 def own_features(blanket: Blanket, prior: Prior, of: Moving) -> dict[Feature, Expression]:
@@ -292,8 +309,29 @@ def of_members(natural: Expression, blanket: Blanket, members: np.ndarray | None
 # ---- private ------------------------------------------------------------------------------------
 
 
-#: support of a prior, where that is not all positive numbers
-_SUPPORTS = {"Normal": (-np.inf, np.inf), "Uniform": (-np.inf, np.inf), "Beta": (0.0, 1.0)}
+#: supports of families that any parameters leave as they are; Uniform's ends stand apart
+_SUPPORTS: dict[Any, tuple[float, float]] = {
+    Normal: (-np.inf, np.inf),
+    Uniform: (-np.inf, np.inf),
+    Beta: (0.0, 1.0),
+    **dict.fromkeys((Gamma, InverseGamma, Exponential, LogNormal, Weibull), (0.0, np.inf)),
+}
+
+
+def _own_bounds(
+    blanket: Blanket, low: Expression, high: Expression
+) -> tuple[Expression, Expression]:
+    """Bounds that a family's support adds, the same for all parents."""
+    support = blanket.node.support
+    if support is None or support.kind not in ("real", "interval"):
+        raise TraceError(
+            "its support is no interval that stays the same, so that it has no conjugate pair"
+        )
+    return elementwise(np.maximum, low, support.low), elementwise(np.minimum, high, support.high)
+
+
+def _is(bound: Expression, value: float) -> bool:
+    return isinstance(bound, Constant) and bool((bound.value == value).all())
 
 
 def _as_family(result: Any) -> Family:

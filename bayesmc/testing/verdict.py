@@ -25,6 +25,10 @@ import numpy as np
 _SHOWN = 10
 
 
+class NothingToCompare(ValueError):
+    """The two answers know no hidden node in common, and not both of them the evidence."""
+
+
 @dataclass(frozen=True)
 class Comparison:
     """One figure against what it should be.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.distributions.base import as_float
 from bayesmc.distributions.support import positive
-from bayesmc.errors import TraceError
+from bayesmc.errors import BayesmcError, ShapeError, TraceError
 from bayesmc.expression import evaluate
 from bayesmc.network import pose
 from bayesmc.network.expressions import log_density_of
@@ -94,3 +95,60 @@ def test_a_form_that_is_not_the_density_is_refused(family, why):
     assert np.isfinite(
         bmc.infer(net, {"speed": 1.0}, engine=bmc.LikelihoodWeighting(50), rng=0).mean("rate")
     )
+
+
+# ---- families that are wrong ---------------------------------------------------------------------
+
+
+def test_a_density_that_is_summed_over_all_draws_is_refused() -> None:
+    class Summed(Rayleigh):
+        @staticmethod
+        def log_density(x: Any, rate: Any) -> Any:
+            return np.sum(Rayleigh.log_density(x, rate))
+
+    with pytest.raises(
+        ShapeError, match=r"Summed.log_density gives shape \(\) for values of shape \(2,\)"
+    ):
+        Summed(1.0).log_prob([1.0, 2.0])
+    net = bmc.BayesNet()
+    net.add("rate", bmc.Gamma(2.0, 1.0))
+    net.add("y", lambda rate: Summed(rate))
+    for engine in (bmc.LikelihoodWeighting(100), bmc.Gibbs(draws=10, warmup=5)):
+        with pytest.raises(BayesmcError, match="Summed.log_density gives shape"):
+            bmc.infer(net, {"y": 1.0}, engine=engine, rng=0)
+
+
+def test_a_form_is_a_static_method() -> None:
+    with pytest.raises(TypeError, match="put @staticmethod above it"):
+
+        class Bound(bmc.Distribution):
+            parameter_ndim = {"rate": 0}
+
+            def log_density(x: Any, rate: Any) -> Any:  # type: ignore[override]
+                return -rate * x
+
+
+@pytest.mark.parametrize("names", [{}, {"rte": 0}])
+def test_a_form_names_the_parameters(names: dict[str, int]) -> None:
+    with pytest.raises(
+        TypeError, match=r"name the same in both, as in parameter_ndim = {'rate': 0}"
+    ):
+
+        class Misspelt(bmc.Distribution):
+            parameter_ndim = names
+
+            @staticmethod
+            def log_density(x: Any, rate: Any) -> Any:
+                return -rate * x
+
+
+def test_what_is_missing_is_named() -> None:
+    class Empty(bmc.Distribution):
+        pass
+
+    with pytest.raises(NotImplementedError, match="Empty has no property support"):
+        Empty().support  # noqa: B018
+    with pytest.raises(NotImplementedError, match=r"Empty has no method _sample\(rng, shape\)"):
+        Empty().sample(rng=0)
+    with pytest.raises(NotImplementedError, match=r"Empty has no log_density\(x, \*\*parameters\)"):
+        Empty().log_prob(0.0)

@@ -50,3 +50,18 @@ def test_what_is_no_engine_is_refused():
         engine_test(3)
     with pytest.raises(ValueError, match="no kind 'planar'"):
         engine_test(bmc.Exact(), kinds=["planar"])
+
+
+def test_nets_that_leave_nothing_to_compare_are_no_fault():
+    """Some nets are observed in all their nodes, and these weights come without their evidence."""
+
+    def without_evidence(net, evidence, rng):
+        return bmc.infer(net, evidence, engine=bmc.Gibbs(draws=100, warmup=50, chains=8), rng=rng)
+
+    found = engine_test(without_evidence, kinds=["discrete"], nets=5, rng=2)
+    assert found.answered == {"discrete": 5}
+
+
+def test_a_class_is_no_engine():
+    with pytest.raises(TypeError, match=r"such as LikelihoodWeighting\(\)"):
+        engine_test(bmc.LikelihoodWeighting)

@@ -61,7 +61,13 @@ def sampler_of(call: str, kernel: Any, problem: Any) -> SweepSampler:
     if isinstance(kernel, ChainEngine):
         found: Any = kernel.sampler(problem)
     elif isinstance(kernel, Kernel):
-        found = SweepSampler(kernel.blanket.target, [kernel])  # type: ignore[attr-defined]
+        target = getattr(getattr(kernel, "blanket", kernel), "target", None)
+        if not isinstance(target, Target):
+            raise UnsupportedError(
+                f"{call}: {type(kernel).__name__} does not say which target it moves; give a function that "
+                f"makes one of a target, such as lambda target: {type(kernel).__name__}(...)"
+            )
+        found = SweepSampler(target, [kernel])
     elif callable(kernel) and positional(kernel) == 1:
         target = target_of(problem)
         made = kernel(target)
@@ -395,8 +401,9 @@ def _reversed(
         if back is None:
             shown = ", ".join(map(repr, kernel.names))
             why = (
-                f"{call}: the kernel of {shown} ({kernel.label}) moves several parts in turn, and its "
-                "reverse is not known; give reverse=, or use geweke_test or simulation_based_calibration"
+                f"{call}: of the kernel of {shown} ({kernel.label}) its reverse is not known; give reverse= "
+                "(the same again, if it is its own reverse), or use geweke_test or "
+                "simulation_based_calibration"
             )
             return None, why, False
         found.append(back)

@@ -34,7 +34,7 @@ from bayesmc.testing.posteriors.figures import (
 )
 from bayesmc.testing.posteriors.samples import Draws, energy_comparison
 from bayesmc.testing.posteriors.slices import SlicePosterior
-from bayesmc.testing.verdict import Verdict, check_level, counted
+from bayesmc.testing.verdict import NothingToCompare, Verdict, check_level, counted
 
 #: rows of a joint sample below which it is not judged
 _MIN_ROWS = 30
@@ -275,7 +275,7 @@ def _match(
     table.settle()
     remarks = _compare_joint(table, posterior, exact, chosen, draws, rng, alpha) if draws else []
     if not table.comparisons and not table.skipped and not remarks:
-        raise ValueError(f"{test}: there is nothing to compare; name nodes that both know")
+        raise NothingToCompare(f"{test}: there is nothing to compare; name nodes that both know")
     of_nodes = len(table.comparisons) - of_evidence
     return counted(Match(test, alpha, table.comparisons, table.skipped, tuple(remarks), of_nodes))
 

@@ -21,7 +21,7 @@ from bayesmc.testing.makers.nets import random_net
 from bayesmc.testing.makers.observing import random_evidence
 from bayesmc.testing.oracles.enumeration import enumerate_posterior
 from bayesmc.testing.posteriors.matching import compare
-from bayesmc.testing.verdict import Verdict, counted, uncounted
+from bayesmc.testing.verdict import NothingToCompare, Verdict, counted, uncounted
 
 #: kinds of nets: options of ``random_net``, of "gaussian" those of ``random_gaussian_net``
 KINDS: dict[str, dict[str, Any]] = {
@@ -125,6 +125,9 @@ def engine_test(
         except (UnsupportedError, BudgetError, ZeroProbabilityError) as error:
             refused.append(str(error))
             continue
+        except NothingToCompare:  # all is observed, or what is not is known to one of them only
+            answered[kind] += 1
+            continue
         answered[kind] += 1
         skipped += match.skipped
         where = f"net {kind!r}, {first}: "
@@ -157,8 +160,13 @@ def matrix_case(
 def _asked(engine: Any) -> Callable[[BayesNet, dict[str, Any], int], Any]:
     if isinstance(engine, Engine):
         return lambda net, evidence, seed: infer(net, evidence, engine=engine, rng=seed)
-    if not callable(engine):
+    if isinstance(engine, type) or not callable(engine):
         raise TypeError(
-            f"engine_test: {engine!r} is no engine; give Exact(), or a function (net, evidence, rng)"
+            f"engine_test: {engine!r} is no engine; give one, such as {_shown(engine)}(), or a function "
+            "(net, evidence, rng)"
         )
     return engine
+
+
+def _shown(engine: Any) -> str:
+    return engine.__name__ if isinstance(engine, type) else "Exact"
