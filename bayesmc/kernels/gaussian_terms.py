@@ -116,8 +116,7 @@ class NormalTerms:
         >>> import bayesmc as bmc
         >>> from bayesmc.kernels.gaussian_terms import NormalTerms
         >>> from bayesmc.network import pose
-        >>> from bayesmc.structure.programs import family_read, roots_of, template_of
-    from bayesmc.structure.target import target_of
+        >>> from bayesmc.structure.target import target_of
         >>> net = bmc.BayesNet()
         >>> net.add("a", bmc.Normal(0.0, 1.0))
         >>> net.add("b", bmc.Normal(0.0, 1.0))
