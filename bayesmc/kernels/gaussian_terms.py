@@ -107,24 +107,24 @@ class NormalTerm:
 class NormalTerms:
     """The Normal terms of a target, each read once.
 
-        Parameters
-        ----------
-        target : Target
+    Parameters
+    ----------
+    target : Target
 
-        Examples
-        --------
-        >>> import bayesmc as bmc
-        >>> from bayesmc.kernels.gaussian_terms import NormalTerms
-        >>> from bayesmc.network import pose
-        >>> from bayesmc.structure.target import target_of
-        >>> net = bmc.BayesNet()
-        >>> net.add("a", bmc.Normal(0.0, 1.0))
-        >>> net.add("b", bmc.Normal(0.0, 1.0))
-        >>> net.add("y", lambda a, b: bmc.Normal(a + b, 1.0))
-        >>> net.add("z", lambda a, b: bmc.Normal(a * b, 1.0))
-        >>> terms = NormalTerms(target_of(pose(net, {"y": 1.0, "z": 1.0})))
-        >>> [terms.are_joint(terms.of(n), {"a", "b"}) for n in "yz"]
-        [True, False]
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.kernels.gaussian_terms import NormalTerms
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Normal(0.0, 1.0))
+    >>> net.add("b", bmc.Normal(0.0, 1.0))
+    >>> net.add("y", lambda a, b: bmc.Normal(a + b, 1.0))
+    >>> net.add("z", lambda a, b: bmc.Normal(a * b, 1.0))
+    >>> terms = NormalTerms(target_of(pose(net, {"y": 1.0, "z": 1.0})))
+    >>> [terms.are_joint(terms.of(n), {"a", "b"}) for n in "yz"]
+    [True, False]
     """
 
     def __init__(self, target: Target) -> None:
