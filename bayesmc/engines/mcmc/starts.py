@@ -14,7 +14,7 @@ import numpy as np
 
 from bayesmc.categorical import pick_log
 from bayesmc.distributions.transforms import transform_of
-from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, largest_term, row_logs, with_seen
+from bayesmc.engines.mcmc.climbing import MOST_NUMBERS, Climb, in_order, largest_term, row_logs
 from bayesmc.errors import (
     BayesmcError,
     DensityError,
@@ -292,7 +292,8 @@ def _attempt(
         if not (log > -np.inf).any():
             culprits[term.name] = culprits.get(term.name, 0) + 1
             break
-    chosen = {n: v for n, v in values.items() if n in inside or n in target.links}
+    inside |= set(target.links)
+    chosen = {n: v for n, v in values.items() if n in inside}
     return chosen, log
 
 
@@ -303,21 +304,14 @@ def _drawn_all(
 
     With them, by node, the draws whose own parameters are out of range, shape ``(count,)``.
     """
-    model = target.model
-    values: Values = dict(target.known)
     undefined: dict[str, np.ndarray] = {}
-    inside = set(target.chain)
-    for name in model.nodes:
-        if name in inside:
-            value = given[name] if name in given else None
-            if value is None:
-                value = _drawn(target, model[name], values, count, spread, rng, undefined)
-            values[name] = with_seen(target, model[name], value)
-        elif name in target.links:
-            computed, _ = model.evaluate(name, values)
-            shape = (count, *model[name].value_shape)
-            values[name] = np.array(np.broadcast_to(computed, shape))
-    return values, undefined
+
+    def value(node: CompiledNode, values: Values) -> np.ndarray:
+        if node.name in given:
+            return given[node.name]
+        return _drawn(target, node, values, count, spread, rng, undefined)
+
+    return in_order(target, count, value), undefined
 
 
 def _drawn(
