@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.mcmc.chains import ChainEngine
-from bayesmc.engines.mcmc.gibbs import Gibbs
-from bayesmc.engines.mcmc.gibbs_plan import Plan
+from bayesmc.engines.mcmc.gibbs import Gibbs, Plan
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import BayesmcError

@@ -12,8 +12,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
-from bayesmc.engines.mcmc.gibbs import Gibbs
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import UnknownNodeError, UnsupportedError, did_you_mean

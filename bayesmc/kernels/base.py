@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.errors import DensityError
 from bayesmc.structure.target import Values
 
 #: what a kernel keeps from step to step: arrays and numbers by name
 Memory = dict[str, Any]
+#: how far the log ratio may be from zero, relative to the sizes of the terms it is made of
+TOLERANCE = 1e-9
 
 
 class Kernel:
@@ -64,4 +67,36 @@ class Kernel:
 
     def acceptance(self, memory: Memory) -> np.ndarray | None:
         """Rate of accepted proposals per chain since the warmup; None where nothing is rejected."""
-        return None
+        return memory["accepted"] / max(memory["moves"], 1) if "accepted" in memory else None
+
+
+def counted(memory: Memory, share: np.ndarray) -> Memory:
+    """The memory with one more step, of which each chain accepted a share."""
+    return {**memory, "accepted": memory["accepted"] + share, "moves": memory["moves"] + 1}
+
+
+def check_ratio(
+    name: str, match: str, target: np.ndarray, proposal: np.ndarray, sizes: np.ndarray
+) -> None:
+    """Refuse a draw whose log density ratio is not that of the distribution it was drawn from.
+
+    Parameters
+    ----------
+    target, proposal : ndarray
+        Log density at the new value minus at the old one, by the model and by the closed form.
+    sizes : ndarray
+        Sum of the absolute values of all terms on both sides.
+
+    Raises
+    ------
+    DensityError
+        Naming the node, the conjugate pair and the ratio.
+    """
+    ratio = np.asarray(target - proposal)
+    wrong = ~(np.abs(ratio) <= TOLERANCE * (1.0 + sizes))
+    if wrong.any():
+        worst = ratio[wrong].flat[np.abs(ratio[wrong]).argmax()]
+        raise DensityError(
+            f"node {name!r}: the closed form ({match}) is not the full conditional: log ratio {worst:.3g} "
+            "instead of 0"
+        )

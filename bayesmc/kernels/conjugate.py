@@ -20,18 +20,16 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.errors import DensityError, UnsupportedError
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, check_ratio
 from bayesmc.kernels.conjugate_families import (
     Bounds,
-    Naturals,
+    Form,
 )
-from bayesmc.kernels.conjugate_forms import Form
 from bayesmc.kernels.conjugate_naturals import form_of
 from bayesmc.kernels.slice import slice_move
-from bayesmc.kernels.verify import check_ratio
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.joint_values import JointValues
-from bayesmc.structure.like_children import with_like_children
+from bayesmc.structure.like_terms import with_like_children
+from bayesmc.structure.programs import JointValues
 from bayesmc.structure.target import Values
 
 
@@ -80,8 +78,7 @@ class Conjugate(Kernel):
         Distribution
             Batch broadcasts to ``(chains, *plates)``, or ``(chains, members)`` for a class of elements.
         """
-        naturals, bounds = self._naturals(values, part)
-        return self.forms[part].family.posterior(naturals, bounds)
+        return self.forms[part].family.posterior(*self.forms[part](values))
 
     def reading(self, joints: Sequence[JointValues]) -> Conjugate:
         """The same kernel, with what others draw together read as one array."""
@@ -102,7 +99,7 @@ class Conjugate(Kernel):
                 return quick
         now = self.blanket.current(values, members)
         shape = now.shape[: now.ndim - len(self.blanket.event_shape)]
-        naturals, bounds = self._naturals(values, part)
+        naturals, bounds = self.forms[part](values)
         family = self.forms[part].family
         drawn = family.draw(naturals, bounds, rng, shape)
         if drawn is not None and not self.debug:
@@ -113,10 +110,6 @@ class Conjugate(Kernel):
         if self.debug:
             self._check(values, members, posterior, now, drawn)
         return drawn
-
-    def _naturals(self, values: Values, part: int) -> tuple[Naturals, Bounds | None]:
-        """Natural parameters of the full conditional of a class's elements."""
-        return self.forms[part](values)
 
     def _drawn(
         self,

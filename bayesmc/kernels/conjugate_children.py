@@ -9,33 +9,46 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import (
+    Constant,
+    Elementwise,
     Expression,
     Family,
+    Gather,
     Leaf,
+    Pick,
+    Reduction,
     as_expression,
     broadcast,
     elementwise,
     expressions_of,
+    mapped,
     ordered,
     pick,
+    reduction,
 )
-from bayesmc.kernels.conjugate_labels import by_label
-from bayesmc.kernels.label_sums import LabelSums
+from bayesmc.kernels.label_sums import LabelSums, label_sums
+from bayesmc.network import Model
 from bayesmc.network.expressions import Opaque, stored_leaf
-from bayesmc.network.readings import frame
+from bayesmc.network.readings import with_axes
 from bayesmc.passes.log_density import has_own_form, log_density
-from bayesmc.passes.templates import stacked_rows, template
 from bayesmc.passes.widening import widened
 from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.programs import like_roots, roots_of, template_of
 from bayesmc.structure.relation import with_known
-from bayesmc.structure.target import Target, Term
+from bayesmc.structure.target import Target, Term, Values
+
+#: elements per label from which on sums by label pay
+_PER_LABEL = 4
+#: parameters that must be positive
+_POSITIVE = frozenset(
+    ("scale", "rate", "concentration", "concentration1", "concentration0", "df", "scale_diag")
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +101,11 @@ class Child:
         ]
 
     @property
+    def is_alone(self) -> bool:
+        """Whether it is one child, entry by entry."""
+        return self.sums is None and len(self.terms) == 1
+
+    @property
     def word(self) -> str:
         """What the family is called."""
         return getattr(self.family.make, "__name__", str(self.family.make))
@@ -100,35 +118,39 @@ def children_of(blanket: Blanket) -> list[Child] | Term:
         term = child.term
         if term.is_potential or isinstance(term.read, Opaque):
             return term
-        if blanket.name in term.read.leaves:
-            groups.setdefault(_key(blanket, term), []).append(term)
+        like = template_of(term)
+        if blanket.name in like.leaves:
+            key = like.key, like.leaves.index(blanket.name), term.shape, _low(term)
+            groups.setdefault(key, []).append(term)
     return [c for terms in groups.values() for c in _made(blanket, terms)]
 
 
 def apart(blanket: Blanket, child: Child) -> list[Child]:
-    """Many like children one by one, or one entry by entry and not by label; nothing of others."""
-    if child.sums is None and len(child.terms) == 1:
-        return []
+    """Many like children one by one, or one entry by entry and not by label."""
     return [_alone(blanket, t) for t in child.terms]
 
 
+def least_values(child: Child, name: str, model: Model) -> Iterator[Expression]:
+    """The least value of each parameter that should be positive and is not known to be.
+
+    Those that depend on the node itself are left out: there its prior's support looks after that.
+    """
+    for key, value in child.family.parameters.items():
+        if key not in _POSITIVE or not isinstance(value, Expression) or not value.leaves:
+            continue
+        if name not in value.leaves and not _is_positive(value, model):
+            yield reduction(np.minimum, value, range(len(value.shape)))
+
+
+def refuse(child: Child, values: Values) -> None:
+    """Raise where a child's parameters are out of range and did not overflow, naming it."""
+    for term in child.terms:
+        dist, batch = term.distribution(values)
+        if dist.invalid is not None:
+            term.refuse_out_of_range(dist, batch, values[term.name])
+
+
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _roots(term: Term) -> tuple[Expression, ...]:
-    """A term's parameters, and its value as it is stored."""
-    own = stored_leaf(term.model, term.model[term.name])
-    return (*expressions_of(term.read.result), own)  # type: ignore[union-attr]
-
-
-def _key(blanket: Blanket, term: Term) -> Hashable:
-    """Equal for like children."""
-    known = term.model.cache.setdefault("templates of terms", {})
-    if term.name not in known:
-        known[term.name] = template(*_roots(term))
-    found = known[term.name]
-    low = _low(term)
-    return frame(term.read.result), found.key, found.leaves.index(blanket.name), term.shape, low  # type: ignore[union-attr]
 
 
 def _low(term: Term) -> int:
@@ -136,8 +158,19 @@ def _low(term: Term) -> int:
     return 0 if domain is None else domain.low
 
 
+def _by_label(target: Target, term: Term, node: str) -> LabelSums | None:
+    """The sums of a child of a node by its label, where it has one and they pay."""
+    own = [p for p in term.parents if set(term.plates) & set(target.model[p].plates)]
+    if len(own) != 1 or node in own:
+        return None
+    sums = label_sums(target, term, own[0])
+    if sums is None or sums.states * _PER_LABEL > sums.statistics.shape[1]:
+        return None
+    return sums
+
+
 def _made(blanket: Blanket, terms: Sequence[Term]) -> Iterator[Child]:
-    summed = {t.name: by_label(blanket.target, t, blanket.name) for t in terms}
+    summed = {t.name: _by_label(blanket.target, t, blanket.name) for t in terms}
     if len(terms) > 1 and not any(summed.values()):
         found = _joined(blanket, terms)
         if found is not None:
@@ -150,99 +183,84 @@ def _made(blanket: Blanket, terms: Sequence[Term]) -> Iterator[Child]:
 
 
 def _alone(blanket: Blanket, term: Term) -> Child:
-    roots = [with_known(blanket.target, r) for r in _roots(term)]
-    return _child((term,), roots, term.shape, term.mask)
+    roots = [with_known(blanket.target, r) for r in roots_of(term)]
+    return _child((term,), _family(term, roots), roots[-1], term.shape, term.mask)
 
 
 def _joined(blanket: Blanket, terms: Sequence[Term]) -> Child | None:
     """Like children as one."""
-    found = stacked_rows([_roots(t) for t in terms])
-    if found is None:
-        return None
-    leaves = {n.name: n for n in ordered(*found.roots) if isinstance(n, Leaf)}
+    target, first, count = blanket.target, terms[0], len(terms)
+    found = like_roots(terms)
     values = {k: as_expression(v) for k, v in found.constants.items()}
     for names in zip(*found.leaves, strict=True):
         if len(set(names)) > 1:
             if blanket.name in names:
                 return None
-            values[names[0]] = _side_by_side(blanket.target, leaves[names[0]], names)
-    count = len(terms)
-    roots = [with_known(blanket.target, widened(r, values, count)) for r in found.roots]
+            values[names[0]] = _side_by_side(target, names)
+    try:  # of parameters, plates may be fewer than the value's: the group stays in front of all
+        family = with_axes(_family(first, found.roots), len(first.shape))
+    except TraceError:
+        return None
+    *parameters, value = (
+        with_known(target, widened(r, values, count))
+        for r in (*expressions_of(family), found.roots[-1])
+    )
     mask = None
     if any(t.mask is not None for t in terms):
-        shape = terms[0].shape
-        mask = np.stack([np.broadcast_to(True if t.mask is None else t.mask, shape) for t in terms])
-    # of parameters, plates and event may be fewer than the value's: the group stays in front of all
-    rank = len(terms[0].shape)
-    roots = [
-        _in_front(r, o, rank, len(v)) for r, o, v in _with_events(terms[0], roots, found.roots)
-    ]
-    return _child(tuple(terms), roots, (count, *terms[0].shape), mask)
+        every = [True if t.mask is None else t.mask for t in terms]
+        mask = np.stack([np.broadcast_to(m, first.shape) for m in every])
+    family = _family(first, parameters)
+    return _child(tuple(terms), family, value, (count, *first.shape), mask)
 
 
-def _with_events(
-    term: Term, wide: Sequence[Expression], roots: Sequence[Expression]
-) -> Iterator[tuple[Expression, Expression, Shape]]:
-    """Expressions with the event axes that each has."""
-    result: Any = term.read.result  # type: ignore[union-attr]
-    ndims = list(_event_ndims(result))
-    event = len(term.model[term.name].event_shape)
-    for w, r, n in zip(wide, roots, [*ndims, event], strict=True):
-        yield w, r, (1,) * n
+def _side_by_side(target: Target, names: Sequence[str]) -> Expression:
+    leaves = [stored_leaf(target.model, target.model[n]) for n in names]
+    at = np.arange(len(names) * leaves[0].size).reshape(len(names), *leaves[0].shape)
+    return pick([with_known(target, node) for node in leaves], at)
 
 
-def _event_ndims(result: Any, make: Any = None, name: str = "") -> Iterator[int]:
-    """Axes that one value of each parameter has."""
-    if isinstance(result, Expression):
-        known = getattr(make, "parameter_ndim", {})
-        others = {"scale_tril": 2, "scale_diag": 1, "logits": known.get("probs", 0)}
-        yield known.get(name, others.get(name, 0))
-    elif isinstance(result, Family):
-        for key, value in result.parameters.items():
-            yield from _event_ndims(value, result.make, key)
-    elif isinstance(result, (list, tuple)):
-        for value in result:
-            yield from _event_ndims(value, make, name)
-
-
-def _in_front(wide: Expression, root: Expression, rank: int, event: int) -> Expression:
-    """An expression with the group in front of all plates, those that it lacks of size one."""
-    missing = rank + event - len(root.shape)
-    if missing <= 0:
-        return wide
-    shape = (wide.shape[0], *(1,) * missing, *wide.shape[1:])
-    at = np.arange(wide.size).reshape(shape)
-    return pick([wide], at)
-
-
-def _side_by_side(target: Target, first: Leaf, names: Sequence[str]) -> Expression:
-    from_names: list[Expression] = []
-    for name in names:
-        node = stored_leaf(target.model, target.model[name])
-        from_names.append(with_known(target, node))
-    at = np.arange(len(names) * first.size).reshape(len(names), *first.shape)
-    return pick(from_names, at)
+def _family(term: Term, roots: Sequence[Expression]) -> Family:
+    """The family of a term, of other parameters."""
+    parameters = iter(roots)
+    result = mapped(term.read.result, lambda _: next(parameters))  # type: ignore[union-attr]
+    if not isinstance(result, Family):
+        raise TraceError("it is no distribution that can be followed")
+    return result
 
 
 def _child(
-    terms: tuple[Term, ...], roots: Sequence[Expression], shape: Shape, mask: np.ndarray | None
+    terms: tuple[Term, ...],
+    family: Family,
+    value: Expression,
+    shape: Shape,
+    mask: np.ndarray | None,
 ) -> Child:
-    *parameters, value = roots
     low = _low(terms[0])
-    if low:
-        value = elementwise(np.add, value, low)
-    result: Any = terms[0].read.result  # type: ignore[union-attr]
-    if not isinstance(result, Family):
-        raise TraceError("it is no distribution that can be followed")
-    return Child(terms, _with_parts(result, iter(parameters)), value, shape, mask)
+    return Child(terms, family, elementwise(np.add, value, low) if low else value, shape, mask)
 
 
-def _with_parts(traced: Any, parts: Iterator[Expression]) -> Any:
-    """What was traced, with other expressions."""
-    if isinstance(traced, Expression):
-        return next(parts)
-    if isinstance(traced, Family):
-        return Family(traced.make, {k: _with_parts(v, parts) for k, v in traced.parameters.items()})
-    if isinstance(traced, (list, tuple)):
-        return type(traced)(_with_parts(v, parts) for v in traced)
-    return traced
+_ALWAYS = (np.exp, np.logaddexp)
+_KEEPING = (np.multiply, np.divide, np.add, np.sqrt, np.square, np.power, np.reciprocal, np.maximum)
+
+
+def _is_positive(root: Expression, model: Model) -> bool:
+    """Whether an expression is positive wherever it is a number."""
+    found: dict[Expression, bool] = {}
+    for node in ordered(root):
+        inner = [found[a] for a in node.operands]
+        if isinstance(node, Constant):
+            found[node] = bool((node.value > 0).all())
+        elif isinstance(node, Leaf):
+            support = model[node.name].support
+            low = getattr(support, "low", None)
+            found[node] = low is not None and bool(np.min(low) >= 0)
+        elif isinstance(node, Elementwise):
+            rest = inner[:1] if node.function is np.power else inner
+            kept = node.function in _KEEPING and all(rest)
+            found[node] = kept or node.function in _ALWAYS
+        elif isinstance(node, Gather):
+            found[node] = inner[0]
+        else:
+            sums = not isinstance(node, Reduction) or node.ufunc is np.add
+            found[node] = isinstance(node, (Pick, Reduction)) and sums and all(inner)
+    return found[root]

@@ -1,8 +1,8 @@
 """Full conditionals in closed form: families by the features of their log density.
 
 A family is known by which features (``passes.features``) its log density is a sum of; the sums of their
-coefficients over a node's prior and children are its natural parameters. The support of the prior only
-truncates it.
+coefficients over a node's prior and children are its natural parameters: expressions of the state, one
+program. The support of the prior only truncates it.
 
 References
 ----------
@@ -12,7 +12,7 @@ Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), ch. 2-3; Bernardo and Smi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,28 @@ from bayesmc.distributions import (
     Truncated,
 )
 from bayesmc.distributions.support import Support, interval
-from bayesmc.kernels.vector_draws import gammas, inverse_wishart_draw, normal_draw
+from bayesmc.errors import BayesmcError
+from bayesmc.expression import Expression
+from bayesmc.expression.scalars import SmallProgram
+from bayesmc.kernels.conjugate_children import Child, refuse
+from bayesmc.kernels.label_sums import Counts, LabelSums
+from bayesmc.kernels.vector_draws import (
+    DirichletDraw,
+    InverseWishartDraw,
+    NormalDraw,
+)
+from bayesmc.passes.arithmetic import multiply
 from bayesmc.passes.features import LOG, LOG1M, Feature
 from bayesmc.shapes import Shape
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.programs import JointValues
+from bayesmc.structure.target import Values
 
 Naturals = tuple[np.ndarray, ...]
 #: lower and upper end of a truncated full conditional
 Bounds = tuple[Any, Any]
+#: numbers that are added up one by one
+_FEW = 64
 
 
 class Conditional:
@@ -73,17 +88,6 @@ class NormalConditional(Conditional):
         precision = -2.0 * square
         base = Normal(linear / precision, precision**-0.5)
         return base if bounds is None else Truncated(base, *bounds)
-
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        if bounds is not None:
-            return None
-        linear, square = naturals
-        precision = -2.0 * square
-        draw = linear / precision + rng.standard_normal(shape) / np.sqrt(precision)
-        # where a coefficient was lost the draw is no number, and the posterior says which
-        return draw if math.isfinite(draw.sum()) else None
 
 
 class GammaConditional(Conditional):
@@ -157,19 +161,6 @@ class DirichletConditional(Conditional):
     def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
         return Dirichlet(naturals[0] + 1.0)
 
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        counts = naturals[0] + 1.0
-        if not counts.min(initial=1.0) >= 1.0:  # small ones underflow, which the family looks after
-            return None
-        shape = shape + counts.shape[-1:]
-        draw = gammas(
-            rng, counts if counts.shape == shape else np.broadcast_to(counts, shape), shape
-        )
-        draw /= draw.sum(axis=-1, keepdims=True)
-        return draw
-
 
 class MvNormalConditional(Conditional):
     """``exp(h'x - x'Px / 2)`` of a vector."""
@@ -180,25 +171,12 @@ class MvNormalConditional(Conditional):
         mean = np.matvec(factor, np.vecmat(linear, factor))
         return MvNormal(mean, scale_tril=factor)
 
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        precision, linear = naturals
-        draw = normal_draw(rng, precision, linear, shape)
-        return draw if math.isfinite(draw.sum()) else None
-
 
 class InverseWishartConditional(Conditional):
     """``|x|^-(df + d + 1)/2 exp(-tr(S x^-1) / 2)``: inverse Wishart."""
 
     def posterior(self, naturals: Naturals, bounds: Bounds | None) -> Distribution:
         return InverseWishart(*naturals)
-
-    def draw(
-        self, naturals: Naturals, bounds: Bounds | None, rng: np.random.Generator, shape: Shape
-    ) -> np.ndarray | None:
-        df, scale = naturals
-        return inverse_wishart_draw(rng, df, scale, shape)
 
 
 def family_of_features(found: Mapping[Feature, Any], low: float, high: float) -> Conditional | None:
@@ -261,6 +239,116 @@ class RootOf(Distribution):
         return interval(low, high, True, True)
 
 
+class Form:
+    """The full conditional of a class of elements.
+
+    Parameters
+    ----------
+    family : Conditional
+    words : str
+        The prior and the children that it rests on.
+    naturals : sequence of Expression
+        With the node's plates in front, or the members of the class.
+    bounds : sequence of Expression
+        Of the support, none or two.
+    positive : sequence of tuple
+        What must be positive, and the child that it is a parameter of.
+    placed : sequence
+        What it reads beside the state: sums by label, and values of many nodes as one array.
+    """
+
+    def __init__(
+        self,
+        family: Conditional,
+        words: str,
+        naturals: list[Expression],
+        bounds: list[Expression],
+        positive: list[tuple[Expression, Child]],
+        placed: Sequence[LabelSums | Counts | JointValues],
+    ) -> None:
+        self.family, self.words, self._placed = family, words, placed
+        self._naturals, self._bounds, self._least = naturals, bounds, positive
+        roots = [*naturals, *bounds]
+        self._program, self._range = SmallProgram(roots), SmallProgram([e for e, _ in positive])
+        self._ndims = [len(r.shape) for r in roots]
+        self._kept: tuple[Naturals, Bounds | None] | None = None
+        self._draw = None if bounds else _one_program(family, naturals)
+        if not any(r.leaves for r in (*roots, *(e for e, _ in positive))):
+            self._kept = self({})
+
+    def reading(self, joint: JointValues) -> Form:
+        """The same, with an array of many nodes' values in their place where it reads several of them."""
+
+        def changed(found: list[Expression]) -> list[Expression]:
+            return [joint.read_by(e) for e in found]
+
+        naturals, bounds = changed(self._naturals), changed(self._bounds)
+        positive = [(joint.read_by(e), child) for e, child in self._least]
+        before = [*self._naturals, *self._bounds, *(e for e, _ in self._least)]
+        after = [*naturals, *bounds, *(e for e, _ in positive)]
+        if all(a is b for a, b in zip(before, after, strict=True)):
+            return self
+        return Form(self.family, self.words, naturals, bounds, positive, [*self._placed, joint])
+
+    def __call__(self, values: Values) -> tuple[Naturals, Bounds | None]:
+        """Natural parameters, ``(lead, *plates, ...)`` or ``(lead, members, ...)``, and bounds."""
+        if self._kept is not None:
+            return self._kept
+        found = [
+            a if a.ndim > n else a[None]
+            for a, n in zip(self._program(self._ready(values)), self._ndims, strict=True)
+        ]
+        k = len(self._naturals)
+        return tuple(found[:k]), (found[k], found[k + 1]) if self._bounds else None
+
+    def drawn(self, values: Values, rng: np.random.Generator, chains: int) -> np.ndarray | None:
+        """A draw by one program, where there is one and it is a number; else None.
+
+        Raises
+        ------
+        LinAlgError
+            A matrix is not positive definite to rounding.
+        """
+        if self._draw is None:
+            return None
+        found = self._draw(self._ready(values), rng, chains)
+        return found if found is None or _is_finite(found) else None
+
+    def left(self, values: Values) -> Values:
+        """Sums by label that it reads and that are not in the state yet, for others that read them."""
+        found: Values = {}
+        for placed in self._placed:
+            if isinstance(placed, JointValues):  # left by who draws them
+                continue
+            sums = placed.sums if isinstance(placed, Counts) else placed
+            state = values if sums is None else sums.placed(values)
+            if sums is not None and state is not values:
+                found |= sums.kept(state[sums.label], state[sums.key])
+        return found
+
+    def _ready(self, values: Values) -> Values:
+        """The state with what is read beside it, parameters of children in their range."""
+        for placed in self._placed:
+            values = placed.placed(values)
+        if self._least:
+            for least, (_, child) in zip(self._range(values), self._least, strict=True):
+                if (least <= 0.0).any():
+                    refuse(child, values)
+        return values
+
+
+def is_closed(form: Form, blanket: Blanket) -> bool:
+    """Whether there is a closed form at some states."""
+    states: Values | None = blanket.target.states
+    if states is None:
+        return False
+    try:
+        naturals, _ = form(states)
+    except BayesmcError:
+        return False
+    return all(bool(np.isfinite(n).all()) for n in naturals)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -280,3 +368,23 @@ def _root_of_inverse(precision: np.ndarray) -> np.ndarray:
     scaled = precision * (spread[..., :, None] * spread[..., None, :])
     upper = np.linalg.cholesky(scaled[..., ::-1, ::-1])[..., ::-1, ::-1]
     return spread[..., :, None] * np.matrix_transpose(np.linalg.inv(upper))
+
+
+def _is_finite(numbers: np.ndarray) -> bool:
+    if numbers.size <= _FEW:
+        return math.isfinite(sum(numbers.ravel().tolist()))
+    return math.isfinite(np.add.reduce(numbers, axis=None))
+
+
+def _one_program(
+    family: Conditional, naturals: list[Expression]
+) -> NormalDraw | InverseWishartDraw | DirichletDraw | None:
+    """Natural parameters and draw as one."""
+    if isinstance(family, NormalConditional):
+        linear, square = naturals
+        return NormalDraw(multiply(square, -2.0), linear)
+    if isinstance(family, MvNormalConditional):
+        return NormalDraw(*naturals)
+    if isinstance(family, InverseWishartConditional):
+        return InverseWishartDraw(*naturals)
+    return DirichletDraw(*naturals) if isinstance(family, DirichletConditional) else None

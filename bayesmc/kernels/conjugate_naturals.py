@@ -1,4 +1,4 @@
-"""Natural parameters of a full conditional: the prior's and what every child adds, as one program."""
+"""Natural parameters of a full conditional: the prior's and its children's; or why there are none."""
 
 from __future__ import annotations
 
@@ -7,44 +7,63 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Categorical, Dirichlet, InverseWishart, MvNormal
+from bayesmc.distributions import Categorical, Dirichlet, InverseWishart, Multinomial, MvNormal
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression, as_expression, broadcast, reshape
-from bayesmc.kernels.conjugate_children import Child, apart, children_of
+from bayesmc.expression import (
+    Expression,
+    Family,
+    as_expression,
+    broadcast,
+    expressions_of,
+    leaf,
+    reshape,
+)
+from bayesmc.kernels.conjugate_children import Child, apart, children_of, least_values
 from bayesmc.kernels.conjugate_families import (
     Conditional,
     DirichletConditional,
+    Form,
     InverseWishartConditional,
     MvNormalConditional,
     family_of_features,
+    is_closed,
 )
-from bayesmc.kernels.conjugate_forms import Form, is_closed
-from bayesmc.kernels.conjugate_labels import Counts, covariance_by_label, mean_by_label
-from bayesmc.kernels.conjugate_priors import (
+from bayesmc.kernels.conjugate_terms import (
+    Added,
+    Moving,
     Prior,
     bounds_of,
+    features_of,
+    moving,
     naturals_of,
     of_members,
     own_features,
     prior_of,
-)
-from bayesmc.kernels.conjugate_range import least_values
-from bayesmc.kernels.conjugate_terms import (
-    Added,
-    Moving,
-    features_of,
-    moving,
     refuse_moving_support,
     shares_sum_to_one,
 )
-from bayesmc.kernels.conjugate_vectors import covariance_added, mean_added
-from bayesmc.kernels.conjugate_words import why_not
-from bayesmc.kernels.label_sums import LabelSums
-from bayesmc.network.expressions import stored_leaf
+from bayesmc.kernels.conjugate_vectors import (
+    covariance_added,
+    covariance_by_label,
+    mean_added,
+    mean_by_label,
+)
+from bayesmc.kernels.label_sums import Counts, LabelSums
+from bayesmc.network.expressions import Opaque, stored_leaf
+from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import ZERO, add
-from bayesmc.passes.features import LOG, Feature
+from bayesmc.passes.features import LOG, LOG1M, Feature, statistics
+from bayesmc.passes.log_density import log_density
 from bayesmc.passes.reads import same_along
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Term
+
+#: parameters of vectors -> how a node must enter them
+_OF_VECTORS: dict[tuple[Any, str], str] = {
+    (MvNormal, "loc"): "mean", (MvNormal, "cov"): "multiple", (MvNormal, "scale_tril"): "power",
+    (MvNormal, "scale_diag"): "power", (Categorical, "probs"): "shares",
+    (Multinomial, "probs"): "shares",
+}  # fmt: skip
 
 
 def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
@@ -60,6 +79,45 @@ def form_of(blanket: Blanket, members: np.ndarray | None) -> Form | str:
     if prior.base.make is InverseWishart:
         return _of_events(blanket, members, prior, InverseWishartConditional())
     return _of_numbers(blanket, members, prior)
+
+
+def why_not(blanket: Blanket, term: Term, prior: str) -> str:
+    """Why a child makes no conjugate pair with a node under a prior."""
+    name, child = blanket.name, term.name
+    if term.is_potential:
+        return f"it enters the potential {child!r}"
+    if isinstance(term.read, Opaque):
+        return f"child {child!r} cannot be followed ({term.read.reason})"
+    family = term.read.result
+    if not isinstance(family, Family):
+        return f"child {child!r} is no distribution that can be followed"
+    word = getattr(family.make, "__name__", str(family.make))
+    parameters = family.parameters.items()
+    read = [k for k, v in parameters if any(name in e.leaves for e in expressions_of(v))]
+    forms = {k: form for k in family.parameters if (form := _form(family, k, read)) is not None}
+    if not forms:
+        return f"child {child!r} is {word}, which makes no conjugate pair"
+    if len(read) > 1:
+        return f"it enters {' and '.join(read)} of child {child!r}"
+    (parameter,) = read
+    if parameter not in forms:
+        return f"it enters the {parameter} of {word} {child!r}"
+    told = f"the {parameter} of child {child!r}"
+    fits = _fits(forms[parameter], prior)
+    if not fits:
+        return f"child {child!r} is {word}, which makes no conjugate pair with a {prior} prior"
+    why = _bent(family.parameters[parameter], name) if forms[parameter] == "mean" else ""
+    if why:
+        return f"{told} is not known to be affine in it (after {why})"
+    if len(blanket.classes) > 1 or forms[parameter] == "mean":
+        return f"{told} may depend on several elements of {name!r}"
+    if forms[parameter] == "power":
+        return f"{told} is not known to be a power of it times a constant"
+    if forms[parameter] == "multiple":
+        many = blanket.event_shape == (family.parameters[parameter].shape[-1],) * 2
+        what = "its value times a number" if many else "a power of it times a constant"
+        return f"{told} is not known to be {what}"
+    return f"{told} is not known to be its value itself"
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -121,16 +179,16 @@ def _added(
 ) -> dict[Child, Added]:
     """What a child adds; like ones one by one, where together they are no sum of features."""
     is_share = ends[0] >= 0.0 and ends[1] <= 1.0
-    alone = apart(blanket, child)
     refuse_moving_support(child.density, blanket.name)
     try:
         found = {child: features_of(child.density, of, child.mask, False, is_share)}
         both = {**own, **found[child].coefficients}
-        if alone and family_of_features(both, *ends) is None:
+        if not child.is_alone and family_of_features(both, *ends) is None:
             raise TraceError("together they have other features")
     except TraceError:
-        if not alone:
+        if child.is_alone:
             raise
+        alone = apart(blanket, child)
         found = {c: features_of(c.density, of, c.mask, False, is_share) for c in alone}
     return {c: a for c, a in found.items() if a.coefficients}
 
@@ -230,7 +288,7 @@ def _event_added(
     if child.sums is not None:
         try:
             short = mean_by_label if is_mean else covariance_by_label
-            return short(child.sums, blanket), False, [child.sums]
+            return short(child.sums, of), False, [child.sums]
         except TraceError:
             (child,) = apart(blanket, child)
     whole = mean_added if is_mean else covariance_added
@@ -250,3 +308,44 @@ def _counts(blanket: Blanket, child: Child) -> Counts | None:
     if same_along(row, range(len(term.shape))) is not own:
         return None
     return Counts(target, term.name)
+
+
+_PRIORS = {
+    "mean": ("Normal", "MvNormal", "Uniform"),
+    "power": ("Gamma", "InverseGamma", "Exponential", "Uniform"),
+    "multiple": ("Gamma", "InverseGamma", "Exponential", "Uniform", "InverseWishart"),
+    "share": ("Beta", "Uniform"),
+    "shares": ("Beta", "Dirichlet", "Uniform"),
+}
+
+
+def _fits(form: str, prior: str) -> bool:
+    return prior.removeprefix("truncated ") in _PRIORS[form]
+
+
+def _form(family: Family, parameter: str, read: list[str]) -> str | None:
+    """How a node must enter a parameter: as the features tell that this parameter has itself."""
+    if (family.make, parameter) in _OF_VECTORS:
+        return _OF_VECTORS[family.make, parameter]
+    others: dict[str, Any] = {**family.parameters}
+    if family.parameters[parameter] is None:  # given instead of what is read
+        others |= dict.fromkeys(read)
+    others[parameter] = leaf("\0itself", ())
+    try:
+        found = statistics(
+            log_density(Family(family.make, others), leaf("\0value", ())), "\0itself"
+        )
+    except (TraceError, TypeError):
+        return None
+    if set(found.coefficients) == {1.0, 2.0}:
+        return "mean"
+    return "share" if LOG1M in found.coefficients else "power"
+
+
+def _bent(value: Any, name: str) -> str:
+    """The operation after which a parameter is no longer affine."""
+    try:
+        affine(value, [name])
+    except TraceError as error:
+        return str(error).removesuffix(" is not affine")
+    return ""

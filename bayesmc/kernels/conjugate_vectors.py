@@ -1,7 +1,8 @@
-"""What a term adds to the natural parameters of a vector that enters a mean, or of a covariance.
+"""What children add to the natural parameters of a vector that enters a mean, or of a covariance.
 
 A mean that is affine in a vector makes the log density a quadratic form in it; a covariance that is a
-multiple of a matrix makes it that of an inverse Wishart.
+multiple of a matrix makes it that of an inverse Wishart. Of children that are summed by label the same is
+said of the sums (``label_sums``).
 
 References
 ----------
@@ -31,13 +32,16 @@ from bayesmc.expression import (
     reshape,
     substituted,
 )
+from bayesmc.expression.functions import product
 from bayesmc.kernels.conjugate_children import Child
 from bayesmc.kernels.conjugate_terms import Moving
+from bayesmc.kernels.label_sums import LabelSums
 from bayesmc.passes.affine import affine
-from bayesmc.passes.arithmetic import ONE, divide, subtract
+from bayesmc.passes.arithmetic import ONE, add, divide, is_all, multiply, subtract
 from bayesmc.passes.derivatives import tangent
 from bayesmc.passes.features import alone, statistics
 from bayesmc.passes.reads import element_read, same_along
+from bayesmc.passes.sufficient import precision_of, transposed
 from bayesmc.passes.totals import total
 from bayesmc.shapes import Shape
 
@@ -59,18 +63,8 @@ def mean_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
     is_vector = family.make is MvNormal
     shape = child.shape + (value.shape[-1:] if is_vector else (1,))
     value = broadcast(value, shape if is_vector else child.shape)
-    loc, own = alone(broadcast(parameters["loc"], value.shape), of.name, of.numbers)
-    if own is None:
-        raise TraceError("it enters no mean")
-    affine(loc, [own.name])
-    mean = reshape(loc, shape)
-    at = element_read(reduction(np.add, mean, [-1]), own.name, of.numbers)
-    d = own.shape[-1]
-    units = [np.broadcast_to(row, own.shape) for row in np.eye(d)]
-    slopes = [tangent(mean, {own.name: as_expression(u)}) for u in units]
-    slope = _stacked(slopes)
-    zero = as_expression(np.zeros(own.shape))
-    off = subtract(reshape(value, shape), substituted(mean, {own.name: zero}))
+    slope, at, offset = _slopes(reshape(broadcast(parameters["loc"], value.shape), shape), of)
+    off = subtract(reshape(value, shape), offset)
     if not is_vector:
         weight = divide(1.0, elementwise(np.square, broadcast(parameters["scale"], child.shape)))
         return _of_numbers(slope, off, weight, _Entries(at, of.count, child.mask))
@@ -91,23 +85,56 @@ def covariance_added(child: Child, of: Moving) -> tuple[Expression, Expression]:
         raise TraceError("it enters no covariance")
     d = value.shape[-1]
     cov = broadcast(parameters["cov"], (*child.shape, d, d))
-    size = of.numbers.size
-    flat = np.arange(size).reshape(of.numbers.shape)
-    found = statistics(cov, of.name, flat)
-    if set(found.coefficients) != {1.0}:
-        raise TraceError("it is no multiple")
-    times = same_along(found.coefficients[1.0], [-1, -2])
-    whole, own = alone(cov, of.name, flat)
-    assert own is not None
-    place = element_read(whole, own.name, flat % (d * d))
-    at = same_along(element_read(whole, own.name, of.numbers), [-1, -2])
-    in_place = np.broadcast_to(np.arange(d * d).reshape(d, d), place.shape)
-    if times is None or at is None or place is not as_expression(in_place):
-        raise TraceError("it is no multiple")
+    times, at = _multiples(cov, of)
     entries = _Entries(at, of.count, child.mask)
     off = subtract(value, broadcast(parameters["loc"], value.shape))
     scaled = divide(off, reshape(elementwise(np.sqrt, times), (*child.shape, 1)))
     return entries.total(broadcast(ONE, child.shape)), entries.outer(scaled, scaled)
+
+
+def mean_by_label(sums: LabelSums, of: Moving) -> tuple[Expression, Expression]:
+    """The same of a child that is summed by label, from its sums.
+
+    Raises
+    ------
+    TraceError
+        It is not in the mean alone, or not affinely.
+    """
+    labels, d = _normal_labels(sums)
+    given = [v for k, v in sums.family.parameters.items() if k != "loc"]
+    if any(of.name in v.leaves for v in given if isinstance(v, Expression)):
+        raise TraceError("it is not in the mean alone")
+    loc = broadcast(as_expression(sums.family.parameters["loc"]), (*sums.shape, d))
+    slope, at, offset = _slopes(reshape(loc, (labels, d)), of)
+    precision = reshape(precision_of(sums.family, sums.shape)[0], (labels, d, d))
+    count, first, _ = _moments(sums)
+    off = add(first, multiply(count, subtract(sums.centre, offset)))
+    linear = product(np.matvec, precision, off)
+    itself = np.eye(d, slope.shape[-1])
+    if not (isinstance(slope, Constant) and is_all(subtract(slope, itself), 0)):
+        linear = product(np.matvec, transposed(slope), linear)
+        precision = product(np.matmul, product(np.matmul, transposed(slope), precision), slope)
+    entries = _Entries(at, of.count, None)
+    precision = multiply(reshape(count, (labels, 1, 1)), precision)
+    return entries.total(precision), entries.total(linear)
+
+
+def covariance_by_label(sums: LabelSums, of: Moving) -> tuple[Expression, Expression]:
+    """The same of a child that is summed by label, from its sums.
+
+    Raises
+    ------
+    TraceError
+        It is not the covariance alone, or not a multiple of it.
+    """
+    labels, d = _normal_labels(sums)
+    cov = sums.family.parameters.get("cov")
+    if cov is None or of.name in as_expression(sums.family.parameters["loc"]).leaves:
+        raise TraceError("it is not the covariance alone")
+    times, at = _multiples(reshape(broadcast(cov, (*sums.shape, d, d)), (labels, d, d)), of)
+    scatter = divide(_about_loc(sums), reshape(times, (labels, 1, 1)))
+    entries = _Entries(at, of.count, None)
+    return entries.total(reshape(sums.column(0, 1), (labels,))), entries.total(scatter)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -170,6 +197,49 @@ class _Outer:
         return np.stack(np.broadcast_arrays(*parts), axis=-3)
 
 
+def _slopes(mean: Expression, of: Moving) -> tuple[Expression, Expression, Expression]:
+    """Of means ``(*entries, m)`` the slopes in a vector ``(*entries, m, d)``, which one it is, and the rest.
+
+    Raises
+    ------
+    TraceError
+        They are not affine, or not in one element alone.
+    """
+    whole, own = alone(mean, of.name, of.numbers)
+    if own is None:
+        raise TraceError("it enters no mean")
+    affine(whole, [own.name])
+    at = element_read(reduction(np.add, whole, [-1]), own.name, of.numbers)
+    units = [np.broadcast_to(row, own.shape) for row in np.eye(own.shape[-1])]
+    slopes = [tangent(whole, {own.name: as_expression(u)}) for u in units]
+    zero = as_expression(np.zeros(own.shape))
+    return _stacked(slopes), at, substituted(whole, {own.name: zero})
+
+
+def _multiples(cov: Expression, of: Moving) -> tuple[Expression, Expression]:
+    """By what covariances ``(*entries, d, d)`` multiply a matrix, and which one it is.
+
+    Raises
+    ------
+    TraceError
+        They are no multiples of one element.
+    """
+    d = cov.shape[-1]
+    flat = np.arange(of.numbers.size).reshape(of.numbers.shape)
+    found = statistics(cov, of.name, flat)
+    if set(found.coefficients) != {1.0}:
+        raise TraceError("it is no multiple")
+    times = same_along(found.coefficients[1.0], [-1, -2])
+    whole, own = alone(cov, of.name, flat)
+    assert own is not None
+    place = element_read(whole, own.name, flat % (d * d))
+    at = same_along(element_read(whole, own.name, of.numbers), [-1, -2])
+    in_place = np.broadcast_to(np.arange(d * d).reshape(d, d), place.shape)
+    if times is None or at is None or place is not as_expression(in_place):
+        raise TraceError("it is no multiple")
+    return times, at
+
+
 def _stacked(parts: list[Expression]) -> Expression:
     """Side by side along a new last axis."""
     size, shape = parts[0].size, parts[0].shape
@@ -201,17 +271,17 @@ def _of_vectors(
     """Of slopes ``(*entries, m, d)``, residuals ``(*entries, m)`` and what whitens them."""
     same_slope, same_root = entries.by_element(slope), entries.by_element(root)
     if same_slope is not None and same_root is not None:
-        rows = _product(same_root, same_slope)
+        rows = product(np.matmul, same_root, same_slope)
         count = entries.total(broadcast(ONE, entries.at.shape))
         sums = entries.total(off)
-        gram = _product(_transposed(rows), rows)
+        gram = product(np.matmul, transposed(rows), rows)
         precision = elementwise(np.multiply, gram, reshape(count, (entries.count, 1, 1)))
-        white = _product(same_root, reshape(sums, (*sums.shape, 1)))
-        linear = _product(_transposed(rows), white)
+        white = product(np.matmul, same_root, reshape(sums, (*sums.shape, 1)))
+        linear = product(np.matmul, transposed(rows), white)
         return precision, reshape(linear, linear.shape[:-1])
     ndim, (m, d) = len(entries.at.shape), slope.shape[-2:]
     both = pick([slope, off], _joined(slope.shape, (*off.shape, 1)))
-    white = _product(root, both)
+    white = product(np.matmul, root, both)
     at = np.repeat(np.arange(entries.at.size), m).reshape(*entries.at.shape, m)
     wide = _Entries(pick([entries.at], at), entries.count, _expanded(entries.mask, ndim))
     rows = pick([white], np.arange(white.size).reshape(white.shape)[..., :d])
@@ -254,11 +324,37 @@ def _inverse_root(parameters: dict[str, Any], shape: Shape) -> Expression:
     )
 
 
-def _product(first: Expression, second: Expression) -> Expression:
-    found: Any = np.matmul(TracedArray(first), TracedArray(second))
-    return found.expression
+def _normal_labels(sums: LabelSums) -> tuple[int, int]:
+    """How many labels there are, and the size of the normal vectors that they are of."""
+    if sums.family.make is not MvNormal or sums.repeats != 1:
+        raise TraceError("they are no normal vectors")
+    return sums.states, len(sums.centre)
 
 
-def _transposed(matrix: Expression) -> Expression:
-    found: Any = np.matrix_transpose(TracedArray(matrix))
-    return found.expression
+def _moments(sums: LabelSums) -> tuple[Expression, Expression, Expression | None]:
+    """How many, their sum about the centre and the products', by label."""
+    d = len(sums.centre)
+    rows = sums.leaf.shape[1]
+    count, first = sums.column(0, 1), sums.column(1, d)
+    if rows == 1 + d:
+        return count, first, None
+    if rows != 1 + d + d * (d + 1) // 2:
+        raise TraceError("some products have no coefficient")
+    i, j = np.tril_indices(d)
+    place = np.empty((d, d), dtype=np.intp)
+    place[i, j] = place[j, i] = 1 + d + np.arange(len(i))
+    at = np.arange(sums.leaf.size).reshape(sums.leaf.shape)
+    return count, first, pick([sums.leaf], at[:, place])
+
+
+def _about_loc(sums: LabelSums) -> Expression:
+    """Scatter matrices about the mean, (labels, d, d)."""
+    labels, d = sums.states, len(sums.centre)
+    count, first, second = _moments(sums)
+    if second is None:
+        raise TraceError("the covariance is known")
+    loc = broadcast(as_expression(sums.family.parameters["loc"]), (*sums.shape, d))
+    off = subtract(reshape(loc, (labels, d)), sums.centre)
+    half = subtract(first, multiply(multiply(0.5, count), off))
+    cross = multiply(reshape(off, (labels, d, 1)), reshape(half, (labels, 1, d)))
+    return subtract(second, add(cross, transposed(cross)))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.factors.named import Named, aligned, connected, sizes_of
-from bayesmc.kernels.conditionals import FiniteTerm, FiniteTerms
+from bayesmc.kernels.enumerate import FiniteTerm, FiniteTerms
 from bayesmc.structure.target import Target
 
 #: one element of a node: its name and number

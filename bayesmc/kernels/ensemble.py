@@ -29,10 +29,9 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.adaptation import SCALE_DECAY, Steps, best_rate, chance
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.densities import Block, accepted, instead
-from bayesmc.kernels.parts import Part, angles_of, parts_of
-from bayesmc.kernels.random_walk import counted, finite, walked
+from bayesmc.kernels.random_walk import Part, angles_of, finite, parts_of, walked
 from bayesmc.kernels.tempering import MixtureOfT, fitted_mixture
 from bayesmc.structure.target import Target, Values
 
@@ -183,7 +182,7 @@ class BlockWalk(Kernel):
     def acceptance(self, memory: Memory) -> np.ndarray | None:
         if self.anew == 1.0 and memory["mixture"] is None:
             return None
-        return memory["accepted"] / max(memory["moves"], 1)
+        return super().acceptance(memory)
 
     def replaced(self, memory: Memory, rows: np.ndarray) -> Memory:
         """The memory once row i of the chains has become what row ``rows[i]`` was."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
-from bayesmc.kernels.conditionals import FiniteTerms
+from bayesmc.kernels.enumerate import FiniteTerms
 from bayesmc.kernels.forest_block import ForestBlock, members_of
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_terms import FEWEST
@@ -46,7 +46,7 @@ def forest_blocks(
     --------
     >>> import numpy as np
     >>> import bayesmc as bmc
-    >>> from bayesmc.kernels.conditionals import FiniteTerms
+    >>> from bayesmc.kernels.enumerate import FiniteTerms
     >>> from bayesmc.kernels.forest_search import forest_blocks
     >>> from bayesmc.network import pose
     >>> from bayesmc.structure.blanket import Blanket
@@ -114,7 +114,11 @@ def _families(target: Target, names: Sequence[str]) -> dict[str, tuple[int, int]
     kinds: dict[Hashable, list[str]] = {}
     for name in names:
         signature = target.signatures.of(name) if name in target.terms else None
-        key = ("alone", name) if signature is None else signature.key
+        table = target.model[name].declaration.probs
+        what = (
+            None if table is None else table.tobytes()
+        )  # tables of one shape are not of a kind yet
+        key = ("alone", name) if signature is None else (signature.key, what)
         kinds.setdefault(key, []).append(name)
     return {n: (i, len(these)) for i, these in enumerate(kinds.values()) for n in these}
 

@@ -23,20 +23,97 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import DensityError
-from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.gaussian_layout import BlockSums, Factor, Layout, factored, solved
-from bayesmc.kernels.gaussian_order import Components
+from bayesmc.kernels.base import Kernel, Memory, check_ratio
+from bayesmc.kernels.gaussian_layout import BlockSums, Components, Layout
 from bayesmc.kernels.gaussian_rows import NormalRows
 from bayesmc.kernels.gaussian_terms import NormalTerms
-from bayesmc.kernels.verify import check_ratio
+from bayesmc.linalg.patterns import cholesky, lapack
 from bayesmc.structure.target import Target, Values
 
 #: components that one dense matrix may have, and how far from the diagonal a band may reach
 MAX_DENSE = 400
 #: numbers that are stored of one chain's precision
 _MAX_ENTRIES = 1 << 22
+#: components up to which triangles are solved by one call for all chains
+_SMALL = 32
 #: nodes that are all named to the user, and how many of more
 _SHOWN, _FEW = 8, 4
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """A factorised precision: what solving needs of it, for each chain or one for all.
+
+    Attributes
+    ----------
+    root : ndarray
+        Of what is eliminated first.
+    mixed : ndarray, shape (lead, cut, dg)
+        ``root^-1`` times the entries between that and the rest.
+    rest : ndarray, shape (lead, dg, dg)
+        Cholesky factor of the rest, the first part eliminated.
+    log_det : ndarray, shape (lead,)
+        Of the precision.
+    bad : ndarray of bool, shape (lead,)
+        It is not positive definite.
+    """
+
+    layout: Layout
+    root: np.ndarray
+    mixed: np.ndarray
+    rest: np.ndarray
+    log_det: np.ndarray
+    bad: np.ndarray
+
+    def solved(self, linear: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
+        """The mean, plus noise of the Gaussian's covariance, shape (chains, size)."""
+        layout, cut = self.layout, self.layout.cut
+        head, right = linear[:, :cut], linear[:, cut:]
+        joined = np.empty_like(linear)
+        if cut:
+            head = layout.first.lower(self.root, head[..., None])[..., 0]
+        if layout.dg:
+            if cut:
+                right = right - np.vecmat(head, self.mixed)
+            half = _triangle(self.rest, right, "N")
+            if noise is not None:
+                half = half + noise[:, cut:]
+            joined[:, cut:] = _triangle(self.rest, half, "T")
+        if cut:
+            if noise is not None:
+                head = head + noise[:, :cut]
+            if layout.dg:
+                head = head - np.matvec(self.mixed, joined[:, cut:])
+            joined[:, :cut] = layout.first.upper(self.root, head[..., None])[..., 0]
+        return joined
+
+
+def factored(layout: Layout, precision: np.ndarray) -> Factor:
+    """Factorise precisions as ``BlockSums`` holds them."""
+    first, mixed, rest = layout.parts(layout.with_units(precision))
+    lead = len(precision)
+    log_det, bad = np.zeros(lead), np.zeros(lead, dtype=bool)
+    root = first
+    if layout.cut:
+        root, log_det, bad = layout.first.factored(first)
+        if layout.dg:
+            mixed = layout.first.lower(root, mixed)
+            rest = rest - np.swapaxes(mixed, -1, -2) @ mixed
+    if layout.dg:
+        rest, wrong = cholesky(rest)
+        bad = bad | wrong
+        log_det = log_det + 2.0 * np.log(np.linalg.diagonal(rest)).sum(axis=-1)
+    return Factor(layout, root, mixed, rest, log_det, bad)
+
+
+def solved(
+    layout: Layout, sums: BlockSums, noise: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean plus noise of the Gaussian's covariance, the log determinant of its precision, and bad chains."""
+    factor = factored(layout, sums.precision)
+    joined = factor.solved(sums.linear, noise)
+    shape = (len(joined),)
+    return joined, np.broadcast_to(factor.log_det, shape), sums.bad | factor.bad
 
 
 class GaussianBlock(Kernel):
@@ -311,3 +388,15 @@ def _are_joint(normal: NormalTerms, owner: dict[str, _Group], one: _Group, other
         if not normal.are_joint(found, inside):
             return False
     return True
+
+
+def _triangle(factor: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:
+    """Lower triangles, or their transposes, solved for one vector each ``(chains, d)``."""
+    if factor.shape[-1] <= _SMALL:
+        lower = factor if trans == "N" else np.swapaxes(factor, -1, -2)
+        return np.linalg.solve(lower, right[..., None])[..., 0]
+    trtrs = lapack().dtrtrs
+    if len(factor) == 1:
+        return trtrs(factor[0], right.T, lower=1, trans=int(trans == "T"))[0].T
+    pairs = zip(factor, right, strict=True)
+    return np.stack([trtrs(f, r, lower=1, trans=int(trans == "T"))[0] for f, r in pairs])

@@ -15,8 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bayesmc.expression import Constant, Expression, Gather
-from bayesmc.kernels.gaussian_layout import BlockSums, Layout
-from bayesmc.kernels.gaussian_order import Components, Meeting
+from bayesmc.kernels.gaussian_layout import BlockSums, Components, Layout, Meeting
 from bayesmc.kernels.gaussian_terms import NormalTerm
 from bayesmc.linalg.patterns import cholesky
 from bayesmc.passes.affine import Read, affine
@@ -63,9 +62,10 @@ class NormalRows:
         self.plates, self.event = first.term.shape, target.model[self.names[0]].event_shape
         self.elements = len(self.names) * math.prod(self.plates)
         self.d = math.prod(self.event)
-        like = stacked_rows([(m.residual, m.scale) for m in members], [m.template for m in members])
+        self.spread = first.kind.spread
+        like = stacked_rows([first.roots], [m.template for m in members])
         assert like is not None, "they have one key"
-        residual, scale = like.roots
+        residual, scale = first.kind.parts(like.roots)
         inside = {n: k for k, n in enumerate(first.leaves) if n in components.start}
         form = affine(residual, inside)
         self._columns = [
@@ -290,10 +290,10 @@ class NormalRows:
     def _noise(self, value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Scales ``(lead, elements, d)`` or roots of matrices, and the chains where some are none."""
         own = self._scale_shape
-        is_matrix = self.members[0].spread in ("cov", "scale_tril")
+        is_matrix = self.spread in ("cov", "scale_tril")
         inner = (*self.event, *self.event) if is_matrix else self.event
         batch = value.shape[: value.ndim - len(own)]
-        if self.members[0].spread == "cov":
+        if self.spread == "cov":
             value, wrong = cholesky(value)
         else:
             checked = np.linalg.diagonal(value) if is_matrix else value

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Distribution, LogNormal, MvNormal, Normal
+from bayesmc.distributions import LogNormal, MvNormal, Normal
 from bayesmc.errors import DensityError, TraceError
 from bayesmc.expression import (
     Expression,
@@ -21,15 +21,57 @@ from bayesmc.expression import (
     as_expression,
     call,
     elementwise,
+    expressions_of,
+    mapped,
     pick,
 )
 from bayesmc.network.expressions import Opaque, stored_leaf, value_of
 from bayesmc.passes.affine import Affine, affine
-from bayesmc.passes.log_density import family_of
 from bayesmc.passes.templates import Template, template
+from bayesmc.structure.programs import family_read, roots_of, template_of
 from bayesmc.structure.target import Target, Term
 
 _FAMILIES = (Normal, MvNormal, LogNormal)
+
+
+@dataclass(frozen=True, eq=False)
+class NormalKind:
+    """What like Normal terms are.
+
+    Attributes
+    ----------
+    first : Term
+    family : Family
+        Of the first: ``Normal``, ``MvNormal``, or ``LogNormal``, of which the logarithm is meant.
+    spread : str
+        What ``scale`` is: ``"scale"`` standard deviations, ``"cov"``, ``"scale_tril"`` or ``"scale_diag"``.
+    """
+
+    first: Term
+    family: Family
+    spread: str
+
+    @property
+    def roots(self) -> tuple[Expression, ...]:
+        """The first one's parameters and its stored value."""
+        own = stored_leaf(self.first.model, self.first.model[self.first.name])
+        return (*expressions_of(self.family), own)
+
+    def parts(self, roots: Sequence[Expression]) -> tuple[Expression, Expression]:
+        """The value less the mean, shape ``(*plates, *event)``, and the scale as it was given.
+
+        Parameters
+        ----------
+        roots : sequence of Expression
+            In the place of its own.
+        """
+        *parameters, value = roots
+        given = iter(parameters)
+        family = mapped(self.family, lambda _: next(given))
+        if family.make is LogNormal:
+            value = elementwise(np.log, value)
+        residual = elementwise(np.subtract, value, family.parameters["loc"])
+        return residual, as_expression(family.parameters[self.spread])
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,25 +81,15 @@ class NormalTerm:
     Attributes
     ----------
     term : Term
-    family : callable
-        ``Normal``, ``MvNormal``, or ``LogNormal``, of which the logarithm is meant.
-    spread : str
-        What ``scale`` is: ``"scale"`` standard deviations, ``"cov"``, ``"scale_tril"`` or ``"scale_diag"``.
-    residual : Expression
-        The value less the mean, shape ``(*plates, *event)``.
-    scale : Expression
-        As it was given: of a shape that broadcasts to the residual's, or of matrices.
+    kind : NormalKind
     template : Template
-        Of the two.
+        Of parameters and value.
     key : hashable
         Equal for like terms.
     """
 
     term: Term
-    family: Any
-    spread: str
-    residual: Expression
-    scale: Expression
+    kind: NormalKind
     template: Template
     key: Hashable
 
@@ -65,6 +97,11 @@ class NormalTerm:
     def leaves(self) -> tuple[str, ...]:
         """The nodes that it reads, in the order in which like terms correspond."""
         return self.template.leaves
+
+    @property
+    def roots(self) -> tuple[Expression, ...]:
+        """Its parameters and its stored value."""
+        return self.kind.roots if self.kind.first is self.term else roots_of(self.term)
 
 
 class NormalTerms:
@@ -94,6 +131,7 @@ class NormalTerms:
         self.target = target
         self._found: dict[str, NormalTerm | None] = {}
         self._forms: dict[Hashable, Affine | None] = {}
+        self._kinds: dict[Hashable, NormalKind | None] = {}
 
     def of(self, name: str) -> NormalTerm | None:
         """A term; None where it is not Normal."""
@@ -105,7 +143,7 @@ class NormalTerms:
         """Whether a node's own density is that of a Normal number or vector."""
         own = self.of(name) if name in self.target.terms else None
         event = self.target.model[name].event_shape
-        return own is not None and own.family is not LogNormal and len(event) < 2
+        return own is not None and own.kind.family.make is not LogNormal and len(event) < 2
 
     def are_joint(self, found: NormalTerm, names: Collection[str]) -> bool:
         """Whether the nodes among ``names`` that a term reads enter it in an affine way.
@@ -139,38 +177,34 @@ class NormalTerms:
     # ---- private -------------------------------------------------------------------------------
 
     def _read(self, term: Term) -> NormalTerm | None:
-        family = _family(self.target, term)
-        if family is None:
+        if term.is_potential or term.model[term.name].is_discrete:
             return None
-        kinds = [k for k in ("scale", "cov", "scale_tril", "scale_diag")
-                 if family.parameters.get(k) is not None]  # fmt: skip
-        node = term.model[term.name]
-        value: Expression = stored_leaf(term.model, node)
-        if family.make is LogNormal:
-            value = elementwise(np.log, value)
-        loc = as_expression(family.parameters["loc"])
-        scale = as_expression(family.parameters[kinds[0]])
-        residual = elementwise(np.subtract, value, loc)
-        made = template(residual, scale)
-        known = tuple(self.target.is_known(n) for n in made.leaves)
-        key = made.key, known, family.make, kinds[0]
-        return NormalTerm(term, family.make, kinds[0], residual, scale, made, key)
+        if isinstance(term.read, Opaque):
+            kind = _kind(term, _called(self.target, term))
+            made = None if kind is None else template(*kind.roots)
+        else:
+            made = template_of(term)
+            if made.key not in self._kinds:
+                self._kinds[made.key] = _kind(term, family_read(term))
+            kind = self._kinds[made.key]
+        if kind is None or made is None:
+            return None
+        known = tuple(map(self.target.is_known, made.leaves))
+        return NormalTerm(term, kind, made, (made.key, known))
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _family(target: Target, term: Term) -> Family | None:
-    """The family of a Normal term, its parameters as expressions."""
-    if term.is_potential or term.model[term.name].is_discrete:
+def _kind(term: Term, family: Any) -> NormalKind | None:
+    """What a term is, if it is Normal."""
+    if not isinstance(family, Family) or family.make not in _FAMILIES:
         return None
-    result = term.read
-    if isinstance(result, Opaque):
-        return _called(target, term)
-    found: Any = result.result
-    if isinstance(found, Distribution) and type(found) in _FAMILIES:
-        return family_of(found)
-    return found if isinstance(found, Family) and found.make in _FAMILIES else None
+    spreads = (
+        k for k in ("scale", "cov", "scale_tril", "scale_diag")
+        if family.parameters.get(k) is not None
+    )  # fmt: skip
+    return NormalKind(term, family, next(spreads))
 
 
 def _called(target: Target, term: Term) -> Family | None:
@@ -213,9 +247,10 @@ class _Parameters:
 
 
 def _form(found: NormalTerm, names: Sequence[str]) -> Affine | None:
-    if found.scale.leaves & set(names):
+    residual, scale = found.kind.parts(found.roots)
+    if scale.leaves & set(names):
         return None
     try:
-        return affine(found.residual, names)
+        return affine(residual, names)
     except TraceError:
         return None

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from bayesmc.kernels.adaptation import SCALE_DECAY, best_rate, chance
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.densities import accepted, compare, instead
 from bayesmc.kernels.proposal import to_stored
-from bayesmc.kernels.random_walk import counted, picked
+from bayesmc.kernels.random_walk import picked
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
 
@@ -104,9 +104,6 @@ class Jump(Kernel):
             return {name: state[name]}, self._learnt(memory, rates)
         share = np.concatenate(taken, axis=1).mean(axis=1)
         return {name: state[name]}, counted(memory, share)
-
-    def acceptance(self, memory: Memory) -> np.ndarray | None:
-        return memory["accepted"] / max(memory["moves"], 1)
 
     # ---- private -------------------------------------------------------------------------------
 

@@ -9,6 +9,8 @@ sums stand in the state beside the labels that they belong to.
 from __future__ import annotations
 
 import math
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -23,14 +25,18 @@ from bayesmc.expression import (
     leaf,
     pick,
     reduction,
+    reshape,
 )
 from bayesmc.network.expressions import Opaque, density_at
 from bayesmc.passes.arithmetic import add, multiply
-from bayesmc.passes.sufficient import VALUE, NaturalForm, natural_form, tabulated
+from bayesmc.passes.sufficient import VALUE, NaturalForm, log_probabilities, natural_form, tabulated
+from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Term, Values
 
 #: logarithm of a probability of zero, in products with indicators: 0 times it is 0, and sums stay finite
 IMPOSSIBLE = -1e300
+#: sums of logs below which something was impossible
+NEVER = 0.1 * IMPOSSIBLE
 #: values up to which each is counted
 _FEW = 32
 #: numbers that statistics may fill
@@ -239,8 +245,111 @@ class LabelSums:
             rounding = _ROUNDING * (1.0 + np.abs(log) + np.abs(logs[0]))
             near = off <= (rounding + _CANCELLING * (size + sizes[0]))[fine]
             # and what is impossible, as values outside of a support are, must be so here, too
-            if not (near.all() and (own[log == -np.inf] < 0.1 * IMPOSSIBLE).all()):
+            if not (near.all() and (own[log == -np.inf] < NEVER).all()):
                 raise TraceError("what was read of it gives other values than the function")
+
+
+class Counts:
+    """How often each of a label's states came, from sums that somebody takes by it where there are any.
+
+    Attributes
+    ----------
+    leaf : Leaf, shape (states,)
+        What stands for them.
+    sums : LabelSums or None
+        That somebody takes by the label.
+    """
+
+    def __init__(self, target: Target, label: str) -> None:
+        self.target, self.label = target, label
+        domain = target.model[label].domain
+        assert domain is not None
+        self.leaf = leaf(f"counts of {label}", (domain.size,))
+
+    def placed(self, values: Values) -> Values:
+        """A state with the counts beside it."""
+        if self.sums is not None:
+            return {**values, self.leaf.name: self.sums.sums(values)[..., 0]}
+        label = values[self.label]
+        ones = np.ones((1, label[0].size))
+        found = sums_by_label(label.reshape(len(label), -1), ones, self.leaf.size)
+        return {**values, self.leaf.name: found[..., 0]}
+
+    @cached_property
+    def sums(self) -> LabelSums | None:
+        """Looked up at the first step, when all kernels have been made."""
+        return _counted(self.target, self.label)
+
+
+class LabelPrior:
+    """Log prior probabilities of the states: common to all elements, or of every element."""
+
+    def __init__(self, blanket: Blanket, members: np.ndarray | None) -> None:
+        self.blanket, self.members = blanket, members
+        own, target = blanket.own, blanket.target
+        domain = blanket.node.domain
+        assert domain is not None and target.states is not None
+        axes = len(blanket.node.plates)
+        self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape(
+            (-1,) + (1,) * (1 + axes)
+        )
+        self.steep = False
+        self._kept: np.ndarray | None = None
+        log = self._evaluated(target.first_state)
+        self._is_common = log.shape[2:] == (1,) * axes
+        #: the common ones, shape (states,), where they are known or followed
+        self.expression: Expression | None = None
+        above = () if own is None else target.hidden_above(own)
+        if not above:
+            self._kept = self._shaped(self._evaluated({**target.known}))
+            self.steep = bool((self._kept < NEVER).any())
+            if self._is_common:
+                self.expression = as_expression(self._kept[:, 0])
+        elif self._is_common:
+            self.expression = self._read()
+
+    def _read(self) -> Expression | None:
+        """The common ones as an expression, where the label's function is followed."""
+        own, domain = self.blanket.own, self.blanket.node.domain
+        if own is None or domain is None or isinstance(own.read, Opaque):
+            return None
+        values = domain.to_support(np.arange(domain.size))
+        try:
+            family = density_at(own.model, own.name, {})
+            logs = log_probabilities(family, values)
+        except TraceError:
+            return None
+        return reshape(logs, (domain.size,)) if logs.size == domain.size else None
+
+    def common(self, values: Values) -> np.ndarray | None:
+        """Shape (states, chains or 1), or None where elements differ or it is an expression."""
+        if not self._is_common or self.expression is not None:
+            return None
+        return self._shaped(self._evaluated(values))
+
+    def by_element(self, values: Values) -> np.ndarray | None:
+        """Shape (states, chains or 1, elements), or None where they are alike."""
+        if self._is_common:
+            return None
+        if self._kept is not None:
+            return self._kept
+        found = self._shaped(self._evaluated(values))
+        self.steep = bool((found < NEVER).any())
+        return found
+
+    def _evaluated(self, values: Values) -> np.ndarray:
+        state: dict[str, Any] = {**values, self.blanket.name: self._candidate}
+        log = self.blanket.own_log(state)
+        missing = 2 + len(self.blanket.node.plates) - log.ndim
+        return log.reshape((*log.shape[:1], *(1,) * missing, *log.shape[1:])) if missing else log
+
+    def _shaped(self, log: np.ndarray) -> np.ndarray:
+        log = np.maximum(log, IMPOSSIBLE)
+        if self._is_common:
+            return log.reshape(log.shape[:2])
+        full = np.broadcast_to(log, log.shape[:2] + self.blanket.node.plate_shape)
+        flat = full.reshape((*log.shape[:2], -1))
+        return flat if self.members is None else flat[..., self.members]
 
 
 def label_sums(target: Target, term: Term, label: str) -> LabelSums | None:
@@ -300,6 +409,15 @@ def sums_by_label(label: np.ndarray, statistics: np.ndarray, states: int) -> np.
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _counted(target: Target, label: str) -> LabelSums | None:
+    """Sums by this very label that count all its elements, if somebody takes any."""
+    for term in target.terms.values():
+        sums = term.summaries.get(label)
+        if sums is not None and sums.ones == 1 and term.mask is None:
+            return sums
+    return None
 
 
 def _found(target: Target, term: Term, label: str) -> LabelSums | None:

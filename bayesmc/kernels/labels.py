@@ -15,11 +15,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import BayesmcError, TraceError, ZeroProbabilityError
+from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.expression import (
     Expression,
     as_expression,
@@ -27,18 +26,20 @@ from bayesmc.expression import (
     elementwise,
     pick,
     reduction,
-    reshape,
 )
 from bayesmc.expression.scalars import SmallProgram
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, check_ratio
 from bayesmc.kernels.enumerate import Enumerate
-from bayesmc.kernels.label_sums import IMPOSSIBLE, LabelSums, label_sums
-from bayesmc.kernels.verify import check_ratio
-from bayesmc.network.expressions import Opaque, density_at
+from bayesmc.kernels.label_sums import (
+    IMPOSSIBLE,
+    NEVER,
+    LabelPrior,
+    LabelSums,
+    label_sums,
+)
 from bayesmc.passes.arithmetic import add, multiply, subtract
-from bayesmc.passes.sufficient import log_probabilities
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Target, Values
+from bayesmc.structure.target import Values
 
 #: sum of the sizes of the products in a log density, from which on rounding could reach 1e-9 of it
 _LARGEST = 2.0**19
@@ -46,7 +47,6 @@ _LARGEST = 2.0**19
 _STEEP = 600.0
 #: numbers in a chunk of log densities, and least elements of one
 _CHUNK, _NARROW = 1 << 14, 512
-_ZERO = 0.1 * IMPOSSIBLE
 
 
 class LostParameters(Exception):
@@ -76,7 +76,7 @@ class Labels(Kernel):
         self.match = f"{domain.size} states, as one matrix product"
         self.members = blanket.classes[0]
         self._plain = Enumerate(blanket)
-        self._prior = _Prior(blanket, self.members)
+        self._prior = LabelPrior(blanket, self.members)
         self._layout()
         self._parts: dict[int, list[tuple[slice, np.ndarray, _Buffers]]] = {}
         self._codes = np.arange(self.states, dtype=self.dtype)[:, None, None]
@@ -179,12 +179,12 @@ class Labels(Kernel):
         table = self._by_state(values, chains)
         if more is not None:
             table[:, :, self._one] += more
-        finite = np.where(self._may_vanish & (table < _ZERO), 0.0, table)
+        finite = np.where(self._may_vanish & (table < NEVER), 0.0, table)
         if not (np.abs(finite) @ self._most).max() < _LARGEST:
             raise LostParameters
         table = np.maximum(table, 3 * IMPOSSIBLE)
         odds = (table[1:] - table[:1]).swapaxes(0, 1)
-        lost = bool((self._may_vanish & (table < _ZERO)).any())
+        lost = bool((self._may_vanish & (table < NEVER)).any())
         return _Table(odds, lambda: table, lost or self._prior.steep)
 
     def _by_state(self, values: Values, chains: int) -> np.ndarray:
@@ -207,7 +207,7 @@ class Labels(Kernel):
         for part, features, buffers in self._chunks(chains):
             own = None if by_element is None else by_element[..., part]
             if table.steep or self._prior.steep or not buffers.odds(table.odds, features, own):
-                if buffers.tilted(table.flat, features, own) < _ZERO:
+                if buffers.tilted(table.flat, features, own) < NEVER:
                     raise ZeroProbabilityError(
                         f"node {self.blanket.name!r}: no state has positive probability given the "
                         "others; the chain is at an impossible configuration"
@@ -256,7 +256,7 @@ class Labels(Kernel):
         here = found - np.take_along_axis(found, best, axis=0)
         zero = log == -np.inf
         target = np.where(zero, 0.0, log - top)
-        here = np.where(zero & (here < _ZERO), 0.0, here)
+        here = np.where(zero & (here < NEVER), 0.0, here)
         sizes = np.where(zero, 0.0, np.abs(log)) + np.abs(top)
         check_ratio(self.blanket.name, self.match, target, here, sizes)
 
@@ -347,77 +347,6 @@ class _Buffers:
             np.add(self.log[k], self.log[k - 1], out=self.log[k])
 
 
-class _Prior:
-    """Log prior probabilities of the states: common to all elements, or of every element."""
-
-    def __init__(self, blanket: Blanket, members: np.ndarray | None) -> None:
-        self.blanket, self.members = blanket, members
-        own, target = blanket.own, blanket.target
-        domain = blanket.node.domain
-        assert domain is not None and target.states is not None
-        axes = len(blanket.node.plates)
-        self._candidate = np.arange(domain.size, dtype=domain.dtype).reshape(
-            (-1,) + (1,) * (1 + axes)
-        )
-        self.steep = False
-        self._kept: np.ndarray | None = None
-        log = self._evaluated(_first_of(target))
-        self._is_common = log.shape[2:] == (1,) * axes
-        #: the common ones, shape (states,), where they are known or followed
-        self.expression: Expression | None = None
-        above = () if own is None else target.hidden_above(own)
-        if not above:
-            self._kept = self._shaped(self._evaluated({**target.known}))
-            self.steep = bool((self._kept < _ZERO).any())
-            if self._is_common:
-                self.expression = as_expression(self._kept[:, 0])
-        elif self._is_common:
-            self.expression = self._read()
-
-    def _read(self) -> Expression | None:
-        """The common ones as an expression, where the label's function is followed."""
-        own, domain = self.blanket.own, self.blanket.node.domain
-        if own is None or domain is None or isinstance(own.read, Opaque):
-            return None
-        values = domain.to_support(np.arange(domain.size))
-        try:
-            family = density_at(own.model, own.name, {})
-            logs = log_probabilities(family, values)
-        except TraceError:
-            return None
-        return reshape(logs, (domain.size,)) if logs.size == domain.size else None
-
-    def common(self, values: Values) -> np.ndarray | None:
-        """Shape (states, chains or 1), or None where elements differ or it is an expression."""
-        if not self._is_common or self.expression is not None:
-            return None
-        return self._shaped(self._evaluated(values))
-
-    def by_element(self, values: Values) -> np.ndarray | None:
-        """Shape (states, chains or 1, elements), or None where they are alike."""
-        if self._is_common:
-            return None
-        if self._kept is not None:
-            return self._kept
-        found = self._shaped(self._evaluated(values))
-        self.steep = bool((found < _ZERO).any())
-        return found
-
-    def _evaluated(self, values: Values) -> np.ndarray:
-        state: dict[str, Any] = {**values, self.blanket.name: self._candidate}
-        log = self.blanket.own_log(state)
-        missing = 2 + len(self.blanket.node.plates) - log.ndim
-        return log.reshape((*log.shape[:1], *(1,) * missing, *log.shape[1:])) if missing else log
-
-    def _shaped(self, log: np.ndarray) -> np.ndarray:
-        log = np.maximum(log, IMPOSSIBLE)
-        if self._is_common:
-            return log.reshape(log.shape[:2])
-        full = np.broadcast_to(log, log.shape[:2] + self.blanket.node.plate_shape)
-        flat = full.reshape((*log.shape[:2], -1))
-        return flat if self.members is None else flat[..., self.members]
-
-
 def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
     """The kernel of a mixture's labels, where the model has that form.
 
@@ -472,7 +401,7 @@ def label_kernel(blanket: Blanket, debug: bool = False) -> Labels | None:
 
 def _is_right(kernel: Labels) -> bool:
     """Whether log densities at a reachable state are the model's."""
-    state = _first_of(kernel.blanket.target)
+    state = kernel.blanket.target.first_state
     try:
         table = kernel._table(state, 1)
         kernel._check(state, table, kernel._prior.by_element(state))
@@ -481,9 +410,3 @@ def _is_right(kernel: Labels) -> bool:
     except BayesmcError:
         return False
     return True
-
-
-def _first_of(target: Target) -> Values:
-    """One reachable state, ``(1, *plates, *event)``."""
-    assert target.states is not None
-    return {n: v if target.is_known(n) else v[:1] for n, v in target.states.items()}

@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesmc.distributions import Distribution
 from bayesmc.errors import BroadcastError
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.densities import Block, accepted, compare, instead
 from bayesmc.kernels.proposal import (
     Parts,
@@ -30,7 +30,7 @@ from bayesmc.kernels.proposal import (
     to_support,
     warn_of_gaps,
 )
-from bayesmc.kernels.random_walk import counted, picked
+from bayesmc.kernels.random_walk import picked
 from bayesmc.network import CompiledNode
 from bayesmc.shapes import masks, nearly_equal
 from bayesmc.structure.blanket import Blanket
@@ -86,9 +86,6 @@ class Proposed(Kernel):
         if warmup:
             return {name: state[name]}, memory
         return {name: state[name]}, counted(memory, share / max(count, 1))
-
-    def acceptance(self, memory: Memory) -> np.ndarray | None:
-        return memory["accepted"] / max(memory["moves"], 1)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -209,9 +206,6 @@ class ProposedBlock(Kernel):
         if warmup:
             return moved, memory
         return moved, counted(memory, accept.astype(float))
-
-    def acceptance(self, memory: Memory) -> np.ndarray | None:
-        return memory["accepted"] / max(memory["moves"], 1)
 
     # ---- private -------------------------------------------------------------------------------
 

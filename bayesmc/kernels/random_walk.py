@@ -1,12 +1,15 @@
 """Random walks of one node: every element takes a Gaussian step and is accepted by itself.
 
 On the unconstrained scale of its support a node of any kind can walk, a simplex and a matrix, too; the
-acceptance ratio then has the change of volume. Walks of several nodes at once are in ``ensemble``.
+acceptance ratio then has the change of volume. Walks of several nodes at once are in ``ensemble``; where the
+numbers of each stand in one vector is said here.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,15 +18,17 @@ from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Identity, Transform, Wrapped, transform_of
 from bayesmc.errors import ShapeError
 from bayesmc.kernels.adaptation import Steps, chance, turning
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.densities import accepted, compare, instead
 from bayesmc.network import Model
-from bayesmc.shapes import broadcasts_to
+from bayesmc.shapes import Shape, broadcasts_to
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.target import Values
+from bayesmc.structure.target import Target, Values
 
 #: free numbers beyond these are at a bound as far as floating point can tell
 _FAR = 700.0
+#: numbers that are few enough for a mixture to be fitted to them
+_FEW = 6
 
 
 class AdaptiveWalk(Kernel):
@@ -140,9 +145,6 @@ class AdaptiveWalk(Kernel):
     def end_warmup(self, memory: Memory) -> Memory:
         return {**memory, "steps": self.steps.frozen(memory["steps"])}
 
-    def acceptance(self, memory: Memory) -> np.ndarray | None:
-        return memory["accepted"] / max(memory["moves"], 1)
-
     # ---- private -------------------------------------------------------------------------------
 
     def _transform(self, values: Values) -> Transform:
@@ -203,6 +205,58 @@ def picked(
     return flat[:, members], log.reshape(chains, -1)[:, members]
 
 
-def counted(memory: Memory, share: np.ndarray) -> Memory:
-    """The memory with one more step, of which each chain accepted a share."""
-    return {**memory, "accepted": memory["accepted"] + share, "moves": memory["moves"] + 1}
+@dataclass(frozen=True)
+class Part:
+    """Where the numbers of one node stand in the vector of a block.
+
+    Attributes
+    ----------
+    free : ndarray or None
+        Flat plate elements that move; None where all do.
+    shape : tuple of int
+        Of the unconstrained numbers of one element.
+    start, stop : int
+    """
+
+    name: str
+    free: np.ndarray | None
+    shape: Shape
+    start: int
+    stop: int
+
+
+def parts_of(target: Target, names: Sequence[str], unconstrained: bool = True) -> list[Part]:
+    """Where the numbers of each node stand in the vector of a block; names with parents first."""
+    parts, start = [], 0
+    for name in names:
+        node = target.model[name]
+        free = target.free_elements(name)
+        support = some_support(target.model, name)
+        shape = walked(support, node.event_shape, unconstrained).unconstrained_shape
+        count = math.prod(node.plate_shape) if free is None else len(free)
+        stop = start + count * math.prod(shape)
+        parts.append(Part(name, free, shape, start, stop))
+        start = stop
+    return parts
+
+
+def angles_of(target: Target, part: Part, unconstrained: bool) -> np.ndarray:
+    """Which numbers of a part are angles, shape (stop - start,)."""
+    support = some_support(target.model, part.name)
+    one = turning(support, target.model[part.name].event_shape, unconstrained)
+    return np.tile(one, (part.stop - part.start) // max(len(one), 1))
+
+
+def may_be_drawn_anew(target: Target, names: Sequence[str]) -> bool:
+    """Whether some nodes are all that is hidden, few numbers, each with a prior that can be drawn from.
+
+    Angles are left out, which a mixture does not know to be such, and nodes that are seen in part.
+    """
+    nodes = [target.model[n] for n in names]
+    if set(names) != set(target.chain) or any(n not in target.terms for n in names):
+        return False
+    if any(n.is_discrete or n.unsampled or target.seen(n.name) is not None for n in nodes):
+        return False
+    parts = parts_of(target, names)
+    angles = (turned for part in parts for turned in angles_of(target, part, True))
+    return parts[-1].stop <= _FEW and not any(angles)

@@ -162,10 +162,9 @@ class Slice(Kernel):
 
     label = "slice"
 
-    def __init__(self, blanket: Blanket, reason: str = "") -> None:
+    def __init__(self, blanket: Blanket) -> None:
         self.blanket = blanket
         self.names = (blanket.name,)
-        self.match = reason
         self.is_integer = blanket.node.is_discrete
         support = blanket.node.support
         self.on_logs = support is not None and is_half_line(support)

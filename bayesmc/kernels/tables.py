@@ -14,8 +14,13 @@ import numpy as np
 from bayesmc.categorical import edges
 from bayesmc.errors import ZeroProbabilityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.conditionals import Conditional, FiniteTerms, conditional_of
-from bayesmc.kernels.joint_states import MOST_STATES, JointStates, RowSums
+from bayesmc.kernels.enumerate import (
+    MOST_STATES,
+    Conditional,
+    FiniteTerms,
+    JointStates,
+    conditional_of,
+)
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Target, Values
 
@@ -68,8 +73,7 @@ def joint_states(target: Target, names: Sequence[str], terms: FiniteTerms | None
     conditional = conditional_of(terms, names)
     if conditional is not None and conditional.states <= MOST_STATES:
         return TableSweep(target, (conditional,))
-    around = terms.around(names)
-    return JointStates(target, names) if around is None else RowSums(target, names, around)
+    return JointStates(target, names, terms)
 
 
 def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel | None:
@@ -90,7 +94,7 @@ def table_kernel(blanket: Blanket, terms: FiniteTerms | None = None) -> Kernel |
     around = terms.around((blanket.name,))
     if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
         return None
-    return RowSums(blanket.target, (blanket.name,), around)
+    return JointStates(blanket.target, (blanket.name,), terms)
 
 
 def table_kernels(

@@ -1,6 +1,6 @@
-"""Draws of normals and covariances from natural parameters, few of them on Python's floats.
+"""Draws of normals, covariances and shares whose natural parameters are expressions of a state.
 
-Natural parameters are arrays, or expressions of a state, which makes parameters and draw one program.
+Parameters and draw are one program, of few numbers on Python's floats.
 
 References
 ----------
@@ -43,98 +43,22 @@ _FEW = 24
 _LEAST = 1e-280
 
 
-def normal_draw(
-    rng: np.random.Generator, precision: np.ndarray, linear: np.ndarray, shape: Shape
-) -> np.ndarray:
-    """Draws from ``exp(linear'x - x' precision x / 2)``.
-
-    Parameters
-    ----------
-    precision : ndarray, shape (*batch, d, d)
-    linear : ndarray, shape (*batch, d)
-    shape : tuple of int
-        What the batches broadcast to.
-
-    Returns
-    -------
-    ndarray, shape (*shape, d)
-
-    Raises
-    ------
-    LinAlgError
-        A precision is not positive definite to rounding.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesmc.kernels.vector_draws import normal_draw
-    >>> rng = np.random.default_rng(0)
-    >>> draws = normal_draw(rng, np.diag([4.0, 1.0]), np.array([4.0, 0.0]), (10_000,))
-    >>> draws.mean(axis=0).round(1).tolist(), draws.std(axis=0).round(1).tolist()
-    ([1.0, 0.0], [0.5, 1.0])
-    """
-    d = linear.shape[-1]
-    noise = rng.standard_normal((*shape, d))
-    values = {"precision": precision, "linear": linear, "noise": noise}
-    if precision.shape[:-2] != shape:
-        values["precision"] = np.broadcast_to(precision, (*shape, d, d))
-    if linear.shape[:-1] != shape:
-        values["linear"] = np.broadcast_to(linear, (*shape, d))
-    (draw,) = _normal(d)(values)
-    return draw
-
-
-def inverse_wishart_draw(
-    rng: np.random.Generator, df: np.ndarray, scale: np.ndarray, shape: Shape
-) -> np.ndarray:
-    """Draws from the inverse Wishart distribution, positive definite after rounding, too.
-
-    If the scale is ``R R'`` and B is Bartlett's triangle, the draw is ``M M'`` with ``M = R B^-1'``.
-
-    Parameters
-    ----------
-    df : ndarray, shape (*batch)
-    scale : ndarray, shape (*batch, d, d)
-    shape : tuple of int
-        What the batches broadcast to.
-
-    Returns
-    -------
-    ndarray, shape (*shape, d, d)
-
-    Raises
-    ------
-    LinAlgError
-        A scale is not positive definite to rounding.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from bayesmc.kernels.vector_draws import inverse_wishart_draw
-    >>> rng = np.random.default_rng(0)
-    >>> draws = inverse_wishart_draw(rng, np.array(12.0), 9.0 * np.eye(2), (10_000,))
-    >>> bool(np.abs(draws.mean(axis=0) - np.eye(2)).max() < 0.05)  # the scale over df - d - 1
-    True
-    """
-    d = scale.shape[-1]
-    half = 0.5 * df[..., None] - _halves(d)
-    values = {
-        "normal": rng.standard_normal((*shape, d * (d - 1) // 2)),
-        "gamma": gammas(rng, half, (*shape, d)),
-        "scale": scale,
-    }
-    if scale.shape[:-2] != shape:
-        values["scale"] = np.broadcast_to(scale, (*shape, d, d))
-    draw, angle, factor = _inverse_wishart(d)(values)
-    return draw if _least_of(angle) >= _CLOSE else gram(factor)[0]
-
-
 class NormalDraw:
-    """Draws of all elements of a node whose natural parameters are expressions of the state.
+    """Draws from ``exp(linear'x - x' precision x / 2)`` of all elements of a node.
 
     Parameters
     ----------
     precision, linear : Expression, shapes (*plates, d, d) and (*plates, d), or both (*plates)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import as_expression
+    >>> from bayesmc.kernels.vector_draws import NormalDraw
+    >>> draw = NormalDraw(as_expression(np.diag([4.0, 1.0])), as_expression(np.array([4.0, 0.0])))
+    >>> draws = draw({}, np.random.default_rng(0), 10_000)
+    >>> draws.mean(axis=0).round(1).tolist(), draws.std(axis=0).round(1).tolist()
+    ([1.0, 0.0], [0.5, 1.0])
     """
 
     def __init__(self, precision: Expression, linear: Expression) -> None:
@@ -153,11 +77,23 @@ class NormalDraw:
 
 
 class InverseWishartDraw:
-    """The same for covariances.
+    """Draws from the inverse Wishart distribution, positive definite after rounding, too.
+
+    If the scale is ``R R'`` and B is Bartlett's triangle, the draw is ``M M'`` with ``M = R B^-1'``.
 
     Parameters
     ----------
     df, scale : Expression, shapes (*plates) and (*plates, d, d)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import as_expression
+    >>> from bayesmc.kernels.vector_draws import InverseWishartDraw
+    >>> draw = InverseWishartDraw(as_expression(12.0), as_expression(9.0 * np.eye(2)))
+    >>> draws = draw({}, np.random.default_rng(0), 10_000)
+    >>> bool(np.abs(draws.mean(axis=0) - np.eye(2)).max() < 0.05)  # the scale over df - d - 1
+    True
     """
 
     def __init__(self, df: Expression, scale: Expression) -> None:
@@ -242,18 +178,6 @@ def _least_of(array: np.ndarray) -> float:
 def _halves(d: int) -> np.ndarray:
     """Half of ``d - 1, ..., 0``."""
     return 0.5 * np.arange(d - 1, -1, -1.0)
-
-
-@cache
-def _normal(d: int) -> SmallProgram:
-    leaves = leaf("precision", (d, d)), leaf("linear", (d,)), leaf("noise", (d,))
-    return SmallProgram([_normal_of(*leaves)])
-
-
-@cache
-def _inverse_wishart(d: int) -> SmallProgram:
-    normal = leaf("normal", (d * (d - 1) // 2,))
-    return SmallProgram(_inverse_wishart_of(leaf("scale", (d, d)), leaf("gamma", (d,)), normal))
 
 
 def _normal_of(precision: Expression, linear: Expression, noise: Expression) -> Expression:

@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.engines.base import Treatment
-from bayesmc.engines.mcmc.gibbs_plan import Plan, plan_of
+from bayesmc.engines.mcmc.gibbs import Plan, plan_of
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.network import Problem

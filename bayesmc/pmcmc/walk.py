@@ -20,10 +20,9 @@ import scipy.special
 
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.adaptation import chance
-from bayesmc.kernels.base import Memory
+from bayesmc.kernels.base import Memory, counted
 from bayesmc.kernels.densities import accepted, instead
 from bayesmc.kernels.ensemble import BlockWalk
-from bayesmc.kernels.random_walk import counted
 from bayesmc.pmcmc.filters import Filter
 from bayesmc.resampling import systematic
 from bayesmc.structure.target import Target, Values

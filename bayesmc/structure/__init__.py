@@ -1,12 +1,12 @@
 """Structure read off a net: tables of finite nodes, discrete factors, linear-Gaussian conditionals."""
 
 from bayesmc.structure.affine import is_hidden, why_not_linear
-from bayesmc.structure.core import core_size
 from bayesmc.structure.discrete import (
     DiscreteNet,
     FactorSource,
     InvalidRows,
     Variable,
+    core_size,
     discrete_net,
     known_values,
     why_not_discrete,

@@ -9,15 +9,16 @@ that were read.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from operator import is_, itemgetter
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from bayesmc.errors import ModelError
+from bayesmc.errors import BayesmcError, ModelError
 from bayesmc.expression import (
     Expression,
     Program,
@@ -28,15 +29,32 @@ from bayesmc.expression import (
     rebuilt,
     replaced,
 )
-from bayesmc.network import CompiledNode
+from bayesmc.network import CompiledNode, Model
 from bayesmc.network.expressions import Followed, density
 from bayesmc.network.node import identity
 from bayesmc.network.readings import Reading, with_axes
 from bayesmc.passes.templates import stacked_rows
 from bayesmc.shapes import Shape, broadcast_shapes
 
-if TYPE_CHECKING:  # a target recomputes like links as one
-    from bayesmc.structure.target import Target, Values
+#: stored values by node
+Values = dict[str, np.ndarray]
+#: links that are worth a group
+FEWEST = 4
+#: elements of one link from which on arrays, not calls, take the time
+_LARGE = 512
+
+
+class Facts(Protocol):
+    """What is asked of a target: a model, values that never change, and what its functions are."""
+
+    @property
+    def model(self) -> Model: ...
+
+    @property
+    def known(self) -> Values: ...
+
+    @property
+    def signatures(self) -> Signatures: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +82,7 @@ class Signature:
 class Signatures:
     """Signatures of a target's terms and deterministic nodes, each found once."""
 
-    def __init__(self, target: Target) -> None:
+    def __init__(self, target: Facts) -> None:
         self.target = target
         self._found: dict[str, Signature | None] = {}
         self._values: dict[str, Hashable] = {}
@@ -121,7 +139,7 @@ class Slots:
         Size of the group.
     """
 
-    def __init__(self, target: Target, sources: Mapping[str, Sequence[str]], count: int) -> None:
+    def __init__(self, target: Facts, sources: Mapping[str, Sequence[str]], count: int) -> None:
         self.sources = {name: _once(these) for name, these in sources.items()}
         self.count = count
         self._trailing = {name: len(target.model[name].value_shape) for name in self.sources}
@@ -237,6 +255,95 @@ def value_key(node: CompiledNode) -> Hashable:
     return node.plates, node.event_shape, node.is_discrete, node.domain and node.domain.key
 
 
+class LinkSteps:
+    """Deterministic nodes that are recomputed together, parents first.
+
+    Parameters
+    ----------
+    target : Target
+    links : sequence of str
+        In an order in which they can be computed.
+    also : callable, optional
+        What of a link must be equal within a group, besides what it is.
+
+    Attributes
+    ----------
+    steps : tuple
+        Names that are computed alone, and groups of like ones.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.like_functions import LinkSteps
+    >>> from bayesmc.structure.target import target_of
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Normal(0.0, 1.0))
+    >>> for t in range(5):
+    ...     net.add(f"m[{t}]", lambda x, t=t: x * t)
+    ...     net.add(f"y[{t}]", lambda m: bmc.Normal(m, 1.0), parents=[f"m[{t}]"])
+    >>> target = target_of(pose(net, {f"y[{t}]": 0.0 for t in range(5)}))
+    >>> steps = LinkSteps(target, target.links)
+    >>> len(steps.steps)
+    1
+    >>> values = {**target.known, "x": np.array([1.0, 2.0])}
+    >>> steps.compute(values)
+    >>> values["m[3]"].tolist()
+    [3.0, 6.0]
+    """
+
+    def __init__(
+        self,
+        target: Facts,
+        links: Sequence[str],
+        also: Callable[[str], Hashable] | None = None,
+    ) -> None:
+        self.target = target
+        self.steps: tuple[str | LikeLinks, ...] = tuple(_steps(target, links, also))
+
+    def compute(self, values: Values) -> None:
+        """Put the links' values, given all others, in place."""
+        for step in self.steps:
+            if isinstance(step, str):
+                values[step], _ = self.target.model.evaluate(step, values)
+            else:
+                values.update(step.computed(values))
+
+
+class LikeLinks:
+    """Links that are alike, none of which follows from another, as one call.
+
+    Attributes
+    ----------
+    names : tuple of str
+    """
+
+    def __init__(self, target: Facts, names: Sequence[str]) -> None:
+        self.target = target
+        self.names = tuple(names)
+        found = [target.signatures.of(n) for n in names]
+        signatures = [s for s in found if s is not None]
+        self.evaluate = as_one(signatures) or partial(target.model.evaluate, names[0])
+        scopes = [s.scope[:-1] for s in signatures]  # the last is the link itself
+        sources = {name: tuple(s[i] for s in scopes) for i, name in enumerate(scopes[0])}
+        self.slots = Slots(target, sources, len(names))
+
+    def computed(self, values: Values) -> Values:
+        """Values of all, each with the batch of the parents of all."""
+        try:
+            found, batch = self.evaluate(self.slots.gathered(values))
+        except BayesmcError:
+            for name in self.names:  # the group knows the first one's name only
+                self.target.model.evaluate(name, values)
+            raise
+        shape = self.target.model[self.names[0]].value_shape
+        full = np.broadcast_to(found, (*batch[:-1], len(self.names), *shape))
+        rows = np.ascontiguousarray(np.moveaxis(full, len(batch) - 1, 0))
+        rows.flags.writeable = False
+        return dict(zip(self.names, rows, strict=True))
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -313,3 +420,30 @@ def _full(value: np.ndarray, shape: Shape) -> np.ndarray:
     """A value with all its elements, where candidates have one for all of a plate."""
     lead = value.shape[: value.ndim - len(shape)]
     return value if value.shape == lead + shape else np.broadcast_to(value, lead + shape)
+
+
+def _steps(
+    target: Facts, links: Sequence[str], also: Callable[[str], Hashable] | None
+) -> list[str | LikeLinks]:
+    """Each link alone, or in the first group of its like that comes after all it is computed from."""
+    groups: list[list[str]] = []
+    place: dict[str, int] = {}
+    last: dict[Hashable, int] = {}
+    signatures = target.signatures
+    for link in links:
+        after = max((place[p] for p in target.model[link].parents if p in place), default=-1)
+        signature = signatures.of(link)
+        at = -1
+        if signature is not None and math.prod(target.model[link].value_shape) < _LARGE:
+            repeated = tuple(signature.scope.index(n) for n in signature.scope)
+            key = signature.key, repeated, None if also is None else also(link)
+            at = last.get(key, -1)
+            if at <= after:
+                at = last[key] = len(groups)
+        if at < 0 or at == len(groups):
+            at = len(groups)
+            groups.append([])
+        groups[at].append(link)
+        place[link] = at
+    many = (group if len(group) < FEWEST else [LikeLinks(target, group)] for group in groups)
+    return [step for steps in many for step in steps]

@@ -17,8 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.colouring import colours
+from bayesmc.structure.blanket import Blanket, colours
 from bayesmc.structure.like_functions import (
     Signature,
     Slots,

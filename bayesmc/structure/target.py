@@ -23,10 +23,8 @@ from bayesmc.network.expressions import Followed, Opaque, density, log_density_o
 from bayesmc.network.model import invalid_error
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
-from bayesmc.structure.like_functions import Signatures, StackedFunction
-from bayesmc.structure.like_links import FEWEST, LinkSteps
+from bayesmc.structure.like_functions import FEWEST, LinkSteps, Signatures, StackedFunction, Values
 
-Values = dict[str, np.ndarray]
 #: rows of the states on which functions are compared
 _STATES = 6
 
@@ -190,7 +188,7 @@ class Target:
 
     def is_known(self, name: str) -> bool:
         """Whether a node's values never change (of a partly seen one in the chain they do)."""
-        return name in self.known and name not in self.chain
+        return name in self.known and name not in self._inside
 
     def hidden_above(self, term: Term) -> tuple[str, ...]:
         """Nodes of the chain that a term's function varies with, through deterministic ones, too."""
@@ -208,6 +206,11 @@ class Target:
         """Flat plate elements of a chain node that are hidden; None where all are."""
         seen = self.seen(name)
         return None if seen is None else np.flatnonzero(~seen.mask)  # type: ignore[operator]
+
+    @cached_property
+    def _inside(self) -> frozenset[str]:
+        """The chain."""
+        return frozenset(self.chain)
 
     @cached_property
     def _order(self) -> dict[str, int]:
@@ -304,32 +307,11 @@ class Target:
             return None
         return values
 
-    def example(self, names: Iterable[str]) -> Values:
-        """One reachable value of some chain nodes, and of what else is needed for what follows from them."""
-        wanted = dict.fromkeys(names)
-        for link in self.below(wanted):
-            wanted |= dict.fromkeys(self._ancestors(link))
-        state: Values = dict(self.known)
-        for name in wanted:
-            rows = np.asarray(self.model.probe[name])
-            state[name] = rows.reshape((-1, *self.model[name].value_shape))[:1]
-        for link in self.links:
-            if all(p in state for p in self.model[link].parents):
-                state[link], _ = self.model.evaluate(link, state)
-        return state
-
-    def _ancestors(self, link: str) -> Iterable[str]:
-        """Chain nodes that a deterministic node is computed from."""
-        todo, seen = [link], {link}
-        while todo:
-            for parent in self.model[todo.pop()].parents:
-                if parent in seen or self.is_known(parent):
-                    continue
-                seen.add(parent)
-                if self.model[parent].is_stochastic:
-                    yield parent
-                else:
-                    todo.append(parent)
+    @property
+    def first_state(self) -> Values:
+        """The first of the reachable values, shape ``(1, *plates, *event)``."""
+        assert self.states is not None
+        return {n: v if self.is_known(n) else v[:1] for n, v in self.states.items()}
 
     def terms_of(self, names: Iterable[str]) -> tuple[Term, ...]:
         """The terms that some chain nodes enter, directly or through deterministic nodes."""
@@ -355,7 +337,7 @@ class Target:
 
 
 def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
-    """Chain, forward nodes, terms and constants of a posed problem.
+    """Chain, forward nodes, terms and constants of a posed problem, found once.
 
     Parameters
     ----------
@@ -363,6 +345,17 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
         Nodes that belong to the chain even where nothing observed depends on them; so do those whose
         density has no sampler.
     """
+    kept: dict[frozenset[str], Target] = problem.cache.setdefault("targets", {})
+    key = frozenset(also)
+    if key not in kept:
+        kept[key] = _target(problem, key)
+    return kept[key]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _target(problem: Problem, also: frozenset[str]) -> Target:
     model, observed = problem.model, problem.observed
     known: Values = dict(problem.inputs)
     varying: set[str] = set()
@@ -382,7 +375,7 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
         else:
             varying.add(name)
     unsampled = {n for n in varying if model[n].is_stochastic and model[n].unsampled}
-    wanted = _ancestors(model, observed, varying, unsampled | set(also))
+    wanted = _ancestors(model, observed, varying, unsampled | also)
     chain = tuple(
         n for n, node in model.nodes.items() if n in wanted and n in varying and node.is_stochastic
     )
@@ -398,9 +391,6 @@ def target_of(problem: Problem, also: Iterable[str] = ()) -> Target:
         if name in observed:  # its term reads what was seen; what is missing is masked
             known[name] = observed[name].value
     return Target(problem, chain, forward, known, terms, links)
-
-
-# ---- private ------------------------------------------------------------------------------------
 
 
 def _shown(name: str, value: np.ndarray) -> str:

@@ -14,7 +14,7 @@ import pytest
 from scipy import stats
 
 import bayesmc as bmc
-from bayesmc.engines.mcmc import gibbs_plan
+from bayesmc.engines.mcmc import gibbs
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.testing import session
 
@@ -133,7 +133,7 @@ def test_without_joint_moves_they_do_not(
     build: Callable[[], Question], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The negative control; and what never moved is not held for known."""
-    monkeypatch.setattr(gibbs_plan, "redrawn_kernels", lambda *_: [])
+    monkeypatch.setattr(gibbs, "redrawn_kernels", lambda *_: [])
     off, error = answered(build, engine=QUICK)
     assert error.max() > 0.2 and (off < 4.5).all()
 

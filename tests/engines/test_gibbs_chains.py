@@ -16,7 +16,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.diagnostics import chain_statistic
-from bayesmc.engines.mcmc import gibbs_plan
+from bayesmc.engines.mcmc import gibbs
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.testing import session
 from bayesmc.testing.posteriors.matching import assert_matches
@@ -156,7 +156,7 @@ def test_parameters_mix(name: str) -> None:
 def test_single_sites_mix_far_worse(monkeypatch: pytest.MonkeyPatch) -> None:
     """Blocks had 93 to 293 effective draws at six seeds, and single sites 8 to 30 % of that."""
     block = min(v.min() for v in learnt("noisy", 100, FEW)[0].values())
-    monkeypatch.setattr(gibbs_plan, "forest_blocks", lambda *_: [])
+    monkeypatch.setattr(gibbs, "forest_blocks", lambda *_: [])
     alone = min(v.min() for v in learnt("noisy", 100, FEW)[0].values())
     assert block > SHARE * 600 and alone < 0.5 * block
 

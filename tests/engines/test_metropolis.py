@@ -16,8 +16,12 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.metropolis import MetropolisHastings, MetropolisSampler
-from bayesmc.engines.mcmc.metropolis_plan import LARGEST_BLOCK, plan_of
+from bayesmc.engines.mcmc.metropolis import (
+    LARGEST_BLOCK,
+    MetropolisHastings,
+    MetropolisSampler,
+    plan_of,
+)
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.errors import (
     BroadcastError,

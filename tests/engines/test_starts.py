@@ -11,7 +11,7 @@ from scipy.special import expit
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import (
     EvidenceError,

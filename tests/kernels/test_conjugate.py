@@ -14,10 +14,11 @@ import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import DensityError, UnsupportedError
-from bayesmc.expression import elementwise
+from bayesmc.expression import as_expression, elementwise
 from bayesmc.kernels import conjugate_naturals
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel, full_conditional
 from bayesmc.kernels.conjugate_families import MvNormalConditional, NormalConditional, RootOf
+from bayesmc.kernels.vector_draws import NormalDraw
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values, target_of
@@ -725,10 +726,14 @@ def test_quick_draws_are_those_of_the_distribution() -> None:
     """Mean and Cholesky factor of draws that skip the distribution's checks, read off given noise."""
     precision = np.linalg.inv(COV3)
     linear = np.array([1.0, -2.0, 0.5])
-    for kind, naturals, d in ((NormalConditional(), (np.array([2.0]), np.array([-2.0])), ()),
-                              (MvNormalConditional(), (precision[None], linear[None]), (3,))):  # fmt: skip
+    vectors = as_expression(precision), as_expression(linear)
+    for kind, naturals, made, d in (
+        (NormalConditional(), (np.array([2.0]), np.array([-2.0])),
+         NormalDraw(as_expression(4.0), as_expression(2.0)), ()),
+        (MvNormalConditional(), (precision[None], linear[None]), NormalDraw(*vectors), (3,)),
+    ):  # fmt: skip
         posterior = kind.posterior(naturals, None)
-        draw = lambda noise: kind.draw(naturals, None, _Given(noise), (1,))  # noqa: B023, E731
+        draw = lambda noise: made({}, _Given(noise), 1)  # noqa: B023, E731
         mean = draw(np.zeros(d))
         np.testing.assert_allclose(mean, posterior.mean, rtol=1e-12)
         units = np.eye(3) if d else np.ones((1, *d))

@@ -11,7 +11,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels import conjugate_children
@@ -253,17 +253,17 @@ def test_the_wrong_neighbours_are_noticed(monkeypatch: pytest.MonkeyPatch) -> No
     """Negative control: values of other slices in their places, and the numbers of one for all."""
     target, _ = posed(autoregression)
     values = state(target, 1)
-    right = conjugate_children.stacked_rows
+    right = conjugate_children.like_roots
 
-    def wrong(rows: Any) -> Any:
-        found = right(rows)
+    def wrong(terms: Any) -> Any:
+        found = right(terms)
         first, *rest = found.leaves
         mixed = [(*a[:-1], b[-1]) for a, b in zip(rest, reversed(rest), strict=True)]
         same = {k: np.broadcast_to(v[:1], v.shape) for k, v in found.constants.items()}
         return dataclasses.replace(found, leaves=(first, *mixed), constants=same)
 
     kernels = {name: kernel_of(target, name) for name in ("phi", "tau", "bias")}
-    monkeypatch.setattr(conjugate_children, "stacked_rows", wrong)
+    monkeypatch.setattr(conjugate_children, "like_roots", wrong)
     for name, kernel in kernels.items():
         assert worst_difference(kernel, kernel_of(target, name), values) > 1e-3, name
 

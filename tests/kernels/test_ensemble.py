@@ -18,7 +18,7 @@ from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.kernels.adaptation import Steps
 from bayesmc.kernels.densities import Block
 from bayesmc.kernels.ensemble import BlockWalk, stragglers
-from bayesmc.kernels.parts import parts_of
+from bayesmc.kernels.random_walk import parts_of
 from bayesmc.network import pose
 from bayesmc.robotics import AndAngle, PoseNormal
 from bayesmc.structure.target import Target, target_of

@@ -13,11 +13,11 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.errors import ConvergenceWarning, ParameterError, ZeroProbabilityError
 from bayesmc.kernels.forest import Forest
 from bayesmc.kernels.forest_block import ForestBlock
-from bayesmc.kernels.forest_sites import SiteForest
+from bayesmc.kernels.lattice import SiteForest
 from bayesmc.network import pose
 from bayesmc.structure.target import Target
 from bayesmc.testing import invariant, session
@@ -366,6 +366,22 @@ def sites(pairs: list[tuple[int, int]]) -> bmc.FactorGraph:
     graph.factor(lambda a, b: 1.0 * (a > b), scope=("s", "s"), index=(first[:1], second[:1]))
     graph.factor(lambda a: 0.3 * a, scope=("s",), index=([1],))
     return graph
+
+
+def test_tables_of_one_shape_are_not_of_a_kind() -> None:
+    """Nodes of different tables move fast one by one, as many as there are; those of one table as one."""
+
+    def kernels(alike: bool) -> set[str]:
+        net = bmc.BayesNet()
+        net.table("s[0]", probs=[0.5, 0.5])
+        for t in range(1, 12):
+            stay = 0.9 if alike else 0.9 - 0.01 * t
+            rows = [[stay, 1 - stay], [1 - stay, stay]]
+            net.table(f"s[{t}]", parents=[f"s[{t - 1}]"], probs=rows)
+        return {type(k).__name__ for k in plan_of(pose(net, {"s[11]": 1})).kernels}
+
+    assert kernels(True) == {"ForestBlock"}
+    assert kernels(False) == {"TableSweep"}
 
 
 def test_sites_of_a_factor_graph() -> None:

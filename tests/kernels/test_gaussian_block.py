@@ -15,12 +15,11 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.errors import DensityError
-from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_order, gaussian_rows
-from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks
-from bayesmc.kernels.gaussian_layout import solved
-from bayesmc.kernels.gaussian_order import Order
+from bayesmc.kernels import gaussian_block, gaussian_layout, gaussian_rows
+from bayesmc.kernels.gaussian_block import GaussianBlock, gaussian_blocks, solved
+from bayesmc.kernels.gaussian_layout import Order
 from bayesmc.linalg.patterns import Band, Blocks, Pattern
 from bayesmc.network import pose
 from bayesmc.network.expressions import Opaque
@@ -362,9 +361,9 @@ def replaced_data(target: Target, block: GaussianBlock, values: Values) -> Value
 def each_order(block: GaussianBlock) -> list[Order]:
     """All ways in which the block may be eliminated."""
     components = block.layout.components
-    local = gaussian_order._local(components)
+    local = gaussian_layout._local(components)
     dense = Order(np.arange(components.size), Blocks(0, 0))
-    return [dense, *([local] if local else []), *gaussian_order._bands(components)]
+    return [dense, *([local] if local else []), *gaussian_layout._bands(components)]
 
 
 @pytest.mark.parametrize("name", NETS)
@@ -601,7 +600,7 @@ def test_what_all_slices_share_is_no_part_of_the_band() -> None:
 
 def test_small_blocks_stay_dense_and_wide_ones_are_cut(monkeypatch: pytest.MonkeyPatch) -> None:
     target, _ = posed(lagged)
-    monkeypatch.setattr(gaussian_order, "_SMALL", 100)
+    monkeypatch.setattr(gaussian_layout, "_SMALL", 100)
     (block,) = gaussian_blocks(target, target.chain)
     assert block.layout.cut == 0
     monkeypatch.setattr(gaussian_block, "MAX_DENSE", 15)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.kernels import gaussian_layout
+from bayesmc.kernels import gaussian_block
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.conjugate_children import children_of
@@ -296,8 +296,8 @@ class _Wide(GaussianBlock):
     def step(self, values: Any, memory: Any, rng: Any, warmup: bool) -> Any:
         sums = self._summed(values, len(values[self.names[0]]))
         noise = rng.standard_normal(sums.linear.shape)
-        mean, *_ = gaussian_layout.solved(self.layout, sums, None)
-        draw, *_ = gaussian_layout.solved(self.layout, sums, noise)
+        mean, *_ = gaussian_block.solved(self.layout, sums, None)
+        draw, *_ = gaussian_block.solved(self.layout, sums, noise)
         return self.layout.split(mean + 2.0 * (draw - mean), values), memory
 
 
@@ -354,7 +354,7 @@ class _NoDeterminant(GaussianBlock):
     def log_integral(self, values: Any, count: int) -> np.ndarray:
         sums = self._summed(values, count)
         return sums.constant + 0.5 * np.vecdot(
-            sums.linear, gaussian_layout.solved(self.layout, sums, None)[0]
+            sums.linear, gaussian_block.solved(self.layout, sums, None)[0]
         )
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,9 +12,8 @@ from scipy import stats
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import UnsupportedError, ZeroProbabilityError
-from bayesmc.kernels.conditionals import FiniteTerms
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
-from bayesmc.kernels.joint_states import JointStates, RowSums
+from bayesmc.kernels.enumerate import FiniteTerms, JointStates
 from bayesmc.kernels.tables import TableSweep, joint_states
 from bayesmc.network import BayesNet, pose
 from bayesmc.structure.target import Target, Values, target_of
@@ -167,17 +167,15 @@ def test_what_is_called_connected_is() -> None:
     assert flagged <= connected // 20
 
 
-@pytest.mark.parametrize("kind", [TableSweep, JointStates, RowSums])
-def test_draws_follow_the_joint_law(kind: type) -> None:
+@pytest.mark.parametrize("kind", [TableSweep, JointStates, "row sums"])
+def test_draws_follow_the_joint_law(kind: Any) -> None:
     target = target_of(pose(parity(), {"odd": 1}))
     kernel = joint_states(target, ("x", "y"))
     assert isinstance(kernel, TableSweep)
     if kind is JointStates:
         kernel = JointStates(target, ("x", "y"))
-    if kind is RowSums:
-        around = FiniteTerms(target).around(("x", "y"))
-        assert around is not None
-        kernel = RowSums(target, ("x", "y"), around)
+    if kind == "row sums":
+        kernel = JointStates(target, ("x", "y"), FiniteTerms(target))
     everyone, probs, cards = everything(target)
     chains = 100_000
     start = {"x": np.ones(chains, dtype=np.uint8), "y": np.zeros(chains, dtype=np.uint8)}
@@ -233,7 +231,7 @@ def test_blocks_with_large_blankets_sum_rows() -> None:
         net.table(f"y{k}", ["b", f"p{k}", "a"], rng.dirichlet(np.ones(2), size=(2, 5, 3)))
     target = target_of(pose(net, {f"y{k}": k % 2 for k in range(7)}))
     kernel = joint_states(target, ("b", "a"))
-    assert isinstance(kernel, RowSums)
+    assert isinstance(kernel, JointStates) and not kernel.evaluated
     values: Values = {**target.known}
     for name in target.chain:
         domain = target.model[name].domain

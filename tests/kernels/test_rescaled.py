@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.mcmc import gibbs_plan
+from bayesmc.engines.mcmc import gibbs
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.rescaled import Rescaled, rescaled_kernels
 from bayesmc.network import pose
@@ -151,7 +151,7 @@ def test_random_effects_mix(monkeypatch: pytest.MonkeyPatch) -> None:
         rescaled_kernels,
         lambda target, slow: [],
     ):  # the second is the negative control
-        monkeypatch.setattr(gibbs_plan, "rescaled_kernels", kernels)
+        monkeypatch.setattr(gibbs, "rescaled_kernels", kernels)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             found = bmc.infer(net, evidence, engine=engine, rng=session.seed())

@@ -13,8 +13,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.errors import BayesmcError, ZeroProbabilityError
 from bayesmc.kernels import tables
-from bayesmc.kernels.conditionals import FiniteTerms, conditional_of
-from bayesmc.kernels.joint_states import RowSums
+from bayesmc.kernels.enumerate import FiniteTerms, JointStates, conditional_of
 from bayesmc.kernels.tables import TableSweep, table_kernel, table_kernels
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
@@ -149,7 +148,7 @@ def test_row_sums_of_random_plated_nets_equal_enumeration() -> None:
             around = terms.around((name,))
             if around is None or any(c.relation.kind != "aligned" for c in blanket.children):
                 continue
-            kernel = RowSums(target, (name,), around)
+            kernel = JointStates(target, (name,), terms)
             compared += 1
             plated += bool(blanket.node.plates)
             free = target.free_elements(name)
@@ -315,14 +314,14 @@ def test_what_is_seen_of_a_plate_stays() -> None:
     target = target_of(pose(net, {"z": seen, "w": np.arange(12).reshape(4, 3) % 2}))
     values = started(target, 50, 0)
     kernel = table_kernel(Blanket(target, "z"))
-    assert isinstance(kernel, RowSums)
+    assert isinstance(kernel, JointStates) and not kernel.evaluated
     new, _ = kernel.step(values, {}, np.random.default_rng(0), False)
     kept = ~np.ma.getmaskarray(seen)
     assert (new["z"][:, kept] == seen.data[kept]).all()
     assert (new["z"][:, ~kept] != values["z"][:, ~kept]).any()
     # the one above all of the plate, by sums over its elements
     group = table_kernel(Blanket(target, "g"))
-    assert isinstance(group, RowSums)
+    assert isinstance(group, JointStates) and not group.evaluated
     found, expected = normalised(group.log_density(values)), brute(Blanket(target, "g"), values)
     np.testing.assert_allclose(found, expected, atol=1e-9)
 
@@ -361,7 +360,7 @@ def test_large_blankets_are_summed() -> None:
         net.table(f"y{k}", ["x", f"p{k}"], rng.dirichlet(np.ones(2), size=(3, 5)))
     target = target_of(pose(net, {f"y{k}": k % 2 for k in range(7)}))
     kernel = table_kernel(Blanket(target, "x"))
-    assert isinstance(kernel, RowSums)
+    assert isinstance(kernel, JointStates) and not kernel.evaluated
     values = started(target, 20, 1)
     expected = brute(Blanket(target, "x"), values)
     np.testing.assert_allclose(normalised(kernel.log_density(values)), expected, atol=1e-9)

@@ -314,7 +314,7 @@ MUTANTS = [
     ),
     Mutant(
         "inverse-Wishart degrees of freedom are off by d",
-        (Edit("bayesmc.kernels.conjugate_priors:naturals_of",
+        (Edit("bayesmc.kernels.conjugate_terms:naturals_of",
               "return [reshape(df, (count,)), ", "return [add(reshape(df, (count,)), 2.0), "),),
         ranks(lambda: closed_form, covariance, 700),
         "rank_test, 700 replications",
@@ -365,7 +365,7 @@ MUTANTS = [
     ),
     Mutant(
         "coupled sites are updated in parallel",
-        (Edit("bayesmc.structure.colouring:colours",
+        (Edit("bayesmc.structure.blanket:colours",
               "found = _two(count, both)", "found = np.zeros(count, dtype=np.intp)"),),
         lambda seed: invariant(bmc.Gibbs(), ring(), alpha=ALPHA, rng=seed),
         "invariant (exact)",

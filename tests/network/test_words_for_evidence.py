@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.mcmc import start_faults
+from bayesmc.engines.mcmc import starts
 from bayesmc.errors import EvidenceError, ModelError, ParameterError, UnsupportedError
 
 #: runs are short
@@ -50,7 +50,7 @@ def test_evidence_that_no_parents_allow_is_named_at_once(
     def search(*_: Any, **__: Any) -> None:
         raise AssertionError("a start was looked for")
 
-    monkeypatch.setattr(start_faults, "refuse_impossible", search)
+    monkeypatch.setattr(starts, "refuse_impossible", search)
     net, value, says = IMPOSSIBLE[name]
     for engine in (None, bmc.Gibbs(), bmc.LikelihoodWeighting(1000)):
         with pytest.raises(EvidenceError, match=f"'k'.*{says}"):

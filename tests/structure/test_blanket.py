@@ -9,8 +9,7 @@ import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.network import pose
-from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.colouring import colours
+from bayesmc.structure.blanket import Blanket, colours
 from bayesmc.structure.target import target_of
 
 CHAINS = 3

@@ -11,7 +11,7 @@ from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.forest_block import ForestBlock
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.joint_values import FEWEST, JointValues
+from bayesmc.structure.programs import FEWEST, JointValues
 from bayesmc.structure.target import Target, target_of
 
 STEPS = FEWEST + 4

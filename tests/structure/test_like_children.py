@@ -15,9 +15,8 @@ from bayesmc.errors import DensityError
 from bayesmc.kernels.slice import Slice
 from bayesmc.network import pose
 from bayesmc.structure.blanket import Blanket
-from bayesmc.structure.like_children import GroupedBlanket, with_like_children
 from bayesmc.structure.like_functions import Slots
-from bayesmc.structure.like_terms import LikeTerms, TermSum
+from bayesmc.structure.like_terms import GroupedBlanket, LikeTerms, TermSum, with_like_children
 from bayesmc.structure.target import Target, Values, target_of
 from tests.structure import test_stacked
 from tests.structure.test_stacked import CHAINS, DATA, a_state

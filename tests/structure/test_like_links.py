@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,7 @@ import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError
 from bayesmc.network import pose
-from bayesmc.structure.like_functions import Slots
-from bayesmc.structure.like_links import LikeLinks, LinkSteps
+from bayesmc.structure.like_functions import LikeLinks, LinkSteps, Slots
 from bayesmc.structure.target import Target, Values, target_of
 from tests.structure.test_stacked import CHAINS, DATA, a_state
 
@@ -176,7 +176,7 @@ def test_the_wrong_neighbours_are_noticed() -> None:
     turned = {**sources, "x[0]": (*sources["x[0]"][1:], "x[0]")}
     for wrong in (
         {"slots": Slots(target, turned, 7)},
-        {"function": None},
+        {"evaluate": functools.partial(target.model.evaluate, group.names[0])},
     ):
         right = dict(vars(group))
         vars(group).update(wrong)

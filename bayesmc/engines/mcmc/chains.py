@@ -1,91 +1,43 @@
-"""The loop of all engines that run Markov chains: warmup, draws, what is kept, interruption, going on.
+"""Engines that run Markov chains: options, where the user wants chains to start, and what is warned of.
 
-An engine supplies a sampler, which moves all chains by one sweep; what a sweep does is not known here.
-Whether the chains have mixed is judged in ``convergence``.
+An engine supplies a sampler, which the ``loop`` asks for one sweep of all chains after the other. Whether
+these have mixed is judged in ``convergence``.
 """
 
 from __future__ import annotations
 
-import copy
-import signal
-import threading
 import warnings
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from dataclasses import fields
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.base import Engine
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing
-from bayesmc.engines.mcmc.funnels import missed_ends
+from bayesmc.engines.mcmc.loop import Kept, Loop, Patience, Sampler
+from bayesmc.engines.mcmc.missed import missed_ends, never_left
 from bayesmc.engines.mcmc.question import difference
-from bayesmc.engines.mcmc.start_values import frozen_start, read_start
-from bayesmc.engines.mcmc.unvisited import never_left
+from bayesmc.engines.proposal import check_targets
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
 from bayesmc.errors import (
-    BayesmcError,
     ConvergenceWarning,
-    DensityError,
+    EvidenceError,
     InterruptWarning,
-    ParameterError,
     ReducibleWarning,
+    ShapeError,
     UnsupportedError,
 )
-from bayesmc.network import Model, Problem
+from bayesmc.network import CompiledNode, Problem
+from bayesmc.network.evidence import store
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
-from bayesmc.results.sums import stored_dtype
+from bayesmc.shapes import first_index
 
-#: what a sampler moves: arrays, numbers and nested dicts of them, picklable
-State = Mapping[str, Any]
 #: share of accepted proposals outside of which a random walk is ill adapted
 _BAND = (0.1, 0.9)
-
-
-class Sampler(Protocol):
-    """Moves all chains of one problem at once; it holds neither state nor random numbers.
-
-    Notes
-    -----
-    Four attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
-    members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
-    ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
-    ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
-    where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
-    A method is, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them.
-
-    Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
-    which is exact if ``step`` writes into no array of the state it is given.
-    """
-
-    def start(self, rng: np.random.Generator, chains: int) -> State:
-        """Starting points of all chains."""
-        ...
-
-    def step(self, state: State, rng: np.random.Generator, warmup: bool) -> State:
-        """One sweep. Arrays that ``values`` handed out are never written to."""
-        ...
-
-    def end_warmup(self, state: State) -> State:
-        """The state with its adaptation frozen."""
-        ...
-
-    def values(self, state: State, rng: np.random.Generator) -> Mapping[str, np.ndarray]:
-        """Stored values of all nodes, ``(chain, *plates, *event)``, without chains where constant.
-
-        It is called once per kept draw, and draws what is not part of the chain. Inputs and what is
-        wholly observed may be left out.
-        """
-        ...
-
-    def acceptance(self, state: State) -> Mapping[str, np.ndarray]:
-        """Block -> share of proposals accepted since the warmup, shape (chain,)."""
-        ...
 
 
 class ChainEngine(Engine):
@@ -158,8 +110,9 @@ class ChainEngine(Engine):
             _warn_of_ties(type(self).__name__, tied)
         try:
             held = self._held(problem, sampler, names, summed, resume)
-            loop = _Loop(sampler, self, stream(seed, Purpose.INFER), problem)
-            with Progress(self._sweeps(resume), self.label, progress) as bar, _Patience() as stop:
+            rng, lengths = stream(seed, Purpose.INFER), (self.chains, self.warmup, self.thinning)
+            loop = Loop(sampler, rng, problem, *lengths)
+            with Progress(self._sweeps(resume), self.label, progress) as bar, Patience() as stop:
                 state = loop.begun(bar, resume, stop)
                 finished = loop.draw(state, held, self.draws, bar, stop)
         except MemoryError as error:
@@ -178,14 +131,14 @@ class ChainEngine(Engine):
         names: tuple[str, ...],
         summed: bool,
         resume: Posterior | None,
-    ) -> _Kept | RunningChains:
+    ) -> Kept | RunningChains:
         """Where draws go: new, or with those of an earlier run in it."""
         if isinstance(resume, ChainsSums):
             return resume._running.with_model(problem.model)
         if summed:
             ensemble = getattr(sampler, "ensemble", 1)
             return RunningChains(problem.model, names, self.chains, ensemble)
-        kept = _Kept(problem.model, names, self.chains, self.draws)
+        kept = Kept(problem.model, names, self.chains, self.draws)
         if isinstance(resume, ChainsPosterior):
             kept.begin_with(resume._stored, resume._shape[1])
         return kept
@@ -194,7 +147,7 @@ class ChainEngine(Engine):
         self,
         problem: Problem,
         sampler: Sampler,
-        held: _Kept | RunningChains,
+        held: Kept | RunningChains,
         checkpoint: Checkpoint,
     ) -> ChainsPosterior | ChainsSums:
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}
@@ -264,10 +217,54 @@ class ChainEngine(Engine):
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 
 
-def known_values(problem: Problem) -> dict[str, np.ndarray]:
-    """Stored values that no chain moves: inputs, and nodes that are wholly observed."""
-    seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
-    return {**problem.inputs, **seen}
+def frozen_start(engine: str, start: Any) -> dict[str, Any] | None:
+    """A copy of the option that nobody else changes.
+
+    Raises
+    ------
+    TypeError
+        It is no dict from node to value.
+    """
+    if start is None:
+        return None
+    if not isinstance(start, Mapping) or not all(isinstance(name, str) for name in start):
+        raise TypeError(
+            f"{engine}(start={start!r:.80}): start is a dict from node name to where its chains "
+            "start, such as start={'x': 1.0}"
+        )
+    kept = {}
+    for name, value in start.items():
+        copied = np.array(value)
+        copied.flags.writeable = False
+        kept[name] = copied
+    return kept
+
+
+def read_start(
+    engine: str, problem: Problem, start: Mapping[str, Any], chains: int
+) -> dict[str, np.ndarray]:
+    """Stored values at which chains start.
+
+    Parameters
+    ----------
+    start : dict
+        Node -> value, shape ``(*plates, *event)``, or ``(chains, *plates, *event)`` with one for each chain.
+
+    Returns
+    -------
+    dict
+        Node -> stored values, shape ``(chains, *plates, *event)``.
+
+    Raises
+    ------
+    UnknownNodeError, ModelError, EvidenceError, ShapeError
+        A name that is no hidden node, or a value that it cannot have.
+    """
+    found = {}
+    for name, value in start.items():
+        check_targets(engine, problem, name, "start")
+        found[name] = _read(engine, problem, problem.model[name], value, chains)
+    return found
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -286,206 +283,42 @@ def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
     )
 
 
-class _Loop:
-    """Sweeps of one run, and the last point that it can return to."""
-
-    last: Checkpoint
-
-    def __init__(
-        self,
-        sampler: Sampler,
-        engine: ChainEngine,
-        rng: np.random.Generator,
-        problem: Problem,
-    ) -> None:
-        self.sampler = sampler
-        self.engine = engine
-        self.rng = rng
-        self.observed = problem.observed
-        self.known = known_values(problem)
-        self.sweep = 0
-        self.phase = ""
-
-    def begun(self, bar: Progress, resume: Posterior | None, stop: _Patience) -> State:
-        """The state from which draws are made: after the warmup, or where an earlier run ended."""
-        if isinstance(resume, (ChainsPosterior, ChainsSums)):
-            assert resume.checkpoint is not None
-            self.last = resume.checkpoint
-            self.sweep = resume._chains_and_draws[1] * self.engine.thinning
-            self.rng.bit_generator.state = self.last.generator
-            # a sampler may write into its state, and the earlier posterior stays as it is
-            return copy.deepcopy(self.last.state)
-        with marking_invalid(), np.errstate(all="ignore"):
-            try:
-                state = self.sampler.start(self.rng, self.engine.chains)
-            except (DensityError, ParameterError) as error:
-                error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
-                raise
-            self.phase = " (warmup)"
-            for _ in range(self.engine.warmup):
-                stop.check()
-                state = self._stepped(state, True)
-                bar.advance()
-            self.sweep, self.phase = 0, ""
-            return self.sampler.end_warmup(state)
-
-    def draw(
-        self,
-        state: State,
-        held: _Kept | RunningChains,
-        draws: int,
-        bar: Progress,
-        stop: _Patience,
-    ) -> bool:
-        """Make and keep draws; whether it was left to finish."""
-        thinning, known, wanted = self.engine.thinning, self.known, held.draws + draws
-        point: tuple[State, Mapping[str, Any], Mapping[str, np.ndarray]] | None = None
-        try:
-            with marking_invalid(), np.errstate(all="ignore"):
-                for _ in range(draws):
-                    stop.check()
-                    for _ in range(thinning):
-                        state = self._stepped(state, False)
-                        bar.advance()
-                    values = self._values(state)
-                    if known:
-                        values = {**known, **values}
-                    held.add(values)
-                    point = state, self.rng.bit_generator.state, values
-        except KeyboardInterrupt:
-            if not held.draws:
-                raise
-        if point is not None:
-            self.last = Checkpoint(*point, self.observed)
-        return held.draws == wanted
-
-    def _stepped(self, state: State, warmup: bool) -> State:
-        self.sweep += 1
-        try:
-            return self.sampler.step(state, self.rng, warmup)
-        except BayesmcError as error:
-            self._place(error)
-            raise
-
-    def _values(self, state: State) -> Mapping[str, np.ndarray]:
-        try:
-            return self.sampler.values(state, self.rng)
-        except BayesmcError as error:
-            self._place(error)
-            raise
-
-    def _place(self, error: BayesmcError) -> None:
-        """Say in the message when it happened."""
-        error.args = (f"{error}, at iteration {self.sweep}{self.phase}", *error.args[1:])
+def _read(engine: str, problem: Problem, node: CompiledNode, value: Any, chains: int) -> np.ndarray:
+    what = f"{engine}: start for {node.name!r}"
+    shape = np.shape(value)
+    wanted = node.value_shape
+    if shape not in (wanted, (chains, *wanted)):
+        raise ShapeError(
+            f"{what} has shape {shape}; give {wanted} for all chains (plates {node.plates}, then one value's "
+            f"shape), or {(chains, *wanted)} for each of the {chains}"
+        )
+    try:
+        stored = store(node, value)
+    except EvidenceError as error:
+        raise EvidenceError(f"{what}: {error}") from None
+    seen = problem.observed.get(node.name)
+    hidden = np.ones(node.plate_shape, dtype=bool)
+    if seen is not None and seen.mask is not None:
+        hidden = ~seen.mask
+    _check(what, node, stored, hidden)
+    return np.array(np.broadcast_to(stored, (chains, *wanted)))
 
 
-class _Kept:
-    """Draws of some nodes, put in place one by one.
-
-    Attributes
-    ----------
-    stored : dict
-        Node -> stored values, shape ``(chain, draw, *plates, *event)``; ``(1, 1, ...)`` where constant.
-    draws : int
-        Draws in place so far.
-    """
-
-    def __init__(self, model: Model, names: Sequence[str], chains: int, draws: int) -> None:
-        self.model = model
-        self.names = names
-        self.chains = chains
-        self.room = draws
-        self.stored: dict[str, np.ndarray] = {}
-        self.draws = 0
-        self._moving: list[tuple[str, np.ndarray]] = []
-        self._together: list[tuple[list[str], np.ndarray]] = []
-        self._earlier: Mapping[str, np.ndarray] = {}
-
-    def begin_with(self, stored: Mapping[str, np.ndarray], draws: int) -> None:
-        """Put earlier draws before those that there is room for."""
-        self._earlier = stored
-        self.room += draws
-        self.draws = draws
-
-    def add(self, values: Mapping[str, np.ndarray]) -> None:
-        """Take in one draw of every chain."""
-        if not self.stored:
-            self._make_room(values)
-        at = self.draws
-        for name, array in self._moving:
-            array[:, at] = values[name]
-        for names, rows in self._together:
-            row = [values[n] for n in names]
-            try:
-                rows[..., at] = np.concatenate(row).reshape(rows.shape[:2])
-            except ValueError:  # some of them come without chains this time
-                for array, value in zip(rows, row, strict=True):
-                    array[:, at] = value
-        self.draws = at + 1
-
-    def frozen(self) -> dict[str, np.ndarray]:
-        """The draws in place, read-only."""
-        if not self.stored:
-            return dict(self._earlier)
-        moving = {n for n, _ in self._moving} | {n for names, _ in self._together for n in names}
-        for name in moving if self.draws < self.room else ():
-            self.stored[name] = self.stored[name][:, : self.draws].copy()
-        for array in self.stored.values():
-            array.flags.writeable = False
-        return self.stored
-
-    def _make_room(self, values: Mapping[str, np.ndarray]) -> None:
-        """Decide from the first draw what is constant; single numbers of a type are kept in one array."""
-        alike: dict[np.dtype[Any], list[str]] = {}
-        for name in self.names:
-            node, value = self.model[name], values[name]
-            dtype = stored_dtype(node, value)
-            if value.ndim == len(node.value_shape):
-                self.stored[name] = np.array(value, dtype=dtype)[None, None]
-                continue
-            self.stored[name] = np.empty(0)  # in its place
-            if value.shape == (self.chains,) and value.dtype == dtype:
-                alike.setdefault(dtype, []).append(name)
-                continue
-            self.stored[name] = np.empty((self.chains, self.room, *node.value_shape), dtype)
-            self._moving.append((name, self.stored[name]))
-        for dtype, names in alike.items():
-            rows = np.empty((len(names), self.chains, self.room), dtype)
-            self.stored.update(zip(names, rows, strict=True))
-            self._together.append((names, rows))
-        if self._earlier:
-            for name, array in self.stored.items():
-                if array.shape[1:2] == (self.room,):
-                    array[:, : self.draws] = self._earlier[name]
-
-
-class _Patience(AbstractContextManager["_Patience"]):
-    """Within it, Ctrl-C waits until it is asked for, so that it cannot cut a sweep; a second one does not.
-
-    Only Python's own handling is put off, which a program that handles the signal itself has replaced.
-    """
-
-    def __init__(self) -> None:
-        self._pressed = False
-        self._own: Callable[..., Any] | None = None
-
-    def check(self) -> None:
-        """Raise what was put off."""
-        if self._pressed:
-            raise KeyboardInterrupt
-
-    def __enter__(self) -> _Patience:
-        main = threading.current_thread() is threading.main_thread()
-        if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._own = signal.default_int_handler
-            signal.signal(signal.SIGINT, self._note)
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._own is not None:
-            signal.signal(signal.SIGINT, self._own)
-
-    def _note(self, number: int, frame: Any) -> None:
-        if self._pressed:
-            raise KeyboardInterrupt
-        self._pressed = True
+def _check(what: str, node: CompiledNode, stored: np.ndarray, hidden: np.ndarray) -> None:
+    """Refuse what is not finite, or outside of a support that does not depend on parents."""
+    event = tuple(range(stored.ndim - len(node.event_shape), stored.ndim))
+    wrong = np.zeros(stored.shape, dtype=bool)
+    if stored.dtype.kind == "f":
+        wrong = ~np.isfinite(stored)
+    support = node.support
+    if node.domain is None and support is not None:
+        inside = np.asarray(
+            support.contains(np.where(wrong, 0.0, stored) if wrong.any() else stored)
+        )
+        wrong = wrong | (np.expand_dims(~inside, event) if inside.ndim < stored.ndim else ~inside)
+    wrong = wrong & np.expand_dims(hidden, tuple(range(hidden.ndim, hidden.ndim + len(event))))
+    if wrong.any():
+        at = first_index(wrong)
+        within = f" ({support.describe()})" if support is not None else ""
+        where = f" at index {at if len(at) > 1 else at[0]}" if at else ""
+        raise EvidenceError(f"{what} is {stored[at]}{where}, which the node cannot be{within}")

@@ -230,16 +230,8 @@ class Climb:
 
     def _evaluated(self, free: Values, rows: int) -> tuple[Values, Scores]:
         """The values of free numbers, and all terms there."""
-        target, model = self.target, self.target.model
-        values: Values = dict(target.known)
-        inside = {*target.chain}
-        for name in model.nodes:
-            if name in inside:
-                values[name] = self._value(name, free, values, rows)
-            elif name in target.links:
-                computed, _ = model.evaluate(name, values)
-                shape = (rows, *model[name].value_shape)
-                values[name] = np.array(np.broadcast_to(computed, shape))
+        target = self.target
+        values = in_order(target, rows, lambda node, above: self._value(node, free, above, rows))
         lost, far, log = np.zeros(rows, dtype=int), np.zeros(rows), np.zeros(rows)
         for term in target.terms.values():
             part = row_logs(term, values, rows).reshape(rows, -1)
@@ -251,16 +243,13 @@ class Climb:
         kept = {n: values[n] for n in (*target.chain, *target.links)}
         return kept, Scores(lost, far, log)
 
-    def _value(self, name: str, free: Values, values: Values, rows: int) -> np.ndarray:
-        node = self.target.model[name]
-        if name in self.given:
-            fixed = self.given[name]
-            value = np.repeat(fixed, rows // len(fixed), axis=0)
-        elif self.is_free[name]:
-            value = self._constrained(node, free[name], values)
-        else:
-            value = free[name]
-        return with_seen(self.target, node, value)
+    def _value(self, node: CompiledNode, free: Values, values: Values, rows: int) -> np.ndarray:
+        if node.name in self.given:
+            fixed = self.given[node.name]
+            return np.repeat(fixed, rows // len(fixed), axis=0)
+        if self.is_free[node.name]:
+            return self._constrained(node, free[node.name], values)
+        return free[node.name]
 
     def _constrained(self, node: CompiledNode, u: np.ndarray, values: Values) -> np.ndarray:
         dist = self._own(node, values)
@@ -300,7 +289,31 @@ class Climb:
         return u
 
 
-def with_seen(target: Target, node: CompiledNode, value: np.ndarray) -> np.ndarray:
+def in_order(
+    target: Target, rows: int, value: Callable[[CompiledNode, Values], np.ndarray]
+) -> Values:
+    """Values of all nodes, parents first: those of the chain, with what was seen in its place, and links.
+
+    Parameters
+    ----------
+    value : callable
+        From a node of the chain and the values of those before it.
+    """
+    values: Values = dict(target.known)
+    inside, links = set(target.chain), set(target.links)
+    for name, node in target.model.nodes.items():
+        if name in inside:
+            values[name] = _with_seen(target, node, value(node, values))
+        elif name in links:
+            computed, _ = target.model.evaluate(name, values)
+            values[name] = np.array(np.broadcast_to(computed, (rows, *node.value_shape)))
+    return values
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _with_seen(target: Target, node: CompiledNode, value: np.ndarray) -> np.ndarray:
     """Values of a node with what was observed of it put in place."""
     seen = target.seen(node.name)
     if seen is None:
@@ -308,9 +321,6 @@ def with_seen(target: Target, node: CompiledNode, value: np.ndarray) -> np.ndarr
     assert seen.mask is not None
     mask = seen.mask.reshape(seen.mask.shape + (1,) * len(node.event_shape))
     return np.where(mask, seen.value, value)
-
-
-# ---- private ------------------------------------------------------------------------------------
 
 
 def _wide(rows: np.ndarray, like: np.ndarray) -> np.ndarray:

@@ -1,19 +1,52 @@
-"""Gibbs sampling on any net: every node from its full conditional, by the best kernel that fits it."""
+"""Gibbs sampling on any net: every node from its full conditional, by the best kernel that fits it.
+
+Which kernel moves which node, and why, is the table that ``explain`` shows.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
+
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
-from bayesmc.engines.mcmc.gibbs_plan import plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
+from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.errors import UnsupportedError
+from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.collapsed import CollapsedBlock, governing
+from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
+from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
+from bayesmc.kernels.ensemble import BlockWalk
+from bayesmc.kernels.enumerate import Enumerate, FiniteTerms
+from bayesmc.kernels.factor_slice import FactorSlice
+from bayesmc.kernels.forest_block import ForestBlock
+from bayesmc.kernels.forest_search import forest_blocks
+from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
+from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.labels import Labels, label_kernel
+from bayesmc.kernels.lattice import lattice_kernel, site_forest
+from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew
+from bayesmc.kernels.redrawn import redrawn_kernels
+from bayesmc.kernels.rescaled import rescaled_kernels
+from bayesmc.kernels.slice import Slice
+from bayesmc.kernels.stacked import Stacked
+from bayesmc.kernels.tables import joint_states, table_kernel, table_kernels
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
-from bayesmc.structure.target import target_of
+from bayesmc.structure.blanket import Blanket, colours
+from bayesmc.structure.like_terms import with_like_children
+from bayesmc.structure.stacked import FEWEST, Forms, stacks
+from bayesmc.structure.target import Target, target_of
+
+#: components that move together along learnt directions, at most
+_FACTOR_SIZE = 24
+#: supports that are boxes: every number on its own
+_BOXES = ("real", "interval", "circle", "real vector", "product", "integers")
 
 
 @dataclass(frozen=True)
@@ -95,3 +128,301 @@ class Gibbs(ChainEngine):
     def sampler(self, problem: Problem) -> SweepSampler:
         plan = plan_of(problem, self.debug)
         return SweepSampler(plan.target, plan.kernels)
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The kernels of a sweep.
+
+    Attributes
+    ----------
+    kernels : list of Kernel
+        In the order of a sweep: children before parents.
+    refusals : dict
+        Node -> why it has no closed form.
+    constraints : tuple of str
+        Nodes among which zeros in tables may keep a chain from reaching every configuration.
+    """
+
+    problem: Problem
+    target: Target
+    blankets: Mapping[str, Blanket] = field(default_factory=dict)
+    kernels: list[Kernel] = field(default_factory=list)
+    refusals: dict[str, str] = field(default_factory=dict)
+    constraints: tuple[str, ...] = ()
+
+    def table(self) -> list[Treatment]:
+        """What happens to each node."""
+        model = self.problem.model
+        by_name: dict[str, list[Kernel]] = {}
+        for kernel in self.kernels:
+            for name in kernel.names:
+                by_name.setdefault(name, []).append(kernel)
+        number = self._colours()
+        rows = []
+        for name, node in model.nodes.items():
+            plates = ", ".join(f"{p}={model.sizes[p]}" for p in node.plates)
+            if name not in by_name:
+                forward = name in self.target.forward and node.is_stochastic
+                barren = forward and self.target.seen(name) is None
+                why = "nothing observed depends on it" if barren else self._given(name)
+                rows.append(Treatment(name, "forward" if barren else "", why, plates))
+                continue
+            kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
+            why = "; then ".join(dict.fromkeys(w for w in words if w))
+            if name in self.refusals:
+                why += f"{', ' if why else ''}since {self.refusals[name]}"
+            classes = len(self.blankets[name].classes)
+            colour = f"{number[name]}" + (f" (elements: {classes})" if classes > 1 else "")
+            rows.append(Treatment(name, " + ".join(dict.fromkeys(kinds)), why, plates, colour))
+        return rows
+
+    def _given(self, name: str) -> str:
+        """What is said of a node that no kernel moves."""
+        seen = self.target.seen(name)
+        if seen is None:
+            return treatment(self.problem, name)
+        return "observed" if seen.mask is None else "observed in part; the rest is drawn forward"
+
+    def in_short(self) -> str:
+        """How many nodes each kind of kernel moves."""
+        kinds: dict[str, set[str]] = {}
+        for kernel in self.kernels:
+            for name in kernel.names:
+                kinds.setdefault(kernel.words(name)[0], set()).add(name)
+        return ", ".join(f"{kind} ({len(names)})" for kind, names in kinds.items())
+
+    def _colours(self) -> dict[str, int]:
+        """Colour of every chain node: those of one colour share no factor."""
+        chain = self.target.chain
+        place = {n: i for i, n in enumerate(chain)}
+        edges = set()
+        for term in self.target.terms.values():
+            inside = self._entering(term.scope)
+            edges |= {(place[a], place[b]) for a in inside for b in inside if place[a] < place[b]}
+        found = colours(len(chain), np.array(sorted(edges), dtype=np.intp).reshape(-1, 2))
+        return {chain[i]: c for c, members in enumerate(found, 1) for i in members}
+
+    def _entering(self, scope: Sequence[str]) -> set[str]:
+        """Chain nodes that reach a scope, through deterministic nodes as well."""
+        found: set[str] = set()
+        todo = list(scope)
+        while todo:
+            name = todo.pop()
+            if name in self.blankets:
+                found.add(name)
+            elif name in self.target.links:
+                todo += self.problem.model[name].parents
+        return found
+
+
+def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None = None) -> Plan:
+    """The plan for a posed problem, made once.
+
+    Parameters
+    ----------
+    only : collection of str, optional
+        Nodes that the plan is to move; the rest of the chain is moved by others. By default all of it.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.mcmc.gibbs import plan_of
+    >>> from bayesmc.network import pose
+    >>> net = bmc.BayesNet()
+    >>> net.add("rate", bmc.Gamma(1.0, 1.0))
+    >>> net.add("n", lambda rate: bmc.Poisson(rate))
+    >>> net.add("seen", lambda n: bmc.Binomial(n, 0.5))
+    >>> [kernel.names for kernel in plan_of(pose(net, {"seen": 3}), only=("rate",)).kernels]
+    [('rate',)]
+    """
+    key = f"gibbs plan, debug={debug}"
+    if only is not None:
+        key += f", only {sorted(only)}"
+    if key not in problem.cache:
+        problem.cache[key] = _planned(problem, debug, only)
+    return problem.cache[key]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Plan:
+    target = target_of(problem)
+    names = tuple(n for n in target.chain if only is None or n in only)
+    blankets = {name: Blanket(target, name) for name in names}
+    blocks = gaussian_blocks(target, blankets, debug)
+    joined = {n for b in blocks for n in b.names}
+    vectors = [
+        b for b in vector_blocks(target, blankets, joined, debug) if governing(target, b, blankets)
+    ]
+    blocks += vectors
+    joined |= {n for b in vectors for n in b.names}
+    forms = Forms(target)
+    kernels, constraints = _finite(target, blankets, forms, debug)
+    left = [n for n in names if n not in joined and target.model[n].domain is None]
+    conjugate, refusals = _conjugate(blankets, forms, left, debug)
+    joints = [k.joint for k in kernels if isinstance(k, ForestBlock) and k.joint is not None]
+    kernels += [k.reading(joints) if isinstance(k, Conjugate) else k for k in conjugate]
+    kernels += _numbers(target, blankets, forms, list(refusals))
+    for block in blocks:
+        scales = governing(target, block, blankets)
+        alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
+        kernels = [k for k in kernels if k not in alone.values()]
+        kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
+    order = {n: i for i, n in enumerate(target.chain)}
+    # labels of mixtures first: others read the sums that they leave in the state
+    kernels.sort(key=lambda k: (not isinstance(k, Labels), -max(order[n] for n in k.names)))
+    slow = [n for k in kernels if _is_slice(k) for n in k.names]
+    moved = set(names)
+    if slow:
+        kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
+    kernels += redrawn_kernels(target, blankets, kernels)
+    if slow and may_be_drawn_anew(target, names):
+        kernels.append(BlockWalk(target, names, anew=1.0))
+    return Plan(problem, target, blankets, kernels, refusals, constraints)
+
+
+def _conjugate(
+    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool
+) -> tuple[list[Kernel], dict[str, str]]:
+    """Kernels of nodes with a closed form, and why others have none: of like nodes one is asked."""
+    kernels: list[Kernel] = []
+    refusals: dict[str, str] = {}
+    asked: dict[Hashable, str] = {}
+    for name in names:
+        key = forms.key(blankets[name]) if len(names) >= FEWEST else None
+        first = None if key is None else asked.get(key)
+        if first is not None:
+            one, other = forms.of(blankets[first]), forms.of(blankets[name])
+            assert one is not None and other is not None
+            refusals[name] = one.said_of(other, refusals[first])
+            continue
+        kernel = conjugate_kernel(blankets[name], debug)
+        if isinstance(kernel, Kernel):
+            kernels.append(kernel)
+        else:
+            refusals[name] = kernel
+            if key is not None:
+                asked[key] = name
+    return kernels, refusals
+
+
+def _is_slice(kernel: Kernel) -> bool:
+    return isinstance(
+        kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice)
+    )
+
+
+def _finite(
+    target: Target, blankets: Mapping[str, Blanket], forms: Forms, debug: bool
+) -> tuple[list[Kernel], tuple[str, ...]]:
+    """Kernels of the finite nodes that have a blanket, and those that these may leave stuck."""
+    names = [n for n in blankets if target.model[n].domain is not None]
+    if not names:
+        return [], ()
+    kernels: list[Kernel] = []
+    for name in names:
+        mixture = _mixture_label(target, blankets[name], debug)
+        kernels += [] if mixture is None else [mixture]
+    names = [n for n in names if all(n not in k.names for k in kernels)]
+    if not names:
+        return kernels, ()
+    lattices: dict[str, Kernel] = {}
+    for name in names:
+        sites = site_forest(blankets[name]) or lattice_kernel(blankets[name])
+        if sites is not None:
+            lattices[name] = sites
+    kernels += lattices.values()
+    tight = tuple(n for n, k in lattices.items() if getattr(k, "constrained", False))
+    if len(lattices) == len(names):
+        return kernels, tight
+    terms = FiniteTerms(target)
+    forests = forest_blocks(target, blankets, [n for n in names if n not in lattices], terms)
+    kernels += forests
+    joined = [f.names for f in forests]
+    blocks = coupled_blocks(target, terms, joined)
+    blocks = [b for b in blocks if blankets.keys() >= set(b)]
+    drawn = {n for f in forests for n in f.names}
+    wanted = [(n,) for n in names if n not in lattices and n not in drawn] + blocks
+    tabulated, left = table_kernels(target, wanted, terms)
+    kernels += tabulated
+    alone = []
+    for block in left:
+        if len(block) > 1:
+            kernels.append(joint_states(target, block, terms))
+        elif (kernel := table_kernel(blankets[block[0]], terms)) is not None:
+            kernels.append(kernel)
+        elif (labels := label_kernel(blankets[block[0]], debug)) is not None:
+            kernels.append(labels)
+        else:
+            alone.append(block[0])
+    groups, alone = stacks(target, blankets, alone, forms)
+    kernels += [Stacked(group, Enumerate) for group in groups]
+    kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
+    tied = deterministic_constraints(target, [*joined, *blocks], terms)
+    return kernels, (*tight, *(n for n in tied if n in blankets))
+
+
+def _mixture_label(target: Target, blanket: Blanket, debug: bool) -> Labels | None:
+    """The kernel of a label of hidden components that no other finite node governs: nothing else fits it."""
+    above = () if blanket.own is None else target.hidden_above(blanket.own)
+    if any(target.model[n].domain is not None for n in above if n != blanket.name):
+        return None
+    found = label_kernel(blanket, debug)
+    return None if found is None or not all(t.is_asked for t in found.terms) else found
+
+
+def _numbers(
+    target: Target, blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str]
+) -> list[Kernel]:
+    """Kernels of nodes without a closed form that have too many values to try."""
+    kernels: list[Kernel] = []
+    left = []
+    for name in names:
+        if _kind(target, blankets[name]) in _BOXES:
+            left.append(name)
+        elif target.model[name].is_discrete:  # vectors of counts
+            kernels.append(Jump(blankets[name]))
+        else:
+            kernels.append(AdaptiveWalk(blankets[name]))
+    stacked, left = stacks(target, blankets, left, forms)
+    kernels += [Stacked(group, Slice) for group in stacked]
+    for group in _together(target, blankets, left):
+        if len(group) > 1 or target.model[group[0]].event_shape:
+            kernels.append(FactorSlice(target, group))
+            left = [n for n in left if n not in group]
+    return kernels + [Slice(with_like_children(blankets[n])) for n in left]
+
+
+def _kind(target: Target, blanket: Blanket) -> str:
+    """The kind of a node's support, its bounds apart."""
+    support = blanket.node.support
+    if support is None:  # the bounds depend on parents
+        assert blanket.own is not None
+        support = blanket.own.distribution({**target.model.probe, **target.known})[0].support
+    return support.kind
+
+
+def _together(
+    target: Target, blankets: Mapping[str, Blanket], names: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Groups of unplated continuous nodes that share terms, small enough to move along learnt axes."""
+    groups: list[list[str]] = []
+    for name in names:
+        node = target.model[name]
+        size = math.prod(node.event_shape)
+        if node.plates or node.is_discrete or blankets[name].own is None or size > _FACTOR_SIZE:
+            continue
+        if node.support is None or node.support.kind in ("circle", "product"):
+            continue  # bounds that move, or turns
+        mine = {id(t) for t in target.terms_of((name,))}
+        merged = [name]
+        for group in list(groups):
+            meets = any(id(t) in mine for other in group for t in target.terms_of((other,)))
+            sizes = sum(math.prod(target.model[n].event_shape) for n in (*group, *merged))
+            if meets and sizes <= _FACTOR_SIZE:
+                merged = [*group, *merged]
+                groups.remove(group)
+        groups.append(merged)
+    return [tuple(n for n in target.chain if n in g) for g in groups]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -10,22 +11,32 @@ from typing import Any, ClassVar
 import numpy as np
 
 from bayesmc.engines.mcmc.chains import ChainEngine
-from bayesmc.engines.mcmc.metropolis_plan import Plan, plan_of
-from bayesmc.engines.mcmc.proposals import RandomWalk, check_given
+from bayesmc.engines.mcmc.proposals import RandomWalk, Read, check_given, read_proposals
 from bayesmc.engines.mcmc.sweep import SweepSampler, block_name
+from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.coupling import deterministic_constraints
-from bayesmc.kernels.ensemble import BlockWalk, stragglers
+from bayesmc.kernels.ensemble import AFRESH, BlockWalk, stragglers
 from bayesmc.kernels.jump import Jump
+from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
+from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew, parts_of
+from bayesmc.kernels.redrawn import Redrawn, redrawn_kernels
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless, refuse_parts
+from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled
 from bayesmc.network.sameness import same
-from bayesmc.structure.target import Values
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.target import Target, Values, target_of
 
 #: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
 _FIRST_RESCUE = 16
+#: numbers beyond which continuous nodes no longer move as one block
+LARGEST_BLOCK = 200
+#: members of an ensemble, least and most
+_LEAST, _MOST = 8, 64
+#: numbers that one evaluation of all terms may take, for all members of all ensembles together
+_ELEMENTS = 2e7
 
 
 @dataclass(frozen=True, repr=False)
@@ -248,6 +259,78 @@ class MetropolisSampler(SweepSampler):
         return {**state, "values": values, "memory": memory}
 
 
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The kernels of a sweep.
+
+    Attributes
+    ----------
+    kernels : list of Kernel
+        In the order of a sweep.
+    ensemble : int
+        Members of the ensemble that each chain is; 1 where chains are ordinary.
+    refusal : str or None
+        Why the engine cannot answer.
+    """
+
+    problem: Problem
+    target: Target
+    kernels: list[Kernel] = field(default_factory=list)
+    ensemble: int = 1
+    refusal: str | None = None
+
+    def describe(self) -> dict[str, str]:
+        """What happens to each node."""
+        found = {n: treatment(self.problem, n) for n in self.problem.model.nodes}
+        for name in self.target.forward:
+            if self.problem.model[name].is_stochastic and self.target.seen(name) is None:
+                found[name] = "drawn forward: nothing observed depends on it"
+        for kernel in self.kernels:
+            if isinstance(kernel, Redrawn):
+                found[kernel.names[0]] += f", then {kernel.label} {kernel.match}"
+                continue
+            for name in kernel.names:
+                others = ", ".join(repr(n) for n in kernel.names if n != name)
+                how = f"{kernel.label}: {kernel.match}" if kernel.match else kernel.label
+                found[name] = how + (f", together with {others}" if others else "")
+        return found
+
+
+def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
+    """The plan for a posed problem.
+
+    Raises
+    ------
+    UnknownNodeError, EvidenceError, ModelError
+        A proposal that does not fit the net or the evidence.
+    """
+    read = read_proposals(problem, proposal)
+    target = target_of(problem, _inside(problem, read))
+    refusal = refuse_unsampled(
+        problem.model,
+        {*problem.observed, *target.chain},
+        "MetropolisHastings",
+    )
+    given = {n for key in read for n in names_of(key)}
+    kernels = [_asked_for(target, key, what) for key, what in read.items()]
+    rest = [n for n in target.chain if n not in given]
+    discrete = [n for n in rest if problem.model[n].is_discrete]
+    continuous = [n for n in rest if not problem.model[n].is_discrete]
+    kernels += [Jump(Blanket(target, n)) for n in reversed(discrete)]
+    ensemble = 1
+    if continuous:
+        size = parts_of(target, continuous)[-1].stop
+        if size > LARGEST_BLOCK:
+            why = f"{size} continuous numbers are too many to move as one"
+            kernels += [AdaptiveWalk(Blanket(target, n), why) for n in reversed(continuous)]
+        else:
+            ensemble = _members(target, size, chains)
+            anew = AFRESH if may_be_drawn_anew(target, continuous) else 0.0
+            kernels.append(BlockWalk(target, continuous, ensemble, alone=not kernels, anew=anew))
+    kernels += redrawn_kernels(target, {n: Blanket(target, n) for n in rest}, kernels)
+    return Plan(problem, target, kernels, ensemble, refusal)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -256,3 +339,51 @@ def _band(kernel: Kernel) -> tuple[float, float] | None:
     if isinstance(kernel, (Jump, Proposed, ProposedBlock)):
         return (0.01, 1.0)
     return (0.1, 0.9)
+
+
+def _inside(problem: Problem, read: Mapping[Key, Read]) -> list[str]:
+    """Nodes of the chain whether or not anything observed depends on them.
+
+    These are nodes with proposals, those that proposals look at, and those that cannot be drawn forward.
+    """
+    found: list[str] = []
+    for key, what in read.items():
+        found += names_of(key)
+        if isinstance(what, Proposal):
+            found += what.parents
+    found += [n for n, node in problem.model.nodes.items() if node.is_stochastic and node.unsampled]
+    return list(dict.fromkeys(found))
+
+
+def _asked_for(target: Target, key: Key, what: Read) -> Kernel:
+    """The kernel of a proposal."""
+    if isinstance(what, RandomWalk):
+        if isinstance(key, tuple):
+            scale = what.scale if what.scale.ndim else float(what.scale)
+            return BlockWalk(
+                target,
+                key,
+                scale=scale,
+                unconstrained=what.unconstrained,
+                adaptive=what.adaptive,
+            )
+        blanket = Blanket(target, key)
+        if blanket.node.is_discrete:
+            return Jump(blanket, int(what.scale.flat[0]))
+        return AdaptiveWalk(
+            blanket,
+            scale=what.scale,
+            unconstrained=what.unconstrained,
+            adaptive=what.adaptive,
+        )
+    if isinstance(key, tuple):
+        return ProposedBlock(target, key, what)
+    return Proposed(Blanket(target, key), what)
+
+
+def _members(target: Target, size: int, chains: int) -> int:
+    """Members of an ensemble for a block of so many numbers; 1 where they would take too much memory."""
+    wanted = min(max(2 * (size + 1), _LEAST), _MOST)
+    elements = sum(max(math.prod(term.shape), 1) for term in target.terms.values())
+    affordable = int(_ELEMENTS / (elements * chains)) // 2 * 2
+    return min(wanted, affordable) if affordable >= 4 else 1

@@ -26,10 +26,9 @@ from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.conjugate import Conjugate
 from bayesmc.kernels.ensemble import BlockWalk
-from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.enumerate import Enumerate, JointStates
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.gaussian_block import GaussianBlock
-from bayesmc.kernels.joint_states import JointStates
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels
 from bayesmc.kernels.lattice import SiteCounts, SiteSums

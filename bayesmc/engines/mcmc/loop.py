@@ -1,0 +1,274 @@
+"""The loop that runs Markov chains: warmup, draws, what is kept of them, interruption, going on.
+
+A sampler moves all chains by one sweep; what a sweep does is not known here.
+"""
+
+from __future__ import annotations
+
+import copy
+import signal
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, Protocol
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError, DensityError, ParameterError
+from bayesmc.network import Model, Problem
+from bayesmc.progress import Progress
+from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
+from bayesmc.results.sums import stored_dtype
+
+#: what a sampler moves: arrays, numbers and nested dicts of them, picklable
+State = Mapping[str, Any]
+
+
+class Sampler(Protocol):
+    """Moves all chains of one problem at once; it holds neither state nor random numbers.
+
+    Notes
+    -----
+    Four attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
+    members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
+    ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
+    ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
+    where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
+    A method is, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them.
+
+    Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
+    which is exact if ``step`` writes into no array of the state it is given.
+    """
+
+    def start(self, rng: np.random.Generator, chains: int) -> State:
+        """Starting points of all chains."""
+        ...
+
+    def step(self, state: State, rng: np.random.Generator, warmup: bool) -> State:
+        """One sweep. Arrays that ``values`` handed out are never written to."""
+        ...
+
+    def end_warmup(self, state: State) -> State:
+        """The state with its adaptation frozen."""
+        ...
+
+    def values(self, state: State, rng: np.random.Generator) -> Mapping[str, np.ndarray]:
+        """Stored values of all nodes, ``(chain, *plates, *event)``, without chains where constant.
+
+        It is called once per kept draw, and draws what is not part of the chain. Inputs and what is
+        wholly observed may be left out.
+        """
+        ...
+
+    def acceptance(self, state: State) -> Mapping[str, np.ndarray]:
+        """Block -> share of proposals accepted since the warmup, shape (chain,)."""
+        ...
+
+
+class Loop:
+    """Sweeps of one run, and the last point that it can return to."""
+
+    last: Checkpoint
+
+    def __init__(
+        self,
+        sampler: Sampler,
+        rng: np.random.Generator,
+        problem: Problem,
+        chains: int,
+        warmup: int,
+        thinning: int,
+    ) -> None:
+        self.sampler, self.rng = sampler, rng
+        self.chains, self.warmup, self.thinning = chains, warmup, thinning
+        self.observed = problem.observed
+        seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
+        #: stored values that no chain moves
+        self.known = {**problem.inputs, **seen}
+        self.sweep = 0
+        self.phase = ""
+
+    def begun(self, bar: Progress, resume: Posterior | None, stop: Patience) -> State:
+        """The state from which draws are made: after the warmup, or where an earlier run ended."""
+        if isinstance(resume, (ChainsPosterior, ChainsSums)):
+            assert resume.checkpoint is not None
+            self.last = resume.checkpoint
+            self.sweep = resume._chains_and_draws[1] * self.thinning
+            self.rng.bit_generator.state = self.last.generator
+            # a sampler may write into its state, and the earlier posterior stays as it is
+            return copy.deepcopy(self.last.state)
+        with marking_invalid(), np.errstate(all="ignore"):
+            try:
+                state = self.sampler.start(self.rng, self.chains)
+            except (DensityError, ParameterError) as error:
+                error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
+                raise
+            self.phase = " (warmup)"
+            for _ in range(self.warmup):
+                stop.check()
+                state = self._stepped(state, True)
+                bar.advance()
+            self.sweep, self.phase = 0, ""
+            return self.sampler.end_warmup(state)
+
+    def draw(
+        self,
+        state: State,
+        held: Kept | RunningChains,
+        draws: int,
+        bar: Progress,
+        stop: Patience,
+    ) -> bool:
+        """Make and keep draws; whether it was left to finish."""
+        thinning, known, wanted = self.thinning, self.known, held.draws + draws
+        point: tuple[State, Mapping[str, Any], Mapping[str, np.ndarray]] | None = None
+        try:
+            with marking_invalid(), np.errstate(all="ignore"):
+                for _ in range(draws):
+                    stop.check()
+                    for _ in range(thinning):
+                        state = self._stepped(state, False)
+                        bar.advance()
+                    values = self._values(state)
+                    if known:
+                        values = {**known, **values}
+                    held.add(values)
+                    point = state, self.rng.bit_generator.state, values
+        except KeyboardInterrupt:
+            if not held.draws:
+                raise
+        if point is not None:
+            self.last = Checkpoint(*point, self.observed)
+        return held.draws == wanted
+
+    def _stepped(self, state: State, warmup: bool) -> State:
+        self.sweep += 1
+        try:
+            return self.sampler.step(state, self.rng, warmup)
+        except BayesmcError as error:
+            self._place(error)
+            raise
+
+    def _values(self, state: State) -> Mapping[str, np.ndarray]:
+        try:
+            return self.sampler.values(state, self.rng)
+        except BayesmcError as error:
+            self._place(error)
+            raise
+
+    def _place(self, error: BayesmcError) -> None:
+        """Say in the message when it happened."""
+        error.args = (f"{error}, at iteration {self.sweep}{self.phase}", *error.args[1:])
+
+
+class Kept:
+    """Draws of some nodes, put in place one by one.
+
+    Attributes
+    ----------
+    stored : dict
+        Node -> stored values, shape ``(chain, draw, *plates, *event)``; ``(1, 1, ...)`` where constant.
+    draws : int
+        Draws in place so far.
+    """
+
+    def __init__(self, model: Model, names: Sequence[str], chains: int, draws: int) -> None:
+        self.model = model
+        self.names = names
+        self.chains = chains
+        self.room = draws
+        self.stored: dict[str, np.ndarray] = {}
+        self.draws = 0
+        self._moving: list[tuple[str, np.ndarray]] = []
+        self._together: list[tuple[list[str], np.ndarray]] = []
+        self._earlier: Mapping[str, np.ndarray] = {}
+
+    def begin_with(self, stored: Mapping[str, np.ndarray], draws: int) -> None:
+        """Put earlier draws before those that there is room for."""
+        self._earlier = stored
+        self.room += draws
+        self.draws = draws
+
+    def add(self, values: Mapping[str, np.ndarray]) -> None:
+        """Take in one draw of every chain."""
+        if not self.stored:
+            self._make_room(values)
+        at = self.draws
+        for name, array in self._moving:
+            array[:, at] = values[name]
+        for names, rows in self._together:
+            row = [values[n] for n in names]
+            try:
+                rows[..., at] = np.concatenate(row).reshape(rows.shape[:2])
+            except ValueError:  # some of them come without chains this time
+                for array, value in zip(rows, row, strict=True):
+                    array[:, at] = value
+        self.draws = at + 1
+
+    def frozen(self) -> dict[str, np.ndarray]:
+        """The draws in place, read-only."""
+        if not self.stored:
+            return dict(self._earlier)
+        moving = {n for n, _ in self._moving} | {n for names, _ in self._together for n in names}
+        for name in moving if self.draws < self.room else ():
+            self.stored[name] = self.stored[name][:, : self.draws].copy()
+        for array in self.stored.values():
+            array.flags.writeable = False
+        return self.stored
+
+    def _make_room(self, values: Mapping[str, np.ndarray]) -> None:
+        """Decide from the first draw what is constant; single numbers of a type are kept in one array."""
+        alike: dict[np.dtype[Any], list[str]] = {}
+        for name in self.names:
+            node, value = self.model[name], values[name]
+            dtype = stored_dtype(node, value)
+            if value.ndim == len(node.value_shape):
+                self.stored[name] = np.array(value, dtype=dtype)[None, None]
+                continue
+            self.stored[name] = np.empty(0)  # in its place
+            if value.shape == (self.chains,) and value.dtype == dtype:
+                alike.setdefault(dtype, []).append(name)
+                continue
+            self.stored[name] = np.empty((self.chains, self.room, *node.value_shape), dtype)
+            self._moving.append((name, self.stored[name]))
+        for dtype, names in alike.items():
+            rows = np.empty((len(names), self.chains, self.room), dtype)
+            self.stored.update(zip(names, rows, strict=True))
+            self._together.append((names, rows))
+        if self._earlier:
+            for name, array in self.stored.items():
+                if array.shape[1:2] == (self.room,):
+                    array[:, : self.draws] = self._earlier[name]
+
+
+class Patience(AbstractContextManager["Patience"]):
+    """Within it, Ctrl-C waits until it is asked for, so that it cannot cut a sweep; a second one does not.
+
+    Only Python's own handling is put off, which a program that handles the signal itself has replaced.
+    """
+
+    def __init__(self) -> None:
+        self._pressed = False
+        self._own: Callable[..., Any] | None = None
+
+    def check(self) -> None:
+        """Raise what was put off."""
+        if self._pressed:
+            raise KeyboardInterrupt
+
+    def __enter__(self) -> Patience:
+        main = threading.current_thread() is threading.main_thread()
+        if main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            self._own = signal.default_int_handler
+            signal.signal(signal.SIGINT, self._note)
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._own is not None:
+            signal.signal(signal.SIGINT, self._own)
+
+    def _note(self, number: int, frame: Any) -> None:
+        if self._pressed:
+            raise KeyboardInterrupt
+        self._pressed = True
