@@ -71,6 +71,8 @@ class Redrawn(Kernel):
         self.blanket = blankets[group.names[0]]
         self.group = group
         self.turn, self.turns = turn, turns
+        #: whether elements that take turns do so from the last one on
+        self.from_last = False
         self.drawn = tuple(n for n in target.chain if n in group.names[1:])
         self.match = f"with {', '.join(self.drawn)} drawn anew"
         domain = self.blanket.node.domain
@@ -111,7 +113,8 @@ class Redrawn(Kernel):
         free = self.target.free_elements(self.names[0])
         if self.group.apart is not None:
             return [free]
-        return [np.array([e]) for e in (range(self.blanket.size) if free is None else free)]
+        each = list(range(self.blanket.size) if free is None else free)
+        return [np.array([e]) for e in (each[::-1] if self.from_last else each)]
 
     def _move(
         self, state: Values, members: np.ndarray | None, rng: np.random.Generator

@@ -26,13 +26,6 @@ class Careless(Redrawn):
         return super()._log({**state, self.names[0]: np.zeros_like(state[self.names[0]])})
 
 
-class LastFirst(Redrawn):
-    """The reverse: elements that take turns do so in reversed order."""
-
-    def _sets(self) -> Any:
-        return super()._sets()[::-1]
-
-
 def redrawn(kind: type[Redrawn] = Redrawn, apart: bool | None = None) -> Make:
     def make(target: Target) -> Kernel:
         names = [n for n in target.chain if n != "y"]
@@ -49,7 +42,7 @@ def redrawn(kind: type[Redrawn] = Redrawn, apart: bool | None = None) -> Make:
 def backwards(make: Make, target: Target, memory: Any) -> tuple[Kernel, Any]:
     kernel = make(target)
     assert isinstance(kernel, Redrawn)
-    kernel.__class__ = type("Reversed", (LastFirst, type(kernel)), {})
+    kernel.from_last = True
     return kernel, memory
 
 

@@ -34,6 +34,7 @@ from bayesmc.kernels.labels import Labels
 from bayesmc.kernels.lattice import SiteCounts, SiteSums
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk
+from bayesmc.kernels.redrawn import Redrawn
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import TableSweep
@@ -424,6 +425,8 @@ def _reverse_of(kernel: Any) -> Kernel | None:
         return _with(back, components=kernel.components[::-1])
     if isinstance(kernel, (AdaptiveWalk, Enumerate, Jump, Proposed)):
         return in_classes(kernel, kernel.blanket.classes[::-1])
+    if isinstance(kernel, Redrawn):
+        return _with(kernel, from_last=not kernel.from_last) if kernel.turns == 1 else None
     if isinstance(kernel, (BlockWalk, GaussianBlock, JointStates, ProposedBlock)):
         return kernel
     if isinstance(kernel, (Conjugate, Labels, SiteCounts, SiteSums)):
