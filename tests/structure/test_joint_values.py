@@ -58,7 +58,7 @@ def test_conditionals_are_the_same(target: Target, block: ForestBlock, name: str
     assert block.joint.key in left
     moved = {**left, "s[3]": 1 - left["s[3]"]}
     for values in (state, left, moved):
-        (own, _), (other, _) = plain._naturals(values, 0), reading._naturals(values, 0)
+        (own, _), (other, _) = plain.forms[0](values), reading.forms[0](values)
         for a, b in zip(own, other, strict=True):
             np.testing.assert_allclose(*np.broadcast_arrays(a, b), rtol=1e-12)
     assert block.joint.placed(left) is left
