@@ -50,9 +50,8 @@ from bayesmc.distributions import (
 from bayesmc.engines.discrete.filter import DiscreteFilter
 from bayesmc.engines.exact.exact import Exact
 from bayesmc.engines.grid.filter import GridFilter
-from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
+from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
 from bayesmc.engines.mcmc.gibbs import Gibbs
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk

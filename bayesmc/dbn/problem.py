@@ -7,7 +7,9 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from bayesmc.dbn.series import Series
+import numpy as np
+
+from bayesmc.dbn.series import Series, read_series
 from bayesmc.dbn.slices import Slices
 from bayesmc.dbn.template import DynamicBayesNet
 from bayesmc.errors import BayesmcError, ModelError
@@ -44,10 +46,19 @@ class SeriesProblem:
         return self.series.steps
 
     @cached_property
+    def seen(self) -> frozenset[str]:
+        """Nodes that are observed in full in all slices."""
+        return frozenset(n for n, o in self.series.observed.items() if o.mask is None)
+
+    @cached_property
     def hidden(self) -> tuple[str, ...]:
         """Nodes of a slice that are not observed in full throughout, parents first."""
-        seen = {n for n, o in self.series.observed.items() if o.mask is None}
-        return tuple(n for n in self.slices.dynamic if n not in seen)
+        return tuple(n for n in self.slices.dynamic if n not in self.seen)
+
+    @property
+    def known_static(self) -> dict[str, np.ndarray]:
+        """Values of the static nodes that are observed."""
+        return {n: o.value for n, o in self.series.static.items()}
 
     @cached_property
     def unknown_static(self) -> tuple[str, ...]:
@@ -80,5 +91,5 @@ def pose_series(
     except BayesmcError:  # with stand-ins for inputs; the data may do better, or say it better
         links = {}
     dbn = dbn.with_links(links) if links else dbn
-    slices, series = dbn.read(observations, inputs, ahead=ahead)
+    slices, series = read_series(dbn, observations, inputs, ahead=ahead)
     return SeriesProblem(dbn.copy(), slices, series)

@@ -116,7 +116,14 @@ def read_series(
     plates: Mapping[str, int] | None = None,
     ahead: int = 0,
 ) -> tuple[Slices, Series]:
-    """See ``DynamicBayesNet.read``."""
+    """The compiled slices for some data, and the data as stored values.
+
+    ``ahead`` slices follow the last row of the observations; inputs have rows for them, too.
+
+    Raises
+    ------
+    EvidenceError, PlateError
+    """
     template = dbn.template
     if observations is not None and not isinstance(observations, Mapping):
         raise EvidenceError(

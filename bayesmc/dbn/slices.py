@@ -45,7 +45,6 @@ _CLOCK = {
     name: Declaration(name, "input", (), (), event_shape=()) for name in (TIME, TIME + PREVIOUS)
 }
 
-
 #: names by which one may try to look further back: x_prev2, x_prev_prev, x_2prev, x_lag2
 _FAR_BACK = re.compile(r"(.+?)_?(?:prev(?:_?prev)+|prev_?\d+|\d+_?prev|prev_?\d+_prev|lag_?\d+)")
 #: other ways to write that of the slice before
@@ -128,14 +127,15 @@ class Template:
                 previous = stem != parent
                 if stem not in known or (previous and stem == TIME):
                     far = self.further_back(parent)
-                    if far is not None:
-                        raise UnknownNodeError(
-                            f"node {name!r} has the parent {parent!r}, but {far}"
+                    why = (
+                        f", but {far}"
+                        if far is not None
+                        else (
+                            f": {self.unknown(parent)}. Declare it, give the argument a default if it is no "
+                            "parent, or name the parents with parents="
                         )
-                    raise UnknownNodeError(
-                        f"node {name!r} has the parent {parent!r}: {self.unknown(parent)}. Declare it, "
-                        "give the argument a default if it is no parent, or name the parents with parents="
                     )
+                    raise UnknownNodeError(f"node {name!r} has the parent {parent!r}{why}")
                 if fixed and parent not in self.static:
                     raise ModelError(
                         f"static node {name!r} has the parent {parent!r}, which has another value in every "
@@ -193,13 +193,15 @@ class Template:
 
     def two_slices(self) -> dict[str, Declaration]:
         """Declarations of a slice and of the one before, as if that were slice 0."""
-        before = {
-            _previous(self, n): replace(
-                d, name=_previous(self, n), parents=tuple(_previous(self, p) for p in d.parents)
-            )
+
+        def before(name: str) -> str:
+            return name if name in self.static else name + PREVIOUS
+
+        zero = {
+            before(n): replace(d, name=before(n), parents=tuple(map(before, d.parents)))
             for n, d in self.slice_zero().items()
         }
-        return {**before, TIME: _CLOCK[TIME], **self.later}
+        return {**zero, TIME: _CLOCK[TIME], **self.later}
 
     def graph(self) -> networkx.DiGraph:
         """The two-slice template as a networkx graph."""
@@ -209,11 +211,10 @@ class Template:
         graph = networkx.DiGraph(name=self.name or "")
         read = {p for d in self.later.values() for p in d.parents}
         for name, declaration in self.later.items():
-            where = "static" if name in self.static else "now"
-            graph.add_node(name, slice=where, source=declaration.source, plates=declaration.plates)
+            about = {"source": declaration.source, "plates": declaration.plates}
+            graph.add_node(name, slice="static" if name in self.static else "now", **about)
             if name + PREVIOUS in read:
-                graph.add_node(name + PREVIOUS, slice="prev", source=declaration.source,
-                               plates=declaration.plates)  # fmt: skip
+                graph.add_node(name + PREVIOUS, slice="prev", **about)
         for name, declaration in self.later.items():
             graph.add_edges_from((p, name) for p in declaration.parents if p != TIME)
         return graph
@@ -278,8 +279,9 @@ class SliceStore:
         at_zero = {n: inputs.get(n + PREVIOUS, v) for n, v in now.items()}
         for _ in range(_ROUNDS):
             one, two = self._stores()
-            first = one.model(sizes, {TIME: _number(0), **at_zero})
-            later = two.model(sizes, {TIME: _number(1), TIME + PREVIOUS: _number(0), **inputs})
+            zero, t = (owned(np.asarray(k)) for k in (0, 1))
+            first = one.model(sizes, {TIME: zero, **at_zero})
+            later = two.model(sizes, {TIME: t, TIME + PREVIOUS: zero, **inputs})
             key = (id(first), id(later))
             if key in self._found:
                 return self._found[key]
@@ -300,8 +302,8 @@ class SliceStore:
     def probe(self, sizes: Mapping[str, int | None]) -> Slices:
         """Both models when nobody has given data: open plates and inputs get stand-ins."""
         self._stores()
-        inputs = self._stand_ins(sizes)
         settled = {p: n if n is not None else _OPEN + k for k, (p, n) in enumerate(sizes.items())}
+        inputs = self._stand_ins(settled)
         try:
             return self.slices(settled, inputs)
         except (ModelError, ParameterError, DensityError):  # inputs may have to be integers
@@ -342,18 +344,13 @@ class SliceStore:
             self._two = ModelStore(template.name, template.two_slices(), {}, template.plates)
         return self._one, self._two
 
-    def _stand_ins(self, sizes: Mapping[str, int | None]) -> dict[str, np.ndarray]:
-        rng = np.random.default_rng(3)
-        found = {}
+    def _stand_ins(self, sizes: Mapping[str, int]) -> dict[str, np.ndarray]:
+        rng, found = np.random.default_rng(3), {}
         for name in self.template.inputs:
             declaration = self.template.later[name]
-            order = {p: k for k, p in enumerate(sizes)}
-            plates = tuple(
-                size if (size := sizes[p]) is not None else _OPEN + order[p]
-                for p in declaration.plates
-            )
+            shape = tuple(sizes[p] for p in declaration.plates) + declaration.event_shape
             for key in (name, name + PREVIOUS):
-                found[key] = owned(1.0 + rng.random(plates + declaration.event_shape))
+                found[key] = owned(1.0 + rng.random(shape))
         return found
 
 
@@ -381,15 +378,11 @@ def _computed_domains(template: Template, first: Model, later: Model) -> dict[st
             found[name] = _UNCOUNTED
             continue
         union: np.ndarray = np.unique(np.concatenate([v for v in values if v is not None]))
-        if not all(_has_values(node, union) for _, node in nodes):
+        held = [None if node.domain is None else node.domain.numbers for _, node in nodes]
+        if not all(h is not None and np.array_equal(h, union) for h in held):
             union.flags.writeable = False
             found[name] = Domain(len(union), values=union)
     return found
-
-
-def _has_values(node: CompiledNode, wanted: np.ndarray) -> bool:
-    numbers = None if node.domain is None else node.domain.numbers
-    return numbers is not None and np.array_equal(numbers, wanted)
 
 
 def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
@@ -400,15 +393,6 @@ def _values(model: Model, node: CompiledNode) -> np.ndarray | None:
         return None
     value = np.asarray(model.probe[node.name])
     return np.unique(value) if value.dtype.kind in "biu" else None
-
-
-def _previous(template: Template, name: str) -> str:
-    """What a node of the slice before is called."""
-    return name if name in template.static else name + PREVIOUS
-
-
-def _number(t: int) -> np.ndarray:
-    return owned(np.asarray(t))
 
 
 def _counts_that_vary(template: Template, first: Model, later: Model) -> dict[str, Domain]:
@@ -442,22 +426,20 @@ def _support_further(model: Model, name: str, parents: set[str]) -> Support | No
 def _check_alike(template: Template, first: Model, later: Model) -> None:
     """Refuse a node that is another thing in slice 0 than later."""
     for name in template.first:
-        a, b = first[name], later[name]
-        what = f"node {name!r}: initial= gives"
-        if a.is_stochastic != b.is_stochastic:
-            kinds = {True: "a distribution", False: "values without chance"}
-            raise ModelError(
-                f"{what} {kinds[a.is_stochastic]}, its function {kinds[b.is_stochastic]}"
-            )
-        if a.event_shape != b.event_shape:
-            raise ModelError(
-                f"{what} values of shape {a.event_shape}, its function values of shape {b.event_shape}"
-            )
-        states = [None if n.domain is None else n.domain.states for n in (a, b)]
-        if a.is_stochastic and states[0] != states[1]:
-            raise ModelError(f"{what} values on {_on(a)}, its function on {_on(b)}")
-        if a.is_discrete != b.is_discrete:
-            raise ModelError(f"{what} values on {_on(a)}, its function on {_on(b)}")
+        for (one, gives), (other, has) in zip(_face(first[name]), _face(later[name]), strict=True):
+            if one != other:
+                raise ModelError(f"node {name!r}: initial= gives {gives}, its function {has}")
+
+
+def _face(node: CompiledNode) -> list[tuple[Any, str]]:
+    """What must be the same of a node in all slices, each with words for it."""
+    chance = "a distribution" if node.is_stochastic else "values without chance"
+    states = node.domain.states if node.domain is not None and node.is_stochastic else None
+    return [
+        (node.is_stochastic, chance),
+        (node.event_shape, f"values of shape {node.event_shape}"),
+        ((states, node.is_discrete), f"values on {_on(node)}"),
+    ]
 
 
 def _on(node: Any) -> str:

@@ -7,11 +7,12 @@ Every node has a declaration for *later* slices, whose function may name ``<node
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.dbn.series import Series, read_series, unrolled
+from bayesmc.dbn.series import unrolled
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, SliceStore, Template
 from bayesmc.dbn.unroll import sampled, unroll
 from bayesmc.distributions import Distribution
@@ -77,13 +78,8 @@ class DynamicBayesNet:
         name: str | None = None,
         plates: Mapping[str, int | Sequence[Any] | None] | None = None,
     ) -> None:
-        self._plates = DeclaredPlates.read("DynamicBayesNet", name, plates)
-        self.name = name
-        self._later: dict[str, Declaration] = {}
-        self._first: dict[str, Declaration] = {}
-        self._inputs: tuple[str, ...] = ()
-        self._static: tuple[str, ...] = ()
-        self._kept_store: SliceStore | None = None
+        declared = DeclaredPlates.read("DynamicBayesNet", name, plates)
+        self._store = SliceStore(Template(name, {}, {}, (), (), declared))
 
     # ---- declaring --------------------------------------------------------------------------
 
@@ -114,15 +110,8 @@ class DynamicBayesNet:
         DuplicateNodeError, PlateError, ModelError
         """
 
-        def declare(f: Callable[..., Any]) -> Callable[..., Any]:
-            own = name or getattr(f, "__name__", None)
-            if own is None or own == "<lambda>":
-                raise ModelError("a node needs a name: pass name=, or decorate a named function")
-            options: dict[str, Any] = {"vectorize": vectorize, "replace": replace}
-            self.add(own, f, parents, plates, states, initial=initial, **options)
-            return f
-
-        return declare if function is None else declare(function)
+        options: dict[str, Any] = {"initial": initial, "vectorize": vectorize, "replace": replace}
+        return _declaring(function, name, self.add, (parents, plates, states), options)
 
     def add(
         self,
@@ -154,11 +143,9 @@ class DynamicBayesNet:
         ('x_prev',)
         """
         self._check_name(name, replace)
-
-        def add(net: BayesNet) -> None:
-            net.add(name, cpd, parents, plates, states, vectorize=vectorize)
-
-        self._declare(name, initial, states, plates, vectorize, add)
+        options: dict[str, Any] = {"vectorize": vectorize}
+        later = self._read(name, BayesNet.add, cpd, parents, plates, states, **options)
+        self._declare(name, later, self._initial(name, initial, plates, states, vectorize))
 
     def table(
         self,
@@ -190,11 +177,8 @@ class DynamicBayesNet:
         ('no', 'yes')
         """
         self._check_name(name, replace)
-
-        def add(net: BayesNet) -> None:
-            net.table(name, parents, probs, states, plates=plates)
-
-        self._declare(name, initial, states, plates, False, add)
+        later = self._read(name, BayesNet.table, parents, probs, states, plates=plates)
+        self._declare(name, later, self._initial(name, initial, plates, states, False))
 
     def input(self, name: str, plates: str | Sequence[str] = (), event_shape: Any = ()) -> None:
         """Declare a value known in every slice, passed as ``inputs={name: array}``, time first.
@@ -202,9 +186,8 @@ class DynamicBayesNet:
         Functions read it as ``name`` and, of the slice before, as ``<name>_prev``.
         """
         self._check_name(name, False)
-        self._later[name] = self._read(name, lambda net: net.input(name, plates, event_shape))
-        self._inputs += (name,)
-        self._changed()
+        later = self._read(name, BayesNet.input, plates, event_shape)
+        self._declare(name, later, inputs=(*self.inputs, name))
 
     def static(
         self,
@@ -221,14 +204,8 @@ class DynamicBayesNet:
         Its parents are static nodes. Unrolled it keeps its name; filters want it observed.
         """
 
-        def declare(f: Callable[..., Any]) -> Callable[..., Any]:
-            own = name or getattr(f, "__name__", None)
-            if own is None or own == "<lambda>":
-                raise ModelError("a node needs a name: pass name=, or decorate a named function")
-            self.add_static(own, f, parents, plates, states, vectorize=vectorize)
-            return f
-
-        return declare if function is None else declare(function)
+        rest, options = (parents, plates, states), {"vectorize": vectorize}
+        return _declaring(function, name, self.add_static, rest, options)
 
     def add_static(
         self,
@@ -242,46 +219,45 @@ class DynamicBayesNet:
     ) -> None:
         """Declare a static node by a distribution, a function or a table."""
         self._check_name(name, False)
-        self._later[name] = self._read(
-            name,
-            lambda net: net.add(name, cpd, parents, plates, states, vectorize=vectorize),
-        )
-        self._static += (name,)
-        self._changed()
+        later = self._read(name, BayesNet.add, cpd, parents, plates, states, vectorize=vectorize)
+        self._declare(name, later, static=(*self.static_nodes, name))
 
     def copy(self) -> DynamicBayesNet:
         """An independent template with the same declarations."""
-        other = DynamicBayesNet(self.name)
-        other._plates = self._plates.copy()
-        other._later, other._first = dict(self._later), dict(self._first)
-        other._inputs, other._static = self._inputs, self._static
+        other = DynamicBayesNet()
+        other._store = self._store  # declarations make a new one
         return other
 
     def with_links(self, links: Mapping[str, int]) -> DynamicBayesNet:
         """A copy in which some computed nodes have distributions without noise, so that they are observed."""
-        other = self.copy()
-        for name, rank in links.items():
-            for declared in (other._later, other._first):
-                if name in declared:
-                    declared[name] = without_noise(declared[name], rank)
+
+        def linked(declared: Mapping[str, Declaration]) -> dict[str, Declaration]:
+            return {n: without_noise(d, links[n]) if n in links else d for n, d in declared.items()}
+
+        other, own = self.copy(), self.template
+        other._store = SliceStore(replace(own, later=linked(own.later), first=linked(own.first)))
         return other
 
     # ---- asking -----------------------------------------------------------------------------
 
     @property
+    def name(self) -> str | None:
+        return self.template.name
+
+    @property
     def plates(self) -> dict[str, int | None]:
         """Plate name -> size; None where the data will tell."""
-        return dict(self._plates.sizes)
+        return dict(self.template.plates.sizes)
 
     @property
     def inputs(self) -> tuple[str, ...]:
         """Names of the inputs."""
-        return self._inputs
+        return self.template.inputs
 
     @property
     def static_nodes(self) -> tuple[str, ...]:
         """Names of the nodes without time."""
-        return self._static
+        return self.template.static
 
     @property
     def template(self) -> Template:
@@ -294,7 +270,7 @@ class DynamicBayesNet:
 
         Every node has ``slice`` (``"prev"``, ``"now"``, or ``"static"``) and ``source``.
         """
-        return self._store.template.graph()
+        return self.template.graph()
 
     def validate(self) -> None:
         """Check both slices: parents, cycles, shapes, domains, and that functions broadcast.
@@ -310,24 +286,6 @@ class DynamicBayesNet:
         found = self._store.slices(sizes, inputs)
         self._store.validate(found)
         return found
-
-    def read(
-        self,
-        observations: Mapping[str, Any] | None,
-        inputs: Mapping[str, Any] | None = None,
-        steps: int | None = None,
-        plates: Mapping[str, int] | None = None,
-        ahead: int = 0,
-    ) -> tuple[Slices, Series]:
-        """The compiled slices for some data, and the data as stored values.
-
-        ``ahead`` slices follow the last row of the observations; inputs have rows for them, too.
-
-        Raises
-        ------
-        EvidenceError, PlateError
-        """
-        return read_series(self, observations, inputs, steps, plates, ahead)
 
     def unroll(self, steps: int, inputs: Mapping[str, Any] | None = None) -> BayesNet:
         """A plain net of so many slices: nodes ``"x[0]"``, ``"x[1]"``, ..., on which every engine runs.
@@ -346,11 +304,11 @@ class DynamicBayesNet:
         >>> float(bmc.infer(dbn.unroll(4), engine=bmc.Exact()).mean("x[3]"))
         6.0
         """
-        return unroll(self._store.template, steps, inputs)
+        return unroll(self.template, steps, inputs)
 
     def unrolled_evidence(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         """Evidence for the unrolled net, ``{"y[0]": row 0, ...}``; missing rows are left out."""
-        return unrolled(self._store.template, observations)
+        return unrolled(self.template, observations)
 
     def sample(
         self,
@@ -380,20 +338,20 @@ class DynamicBayesNet:
         return sampled(self, steps, draws, inputs, plates, chance)
 
     def __getitem__(self, name: str) -> Node:
-        if name not in self._later:
+        if name not in self:
             raise UnknownNodeError(
                 f"the template has no node {name!r}{did_you_mean(name, self)}; its nodes are {list(self)}"
             )
         return self._store.record(name, self.plates)
 
     def __contains__(self, name: object) -> bool:
-        return name in self._later
+        return name in self.template.later
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._later)
+        return iter(self.template.later)
 
     def __len__(self) -> int:
-        return len(self._later)
+        return len(self.template.later)
 
     def __repr__(self) -> str:
         return f"DynamicBayesNet({self.name!r}, {len(self)} nodes)"
@@ -401,54 +359,54 @@ class DynamicBayesNet:
     # ---- private ----------------------------------------------------------------------------
 
     def _declare(
+        self, name: str, later: Declaration, first: Declaration | None = None, **named: Any
+    ) -> None:
+        """Take in a node: for later slices, and for slice 0 if it has another declaration there."""
+        own = self.template
+        zero = {n: d for n, d in own.first.items() if n != name}
+        zero |= {} if first is None else {name: first}
+        self._store = SliceStore(
+            replace(own, later={**own.later, name: later}, first=zero, **named)
+        )
+
+    def _initial(
         self,
         name: str,
         initial: Any,
-        states: Sequence[Any] | None,
         plates: str | Sequence[str],
+        states: Sequence[Any] | None,
         vectorize: bool,
-        add: Callable[[BayesNet], None],
-    ) -> None:
-        """Take in a node: for later slices as ``add`` says, for slice 0 by ``initial`` if there is one."""
-        later = self._read(name, add)
-        first = None
+    ) -> Declaration | None:
+        """The declaration of slice 0, if there is one."""
+        if initial is None:
+            return None
         if isinstance(initial, (list, tuple, np.ndarray)):
             try:
-                first = self._read(
-                    name, lambda net: net.table(name, (), initial, states, plates=plates)
-                )
+                return self._read(name, BayesNet.table, (), initial, states, plates=plates)
             except ParameterError as error:
                 error.add_note(
                     "initial= is the density of slice 0: a list holds the probabilities of a finite node; "
                     "for others give a distribution, such as Normal(0.0, 1.0)"
                 )
                 raise
-        elif isinstance(initial, (int, float, np.number)):
+        if not isinstance(initial, Distribution) and not callable(initial):
+            is_number = isinstance(initial, (int, float, np.number))
+            what = (
+                f"={initial!r} is a number"
+                if is_number
+                else f"= is of type {type(initial).__name__}"
+            )
             raise ModelError(
-                f"node {name!r}: initial={initial!r} is a number; give the distribution of slice 0, such as "
-                "Normal(0.0, 1.0), a function that returns one, or a list of probabilities"
+                f"node {name!r}: initial{what}; give the density of slice 0, such as Normal(0.0, 1.0), a "
+                "function that returns one, or a list of probabilities"
             )
-        elif (
-            initial is not None and not isinstance(initial, Distribution) and not callable(initial)
-        ):
-            raise ModelError(
-                f"node {name!r}: initial= is of type {type(initial).__name__}; give the density of slice "
-                "0, such as Normal(0.0, 1.0), a function that returns one, or a list of probabilities"
-            )
-        elif initial is not None:
-            options: dict[str, Any] = {"vectorize": vectorize and callable(initial)}
-            first = self._read(
-                name, lambda net: net.add(name, initial, None, plates, states, **options)
-            )
-        self._later[name] = later
-        self._first.pop(name, None)
-        if first is not None:
-            self._first[name] = first
-        self._changed()
+        vectorize = vectorize and callable(initial)
+        return self._read(name, BayesNet.add, initial, None, plates, states, vectorize=vectorize)
 
-    def _read(self, name: str, add: Callable[[BayesNet], None]) -> Declaration:
-        net = BayesNet.of(None, {}, self._plates)
-        add(net)
+    def _read(self, name: str, add: Callable[..., Any], *given: Any, **options: Any) -> Declaration:
+        """A declaration as a plain net reads it."""
+        net = BayesNet.of(None, {}, self.template.plates)
+        add(net, name, *given, **options)
         return net.declarations[name]
 
     def _check_name(self, name: Any, replace: bool) -> None:
@@ -462,25 +420,29 @@ class DynamicBayesNet:
             raise ModelError(
                 f"node {name!r}: names that end in {PREVIOUS!r} are those of the slice before; choose another"
             )
-        if name in self._later and not replace:
+        if name in self and not replace:
             raise DuplicateNodeError(
                 f"node {name!r} is declared already; choose another name or pass replace=True"
             )
 
-    def _changed(self) -> None:
-        self._kept_store = None
 
-    @property
-    def _store(self) -> SliceStore:
-        if self._kept_store is None:
-            self._kept_store = SliceStore(
-                Template(
-                    self.name,
-                    dict(self._later),
-                    dict(self._first),
-                    self._inputs,
-                    self._static,
-                    self._plates,
-                )
-            )
-        return self._kept_store
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _declaring(
+    function: Callable[..., Any] | None,
+    name: str | None,
+    add: Callable[..., None],
+    rest: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> Any:
+    """A decorator that declares a function, or what that returns for one that is given."""
+
+    def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+        own = name or getattr(f, "__name__", None)
+        if own is None or own == "<lambda>":
+            raise ModelError("a node needs a name: pass name=, or decorate a named function")
+        add(own, f, *rest, **options)
+        return f
+
+    return declare if function is None else declare(function)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, DynamicBayesNet, Slices
+from bayesmc.dbn import PREVIOUS, DynamicBayesNet, Row, Slices
 from bayesmc.errors import ModelError, QueryError
 from bayesmc.network import CompiledNode, Model
 from bayesmc.results import SeriesPosterior
@@ -29,10 +29,62 @@ class OnlineBelief:
 
 
 class SliceBelief(OnlineBelief):
-    """Base of beliefs that answer as the posterior of a series of one slice, their own, does."""
+    """Base of beliefs that answer as the posterior of a series of one slice, their own, does.
 
-    dbn: DynamicBayesNet | None
-    t: int
+    Attributes
+    ----------
+    dbn : DynamicBayesNet or None
+        None out of a pickle.
+    static : dict
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far.
+    inputs : dict
+        Of the slice.
+    slices : Slices or None
+        What rows are read against; None before the first.
+    state : object
+        What a family goes on with; None before the first row.
+    """
+
+    def __init__(
+        self,
+        dbn: DynamicBayesNet | None,
+        static: Mapping[str, Any],
+        t: int = -1,
+        log_marginal_likelihood: Any = 0.0,
+        inputs: Mapping[str, np.ndarray] | None = None,
+        slices: Slices | None = None,
+        state: Any = None,
+    ) -> None:
+        self.dbn, self.static, self.t = dbn, dict(static), t
+        self.log_marginal_likelihood = log_marginal_likelihood
+        self.inputs, self.slices, self.state = dict(inputs or {}), slices, state
+
+    def after(self, slices: Slices, row: Row, increment: np.ndarray, state: Any) -> Any:
+        """The belief about the next slice, given the log density of its row."""
+        total = self.log_marginal_likelihood + increment
+        inputs = {n: row.inputs[n] for n in slices.template.inputs}
+        total = total if np.ndim(total) else float(total)
+        return type(self)(self.dbn, self.static, self.t + 1, total, inputs, slices, state)
+
+    def bound(self, dbn: DynamicBayesNet, slices: Slices, state: Any) -> Any:
+        """The same belief with the functions of a template."""
+        total = self.log_marginal_likelihood
+        return type(self)(dbn, self.static, self.t, total, self.inputs, slices, state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        if self.t < 0:
+            return {**self.__dict__, "dbn": None}
+        _ = self._posterior  # it goes along
+        return {**self.__dict__, "dbn": None, "state": self._without_functions()}
+
+    def __repr__(self) -> str:
+        if self.t < 0:
+            return f"{type(self).__name__}(nothing absorbed yet)"
+        return f"{type(self).__name__}(t={self.t}, {', '.join(self.names)})"
 
     @cached_property
     def _posterior(self) -> Any:
@@ -44,6 +96,10 @@ class SliceBelief(OnlineBelief):
 
     def _answered(self) -> SeriesPosterior:
         """The posterior; it is worked out once."""
+        raise NotImplementedError
+
+    def _without_functions(self) -> Any:
+        """The state as it travels."""
         raise NotImplementedError
 
     @property

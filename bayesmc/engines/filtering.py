@@ -17,7 +17,8 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, pose_series, read_row
-from bayesmc.engines.beliefs import refuse_unbound, slices_like
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.beliefs import SliceBelief, refuse_unbound, slices_like
 from bayesmc.errors import (
     BayesmcError,
     EvidenceError,
@@ -277,6 +278,8 @@ class FilterEngine:
 
     def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> Any:
         """A family's belief before the first row."""
+        if issubclass(self.belief, SliceBelief):
+            return self.belief(dbn, static)
         raise self._cannot("go row by row")
 
     def _absorbed(self, belief: Any, slices: Slices, row: Row) -> Any:
@@ -352,6 +355,13 @@ def hand_over(stop: BaseException, found: SeriesPosterior | None) -> None:
             last = found.start + found.steps - 1
             before = f"slices {found.start} to {last}" if found.steps > 1 else f"slice {last}"
             stop.add_note(f"the answer about {before} is in `error.filtered`")
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Parameters out of range are marked, and floating-point warnings silent, while functions run."""
+    with marking_invalid(), np.errstate(all="ignore"):
+        yield
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from bayesmc.categorical import edges
 from bayesmc.errors import BayesmcError, ParameterError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.align import Aligner
-from bayesmc.network.forward import Pass, Step, step_for, with_potentials
+from bayesmc.network.forward import Pass, Step, step_for, summed, with_potentials
 from bayesmc.structure import Table, constants_of, tabulate
 
 #: draws per chunk of a net whose largest node is a scalar
@@ -181,35 +181,40 @@ class TableDraw:
 
 
 class TableWeigh:
-    """Weight by a finite observed node: one gather of log probabilities."""
+    """Weight by a finite node that was seen, or whose value is in place: one gather of log probabilities.
 
-    def __init__(self, node: CompiledNode, table: Table, seen: Observed) -> None:
-        self.node = node
-        self.name = node.name
-        self.seen = seen
-        self.plates = len(node.plates)
+    Elements of the plates ``apart`` have weights of their own.
+    """
+
+    def __init__(
+        self,
+        node: CompiledNode,
+        table: Table,
+        seen: Observed | None = None,
+        apart: tuple[str, ...] = (),
+    ) -> None:
+        self.node, self.name, self.seen, self.apart = node, node.name, seen, apart
         self.index = RowIndex(node, table.parents, table.probs.shape[:-1])
         self.guard = _Guard(node, table)
         with np.errstate(divide="ignore"):
             logs = np.log(table.probs.reshape(-1, table.probs.shape[-1]))
         self.states = logs.shape[1]
         # without plates one column will do; with them the state differs from element to element
-        self.logs = (
-            np.ascontiguousarray(logs[:, int(seen.value)]) if not self.plates else logs.ravel()
-        )
+        self.is_column = seen is not None and not node.plates
+        if seen is not None and self.is_column:
+            logs = logs[:, int(seen.value)]
+        self.logs = np.ascontiguousarray(logs).ravel()
 
     def __call__(self, state: Pass) -> None:
         index = self.index(state.values)
         self.guard.check(index, state)
-        if not self.plates:
+        if self.seen is not None:
+            state.values[self.name] = self.seen.value
+        if self.is_column:
             state.weigh(self.logs.take(index))
-        else:
-            rows = np.asarray(index, dtype=np.intp) * self.states + self.seen.value
-            logs = self.logs.take(rows)
-            lead = logs.shape[: max(logs.ndim - self.plates, 0)]
-            full = np.broadcast_to(logs, lead + self.node.plate_shape)
-            state.weigh(full.sum(axis=tuple(range(-self.plates, 0))))
-        state.values[self.name] = self.seen.value
+            return
+        rows = np.asarray(index, dtype=np.intp) * self.states + state.values[self.name]
+        state.weigh(summed(self.logs.take(rows), self.node, self.apart))
 
 
 class TableCompute:

@@ -8,6 +8,7 @@ needs itself.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -72,6 +73,9 @@ def proposal_steps(
 class Propose:
     """Draw the targets of one proposal and divide the weight by its density at the draw."""
 
+    #: whether a proposal that is narrower than its target is warned of
+    warns: ClassVar[bool] = True
+
     def __init__(
         self,
         model: Model,
@@ -82,7 +86,7 @@ class Propose:
         self.proposal = proposal
         self.model, self.observed, self.apart = model, observed, apart
         self.nodes = [model[name] for name in proposal.names]
-        self._compared: set[str] = set()
+        self._compared: set[str] = set() if self.warns else set(proposal.names)
 
     def __call__(self, state: Pass) -> None:
         with blaming(self.proposal):

@@ -16,7 +16,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, Row, Slices
 from bayesmc.distributions import Distribution
-from bayesmc.engines.forward import RowIndex, TableDraw, table_of
+from bayesmc.engines.forward import TableDraw, TableWeigh, table_of
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import proposal_steps
 from bayesmc.errors import ModelError, UnknownNodeError
@@ -30,7 +30,6 @@ from bayesmc.network.forward import (
     Step,
     WeighDrawn,
     nothing,
-    summed,
 )
 from bayesmc.structure import Table
 
@@ -113,7 +112,7 @@ class SlicePlan:
             return quickly(
                 model, model[name], QuickWeigh, WeighDrawn(model, model[name], self.apart)
             )
-        return TableWeighApart(model[name], table, self.apart)
+        return TableWeigh(model[name], table, apart=self.apart)
 
     def _build(self, row: Row) -> list[Step]:
         model = self.slices.model(row.t)
@@ -132,8 +131,9 @@ class SlicePlan:
             model = self.slices.first if first else self.slices.later
             inputs = {*self.slices.template.inputs, TIME}
             inputs |= {n + PREVIOUS for n in inputs}
-            timeless = not inputs & set(model[name].parents)
-            self._tables[key] = table_of(model, model[name], self.static) if timeless else None
+            node = model[name]
+            timeless = node.domain is not None and not inputs & set(node.parents)
+            self._tables[key] = table_of(model, node, self.static) if timeless else None
         return self._tables[key]
 
 
@@ -308,23 +308,6 @@ def quickly(model: Model, node: CompiledNode, kind: type[Quick], plain: Step) ->
     simple = simple and node.declaration.source == "function" and not node.declaration.vectorize
     quick: Any = kind(node, plain)
     return quick if simple and not node.unsampled else plain
-
-
-class TableWeighApart:
-    """A finite node whose value is in place: one gather of log probabilities."""
-
-    def __init__(self, node: CompiledNode, table: Table, apart: tuple[str, ...]) -> None:
-        self.node, self.apart = node, apart
-        self.index = RowIndex(node, table.parents, table.probs.shape[:-1])
-        with np.errstate(divide="ignore"):
-            logs = np.log(table.probs.reshape(-1, table.probs.shape[-1]))
-        self.states = logs.shape[1]
-        self.logs = np.ascontiguousarray(logs).ravel()
-
-    def __call__(self, state: Pass) -> None:
-        rows = np.asarray(self.index(state.values), dtype=np.intp)
-        log = self.logs.take(rows * self.states + state.values[self.node.name])
-        state.weigh(summed(log, self.node, self.apart))
 
 
 def size_of(slices: Slices) -> int:

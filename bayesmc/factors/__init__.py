@@ -7,11 +7,9 @@ the layers above.
 from __future__ import annotations
 
 from .calibrated import Calibrated
-from .cliquetree import BoundTree, CliqueTree
+from .cliquetree import BoundTree, CliqueTree, FactorLike, LogTable, factor_from_log
 from .elimination import HEURISTICS, Elimination, elimination_order
-from .factor import Factor, sum_product
 from .structure import TreeCost
-from .tables import FactorLike, LogTable, factor_from_log
 
 __all__ = [
     "HEURISTICS",
@@ -19,11 +17,9 @@ __all__ = [
     "Calibrated",
     "CliqueTree",
     "Elimination",
-    "Factor",
     "FactorLike",
     "LogTable",
     "TreeCost",
     "elimination_order",
     "factor_from_log",
-    "sum_product",
 ]

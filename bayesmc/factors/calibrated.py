@@ -8,19 +8,15 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 
 from ..categorical import pick_rows
 from ..errors import BudgetError, ZeroProbabilityError
-from .factor import Factor, sum_product
-from .program import Program
-from .propagation import Collected
-from .semiring import Semiring
-
-if TYPE_CHECKING:
-    from .cliquetree import CliqueTree
+from .named import Named, aligned, contract, largest, without_ones
+from .propagation import Collected, Semiring
+from .structure import Program, TreeStructure
 
 JOINT_BYTES = 1e9
 """Default limit on the tables of a joint query."""
@@ -30,7 +26,7 @@ JOINT_BYTES = 1e9
 class Context:
     """The tree, shapes and arithmetic that an answer was made with, and the observed states."""
 
-    tree: CliqueTree
+    tree: TreeStructure
     program: Program
     semiring: Semiring
     states: Mapping[int, int]
@@ -70,9 +66,10 @@ class Calibrated:
         """The marginals of all variables, in the order of ``tree.variables``."""
         return [self._marginal(v) for v in range(len(self._context.tree.variables))]
 
-    def belief(self, clique: int) -> Factor:
+    def belief(self, clique: int) -> Named:
         """The normalised joint table of a clique's variables; sliced ones keep one state."""
-        return self._named(self._belief(clique))
+        found, names = self._belief(clique), self._context.tree.variables
+        return Named(tuple(names[cast(int, v)] for v in found.scope), found.values)
 
     def joint(self, variables: Sequence[Hashable], max_bytes: float = JOINT_BYTES) -> np.ndarray:
         """The joint probabilities of any variables.
@@ -106,9 +103,9 @@ class Calibrated:
                 int(size),
             )
         free = [v for v in positions if v not in states]
-        table = self._joint_factor(free, max_bytes).table(free)
+        table = aligned(self._joint(free, max_bytes), free)
         full = np.zeros(shape)
-        full[tuple(states.get(v, slice(None)) for v in positions)] = table
+        full[tuple(states.get(v, slice(None)) for v in positions)] = table / table.sum()
         return full
 
     def sample(self, rng: np.random.Generator, draws: int) -> dict[Hashable, np.ndarray]:
@@ -168,7 +165,7 @@ class Calibrated:
                 "given it; check log_z first"
             )
 
-    def _belief(self, k: int) -> Factor:
+    def _belief(self, k: int) -> Named:
         """In positions of variables rather than their names."""
         self._possible("belief")
         assert self._collected is not None
@@ -178,9 +175,9 @@ class Calibrated:
                 context.semiring.multiply(self._collected[k].work, self._ratios[k][:, None])
             )
         shape = context.program.cliques[k].shape
-        return Factor(context.tree.cliques[k].variables, values.reshape(shape))
+        return Named(context.tree.cliques[k].variables, values.reshape(shape))
 
-    def _conditional(self, k: int) -> Factor:
+    def _conditional(self, k: int) -> Named:
         """The distribution of a clique's residual given its separator."""
         assert self._collected is not None
         context, one = self._context, self._collected[k]
@@ -188,29 +185,31 @@ class Calibrated:
             scaled = context.semiring.ratio(one.work, one.total[:, None])
             values = context.semiring.to_linear(scaled)
         shape = context.program.cliques[k].shape
-        return Factor(context.tree.cliques[k].variables, values.reshape(shape))
+        return Named(context.tree.cliques[k].variables, values.reshape(shape))
 
-    def _named(self, factor: Factor) -> Factor:
-        names = self._context.tree.variables
-        return Factor(
-            tuple(names[cast(int, v)] for v in factor.scope), factor.values, factor.log_scale
-        )
-
-    def _joint_factor(self, free: Sequence[int], max_bytes: float) -> Factor:
+    def _joint(self, free: Sequence[int], max_bytes: float) -> Named:
         """The joint of unobserved variables: from one clique, or along the paths between them."""
         if not free:
-            return Factor((), np.ones(()))
+            return Named((), np.ones(()))
         tree, shapes = self._context.tree, self._context.program.cliques
         if len(free) == 1:
-            return Factor(tuple(free), self._marginal(free[0]))
+            return Named(tuple(free), self._marginal(free[0]))
         shared = set.intersection(*(set(tree.containing[v]) for v in free))
         if shared:
             smallest = min(shared, key=lambda k: math.prod(shapes[k].matrix))
-            belief = self._belief(smallest)
-            return belief.sum_out([v for v in belief.scope if v not in free])
+            return contract([_of_several(self._belief(smallest))], free)
         tops, others = _connecting(tree, free)
-        factors = [self._belief(k) for k in tops] + [self._conditional(k) for k in others]
-        return sum_product(factors, free, max_bytes)
+        parts = [*map(self._belief, tops), *map(self._conditional, others)]
+        tables, sizes = [_of_several(p) for p in parts], dict(enumerate(tree.cardinalities))
+        count = 8.0 * largest([t.scope for t in tables], free, sizes)
+        if count > max_bytes:
+            raise BudgetError(
+                f"Calibrated.joint of {len(free)} variables: the largest intermediate table would take "
+                f"{count:.3g} bytes, above the {max_bytes:.3g} allowed; ask for fewer variables at once, or "
+                "raise the budget",
+                int(count),
+            )
+        return contract(tables, free)
 
     def _weights(self, k: int) -> np.ndarray:
         """For each state of a clique's separator the residual's probabilities, unnormalised."""
@@ -223,7 +222,12 @@ class Calibrated:
             return np.exp(work - np.where(top == -math.inf, 0.0, top))
 
 
-def _connecting(tree: CliqueTree, free: Sequence[int]) -> tuple[list[int], list[int]]:
+def _of_several(table: Named) -> Named:
+    """Without the variables of one state, sliced ones above all."""
+    return without_ones(table.values, table.scope)
+
+
+def _connecting(tree: TreeStructure, free: Sequence[int]) -> tuple[list[int], list[int]]:
     """The cliques on the paths between the variables' homes: one top per component, the rest."""
     homes = {tree.home[v] for v in free}
     marked: set[int] = set()

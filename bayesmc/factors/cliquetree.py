@@ -2,7 +2,7 @@
 
 `CliqueTree` is the plan (structure and cost), `BoundTree` the plan with tables, and `Calibrated`
 (in `bayesmc.factors.calibrated`) the answer for one evidence. It knows nothing of nets: variables
-are hashables with cardinalities, factors are arrays.
+are hashables with cardinalities, factors are arrays, linear or logarithmic.
 
 Notes
 -----
@@ -14,25 +14,175 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
-from ..errors import EvidenceError, ShapeError
+from ..errors import DensityError, EvidenceError, ShapeError
 from .calibrated import Calibrated, Context
-from .elimination import Elimination, elimination_order
-from .program import Program, compile_program
-from .propagation import Mask, Potentials, collect, distribute, total_log_scale
-from .semiring import LINEAR, LOG
-from .structure import TreeCost, build_cliques, tree_cost
-from .tables import FactorLike, Given, Placement, add_logs, check_factor, multiply_linear
+from .elimination import Elimination
+from .propagation import LINEAR, LOG, Mask, Potentials, collect, distribute, total_log_scale
+from .structure import Program, TreeStructure, compile_program
+
+
+@dataclass(frozen=True, eq=False)
+class LogTable:
+    """A factor given by its natural logarithms; ``-inf`` is a zero entry.
+
+    Examples
+    --------
+    >>> LogTable(np.array([-1000.0, -2000.0])).values.shape
+    (2,)
+    """
+
+    values: np.ndarray
+
+
+FactorLike = np.ndarray | LogTable | tuple[np.ndarray, float]
+"""A table of linear values, of logarithms, or a pair (linear values, log of a multiplier)."""
+
+
+def factor_from_log(log_values: np.ndarray) -> tuple[np.ndarray, float]:
+    """Linear values with their largest at 1, and the log of what was divided out.
+
+    Entries below e**-745 of the largest become zero; pass a `LogTable` where that could matter.
+
+    Examples
+    --------
+    >>> values, log_scale = factor_from_log(np.array([-1000.0, -1000.0 + np.log(0.5)]))
+    >>> values.round(9), log_scale
+    (array([1. , 0.5]), -1000.0)
+    """
+    top = float(np.max(log_values, initial=-math.inf))
+    if top == -math.inf:
+        return np.zeros(np.shape(log_values)), 0.0
+    return np.exp(log_values - top), top
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where a factor goes: its clique, and the transposition and shape that align its axes."""
+
+    clique: int
+    axes: tuple[int, ...]
+    shape: tuple[int, ...]
+    own_shape: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """One checked factor: linear values (None where only logarithms are safe) and their scale."""
+
+    linear: np.ndarray | None
+    logs: np.ndarray | None
+    log_scale: float
+
+    def as_log(self) -> np.ndarray:
+        if self.logs is not None:
+            return self.logs
+        assert self.linear is not None
+        with np.errstate(divide="ignore"):
+            return np.log(self.linear)
+
+
+def check_factor(factor: FactorLike, placement: Placement, index: int) -> Given:
+    """The factor as arrays of float64, refused if its shape or an entry is not a factor's."""
+    if isinstance(factor, LogTable):
+        logs = np.asarray(factor.values, dtype=float)
+        _check_shape(logs, placement, index)
+        if np.isnan(logs).any() or (logs == math.inf).any():
+            raise DensityError(
+                f"CliqueTree.bind: log-factor {index} has a NaN or plus infinity; give finite "
+                "values or minus infinity"
+            )
+        linear, log_scale = factor_from_log(logs)
+        shifted = logs - log_scale
+        finite = shifted[shifted > -math.inf]
+        safe = finite.size == 0 or finite.min() > -600.0
+        return Given(linear if safe else None, shifted, log_scale)
+    values, log_scale = factor if isinstance(factor, tuple) else (factor, 0.0)
+    linear = np.asarray(values, dtype=float)
+    _check_shape(linear, placement, index)
+    if not (linear.min(initial=0.0) >= 0.0 and linear.max(initial=0.0) < math.inf):
+        raise DensityError(
+            f"CliqueTree.bind: factor {index} has a negative, infinite or NaN entry; give finite "
+            "values of at least 0"
+        )
+    return Given(linear, None, float(log_scale))
+
+
+def multiply_linear(
+    shapes: Sequence[tuple[int, ...]], placements: Sequence[Placement], givens: Sequence[Given]
+) -> tuple[list[np.ndarray], float] | None:
+    """The potentials, each with its largest entry near 1; None if one would underflow."""
+    if any(given.linear is None for given in givens):
+        return None
+    log_scale = math.fsum(given.log_scale for given in givens)
+    tables: list[np.ndarray | None] = [None] * len(shapes)
+    try:
+        with np.errstate(under="raise", over="raise"):
+            for given, where in zip(givens, placements, strict=True):
+                linear = given.linear
+                assert linear is not None
+                if where.clique < 0:
+                    if linear == 0.0:
+                        return [np.zeros(shape) for shape in shapes], -math.inf
+                    log_scale += math.log(float(linear))
+                    continue
+                aligned = linear.transpose(where.axes).reshape(where.shape)
+                table = tables[where.clique]
+                table = aligned if table is None else table * aligned
+                top = float(table.max())
+                if 0.0 < top and not 1e-100 < top < 1e100:
+                    table, log_scale = table / top, log_scale + math.log(top)
+                tables[where.clique] = table
+    except FloatingPointError:
+        return None
+    return [_filled(table, shape, 1.0) for table, shape in zip(tables, shapes, strict=True)], (
+        log_scale
+    )
+
+
+def add_logs(
+    shapes: Sequence[tuple[int, ...]], placements: Sequence[Placement], givens: Sequence[Given]
+) -> tuple[list[np.ndarray], float]:
+    """The logs of the potentials, and the log of the multiplier they lack."""
+    log_scale = math.fsum(given.log_scale for given in givens)
+    tables: list[np.ndarray | None] = [None] * len(shapes)
+    for given, where in zip(givens, placements, strict=True):
+        if where.clique < 0:
+            log_scale += float(given.as_log())
+            continue
+        aligned = given.as_log().transpose(where.axes).reshape(where.shape)
+        table = tables[where.clique]
+        tables[where.clique] = aligned if table is None else table + aligned
+    return [_filled(table, shape, 0.0) for table, shape in zip(tables, shapes, strict=True)], (
+        log_scale
+    )
+
+
+def _filled(table: np.ndarray | None, shape: tuple[int, ...], neutral: float) -> np.ndarray:
+    """A C-ordered private array of the full shape."""
+    if table is None:
+        return np.full(shape, neutral)
+    return np.array(np.broadcast_to(table, shape), dtype=float, order="C")
+
+
+def _check_shape(values: np.ndarray, placement: Placement, index: int) -> None:
+    if values.shape != placement.own_shape:
+        raise ShapeError(
+            f"CliqueTree.bind: factor {index} has shape {values.shape}, but its scope has the "
+            f"cardinalities {placement.own_shape}"
+        )
+
 
 _SLICE_ABOVE = 30_000  # entries; below, compiling shapes for an evidence costs more than it saves
 _PROGRAMS_KEPT = 8
 
 
-class CliqueTree:
+class CliqueTree(TreeStructure):
     """The plan for exact inference in a product of factors with fixed scopes.
 
     Parameters
@@ -69,22 +219,7 @@ class CliqueTree:
         scopes: Iterable[Sequence[Hashable]],
         elimination: Elimination | None = None,
     ) -> None:
-        named = cardinalities if isinstance(cardinalities, Mapping) else None
-        self.variables: tuple[Hashable, ...] = (
-            tuple(range(len(cardinalities))) if named is None else tuple(named)
-        )
-        sizes = list(cardinalities) if named is None else list(named.values())
-        self.cardinalities: tuple[int, ...] = tuple(int(cast(int, n)) for n in sizes)
-        self.scopes = tuple(tuple(scope) for scope in scopes)
-        self.index = {v: k for k, v in enumerate(self.variables)}
-        self._check()
-        self._scopes = [tuple(self.index[v] for v in scope) for scope in self.scopes]
-        if elimination is None:
-            elimination = elimination_order(self.cardinalities, self._scopes)
-        self.cliques = build_cliques(elimination)
-        self.cost: TreeCost = tree_cost(self.cliques, self.cardinalities)
-        self._position = {v: k for k, v in enumerate(elimination.order)}
-        self.home = {v: k for k, c in enumerate(self.cliques) for v in c.residual}
+        super().__init__(cardinalities, scopes, elimination)
         self._programs: dict[frozenset[int], Program] = {}
 
     def bind(self, factors: Sequence[FactorLike]) -> BoundTree:
@@ -128,30 +263,6 @@ class CliqueTree:
         return found
 
     @cached_property
-    def shapes(self) -> tuple[tuple[int, ...], ...]:
-        """The full shape of each clique's table."""
-        return tuple(tuple(self.cardinalities[v] for v in c.variables) for c in self.cliques)
-
-    @cached_property
-    def containing(self) -> tuple[tuple[int, ...], ...]:
-        """For each variable the cliques that hold it."""
-        found: list[list[int]] = [[] for _ in self.variables]
-        for k, clique in enumerate(self.cliques):
-            for v in clique.variables:
-                found[v].append(k)
-        return tuple(map(tuple, found))
-
-    @cached_property
-    def mask_shapes(self) -> tuple[tuple[int, int, int], ...]:
-        """For each variable its home clique's table seen as (before, states, after)."""
-        found = []
-        for v in range(len(self.variables)):
-            shape = self.shapes[self.home[v]]
-            axis = self.cliques[self.home[v]].variables.index(v)
-            found.append((math.prod(shape[:axis]), shape[axis], math.prod(shape[axis + 1 :])))
-        return tuple(found)
-
-    @cached_property
     def _placements(self) -> list[Placement]:
         found = []
         for scope in self._scopes:
@@ -166,18 +277,6 @@ class CliqueTree:
             shape = tuple(self.cardinalities[v] if v in scope else 1 for v in order)
             found.append(Placement(clique, axes, shape, own))
         return found
-
-    def _check(self) -> None:
-        for v, n in zip(self.variables, self.cardinalities, strict=True):
-            if n < 1:
-                raise ValueError(f"CliqueTree: variable {v!r} has {n} states; it needs at least 1")
-        for scope in self.scopes:
-            unknown = [v for v in scope if v not in self.index]
-            if unknown or len(set(scope)) != len(scope):
-                raise ValueError(
-                    f"CliqueTree: the scope {scope} must name known variables, each once"
-                    + (f"; unknown: {unknown}" if unknown else "")
-                )
 
 
 class BoundTree:
@@ -255,7 +354,7 @@ class BoundTree:
         return Calibrated(context, log_z, collected, ratios, flat)
 
 
-def _evidence_states(tree: CliqueTree, evidence: Mapping[Any, int]) -> dict[int, int]:
+def _evidence_states(tree: TreeStructure, evidence: Mapping[Any, int]) -> dict[int, int]:
     states = {}
     for variable, state in evidence.items():
         k = tree.index.get(variable)
@@ -271,7 +370,7 @@ def _evidence_states(tree: CliqueTree, evidence: Mapping[Any, int]) -> dict[int,
 
 
 def _entered(
-    tree: CliqueTree, program: Program, states: Mapping[int, int]
+    tree: TreeStructure, program: Program, states: Mapping[int, int]
 ) -> tuple[set[int], dict[int, list[Mask]]]:
     """The cliques whose tables evidence changes, with all above them, and what is masked where."""
     changed: set[int] = set()

@@ -131,27 +131,30 @@ class Choice(NamedTuple):
     best: np.ndarray
 
     def look_up(self, positions: Mapping[Variable, Any]) -> dict[Variable, Any]:
-        """The best positions, given those of the other variables."""
-        at = self.best[tuple(positions[v] for v in self.given)]
+        """The best positions, given those of the other variables; arrays where there are batch axes."""
+        batch = self.best.ndim - len(self.given)
+        open_ = (
+            np.arange(n).reshape(-1, *(1,) * (batch - 1 - k)) if n > 1 else 0
+            for k, n in enumerate(self.best.shape[:batch])
+        )
+        at = self.best[(*open_, *(positions[v] for v in self.given))]
         return dict(zip(self.chosen, unravelled(at, self.shape), strict=True))
 
 
 def maximise(
     tables: Sequence[Table], keep: Sequence[Variable], sizes: Sizes
 ) -> tuple[np.ndarray, list[Choice]]:
-    """The sum of logs, without batch axes, maximised over every variable that is not kept.
+    """The sum of logs maximised over every variable that is not kept, shape ``(*batch, *sizes of keep)``.
 
     The choices are in the order in which they were made; look them up from the last to the first.
     """
-    choices: list[Choice] = []
+    left, choices = _maximised(tables, keep, sizes)
+    return log_product(left, keep, sizes), choices
 
-    def combine(chosen: Sequence[Table], scope: Scope, gone: Scope) -> np.ndarray:
-        flat = _flat(log_product(chosen, (*scope, *gone), sizes), len(gone))
-        best = flat.argmax(axis=-1)
-        choices.append(Choice(gone, tuple(sizes[v] for v in gone), scope, best))
-        return np.take_along_axis(flat, best[..., None], axis=-1)[..., 0]
 
-    return log_product(eliminate(tables, keep, sizes, combine), keep, sizes), choices
+def choices_of(tables: Sequence[Table], keep: Sequence[Variable], sizes: Sizes) -> list[Choice]:
+    """The choices of ``maximise`` alone: no table over all that is kept is made."""
+    return _maximised(tables, keep, sizes)[1]
 
 
 def largest(
@@ -217,6 +220,20 @@ def sizes_of(tables: Iterable[Table]) -> dict[Variable, int]:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _maximised(
+    tables: Sequence[Table], keep: Sequence[Variable], sizes: Sizes
+) -> tuple[list[Table], list[Choice]]:
+    choices: list[Choice] = []
+
+    def combine(chosen: Sequence[Table], scope: Scope, gone: Scope) -> np.ndarray:
+        flat = _flat(log_product(chosen, (*scope, *gone), sizes), len(gone))
+        best = flat.argmax(axis=-1)
+        choices.append(Choice(gone, tuple(sizes[v] for v in gone), scope, best))
+        return np.take_along_axis(flat, best[..., None], axis=-1)[..., 0]
+
+    return eliminate(tables, keep, sizes, combine), choices
 
 
 def _flat(values: np.ndarray, last: int) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Filters of all chains in one array: particles on the first axis, chains on the second.
 
 Each chain has static nodes of its own, so that one pass over the slices is a filter for each of them.
-``Filter`` estimates likelihoods without bias; ``ConditionalFilter`` keeps a trajectory among its particles.
+``Filter`` estimates likelihoods without bias; with ``ConditionalStep`` it keeps a trajectory among its
+particles.
 
 References
 ----------
@@ -12,13 +13,13 @@ and Schön (2014), Particle Gibbs with ancestor sampling, JMLR 15.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.particles import Layout, Particles, Selection, along_plates
-from bayesmc.engines.particles.smc import SMCStep
+from bayesmc.categorical import pick
+from bayesmc.engines.particles.smc import Layout, Particles, Selection, SMCStep, along_plates
 from bayesmc.network.forward import Pass, Step
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic
@@ -104,14 +105,21 @@ class Filter:
     particles : int
     chosen : bool
         Whether another number may be chosen for the data (``of``).
+    step : callable
+        Makes the step of a run from the trellis, the number of particles, values and chains.
     """
 
     #: error of the log likelihood that is best aimed at
     best = 1.0
-    step: ClassVar[type[ChainStep]] = ChainStep
 
-    def __init__(self, trellis: Trellis, particles: int, chosen: bool = False) -> None:
-        self.trellis, self.particles, self.chosen = trellis, particles, chosen
+    def __init__(
+        self,
+        trellis: Trellis,
+        particles: int,
+        chosen: bool = False,
+        step: Callable[[Trellis, int, Values, int], ChainStep] = ChainStep,
+    ) -> None:
+        self.trellis, self.particles, self.chosen, self.step = trellis, particles, chosen, step
 
     def of(self, particles: int) -> Filter:
         """The filter with another number of particles."""
@@ -123,7 +131,7 @@ class Filter:
 
     def run(self, values: Values, chains: int, rng: np.random.Generator) -> History:
         """One filter for the static nodes of every chain; ``values`` and ``chains`` as for ``ChainStep``."""
-        step = self.step_for(values, chains)
+        step = self.step(self.trellis, self.particles, values, chains)
         log, slices = np.zeros((chains, *self.trellis.lead)), list[Particles]()
         now: Particles | None = None
         with np.errstate(divide="ignore", invalid="ignore"):  # chains without a weight are no fault
@@ -132,10 +140,6 @@ class Filter:
                 log = log + now.increment
                 slices.append(now)
         return History(slices, log.reshape(chains, -1).sum(axis=1))
-
-    def step_for(self, values: Values, chains: int) -> ChainStep:
-        """The step of a run."""
-        return self.step(self.trellis, self.particles, values, chains)
 
     def drawn(self, history: History, rng: np.random.Generator) -> Values:
         """One trajectory of every chain: name in the unrolled net -> values ``(chains, *plates, *event)``."""
@@ -211,12 +215,6 @@ class ConditionalStep(ChainStep):
         return found
 
 
-class ConditionalFilter(Filter):
-    """Filters among whose particles one trajectory is kept."""
-
-    step = ConditionalStep
-
-
 def picked(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """One index along the first axis, in proportion to the exponentials, shape ``log.shape[1:]``.
 
@@ -228,9 +226,7 @@ def picked(log: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     >>> picked(log, np.random.default_rng(0)).tolist()
     [0, 1]
     """
-    edges = np.cumsum(np.exp(log - log.max(axis=0)), axis=0)
-    point = (1.0 - rng.random(log.shape[1:])) * edges[-1]
-    return (edges < point).sum(axis=0)
+    return pick(np.exp(log - log.max(axis=0)), rng.random(log.shape[1:]))
 
 
 def independent(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray:

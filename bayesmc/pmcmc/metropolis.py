@@ -10,9 +10,8 @@ from typing import Any, ClassVar
 from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.network import Problem
-from bayesmc.pmcmc.base import ParticleEngine
+from bayesmc.pmcmc.base import ParticleEngine, ParticleSampler
 from bayesmc.pmcmc.quasi import filter_of
-from bayesmc.pmcmc.sampler import ParticleSampler
 from bayesmc.pmcmc.walk import ParameterWalk
 from bayesmc.results import Checkpoint
 

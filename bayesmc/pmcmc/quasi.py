@@ -20,13 +20,14 @@ ch. 17 (shifted lattices).
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
 from scipy.special import ndtri
 
 from bayesmc.dbn import PREVIOUS
-from bayesmc.engines.particles.particles import Particles, Selection
+from bayesmc.engines.particles.smc import Particles, Selection
 from bayesmc.pmcmc.filters import ChainStep, Filter
 from bayesmc.pmcmc.trellis import Slice, Trellis
 from bayesmc.resampling import systematic
@@ -91,11 +92,7 @@ class QuasiFilter(Filter):
     best = 0.7  # variance falls so fast that more particles cost less than chains that stand still
 
     def __init__(self, trellis: Trellis, particles: int, chosen: bool, key: str) -> None:
-        super().__init__(trellis, particles, chosen)
-        self.key = key
-
-    def step_for(self, values: Values, chains: int) -> QuasiStep:
-        return QuasiStep(self.trellis, self.particles, values, chains, self.key)
+        super().__init__(trellis, particles, chosen, partial(QuasiStep, key=key))
 
 
 class Even(np.random.Generator):

@@ -15,13 +15,13 @@ from bayesmc.resampling.adaptive import Adaptive, Resampled, checked, scheme_of
 from bayesmc.resampling.schemes import (
     SCHEMES,
     Scheme,
+    ess,
     multinomial,
     residual,
     ssp,
     stratified,
     systematic,
 )
-from bayesmc.resampling.weights import ess
 
 __all__ = [
     "SCHEMES",

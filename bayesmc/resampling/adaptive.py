@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.resampling.schemes import SCHEMES, Scheme
-from bayesmc.resampling.weights import ess
+from bayesmc.resampling.schemes import SCHEMES, Scheme, ess
 
 
 class Resampled(NamedTuple):

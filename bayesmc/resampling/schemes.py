@@ -9,21 +9,25 @@ All of them work on *edges*: entry ``i`` of the edges says how many draws fall o
 ``[k, k + 1)``, or anywhere), it is the number of points below ``x[i]``. Equal neighbours in ``x`` have equal
 edges, and none lies below a leading zero, which keeps weights of zero out; the edge at the end of ``x`` is
 set to ``draws``, which keeps indices within bounds whatever the rounding.
+
+Checks of weights cost one look at the smallest and one at the sum. Sums that overflow, or are so small that
+dividing by them would, are taken again of weights divided by the largest.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any, Protocol
 
 import numpy as np
 
-from bayesmc.resampling.weights import count_of, cumulative_offspring, expected_offspring
-
 # entries worked on at a time, so that temporaries stay in the cache
 _BLOCK = 16_384
+# between these a sum, its square and its reciprocal are exact to rounding
+_SMALL, _LARGE = 1e-120, 1e120
 
 
 class Scheme(Protocol):
@@ -73,8 +77,8 @@ def multinomial(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np
     >>> np.bincount(picked).tolist()
     [517, 0, 483]
     """
-    draws = count_of(draws)
-    positions = cumulative_offspring(weights, draws)
+    draws = _count_of(draws)
+    positions = _cumulative_offspring(weights, draws)
     return _unfolded(_scattered(positions, draws, rng), draws)
 
 
@@ -98,8 +102,8 @@ def stratified(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.
     >>> np.bincount(picked).tolist()
     [501, 0, 500]
     """
-    draws = count_of(draws)
-    positions = cumulative_offspring(weights, draws)
+    draws = _count_of(draws)
+    positions = _cumulative_offspring(weights, draws)
     points = _one_per_stratum(draws, positions.shape[1:], rng)
     return _unfolded(_closed(_below(positions, points), positions, draws), draws)
 
@@ -124,8 +128,8 @@ def systematic(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.
     >>> systematic(np.array([0.5, 0.25, 0.25]), 4, np.random.default_rng(0)).tolist()
     [0, 0, 1, 2]
     """
-    draws = count_of(draws)
-    positions = cumulative_offspring(weights, draws)
+    draws = _count_of(draws)
+    positions = _cumulative_offspring(weights, draws)
     # ceil(x - u) of the points k + u lie below x: the whole part of x + (1 - u), but for u = 0
     shift = rng.random(positions.shape[1:]) if positions.ndim > 1 else rng.random()
     positions += (1.0 - shift) % 1.0
@@ -152,7 +156,7 @@ def residual(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.nd
     >>> np.bincount(picked).tolist()
     [5, 3, 2]
     """
-    draws = count_of(draws)
+    draws = _count_of(draws)
     kept, positions, left = _kept_and_left(weights, draws)
     return _unfolded(kept + _scattered(positions, left, rng), draws)
 
@@ -187,7 +191,7 @@ def ssp(weights: np.ndarray, draws: int, rng: np.random.Generator) -> np.ndarray
     >>> np.bincount(picked).tolist()
     [2, 2, 1]
     """
-    draws = count_of(draws)
+    draws = _count_of(draws)
     kept, positions, left = _kept_and_left(weights, draws)
     points = _pivotal_points(positions, left, rng)
     return _unfolded(kept + _closed(_below(positions, points), positions, left), draws)
@@ -203,6 +207,123 @@ SCHEMES: Mapping[str, Scheme] = MappingProxyType(
         "ssp": ssp,
     }
 )
+
+
+def ess(weights: np.ndarray) -> Any:
+    """Effective number of equally weighted particles, ``(sum w)**2 / sum w**2``.
+
+    Parameters
+    ----------
+    weights : array_like, shape (n, *batch)
+        Nonnegative, on any scale. ``bayesmc.diagnostics.weight_ess`` takes log weights.
+
+    Returns
+    -------
+    float or ndarray, shape batch
+        Between 1 and n.
+
+    Raises
+    ------
+    ValueError
+        If a weight is negative, infinite or NaN, or all are zero.
+
+    References
+    ----------
+    Kong, Liu and Wong (1994), JASA 89(425).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.resampling import ess
+    >>> ess(np.array([1.0, 1.0, 0.0, 0.0]))
+    2.0
+    >>> ess(np.array([[1.0, 1.0], [1.0, 0.0], [1.0, 0.0]])).round(6).tolist()
+    [3.0, 1.0]
+    """
+    weights = _checked(weights)
+    total = np.add.reduce(weights, axis=0)
+    if not _is_moderate(total):
+        weights = _rescaled(weights)
+        total = np.add.reduce(weights, axis=0)
+    # not a BLAS product, whose threads cost far more than they save
+    squares = np.einsum("i...,i...->...", weights, weights)
+    return total * total / squares if weights.ndim > 1 else float(total * total / squares)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _count_of(draws: int) -> int:
+    """``draws`` as a plain integer; an error says so where it is none, or negative."""
+    try:
+        count = operator.index(draws)
+    except TypeError:
+        count = -1
+    if count < 0:
+        raise ValueError(f"resampling: draws={draws!r}; give a whole number, 0 or more")
+    return count
+
+
+def _expected_offspring(weights: np.ndarray, draws: int) -> np.ndarray:
+    """``draws * weights / sum``, a new array of shape (n, *batch)."""
+    weights = _checked(weights)
+    total = np.add.reduce(weights, axis=0)
+    if not _is_moderate(total):
+        weights = _rescaled(weights)
+        total = np.add.reduce(weights, axis=0)
+    return weights * (draws / total)
+
+
+def _cumulative_offspring(weights: np.ndarray, draws: int) -> np.ndarray:
+    """Running sums of ``expected_offspring`` along axis 0; the last is ``draws`` up to rounding.
+
+    A weight of zero repeats the entry before it exactly.
+    """
+    weights = _checked(weights)
+    running = np.add.accumulate(weights, axis=0)
+    if not _is_moderate(running[-1]):
+        running = np.add.accumulate(_rescaled(weights), axis=0)
+    running *= draws / running[-1]
+    return running
+
+
+def _checked(weights: np.ndarray) -> np.ndarray:
+    """As floats, with nothing negative; what is infinite or NaN shows in the sum."""
+    weights = np.asarray(weights, dtype=float)
+    if weights.ndim == 0 or len(weights) == 0:
+        raise ValueError(
+            f"resampling: weights of shape {weights.shape}; give at least one, particles on axis 0"
+        )
+    if (
+        weights.size and weights.item(weights.argmin()) < 0
+    ):  # faster than a reduction, for few weights
+        where = np.argwhere(weights < 0)[0].tolist()
+        raise ValueError(
+            f"resampling: the weight at {where} is negative ({weights[tuple(where)]}); "
+            "weights are exp(log_weights), not log weights"
+        )
+    return weights
+
+
+def _is_moderate(total: Any) -> bool:
+    if isinstance(total, float):  # a NumPy scalar is one; its array operations cost a microsecond
+        return _SMALL < total < _LARGE
+    return bool(((total > _SMALL) & (total < _LARGE)).all())
+
+
+def _rescaled(weights: np.ndarray) -> np.ndarray:
+    """Weights divided by the largest of their batch element, or the error that there is none."""
+    top = weights.max(axis=0)
+    good = (top > 0) & (top < np.inf)
+    if np.all(good):
+        return weights / top
+    where = tuple(np.argwhere(~good)[0].tolist())
+    place = f" in batch element {where}" if where else ""
+    fault = "all weights are zero" if top[where] == 0 else f"a weight is {top[where]}"
+    raise ValueError(
+        f"resampling: {fault}{place}; weights must be finite with a positive sum "
+        "(from log weights, subtract their maximum before exp)"
+    )
 
 
 def _unfolded(edges: np.ndarray, draws: int) -> np.ndarray:
@@ -267,7 +388,7 @@ def _one_per_stratum(strata: int, batch: tuple[int, ...], rng: np.random.Generat
 
 def _kept_and_left(weights: np.ndarray, draws: int) -> tuple[np.ndarray, np.ndarray, Any]:
     """Edges of the certain offspring, running sums of the residuals, and draws still to be made."""
-    expected = expected_offspring(weights, draws)
+    expected = _expected_offspring(weights, draws)
     certain = expected.astype(np.intp)
     expected -= certain
     kept = np.add.accumulate(certain, axis=0, out=certain)

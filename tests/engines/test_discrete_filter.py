@@ -487,7 +487,7 @@ def test_steps_one_by_one_equal_the_run_over_the_series() -> None:
                     np.testing.assert_allclose(belief.mean(name), wanted, rtol=0, atol=1e-10)
                     np.testing.assert_allclose(belief.std(name), whole.std(name)[t], atol=1e-7)
         np.testing.assert_allclose(belief.log_marginal_likelihood, whole.log_marginal_likelihood)
-        assert belief.run.series.steps <= 3  # what a belief holds does not grow
+        assert belief.state.series.steps <= 3  # what a belief holds does not grow
 
 
 def test_what_is_seen_may_differ_from_step_to_step() -> None:

@@ -105,13 +105,15 @@ def test_ranks_are_uniform_on_a_grid_that_is_given() -> None:
 
 def test_draws_from_cells_are_draws_from_the_belief() -> None:
     """Means of 4,000 draws within 5 standard errors of the belief's: one false alarm in 1e5 runs."""
-    from bayesmc.engines.grid import looked
-    from bayesmc.engines.grid.search import quiet
+    from bayesmc.engines.filtering import quiet
+    from bayesmc.engines.grid.posterior import draws_of
 
     dbn, engine = pairs(), bmc.GridFilter({"x": (-6.0, 6.0, 100)})
     belief = engine.step(engine.start(dbn), {"y": [3.0, 0.5, -1.0], "n": [2, 0, 1]})
     with quiet():
-        drawn = looked.draws_of(belief.mover.model, belief.cells)(np.random.default_rng(5), 4000)
+        drawn = draws_of(belief.state.mover.model, belief.state.cells)(
+            np.random.default_rng(5), 4000
+        )
     for name, mean, std in (
         ("x", belief.mean("x"), belief.std("x")),
         ("on", belief.mean("on"), belief.std("on")),

@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.engines.kalman import base as kalman_base
 from bayesmc.engines.kalman import covariances as kalman_covariances
 from bayesmc.engines.kalman import means as kalman_means
-from bayesmc.engines.kalman.filter import KalmanFilter
+from bayesmc.engines.kalman.filter import GaussianFilter, KalmanFilter
 from bayesmc.linalg.square_root import Conditioned, condition
 from bayesmc.testing import session
 from bayesmc.testing.makers.linear_dbns import LinearSeries, random_linear_dbn
@@ -481,7 +480,7 @@ def test_says_what_it_does_to_each_node() -> None:
     text = str(explained)
     assert "Gaussian" in text
     assert "updates" in text
-    assert kalman_base.GaussianFilter.refusal is KalmanFilter.refusal
+    assert GaussianFilter.refusal is KalmanFilter.refusal
 
 
 @pytest.mark.parametrize("lead", [(), (3,), (2, 3)])

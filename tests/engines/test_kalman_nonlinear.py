@@ -14,12 +14,11 @@ from scipy.special import ndtr
 import bayesmc as bmc
 from bayesmc.engines.kalman import levels as kalman_levels
 from bayesmc.engines.kalman import means as kalman_means
-from bayesmc.engines.kalman import posterior as kalman_posterior
-from bayesmc.engines.kalman import rows as kalman_rows
-from bayesmc.engines.kalman.extended import ExtendedKalmanFilter
+from bayesmc.engines.kalman import passes as kalman_rows
+from bayesmc.engines.kalman import queries as kalman_queries
 from bayesmc.engines.kalman.filter import KalmanFilter
-from bayesmc.engines.kalman.followed import Followed
-from bayesmc.engines.kalman.unscented import UnscentedKalmanFilter
+from bayesmc.engines.kalman.levels import Followed
+from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
 from bayesmc.errors import ModelMisfitWarning
 from bayesmc.testing import session
 from bayesmc.testing.makers.linear_dbns import random_linear_dbn
@@ -270,7 +269,7 @@ def test_angles_go_the_short_way_round(engine: Any, monkeypatch: pytest.MonkeyPa
     before, after = (np.abs(turned(p.mean("a") - heading)).mean() for p in (filtered, smoothed))
     assert after < before
     # without wrapping, the filter is lost where the heading crosses pi
-    for module in (kalman_levels, kalman_means, kalman_posterior):
+    for module in (kalman_levels, kalman_means, kalman_queries):
         monkeypatch.setattr(module, "wrap_angle", lambda a: a)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ModelMisfitWarning)

@@ -11,9 +11,8 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.engines.particles import genealogy, record
-from bayesmc.engines.particles.drift import Compass
-from bayesmc.engines.particles.forgetting import Sight
 from bayesmc.engines.particles.rare_states import Scouting
+from bayesmc.engines.particles.tracking import Compass, Sight
 from bayesmc.errors import BayesmcWarning, LowEssWarning
 
 

@@ -15,7 +15,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.engines.particles import filter_step
 from bayesmc.engines.particles.filter_step import FilterStep
-from bayesmc.engines.particles.particles import Selection
+from bayesmc.engines.particles.smc import Selection
 from bayesmc.errors import (
     DegeneracyError,
     EvidenceError,

@@ -20,7 +20,7 @@ import bayesmc as bmc
 from bayesmc.dbn import pose_series
 from bayesmc.engines.particles import backward as backward_simulation
 from bayesmc.engines.particles.backward import Backward, lagged
-from bayesmc.engines.particles.particles import Layout, evenly_weighted
+from bayesmc.engines.particles.smc import Layout, evenly_weighted
 from bayesmc.errors import UnsupportedError
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.testing import session

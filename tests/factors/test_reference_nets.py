@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bayesmc.factors import CliqueTree
-from bayesmc.factors.semiring import LINEAR
+from bayesmc.factors.propagation import LINEAR
 from bayesmc.io.bif import parse_bif, read_text
 
 EXACT = ["alarm", "asia", "cancer", "earthquake", "hepar2", "mildew", "pigs", "sachs", "survey",

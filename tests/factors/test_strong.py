@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bayesmc.factors import gaussian, strong
-from bayesmc.factors.gaussian import Conditional, GaussianFactor
-from bayesmc.factors.strong import StrongPlan, integrate, strong_plan
+from bayesmc.factors import gaussian
+from bayesmc.factors.gaussian import Conditional, GaussianFactor, StrongPlan, integrate, strong_plan
 
 Scopes = list[tuple[tuple[Hashable, ...], tuple[Hashable, ...]]]
 
@@ -179,7 +178,7 @@ def test_plans_foresee_scopes_and_memory(graph: str, monkeypatch: pytest.MonkeyP
         made.append((block, given, 8 * lead * count * width))
         return given, left
 
-    monkeypatch.setattr(strong, "eliminate", watched)
+    monkeypatch.setattr(gaussian, "eliminate", watched)
     for seed in range(8):
         rng = np.random.default_rng([seed, 7])
         factors, dims = product(rng, GRAPHS[graph](rng, 6))

@@ -159,7 +159,7 @@ MUTANTS = [
     ),
     Mutant(
         "a belief out of a pickle expects the opposite",
-        (Edit("bayesmc.engines.kalman.base:GaussianFilter._bound",
+        (Edit("bayesmc.engines.kalman.filter:GaussianFilter._bound",
               "taken._replace(layout=layout)", "taken._replace(layout=layout, mean=-taken.mean)"),),
         after_pickle(bmc.KalmanFilter(), None, 200),
         "repeated_test, 200 series",

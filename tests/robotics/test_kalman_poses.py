@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines.kalman.nonlinear import _joint_root
 from bayesmc.engines.kalman.slices import Layout
-from bayesmc.engines.kalman.unscented import _joint_root
 from bayesmc.errors import ModelMisfitWarning
 from bayesmc.robotics.landmarks import bearing, range_and_bearing, range_only
 from bayesmc.robotics.motion import OdometryMotion, VelocityMotion

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.averages import called, naming
 from bayesmc.engines.discrete.chain import most_likely
 from bayesmc.engines.discrete.limits import first_gap, is_untold
 from bayesmc.engines.discrete.rows import Rows, Term, Variable
 from bayesmc.engines.discrete.run import Run, bad_parameters
 from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
-from bayesmc.engines.filtering import Answers, Queries
+from bayesmc.engines.filtering import Answers, Queries, quiet
 from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
-from bayesmc.factors.named import connected, log_product
+from bayesmc.factors.named import choices_of
 from bayesmc.network import CompiledNode
 from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import circular_variance
@@ -167,7 +166,7 @@ class SliceAnswers:
         node = self.model[term.name]
         lead = 1 + len(self.reader.cards(term)) + len(node.plates)
         ndim = lead + len(node.event_shape)
-        with marking_invalid(), np.errstate(all="ignore"):
+        with quiet():
             result, _ = self.reader.evaluate(term, rows)
             if not isinstance(result, Distribution):
                 own = self.reader.model(term.kind, 0)[term.name]
@@ -213,31 +212,11 @@ class SliceAnswers:
             second[mask] = np.where(node.angles, np.sin(here), 0.0)
 
     def _place(
-        self,
-        out: np.ndarray,
-        start: int,
-        stop: int,
-        node: CompiledNode,
-        element: int,
-        array: np.ndarray,
-    ) -> None:
-        """Write an element's answers ``(rows, sequences, *rest)`` where they belong."""
-        reader = self.reader
-        shape = (array.shape[0], *(reader.lead if array.shape[1] > 1 else (1,) * len(reader.lead)))
-        full = array.reshape(*shape, *array.shape[2:])
-        outer = [p for p in node.plates if p in reader.apart]
-        index: list[Any] = [slice(None)]
-        index += [slice(None) if p in outer else 0 for p in reader.apart]
-        kept = [p for p in reader.apart if p in outer]
-        full = full[tuple(index)]
-        order = [1 + kept.index(p) for p in outer]
-        full = full.transpose(0, *order, *range(1 + len(order), full.ndim))
-        inner = [p for p in node.plates if p not in reader.apart]
-        sizes = tuple(self.model.sizes[p] for p in inner)
-        at = iter(np.unravel_index(element, sizes) if inner else ())
-        where = [int(next(at)) if p in inner else slice(None) for p in node.plates]
-        rows = slice(start - self.run.first, stop - self.run.first)
-        out[(rows, *where)] = full
+        self, out: np.ndarray, start: int, stop: int, node: CompiledNode, element: int, array: np.ndarray
+    ) -> None:  # fmt: skip
+        """Write an element's answers about some slices where they belong."""
+        rows = out[start - self.run.first : stop - self.run.first]
+        self.reader.put_element(rows, node, element, array)
 
     def _stretches(self, scope: Sequence[Variable]) -> list[tuple[int, int]]:
         """Slices cut so that the joint of some variables stays within bounds."""
@@ -245,7 +224,7 @@ class SliceAnswers:
         for number in {self.plan.chain_of(v) for v in scope}:
             chain = self.plan.chains[number]
             plain = set(scope) <= set(chain.state)
-            entries = max(entries, float(chain.size) if plain else self.plan.widest(chain))
+            entries = max(entries, float(chain.size) if plain else self.plan.widest[number])
         return self.run.stretches(entries * self.run.sequences)
 
     def _cut(self, term: Term, more: float) -> list[tuple[int, int]]:
@@ -253,8 +232,8 @@ class SliceAnswers:
         entries = max(more, math.prod(map(float, self.reader.cards(term))))
         for _, name in (*term.alone, *term.whole):
             for element in range(self.reader.elements(name)):
-                chain = self.plan.chains[self.plan.chain_of((0, name, element))]
-                entries = max(entries, self.plan.widest(chain))
+                number = self.plan.chain_of((0, name, element))
+                entries = max(entries, self.plan.widest[number])
         return self.run.stretches(entries * self.run.sequences)
 
     def _check_question(self, term: Term) -> None:
@@ -281,15 +260,15 @@ class SliceAnswers:
         read: Callable[[Any], np.ndarray],
     ) -> np.ndarray:
         reader = self.reader
-        placed = rows.on_axes(reader, term)
+        placed = reader.placed(term, rows)
         cards = reader.cards(term)
         lead = (rows.count, *cards)
         count = math.prod(lead)
         arguments = []
-        with marking_invalid(), np.errstate(all="ignore"):
+        with quiet():
             for name in names:
                 node = reader.model(term.kind, 0)[name]
-                value = np.broadcast_to(placed.value(name, 0), (*lead, *node.value_shape))
+                value = np.broadcast_to(reader.value(placed, name, 0), (*lead, *node.value_shape))
                 arguments.append(node.decode(value.reshape(count, *node.value_shape)))
             values = read(called(function, arguments))
         if (
@@ -346,29 +325,14 @@ def _fill_inside(run: Run, number: int, states: Mapping[Variable, np.ndarray]) -
     """The best states of the variables of a slice that no other slice reads, given those that some do."""
     plan = run.plan
     chain = plan.chains[number]
-    for start, stop in run.stretches(plan.widest(chain) * run.sequences):
-        rows = plan.rows(run.series, start, stop)
-        pieces = run.pieces(number, rows)
-        for group in connected(chain.inside, [p.scope for p in pieces]):
-            members = [p for p in pieces if set(group) & set(p.scope)]
-            border = tuple(dict.fromkeys(v for p in members for v in p.scope if v not in group))
-            sizes = tuple(plan.cards[v] for v in group)
-            entries = math.prod(map(float, (*sizes, *(plan.cards[v] for v in border))))
-            if entries > BLOCK_ENTRIES:
-                raise BudgetError(
-                    f"most_likely: {len(group)} hidden nodes of a slice have {entries:.3g} joint states that "
-                    "meet in one density; observe more of them",
-                    int(min(8 * entries, 2**62)),
-                )
-            table = log_product(members, (*border, *group), plan.cards)
-            table = table.reshape(*table.shape[: 2 + len(border)], -1)
-            here = np.arange(rows.count)[:, None] if len(table) > 1 else 0
-            there = np.arange(run.sequences) if table.shape[1] > 1 else 0
-            at = [_on_path(states, v, start - run.first, stop - run.first) for v in border]
-            best = table[(here, there, *at)].argmax(axis=-1)
-            best = np.broadcast_to(best, (rows.count, run.sequences))
-            for variable, state in zip(group, unravelled(best, sizes), strict=True):
-                states[variable][start - run.first : stop - run.first] = state
+    for start, stop in run.stretches(plan.widest[number] * run.sequences):
+        pieces = run.pieces(number, plan.rows(run.series, start, stop))
+        border = [v for v in (*chain.before, *chain.state) if any(v in p.scope for p in pieces)]
+        known = {v: _on_path(states, v, start - run.first, stop - run.first) for v in border}
+        for choice in reversed(choices_of(pieces, border, plan.cards)):
+            known.update(choice.look_up(known))
+        for variable in chain.inside:
+            states[variable][start - run.first : stop - run.first] = known[variable]
 
 
 def _on_path(

@@ -48,13 +48,12 @@ class Passed:
     log: np.ndarray | None
     increments: np.ndarray
 
-    @property
-    def log_belief(self) -> np.ndarray:
-        """Logs of the beliefs."""
+    def logs(self, steps: slice) -> np.ndarray:
+        """Logs of the beliefs of some slices."""
         if self.log is not None:
-            return self.log
+            return self.log[steps]
         with np.errstate(divide="ignore"):
-            return np.log(self.belief)
+            return np.log(self.belief[steps])
 
 
 def filtered(

@@ -6,21 +6,18 @@ Options, refusals and the calls; tables of slices are made in ``slices``, passed
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries, best_path
-from bayesmc.engines.discrete.belief import DiscreteBelief, Held, window
 from bayesmc.engines.discrete.limits import is_untold, size_refusal, why_unreadable
-from bayesmc.engines.discrete.looked import rows_compared
-from bayesmc.engines.discrete.path import path_values
-from bayesmc.engines.discrete.posterior import DiscretePosterior
+from bayesmc.engines.discrete.posterior import DiscreteBelief, DiscretePosterior, window
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
+from bayesmc.engines.discrete.states import path_values, rows_compared
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, observed_answers
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BayesmcError, BudgetError, UnsupportedError
@@ -191,27 +188,21 @@ class DiscreteFilter(FilterEngine):
         assert path is not None
         return path_values(run, path, problem.hidden)
 
-    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> DiscreteBelief:
-        return DiscreteBelief(dbn, dict(static))
-
     def _bound(
         self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> DiscreteBelief:
-        held = belief.held
-        plan = DiscreteSlices(
-            slices, plates_apart(slices), frozenset(), read_static(slices, belief.static)
-        )
-        run = Run(plan, held.series, belief.t, held.before)
+        static = read_static(slices, belief.static)
+        plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)
+        run = Run(plan, belief.state.series, belief.t, belief.state.before)
         run.forward()  # the slice once more, from the beliefs before it
-        return DiscreteBelief(dbn, belief.static, belief.t, belief.log_marginal_likelihood, run)
+        return belief.bound(dbn, slices, run)
 
     def _absorbed(self, belief: DiscreteBelief, slices: Slices, row: Row) -> DiscreteBelief:
-        t, run = belief.t + 1, belief.run
-        assert not isinstance(run, Held)
+        t, run = belief.t + 1, belief.state
         if run is None:
             static = read_static(slices, belief.static)
             plan = DiscreteSlices(slices, plates_apart(slices), frozenset(), static)
-            error = self._too_large(plan, 1)
+            error = size_refusal(plan, 1, self.max_states, self.max_bytes)
             if error is not None:
                 raise error
         else:
@@ -220,13 +211,10 @@ class DiscreteFilter(FilterEngine):
         reason = why_unreadable(plan, series, last=True)
         if reason is not None:
             raise UnsupportedError(_words(reason))
-        before = None if run is None else [p.log_belief[-1] for p in run.passed]
+        before = None if run is None else [p.logs(slice(-1, None))[0] for p in run.passed]
         after = Run(plan, series, t, before)
         increment = after.forward()[0].reshape(plan.reader.lead)
-        total = belief.log_marginal_likelihood + increment
-        return DiscreteBelief(
-            belief.dbn, belief.static, t, total if np.ndim(total) else float(total), after
-        )
+        return belief.after(slices, row, increment, after)
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -289,7 +277,7 @@ class DiscreteFilter(FilterEngine):
             return UnsupportedError(_words(str(error)))
         if reason is not None:
             return UnsupportedError(_words(reason))
-        too_large = self._too_large(plan, problem.steps)
+        too_large = size_refusal(plan, problem.steps, self.max_states, self.max_bytes)
         if too_large is not None:
             return too_large
         try:
@@ -300,14 +288,6 @@ class DiscreteFilter(FilterEngine):
                 f"and one of them fails there: {error}; use ParticleFilter(particles)"
             )
         return None
-
-    def _too_large(self, plan: DiscreteSlices, steps: int) -> BudgetError | None:
-        found = size_refusal(plan, steps, int(self.max_states), float(self.max_bytes))
-        if found is None:
-            return None
-        return BudgetError(
-            f"DiscreteFilter: {found[0]}; use ParticleFilter(particles)", int(min(found[1], 2**62))
-        )
 
     def _plan(self, problem: SeriesProblem, leaves: bool = True) -> DiscreteSlices:
         key = f"discrete slices {leaves}"

@@ -7,6 +7,7 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, Series
 from bayesmc.engines.discrete.rows import Term
 from bayesmc.engines.discrete.slices import DiscreteSlices
+from bayesmc.errors import BudgetError
 
 
 def why_unreadable(plan: DiscreteSlices, series: Series, last: bool = False) -> str | None:
@@ -39,25 +40,22 @@ def why_unreadable(plan: DiscreteSlices, series: Series, last: bool = False) -> 
 
 def size_refusal(
     plan: DiscreteSlices, steps: int, max_states: int, max_bytes: float
-) -> tuple[str, float] | None:
-    """Why the tables would be too large, with the bytes; None where they are not."""
+) -> BudgetError | None:
+    """Why the tables would be too large; None where they are not."""
     sequences = plan.reader.sequences
     total = 0.0
-    for chain in plan.chains:
+    for chain, widest in zip(plan.chains, plan.widest, strict=True):
         names = ", ".join(dict.fromkeys(n for _, n, _ in chain.state))
         if chain.size > max_states:
-            return (
-                f"the joint state of {names} has {chain.size:.3g} values, above max_states={max_states}",
-                8.0 * chain.size,
-            )
-        widest = plan.widest(chain)
+            why = f"the joint state of {names} has {chain.size:.3g} values, above max_states={max_states}"
+            return _too_large(why, 8.0 * chain.size)
         total += 8.0 * (4.0 * widest + 3.0 * steps * sequences * chain.size)
         if total > max_bytes:
-            return (
+            why = (
                 f"{chain.size:.3g} joint states of {names} in {steps} slices need about {total:.3g} bytes, "
-                f"above max_bytes={max_bytes:.3g}; raise DiscreteFilter(max_bytes=) where there is room",
-                total,
+                f"above max_bytes={max_bytes:.3g}; raise DiscreteFilter(max_bytes=) where there is room"
             )
+            return _too_large(why, total)
     return None
 
 
@@ -102,6 +100,12 @@ def is_untold(plan: DiscreteSlices, series: Series, name: str, steps: int | None
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _too_large(why: str, count: float) -> BudgetError:
+    return BudgetError(
+        f"DiscreteFilter: {why}; use ParticleFilter(particles)", int(min(count, 2**62))
+    )
 
 
 def _missed(

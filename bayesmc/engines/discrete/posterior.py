@@ -1,16 +1,22 @@
-"""What a discrete filter says of every slice, and of slices in a row."""
+"""What a discrete filter says of every slice, of slices in a row, and of one slice as its rows come in."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.dbn import Row, Series, Slices
 from bayesmc.engines.averages import as_event
+from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.discrete.answers import SliceAnswers
 from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.network import Observed
 from bayesmc.results import SeriesPosterior
+
+#: rows that a slice may read: its own and two before
+_ROWS = 3
 
 
 class DiscretePosterior(SeriesPosterior):
@@ -77,3 +83,88 @@ class DiscretePosterior(SeriesPosterior):
                 "pickle carries; ask the result of filter or smooth itself, or give queries= to the call"
             )
         return self._answers
+
+
+class Held(NamedTuple):
+    """What a belief goes on with once it has its functions again; what it says of a ``Run`` is the same.
+
+    Attributes
+    ----------
+    series : Series
+        The last rows.
+    before : list of ndarray or None
+        Logs of the beliefs in the slice before, by chain.
+    """
+
+    series: Series
+    before: Sequence[np.ndarray] | None
+
+
+class DiscreteBelief(SliceBelief):
+    """Probabilities of the nodes of one slice.
+
+    Attributes
+    ----------
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import DiscreteFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.table("rain", ["rain_prev"], [[0.7, 0.3], [0.3, 0.7]], initial=[0.5, 0.5])
+    >>> dbn.table("umbrella", ["rain"], [[0.8, 0.2], [0.1, 0.9]])
+    >>> engine = DiscreteFilter()
+    >>> belief = engine.step(engine.start(dbn), {"umbrella": 1})
+    >>> belief.t, belief.probabilities("rain").round(3).tolist()
+    (0, [0.182, 0.818])
+    """
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
+        if self.dbn is not None and not self.dbn.template.has_functions:
+            return {**self.__dict__}  # tables alone travel
+        return super().__getstate__()
+
+    def _without_functions(self) -> Held:
+        return Held(self.state.series, self.state.before)
+
+    def _answered(self) -> SeriesPosterior:
+        answers = SliceAnswers(self.state)
+        slices = answers.plan.slices
+        found = answers.of(slices.dynamic)
+        return DiscretePosterior(
+            slices.first, None, "filter", None, tables=found.tables, means=found.means,
+            variances=found.variances, steps=1, start=self.t,
+        ).read_from(answers)  # fmt: skip
+
+
+def window(slices: Slices, before: Series | None, row: Row) -> Series:
+    """The last few rows as a series that ends with ``row``."""
+    names = {*row.seen, *(before.observed if before is not None else ())}
+    kept = 0 if before is None else min(before.steps, _ROWS - 1)
+    observed = {}
+    for name in names:
+        node = slices.first[name]
+        old = None if before is None else before.observed.get(name)
+        new = row.seen.get(name)
+        sample = new.value if new is not None else old.value[-1]  # type: ignore[union-attr]
+        value = np.empty((kept + 1, *node.value_shape), dtype=sample.dtype)
+        mask = np.zeros((kept + 1, *node.plate_shape), dtype=bool)
+        value[:] = sample
+        if old is not None and kept:
+            value[:kept] = old.value[-kept:]
+            mask[:kept] = True if old.mask is None else old.mask[-kept:]
+        if new is not None:
+            mask[kept] = True if new.mask is None else new.mask
+        if mask.any():
+            observed[name] = Observed(value, mask)
+    inputs = {}
+    for name in slices.template.inputs:
+        now = row.inputs[name][None]
+        past = [] if before is None or not kept else [before.inputs[name][-kept:]]
+        inputs[name] = np.concatenate([*past, now])
+    return Series(kept + 1, observed, inputs, {}, row.t - kept)

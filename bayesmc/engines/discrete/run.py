@@ -154,7 +154,7 @@ class Run:
     # ---- private ----------------------------------------------------------------------------
 
     def _stretches(self, number: int | None) -> list[tuple[int, int]]:
-        entries = self.sequences if number is None else self.plan.row_entries(number)
+        entries = self.sequences if number is None else self.plan.row_entries[number]
         return self.stretches(float(entries))
 
     def _is_of(self, piece: Piece, number: int) -> bool:
@@ -193,14 +193,11 @@ class Run:
             if skip:
                 assert self.before is not None
                 logs[0] = self.before[number]
-            with np.errstate(divide="ignore"):
-                source = passed.log if passed.log is not None else None
-                part = slice(first - 1 + skip, last - 1)
-                logs[skip:] = np.log(passed.belief[part]) if source is None else source[part]
+            logs[skip:] = passed.logs(slice(first - 1 + skip, last - 1))
             found.append(Piece("", chain.before, logs.reshape(*logs.shape[:2], *shape)))
         if now is not passed:
-            with np.errstate(divide="ignore", invalid="ignore"):
-                after = _logs(now, first, last) - _logs(passed, first, last)
+            with np.errstate(invalid="ignore"):
+                after = now.logs(slice(first, last)) - passed.logs(slice(first, last))
             after = np.where(np.isnan(after), -np.inf, after)
             found.append(Piece("", chain.state, after.reshape(*after.shape[:2], *shape)))
         return found
@@ -252,12 +249,6 @@ class Run:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _logs(passed: Passed, first: int, last: int) -> np.ndarray:
-    if passed.log is not None:
-        return passed.log[first:last]
-    return np.log(passed.belief[first:last])
 
 
 def _bytes(pieces: Sequence[Piece]) -> int:

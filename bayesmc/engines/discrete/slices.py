@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -112,10 +113,8 @@ class DiscreteSlices:
         self._home = {v: k for k, c in enumerate(self.chains) for v in (*c.state, *c.inside)}
         self._home |= {v: k for k, c in enumerate(self.chains) for v in c.before}
         self.unseen = absent & names
-        self._nodes = self._nodes_by_chain()
+        self._scopes = self._scopes_by_chain()
         self._fixed: dict[Any, Any] = {}
-        self._widest: dict[int, float] = {}
-        self._entries: dict[int, float] = {}
 
     # ---- what there is ----------------------------------------------------------------------
 
@@ -146,11 +145,18 @@ class DiscreteSlices:
                 found.append((name, (*scope, (0, name, element)) if own else scope))
         return found
 
-    def widest(self, chain: Chain) -> float:
-        """Entries of the largest table of a chain's slice."""
-        if id(chain) not in self._widest:
-            self._widest[id(chain)] = self._widest_of(chain)
-        return self._widest[id(chain)]
+    @cached_property
+    def widest(self) -> list[float]:
+        """Entries of the largest table of a slice, of each chain."""
+        return [
+            largest([s for _, s in self._later(k)], (*chain.before, *chain.state), self.cards)
+            for k, chain in enumerate(self.chains)
+        ]
+
+    @cached_property
+    def row_entries(self) -> list[float]:
+        """Entries of the tables that differ from row to row, for one row of each chain."""
+        return [self._entries_of(k) for k in range(len(self.chains))]
 
     # ---- tables -----------------------------------------------------------------------------
 
@@ -159,7 +165,8 @@ class DiscreteSlices:
 
         What is always the same has one row.
         """
-        wanted = self._nodes[number]
+        found = {name for _, name, _ in self._scopes[number]}
+        wanted = (name for name in self.densities if name in found)
         return [p for name in wanted for p in self.of_node(name, rows)]
 
     def of_node(self, name: str, rows: Rows) -> list[Piece]:
@@ -179,12 +186,6 @@ class DiscreteSlices:
     def rows(self, series: Series, start: int, stop: int) -> Rows:
         """Some slices of a series, all of one kind."""
         return Rows(series, start, stop, self.kind(start))
-
-    def row_entries(self, number: int) -> float:
-        """Entries of a chain's tables that differ from row to row, for one row."""
-        if number not in self._entries:
-            self._entries[number] = self._entries_of(self.chains[number])
-        return self._entries[number]
 
     def block(
         self,
@@ -226,15 +227,12 @@ class DiscreteSlices:
 
     # ---- private ----------------------------------------------------------------------------
 
-    def _widest_of(self, chain: Chain) -> float:
-        keep = (*chain.before, *chain.state)
-        inside = {*keep, *chain.inside}
-        scopes = [s for _, s in self.scopes(2) if inside & set(s)]
-        return largest(scopes, keep, self.cards)
+    def _later(self, number: int) -> list[tuple[str, tuple[Variable, ...]]]:
+        """Scopes of the densities of a chain in later slices, by node."""
+        return [(name, scope) for kind, name, scope in self._scopes[number] if kind == 2]
 
-    def _entries_of(self, chain: Chain) -> float:
-        members = {*chain.before, *chain.state, *chain.inside}
-        scopes = [(n, s) for n, s in self.scopes(2) if members & set(s)]
+    def _entries_of(self, number: int) -> float:
+        chain, scopes = self.chains[number], self._later(number)
         widest = float(chain.size)
         for group in connected(chain.inside, [s for _, s in scopes]):
             part = [(n, s) for n, s in scopes if set(group) & set(s)]
@@ -287,13 +285,13 @@ class DiscreteSlices:
     def _reads(self, name: str) -> bool:
         return any(t.clock or t.reads for t in (self.terms[name, k] for k in (1, 2)))
 
-    def _nodes_by_chain(self) -> dict[int | None, tuple[str, ...]]:
-        """The nodes whose densities hold variables of each chain, and those that hold none."""
-        found: dict[int | None, dict[str, None]] = {k: {} for k in (None, *range(len(self.chains)))}
+    def _scopes_by_chain(self) -> dict[int | None, list[tuple[int, str, tuple[Variable, ...]]]]:
+        """Kind of slice, node and scope of the densities that hold variables of each chain, or none."""
+        found: dict[int | None, list[Any]] = {k: [] for k in (None, *range(len(self.chains)))}
         for kind in (0, 1, 2):
             for name, scope in self.scopes(kind):
-                found[self._home[scope[0]] if scope else None][name] = None
-        return {k: tuple(n for n in self.densities if n in names) for k, names in found.items()}
+                found[self._home[scope[0]] if scope else None].append((kind, name, scope))
+        return found
 
     def _chains(self) -> list[Chain]:
         """Variables grouped by the densities of all kinds of slices."""

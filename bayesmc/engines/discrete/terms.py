@@ -15,11 +15,13 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, Slices
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.discrete.rows import Key, Piece, Rows, Term, Variable
+from bayesmc.engines.filtering import quiet
 from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.factors.named import Named, aligned
 from bayesmc.network import CompiledNode, Model
 from bayesmc.shapes import padded
+from bayesmc.structure.tables import configurations
 
 #: reads arrays off a term in some slices
 Read = Callable[["Term", "Rows"], tuple[Any, ...]]
@@ -169,10 +171,34 @@ class SliceReader:
 
         Its batch axes are rows (1 where nothing varies) and one for each entry of ``cards``.
         """
-        placed = rows.on_axes(self, term)
+        placed = self.placed(term, rows)
         model = self.model(term.kind, 0)
-        result, _ = model.evaluate(term.name, placed.arguments(model, term.name, 0))
+        result, _ = model.evaluate(term.name, self._arguments(placed, model, term.name, 0))
         return result, placed
+
+    def placed(self, term: Term, rows: Rows) -> Rows:
+        """Rows with a term's variables along axes of their own."""
+        first = self.slices.first
+        alone, whole = ([first[name] for _, name in keys] for keys in (term.alone, term.whole))
+        values, cards = configurations(alone, whole, self.apart, ahead=1)
+        axes = dict(zip((*term.alone, *term.whole), values, strict=True))
+        return rows.at(axes, 1 + len(cards))
+
+    def value(self, rows: Rows, name: str, lag: int) -> np.ndarray:
+        """Stored values of a node of the slice ``lag`` back, on rows whose variables have values."""
+        if name == TIME or name in rows.series.inputs:
+            return rows.clock(name, lag)
+        if name in self.static:
+            return self.static[name]
+        if (lag, name) in rows.axes:
+            return rows.axes[lag, name]
+        if self.slices.first[name].is_stochastic:
+            seen = rows.observed(name, lag)
+            if seen is None:
+                raise UnsupportedError(f"node {name!r} is needed and was not observed")
+            return seen[0]
+        model = self.model(rows.kind, lag)
+        return np.asarray(model.evaluate(name, self._arguments(rows, model, name, lag))[0])
 
     def over_rows(self, term: Term, rows: Rows, read: Read) -> tuple[Any, ...]:
         """Arrays read off a term, all rows in one call where its functions broadcast over time.
@@ -229,6 +255,8 @@ class SliceReader:
             for e in range(self.elements(name))
         ]
 
+    # ---- elements of plates -----------------------------------------------------------------
+
     def at_element(
         self, array: np.ndarray, node: CompiledNode, cards: int, element: int, rest: int
     ) -> np.ndarray:
@@ -236,30 +264,35 @@ class SliceReader:
 
         Sequences are one where nothing differs between them.
         """
-        plates = len(node.plates)
-        array = padded(array, 1 + cards + plates + rest)
-        inner = [k for k, p in enumerate(node.plates) if p not in self.apart]
-        index: list[Any] = [slice(None)] * array.ndim
-        if inner:
-            at = np.unravel_index(element, self._inner(node))
-            for k, place in zip(inner, at, strict=True):
-                axis = 1 + cards + k
-                index[axis] = int(place) if array.shape[axis] > 1 else 0
-        array = array[tuple(index)]
+        array = padded(array, 1 + cards + len(node.plates) + rest)
+        sizes = array.shape[1 + cards : 1 + cards + len(node.plates)]
+        place = zip(self._place(node, element), sizes, strict=True)
+        index = tuple(at if isinstance(at, slice) or n > 1 else 0 for at, n in place)
+        array = array[(slice(None),) * (1 + cards) + index]
         outer = [p for p in node.plates if p in self.apart]
-        axes = [1 + cards + outer.index(p) for p in self.apart if p in outer]
-        others = [k for k in range(1, array.ndim) if k not in axes]
-        array = array.transpose(0, *axes, *others)
-        sizes = iter(array.shape[1 : 1 + len(axes)])
-        lead = tuple(next(sizes) if p in outer else 1 for p in self.apart)
-        array = array.reshape(array.shape[0], *lead, *array.shape[1 + len(axes) :])
-        if math.prod(lead) == 1:
-            return array.reshape(array.shape[0], 1, *array.shape[1 + len(lead) :])
-        full = np.broadcast_to(array, (array.shape[0], *self.lead, *array.shape[1 + len(lead) :]))
-        flat = full.reshape(array.shape[0], self.sequences, *array.shape[1 + len(lead) :])
+        before, behind = range(cards), range(cards, cards + rest)
+        scope = (*before, *outer, *behind)
+        array = aligned(Named(scope, array), (*self.apart, *before, *behind))
+        tail = array.shape[1 + len(self.apart) :]
+        if math.prod(array.shape[1 : 1 + len(self.apart)]) == 1:
+            return array.reshape(len(array), 1, *tail)
+        full = np.broadcast_to(array, (len(array), *self.lead, *tail))
+        flat = full.reshape(len(array), self.sequences, *tail)
         if len(flat) == 1 and (flat == flat[:, :1]).all():  # one matrix for all is much cheaper
             return flat[:, :1]
         return flat
+
+    def put_element(
+        self, out: np.ndarray, node: CompiledNode, element: int, array: np.ndarray
+    ) -> None:
+        """Write ``(rows, sequences or 1, *rest)`` where an element stands in ``(rows, *plates, *rest)``."""
+        lead = self.lead if array.shape[1] > 1 else (1,) * len(self.lead)
+        full = array.reshape(len(array), *lead, *array.shape[2:])
+        kept = [p for p in self.apart if p in node.plates]
+        full = full[(slice(None), *(slice(None) if p in kept else 0 for p in self.apart))]
+        order = [1 + kept.index(p) for p in node.plates if p in kept]
+        full = full.transpose(0, *order, *range(1 + len(order), full.ndim))
+        out[(slice(None), *self._place(node, element))] = full
 
     # ---- private ----------------------------------------------------------------------------
 
@@ -267,6 +300,23 @@ class SliceReader:
         return tuple(
             n for p, n in zip(node.plates, node.plate_shape, strict=True) if p not in self.apart
         )
+
+    def _place(self, node: CompiledNode, element: int) -> tuple[int | slice, ...]:
+        """Where an element stands among a node's plates; plates apart are taken whole."""
+        at = iter(np.unravel_index(element, self._inner(node)) if self._inner(node) else ())
+        return tuple(slice(None) if p in self.apart else int(next(at)) for p in node.plates)
+
+    def _arguments(self, rows: Rows, model: Model, name: str, lag: int) -> dict[str, np.ndarray]:
+        """Values of a node's parents, of the slice ``lag`` back."""
+        found = {}
+        for parent in model[name].parents:
+            stem, back = self.origin(parent, lag)
+            value = self.value(rows, stem, back)
+            if back > lag and not self.slices.first[stem].is_stochastic:
+                source = self.model(rows.kind, back)[stem] if back <= 1 else model[parent]
+                value = _handed_on(value, source, model[parent])
+            found[parent] = value
+        return found
 
     def _check_back(self, name: str, stem: str, back: int) -> None:
         if back > 1:
@@ -289,7 +339,7 @@ class SliceReader:
 
     def _log_tables(self, term: Term, rows: Rows) -> tuple[np.ndarray, np.ndarray | None]:
         node = self.slices.first[term.name]
-        with marking_invalid(), np.errstate(all="ignore"):
+        with quiet():
             result, placed = self.evaluate(term, rows)
             lead = 1 + len(self.cards(term)) + len(node.plates)
             if not isinstance(result, Distribution):
@@ -351,10 +401,31 @@ def _stacked(parts: Sequence[Any]) -> Any:
     return np.concatenate([blank if p is None else np.broadcast_to(p, blank.shape) for p in parts])
 
 
+def _handed_on(value: np.ndarray, source: CompiledNode, target: CompiledNode) -> np.ndarray:
+    """Stored values of a deterministic node as the next slice reads them, which may number them otherwise."""
+    if source.domain is None and target.domain is None:
+        return value
+    if source.domain is not None and target.domain is not None:
+        if source.domain.states == target.domain.states:
+            return value
+    plain = source.decode(value)
+    if target.domain is None:
+        return np.asarray(plain)
+    states = target.domain.numbers
+    if states is not None:
+        order = np.argsort(states)
+        at = order[np.minimum(np.searchsorted(states[order], plain), len(states) - 1)]
+        if (states[at] == plain).all():
+            return at
+    raise UnsupportedError(
+        f"deterministic node {source.name!r} takes other values in slice 0 than later; give it states="
+    )
+
+
 def _all_static(slices: Slices, known: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Static nodes, the deterministic ones computed."""
     values = dict(known)
-    with marking_invalid(), np.errstate(all="ignore"):
+    with quiet():
         for name, node in slices.first.nodes.items():
             if name in slices.template.static and name not in values and not node.is_stochastic:
                 above = node.parents

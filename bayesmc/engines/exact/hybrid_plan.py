@@ -16,9 +16,15 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.exact.noiseless import clusters
 from bayesmc.factors import BoundTree, Calibrated, CliqueTree, LogTable
-from bayesmc.factors.gaussian import Conditional, GaussianFactor, likelihood_rows
+from bayesmc.factors.gaussian import (
+    Conditional,
+    GaussianFactor,
+    StrongPlan,
+    integrate,
+    likelihood_rows,
+    strong_plan,
+)
 from bayesmc.factors.moments import Moments, mixture_scopes
-from bayesmc.factors.strong import StrongPlan, integrate, strong_plan
 from bayesmc.network import Problem
 from bayesmc.structure import (
     DiscreteNet,

@@ -13,8 +13,8 @@ from bayesmc.distributions import Distribution
 from bayesmc.engines.averages import called, over_line
 from bayesmc.engines.grid.moves import COUNTS
 from bayesmc.engines.grid.refined import Fine, cell_quantiles, quantiles, refined
-from bayesmc.engines.grid.slice import Placed, Scalar
-from bayesmc.engines.grid.sources import Label, is_previous, previous
+from bayesmc.engines.grid.slice import Placed, sizes_by_label
+from bayesmc.engines.grid.sources import Label, is_previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.factors.named import Named, aligned, contract
@@ -53,6 +53,9 @@ class Answers:
         self.first = now.row.t == 0
         self.own = Named((*now.labels, *model.apart), probs)
         self.base = model.base(before, now)
+        self.sizes = sizes_by_label(before, now)
+        self.labels = tuple(self.sizes)
+        self.held = {s.label: s for s in now.scalars}
 
     def table(self, name: str) -> np.ndarray:
         """Probabilities of a finite node's states, shape ``(*plates, states)``."""
@@ -111,16 +114,17 @@ class Answers:
         node, model = self._node(name), self.model
         axes = model.axes.of[name]
         out = np.full((*node.plate_shape, *(a.size for a in axes)), np.nan)
-        held = {s.label: s for s in self.now.scalars}
         events = math.prod(node.event_shape)
         for number, at in enumerate(model.places(node)):
             labels = [(name, number * events + k) for k in range(events)]
-            if not all(label in held for label in labels):
+            if not all(label in self.held for label in labels):
                 continue
             scope = (*model.apart_of(node), *labels)
             table = aligned(contract([self.own], scope), scope)
             for label in labels:
-                table = table / aligned(Named((label, *model.apart), held[label].widths), scope)
+                table = table / aligned(
+                    Named((label, *model.apart), self.held[label].widths), scope
+                )
             out[at] = table
         seen = self.now.row.seen.get(name)
         if seen is not None and seen.mask is not None:
@@ -177,12 +181,11 @@ class Answers:
                 f"{sorted({s.label[0] for s in self.now.scalars})}), "
                 "or of the probability of an event, probability(function)"
             )
-        held = {s.label: s for s in self.now.scalars}
         events = list(np.ndindex(*node.event_shape))
         out = np.empty((*levels.shape, *node.value_shape))
         for number, at in enumerate(model.places(node)):
             for k, event in enumerate(events):
-                scalar = held.get((name, number * len(events) + k))
+                scalar = self.held.get((name, number * len(events) + k))
                 if scalar is None:  # seen in all elements that are apart
                     assert seen is not None
                     out[(..., *at, *event)] = seen.value[(*at, *event)]
@@ -209,8 +212,7 @@ class Answers:
         found = self._over_fine(names, on_cells, labels)
         if found is not None:
             return found
-        sizes = self._sizes()
-        grid = tuple(sizes[x] if x in labels else 1 for x in self._labels())
+        grid = tuple(self.sizes[x] if x in labels else 1 for x in self.labels)
         cells = math.prod(grid)
         arguments = [self._wide(node, value, grid) for node, value, _ in kept]
         result = on_cells(arguments, cells).astype(float)
@@ -251,12 +253,12 @@ class Answers:
         fine = self._fine(numbers[0], labels) if len(numbers) == 1 else None
         if fine is None:
             return None
-        name, spot = numbers[0][0], self._labels().index(numbers[0])
-        node, sizes = self._node(name), self._sizes()
-        others = [sizes[x] if x in labels and x != numbers[0] else 1 for x in self._labels()]
+        name, spot = numbers[0][0], self.labels.index(numbers[0])
+        node = self._node(name)
+        others = [self.sizes[x] if x in labels and x != numbers[0] else 1 for x in self.labels]
         carried = {n for n in self.now.values if n not in self.model.own}
         base = {n: v for n, v in self.base.items() if n not in carried}
-        states, behind = math.prod(others), len(self._labels()) - spot - 1
+        states, behind = math.prod(others), len(self.labels) - spot - 1
 
         def evaluate(_: np.ndarray, points: np.ndarray) -> np.ndarray:
             x = np.asarray(fine.number(points)).reshape(
@@ -287,18 +289,19 @@ class Answers:
 
     def _fine(self, label: Label, labels: set[Label]) -> Fine | None:
         """The belief on finer cells of a number, shape (J, *others, *apart); None where it has none."""
-        held = {s.label: s for s in self.now.scalars}
-        if any(x not in held for x in labels) or label not in held:
+        if any(x not in self.held for x in labels) or label not in self.held:
             return None  # of the slice before, or seen
-        scalar = held[label]
+        scalar = self.held[label]
         axes = self.model.axes.of[label[0]]
         number = label[1]
         if scalar.points.size != scalar.size:  # some elements are seen
             return None
-        order = [x for x in self._labels() if x in labels]
+        order = [x for x in self.labels if x in labels]
         shares = self._marginal(labels)
         shares = np.moveaxis(
-            shares.reshape(*(held[x].size for x in order), *self.model.lead), order.index(label), 0
+            shares.reshape(*(self.held[x].size for x in order), *self.model.lead),
+            order.index(label),
+            0,
         )
         return refined(axes[number % len(axes)], scalar, shares)
 
@@ -336,42 +339,25 @@ class Answers:
             return seen.value if seen is not None and seen.mask is None else None
         return self.model.computed(self.first, name, self.base)
 
-    def _labels(self) -> list[Label]:
-        was = [] if self.before is None else [previous(x) for x in self.before.labels]
-        return [*was, *self.now.labels]
-
-    @property
-    def _batch(self) -> int:
-        return len(self._labels())
-
-    def _sizes(self) -> dict[Label, int]:
-        def of(scalars: Sequence[Scalar]) -> dict[Label, int]:
-            return {s.label: s.size for s in scalars}
-
-        was = {} if self.before is None else of(self.before.scalars)
-        return {**{previous(x): n for x, n in was.items()}, **of(self.now.scalars)}
-
     def _used(self, arrays: Sequence[tuple[CompiledNode, np.ndarray, int]]) -> set[Label]:
         """Axes that some of these values vary along."""
         found: set[Label] = set()
-        labels = self._labels()
         for node, value, more in arrays:
             lead = value.ndim - len(node.value_shape) - more
             for k in range(lead):
                 if value.shape[k] > 1:
-                    found.add(labels[len(labels) - lead + k])
+                    found.add(self.labels[len(self.labels) - lead + k])
         return found
 
     def _belief(self, used: set[Label]) -> Named:
         """Probabilities over some axes and the plates apart."""
         terms = self.pair() if any(map(is_previous, used)) else [self.own]
-        return contract(terms, (*(x for x in self._labels() if x in used), *self.model.apart))
+        return contract(terms, (*(x for x in self.labels if x in used), *self.model.apart))
 
     def _marginal(self, used: set[Label]) -> np.ndarray:
         """Probabilities over some axes, of size one along the others: shape ``(*batch, *apart)``."""
-        labels, sizes = self._labels(), self._sizes()
-        shape = (*(sizes[x] if x in used else 1 for x in labels), *self.model.lead)
-        return np.array(aligned(self._belief(used), (*labels, *self.model.apart), shape))
+        shape = (*(self.sizes[x] if x in used else 1 for x in self.labels), *self.model.lead)
+        return np.array(aligned(self._belief(used), (*self.labels, *self.model.apart), shape))
 
     def _average(self, node: CompiledNode, value: np.ndarray, more: int = 0) -> np.ndarray:
         """Expectation of values ``(*batch, *plates, *event)`` with ``more`` axes behind."""
@@ -383,11 +369,11 @@ class Answers:
         used = self._used([(node, value, more)])
         if not used:
             return np.array(np.broadcast_to(value.reshape(value.shape[lead:]), full))
-        value = value.reshape((1,) * (self._batch - lead) + value.shape)
+        value = value.reshape((1,) * (len(self.labels) - lead) + value.shape)
         weights = self._aligned(used, node, len(node.event_shape) + more)
         with np.errstate(invalid="ignore"):
             product = np.where(weights > 0, weights * value, 0.0)
-        return np.array(np.broadcast_to(product.sum(axis=tuple(range(self._batch))), full))
+        return np.array(np.broadcast_to(product.sum(axis=tuple(range(len(self.labels)))), full))
 
     def _refuse_bad(self, node: CompiledNode, dist: Distribution) -> None:
         """Bad parameters of what is missing are the user's to hear of, where cells that count have them."""
@@ -409,7 +395,7 @@ class Answers:
         """Probabilities with axes where a node's values have them."""
         # a node outside the plates that are apart depends on no cell of theirs
         rest = tuple(p for p in self.model.apart if p not in node.plates)
-        weights = aligned(self._belief(used), (*self._labels(), *node.plates, *rest))
+        weights = aligned(self._belief(used), (*self.labels, *node.plates, *rest))
         at: Any = (Ellipsis, *(0,) * len(rest))
         weights = weights[at]
         return weights.reshape(weights.shape + (1,) * tail)

@@ -16,9 +16,8 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.filtering import in_slice
-from bayesmc.engines.grid.axes import Axis, axis_of
+from bayesmc.engines.grid.axes import Axis, Lattice, Line, axis_of
 from bayesmc.engines.grid.landings import Landings, narrowest_piece
-from bayesmc.engines.grid.lattice import Lattice, Line
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import UnsupportedError, ZeroProbabilityError
@@ -390,12 +389,10 @@ class _Search:
 
     def _shares(self, cells: Cells) -> np.ndarray | None:
         """Probabilities of the cells of the number, shape (n, *apart); zero where it is seen."""
-        for k, scalar in enumerate(cells.placed.scalars):
-            if scalar.label[0] == self.name:
-                others = tuple(j for j in range(len(cells.placed.scalars)) if j != k)
-                share = cells.probs.sum(axis=others)
-                return np.where(scalar.widths[-1] > 0, share, 0.0)
-        return None
+        axis, share = cells.placed.axis(self.name), cells.shares(self.name)
+        if axis is None or share is None:
+            return None
+        return np.where(cells.placed.scalars[axis].widths[-1] > 0, share, 0.0)
 
     def _open(self, lattice: Lattice) -> np.ndarray:
         """Whether the low and the high end may be moved out."""

@@ -58,8 +58,7 @@ class Edges:
             ends = self._open(now, scalar)
             if not ends:
                 continue
-            others = tuple(j for j in range(len(now.scalars)) if j != k)
-            marginal = probs.sum(axis=others)
+            marginal = now.marginal(probs, k)
             widths = np.broadcast_to(scalar.widths, marginal.shape)
             density = np.divide(marginal, widths, out=np.zeros(widths.shape), where=widths > 0)
             top = density.max(axis=0)

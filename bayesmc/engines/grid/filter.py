@@ -3,26 +3,41 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.exact.exact import readable_bytes
-from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far, pass_slices
-from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, read_axes
-from bayesmc.engines.grid.belief import GridBelief
-from bayesmc.engines.grid.limits import too_large, unread, without_density
-from bayesmc.engines.grid.looked import draws_of
+from bayesmc.engines.filtering import (
+    Asked,
+    FilterEngine,
+    Queries,
+    answer_so_far,
+    pass_slices,
+    quiet,
+)
 from bayesmc.engines.grid.moves import Cells, GridMover
-from bayesmc.engines.grid.record import GridPosterior, GridRecord, answers_of
-from bayesmc.engines.grid.search import GridSearch, known_static
-from bayesmc.engines.grid.slice import quiet, same_points
-from bayesmc.engines.grid.sources import Label
-from bayesmc.engines.grid.tables import GridModel
+from bayesmc.engines.grid.posterior import (
+    GridBelief,
+    GridPosterior,
+    GridRecord,
+    GridState,
+    answers_of,
+    draws_of,
+    values_at,
+)
+from bayesmc.engines.grid.search import (
+    GridOptions,
+    GridSearch,
+    known_static,
+    too_large,
+    unread,
+    without_density,
+)
+from bayesmc.engines.grid.slice import same_points
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError, BudgetError
@@ -33,7 +48,7 @@ from bayesmc.results.predictive import warn_of_misfit
 
 
 @dataclass(frozen=True)
-class GridFilter(FilterEngine):
+class GridFilter(GridOptions, FilterEngine):
     """Histogram filter (Markov localisation): beliefs as probabilities of the cells of a grid.
 
     Exact but for the grid: sums over points stand for integrals. With points closer than the narrowest
@@ -92,30 +107,8 @@ class GridFilter(FilterEngine):
     ([-0.907, 1.044, 2.179], -8.3043)
     """
 
-    grid: Mapping[str, Any] = field(default_factory=dict)
-    cells: int | None = None
-    quadrature: str = "midpoint"
-    max_bytes: float = float(2**30)
-    tolerance: float = 0.01
-
     label: ClassVar[str] = "grid filter"
     belief: ClassVar[type] = GridBelief
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.grid, Mapping):
-            raise ValueError(
-                f"GridFilter(grid={type(self.grid).__name__}): give a dict from node to (low, high, cells) "
-                "or an array of points"
-            )
-        cells = CELLS if self.cells is None else self.cells
-        if isinstance(cells, bool) or not isinstance(cells, (int, np.integer)) or cells < 2:
-            raise ValueError(f"GridFilter(cells={cells!r}): give a number of cells, 2 or more")
-        check_rule(self.quadrature)
-        for what in ("max_bytes", "tolerance"):
-            if not getattr(self, what) > 0:
-                raise ValueError(
-                    f"GridFilter({what}={getattr(self, what)!r}): give a number above 0"
-                )
 
     # ---- what it can do ---------------------------------------------------------------------
 
@@ -306,18 +299,14 @@ class GridFilter(FilterEngine):
             node = problem.model[name]
             if name not in model.own or name in model.leaves:
                 continue
-            values = [_chosen(model, name, row, at) for row, at in zip(rows, path, strict=True)]
+            values = [values_at(model, placed, name, at)[0] for placed, at in path]
             found[name] = np.array(node.decode(np.stack(values)), subok=True)
         return found
 
     # ---- one slice at a time ----------------------------------------------------------------
 
-    def _nothing(self, dbn: DynamicBayesNet, static: Mapping[str, Any], rng: Any) -> GridBelief:
-        return GridBelief(dbn, static)
-
     def _bound(self, belief: GridBelief, dbn: DynamicBayesNet, slices: Slices) -> GridBelief:
-        cells = belief.cells
-        assert cells is not None
+        cells = belief.state.cells
         with quiet():
             model = self.model_on_grid(slices, read_static(slices, belief.static))
             placed = model.place(cells.placed.row)
@@ -326,42 +315,19 @@ class GridFilter(FilterEngine):
                 "GridFilter().start: the belief lies on another grid; go on with the engine that it was "
                 "started with"
             )
-        return GridBelief(
-            dbn, belief.static, GridMover(model, self.tolerance), cells, belief.before,
-            belief.log_marginal_likelihood, belief.inputs,
-        )  # fmt: skip
+        mover = GridMover(model, self.tolerance)
+        return belief.bound(dbn, slices, belief.state._replace(mover=mover))
 
     def _absorbed(self, belief: GridBelief, slices: Slices, row: Row) -> GridBelief:
-        mover = belief.mover
+        mover, before, _ = belief.state or (None, None, None)
         with quiet():
             if mover is None:
                 model = self.model_on_grid(slices, read_static(slices, belief.static))
                 mover = GridMover(model, self.tolerance)
-            cells = mover.move(belief.cells, row)
-        total = belief.log_marginal_likelihood + cells.increment
-        return GridBelief(
-            belief.dbn, belief.static, mover, cells, belief.cells,
-            total if np.ndim(total) else float(total),
-            {n: row.inputs[n] for n in slices.template.inputs},
-        )  # fmt: skip
+            cells = mover.move(before, row)
+        return belief.after(slices, row, cells.increment, GridState(mover, cells, before))
 
     # ---- private -------------------------------------------------------------------------------
-
-    def model_on_grid(
-        self,
-        slices: Slices,
-        static: Mapping[str, np.ndarray],
-        logs: bool = False,
-        axis: tuple[str, Axis] | None = None,
-    ) -> GridModel:
-        """The template on its grid; ``axis`` is a node's that was found."""
-        cells = CELLS if self.cells is None else self.cells
-        axes = read_axes(slices, self.grid, cells, self.quadrature)
-        if axis is not None:
-            name, own = axis
-            missing = {n: why for n, why in axes.missing.items() if n != name}
-            axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
-        return GridModel(slices, axes, static, self.max_bytes, logs)
 
     def _start(self, problem: SeriesProblem) -> tuple[GridMover, list[Cells] | None]:
         """What moves beliefs, and the beliefs of all slices where a search for the grid left them."""
@@ -419,27 +385,3 @@ def _looks(problem: SeriesProblem, mover: GridMover) -> Replicates:
     """What holds rows against those that the grid expects; the same draws always, as of all it answers."""
     plan = SlicePlan(problem.slices, mover.model.apart, known_static(problem))
     return Replicates(problem, plan, stream(np.random.SeedSequence(0), Purpose.CHECK))
-
-
-def _chosen(
-    model: GridModel, name: str, row: Any, positions: Mapping[Label, np.ndarray]
-) -> np.ndarray:
-    """Stored values of a node at chosen positions, or as seen."""
-    placed = model.place(row)
-    node = model.slices.first[name]
-    value = placed.values[name]
-    batch = value.ndim - len(node.value_shape)
-    if not batch:
-        return value
-    apart = model.apart
-    full = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
-    out = np.empty(node.value_shape, dtype=value.dtype)
-    for element in np.ndindex(*model.lead):
-        at = tuple(
-            int(positions[s.label][element]) if value.shape[k] > 1 else 0
-            for k, s in enumerate(placed.scalars)
-        )
-        where = dict(zip(apart, element, strict=True))
-        plates = tuple(where.get(p, slice(None)) for p in node.plates)
-        out[plates] = full[at][plates]
-    return out

@@ -16,8 +16,7 @@ import bayesmc.distributions as families
 from bayesmc.dbn import Row
 from bayesmc.distributions import Affine, Distribution, Mixture, Truncated
 from bayesmc.distributions.adapt import ScipyUnivariate
-from bayesmc.engines.grid.axes import Axis
-from bayesmc.engines.grid.lattice import Lattice
+from bayesmc.engines.grid.axes import Axis, Lattice
 from bayesmc.engines.grid.moves import Cells, GridMover
 from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel, ends_of
@@ -147,27 +146,15 @@ class Landings:
 
     def _shares(self, before: Cells | None) -> np.ndarray:
         """Probabilities of the cells of the slice before, the largest of all plate elements."""
-        axis = None if before is None else self._axis(before.placed)
-        if before is None or axis is None:
-            return np.ones(1)
-        return _marginal(before, axis)
-
-    def _axis(self, placed: Placed) -> int | None:
-        for k, scalar in enumerate(placed.scalars):
-            if scalar.label[0] == self.name:
-                return k
-        return None
+        share = None if before is None else before.shares(self.name)
+        return np.ones(1) if share is None else share.reshape(len(share), -1).max(axis=1)
 
     def _landed(
         self, model: GridModel, before: Cells | None, row: Row, ends: tuple[float, float]
     ) -> _Landed:
         """Pieces outside these ends, of a density on the cells of a model."""
-        first = before is None
-        sources = model.sources(first, self.name)
-        fixed = not sources.timed and not any(n in row.seen for n in sources.now)
-        if before is not None:
-            fixed = fixed and not any(n in before.placed.row.seen for n in sources.before)
         was = None if before is None else before.placed
+        fixed = model.is_fixed(self.name, was, row)
         inside = model is self.mover.model
         key = (id(model), was is not None and was.row.t == 0, inside and ends_of(was))
         if fixed and key in self._kept:
@@ -175,7 +162,7 @@ class Landings:
         if was is not None and not inside:
             was = model.place(was.row)
         now = model.place(row)
-        dist = model.evaluate(first, self.name, model.base(was, now))
+        dist = model.evaluate(was is None, self.name, model.base(was, now))
         found = self._outside(dist, was, now, ends)
         if fixed:
             self._kept[key] = found
@@ -194,7 +181,7 @@ class Landings:
         whole = [np.broadcast_to(p, (*shape, count)) for p in pieces[:4]]
         if was is None and pieces.known and count == 1 and np.prod(shape[:lead]) == 1:
             return _nothing()  # one peak in slice 0: the ends of the lattice tell
-        axis = None if was is None else self._axis(was)
+        axis = None if was is None else was.axis(self.name)
         cells = np.zeros(whole[0].shape, dtype=np.intp)
         if axis is not None and shape[axis] > 1:
             cells += np.arange(shape[axis]).reshape(-1, *(1,) * (cells.ndim - 1 - axis))
@@ -234,7 +221,7 @@ class Landings:
             values = np.round(values).astype(np.int64)
         mover = GridMover(self.make(Axis(values, np.ones(len(u)))), np.inf)
         placed, log = mover.likelihood(before, row)
-        axis = self._axis(placed)
+        axis = placed.axis(self.name)
         if axis is None:
             return np.zeros(len(u))
         log = log.max(axis=tuple(k for k in range(len(placed.scalars)) if k != axis))
@@ -245,11 +232,9 @@ class Landings:
         self, before: Cells, row: Row, found: Cells | None, low: float, high: float
     ) -> tuple[float, float]:
         """How far the ends must go, as functions may jump from numbers beyond them."""
-        axis = self._axis(before.placed)
+        axis = before.placed.axis(self.name)
         if axis is None or self.lattice.line.kind == "integers":
             return low, high
-        if before.placed.scalars[axis].size != self.mover.model.axes.of[self.name][0].size:
-            return low, high  # a belief on a narrower lattice does not tell how it ends on this one
         if before.placed.scalars[axis].size != self.mover.model.axes.of[self.name][0].size:
             return low, high  # a belief on a narrower lattice does not tell how it ends on this one
         share = self._shares(before)
@@ -308,12 +293,6 @@ class _Landed(NamedTuple):
 def _nothing() -> _Landed:
     none = np.empty(0)
     return _Landed(none, none, none, none, np.empty(0, dtype=np.intp), False, True)
-
-
-def _marginal(cells: Cells, axis: int) -> np.ndarray:
-    others = tuple(j for j in range(len(cells.placed.scalars)) if j != axis)
-    share = cells.probs.sum(axis=others)
-    return share.reshape(len(share), -1).max(axis=1)
 
 
 def _is_single(dist: Any) -> bool:

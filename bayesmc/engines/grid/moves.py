@@ -60,6 +60,11 @@ class Cells:
     increment: np.ndarray
     mass: np.ndarray
 
+    def shares(self, name: str) -> np.ndarray | None:
+        """Probabilities of the points of a node of one number, (n, *apart); None where it has none."""
+        axis = self.placed.axis(name)
+        return None if axis is None else self.placed.marginal(self.probs, axis)
+
 
 class GridMover:
     """Moves beliefs over a grid from slice to slice.
@@ -141,8 +146,10 @@ class GridMover:
         ratio = np.divide(smoothed, after.predicted, out=np.zeros(some.shape), where=some)
         return [*self._moving(cells, now, factors), Named((*now.labels, *self.model.apart), ratio)]
 
-    def best(self, rows: Sequence[Row], advance: Any) -> list[dict[Label, np.ndarray]]:
-        """The most likely positions of all scalars, slice by slice: label -> positions, shape (*apart,)."""
+    def best(
+        self, rows: Sequence[Row], advance: Any
+    ) -> list[tuple[Placed, tuple[np.ndarray, ...]]]:
+        """The most likely cell of every slice: positions along its axes, shape ``(1, *apart)``."""
         model, lead = self.model, self.model.lead
         elements = list(np.ndindex(*lead))
         value: list[Named] = []
@@ -170,7 +177,10 @@ class GridMover:
             advance()
         path = _traced(value, history, placed, elements, lead)
         self._check_path(path, placed)
-        return path
+        return [
+            (now, tuple(at[s.label][None] for s in now.scalars))
+            for now, at in zip(placed, path, strict=True)
+        ]
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -256,8 +266,7 @@ class GridMover:
             node = self.model.slices.first[name]
             if node.is_discrete or name in now.row.seen or scalar.size < 3:
                 continue
-            others = tuple(j for j in range(len(now.scalars)) if j != k)
-            top = float(probs.sum(axis=others).max())
+            top = float(now.marginal(probs, k).max())
             # the error of a sum for a normal density whose highest cell has this probability
             error = 2 * np.exp(-np.pi / top**2)
             if error > self.tolerance:

@@ -1,42 +1,54 @@
-"""The search of ``GridFilter`` for a grid: where there is one to find, and when it is taken unasked."""
+"""Options of a grid filter, why it cannot answer, and its search for a grid: where there is one to find, and
+when it is taken unasked.
+"""
 
 from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import SeriesProblem, Slices
+from bayesmc.engines.filtering import quiet
 from bayesmc.engines.grid.automatic import TAKEN_FAR, TARGET, FoundGrid, find_grid
-from bayesmc.engines.grid.axes import Axis
-from bayesmc.engines.grid.lattice import line_of
-from bayesmc.engines.grid.record import GridPosterior
-from bayesmc.engines.grid.slice import quiet
+from bayesmc.engines.grid.axes import CELLS, Axes, Axis, check_rule, line_of, read_axes
+from bayesmc.engines.grid.posterior import GridPosterior
+from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.engines.grid.tables import GridModel
 from bayesmc.errors import BayesmcError, GridWarning, UnsupportedError
+from bayesmc.factors.named import largest
+from bayesmc.network.node import nodes_read
 
 
-class Options(Protocol):
-    """What a search reads of a filter: its options (see ``GridFilter``), and a template on a grid."""
+@dataclass(frozen=True)
+class GridOptions:
+    """The options of ``GridFilter``, which says what they are."""
 
-    @property
-    def grid(self) -> Mapping[str, Any]: ...
+    grid: Mapping[str, Any] = field(default_factory=dict)
+    cells: int | None = None
+    quadrature: str = "midpoint"
+    max_bytes: float = float(2**30)
+    tolerance: float = 0.01
 
-    @property
-    def cells(self) -> int | None: ...
-
-    @property
-    def quadrature(self) -> str: ...
-
-    @property
-    def max_bytes(self) -> float: ...
-
-    @property
-    def tolerance(self) -> float: ...
+    def __post_init__(self) -> None:
+        if not isinstance(self.grid, Mapping):
+            raise ValueError(
+                f"GridFilter(grid={type(self.grid).__name__}): give a dict from node to (low, high, cells) "
+                "or an array of points"
+            )
+        cells = CELLS if self.cells is None else self.cells
+        if isinstance(cells, bool) or not isinstance(cells, (int, np.integer)) or cells < 2:
+            raise ValueError(f"GridFilter(cells={cells!r}): give a number of cells, 2 or more")
+        check_rule(self.quadrature)
+        for what in ("max_bytes", "tolerance"):
+            if not getattr(self, what) > 0:
+                raise ValueError(
+                    f"GridFilter({what}={getattr(self, what)!r}): give a number above 0"
+                )
 
     def model_on_grid(
         self,
@@ -46,7 +58,78 @@ class Options(Protocol):
         axis: tuple[str, Axis] | None = None,
     ) -> GridModel:
         """The template on its grid; ``axis`` is a node's that was found."""
-        ...
+        cells = CELLS if self.cells is None else self.cells
+        axes = read_axes(slices, self.grid, cells, self.quadrature)
+        if axis is not None:
+            name, own = axis
+            missing = {n: why for n, why in axes.missing.items() if n != name}
+            axes = Axes({**axes.of, name: (own,)}, axes.asked, missing)
+        return GridModel(slices, axes, static, self.max_bytes, logs)
+
+
+def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:
+    """Values of the static nodes."""
+    return {n: o.value for n, o in problem.series.static.items()}
+
+
+def too_large(model: GridModel, problem: SeriesProblem, max_bytes: float) -> str | None:
+    """Why the tables do not fit, found from their sizes alone."""
+    hidden = frozenset(n for n in problem.hidden if n in model.own and n not in model.leaves)
+    sizes: dict[Any, int] = dict(zip(model.apart, model.lead, strict=True))
+    labels: list[Label] = []
+    for name in sorted(hidden):
+        axes = model.axes.of[name]
+        for e in range(model.elements(name)):
+            label = (name, e)
+            labels.append(label)
+            sizes[label] = sizes[previous(label)] = axes[e % len(axes)].size
+    scopes = []
+    for first in (True, False) if problem.steps > 1 else (True,):
+        for name in hidden | set(problem.series.observed):
+            if name not in model.own or (
+                name in model.leaves and name not in problem.series.observed
+            ):
+                continue
+            scope = model.scope(first, name, hidden)
+            cells = [sizes[x] for x in scope]
+            if 8 * math.prod(map(float, cells)) > max_bytes:
+                return model.too_large(name, cells, 8 * math.prod(map(float, cells)))
+            if any(map(is_previous, scope)):
+                scopes.append(scope)
+    belief: set[Any] = {previous(x) for x in labels} | set(model.apart)
+    entries = largest([belief, *scopes], (*labels, *model.apart), sizes)
+    if 8 * entries > max_bytes:
+        names = ", ".join(sorted(hidden))
+        return model.too_large(names, [sizes[x] for x in labels], 8 * entries)
+    return None
+
+
+def without_density(problem: SeriesProblem) -> str | None:
+    """A node whose density cannot be evaluated, tried where its parents can be."""
+    for model in (problem.slices.first, problem.slices.later):
+        for name in problem.slices.stochastic:
+            try:
+                with quiet():
+                    dist, _ = model.evaluate(name, model.probe)
+                    model.log_density(name, dist, model.probe[name])
+            except (BayesmcError, NotImplementedError) as error:
+                why = str(error) or "it is not implemented"
+                return f"GridFilter evaluates every density, and that of {name!r} cannot be: {why}"
+    return None
+
+
+def unread(
+    model: GridModel, queries: Mapping[str, Callable[..., Any]], hidden: Collection[str]
+) -> str | None:
+    """Why a query cannot be answered: it reads a node that has no axes."""
+    for query, function in queries.items():
+        for name in nodes_read(function):
+            if name in model.leaves and name in hidden:
+                return (
+                    f"queries={{{query!r}: ...}} reads {name!r}, which is hidden and not on the grid, "
+                    "since nothing depends on it"
+                )
+    return None
 
 
 @dataclass(frozen=True)
@@ -55,10 +138,10 @@ class GridSearch:
 
     Parameters
     ----------
-    options : Options
+    options : GridOptions
     """
 
-    options: Options
+    options: GridOptions
 
     def why_not(self, problem: SeriesProblem) -> str | None:
         """Why no grid is taken unasked: it is where a slice has one hidden number and its error is small."""
@@ -170,8 +253,3 @@ def _numbers(problem: SeriesProblem, model: GridModel) -> list[str]:
         for n in problem.hidden
         if n in model.own and n not in model.leaves and problem.model[n].domain is None
     ]
-
-
-def known_static(problem: SeriesProblem) -> dict[str, np.ndarray]:
-    """Values of the static nodes."""
-    return {n: o.value for n, o in problem.series.static.items()}

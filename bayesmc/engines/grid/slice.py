@@ -9,16 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.distributions.base import marking_invalid
 from bayesmc.engines.grid.axes import Axes
-from bayesmc.engines.grid.sources import GridStructure, Label
+from bayesmc.engines.grid.sources import GridStructure, Label, previous
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.factors.named import Named, aligned
 from bayesmc.network import CompiledNode
@@ -65,6 +63,20 @@ class Placed:
     def shape(self) -> Shape:
         return tuple(s.size for s in self.scalars)
 
+    def axis(self, name: str) -> int | None:
+        """The axis of a node of one number; None where it has none."""
+        return next((k for k, s in enumerate(self.scalars) if s.label[0] == name), None)
+
+    def marginal(self, probs: np.ndarray, axis: int) -> np.ndarray:
+        """Probabilities ``(*cells, *apart)`` summed over all cells but those along one axis."""
+        return probs.sum(axis=tuple(k for k in range(len(self.scalars)) if k != axis))
+
+
+def sizes_by_label(before: Placed | None, now: Placed) -> dict[Label, int]:
+    """How many points every hidden number has, in the order of the axes: of the slice before, and of this."""
+    was = {} if before is None else {previous(s.label): s.size for s in before.scalars}
+    return was | {s.label: s.size for s in now.scalars}
+
 
 def same_points(one: Placed, other: Placed) -> bool:
     """Whether two slices have the same hidden numbers at the same points."""
@@ -72,13 +84,6 @@ def same_points(one: Placed, other: Placed) -> bool:
         np.array_equal(a.points, b.points) and np.array_equal(a.widths, b.widths)
         for a, b in zip(one.scalars, other.scalars, strict=True)
     )
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Parameters out of range are marked, and floating-point warnings silent, while functions run."""
-    with marking_invalid(), np.errstate(all="ignore"):
-        yield
 
 
 class GridSlices(GridStructure):

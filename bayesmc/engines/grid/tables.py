@@ -7,15 +7,14 @@ ones are made block by block while a block is in cache. Those that do not change
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import PREVIOUS, Slices
-from bayesmc.engines.grid.axes import Axes
-from bayesmc.engines.grid.slice import GridSlices, Placed, Values
+from bayesmc.dbn import PREVIOUS, Row
+from bayesmc.engines.grid.slice import GridSlices, Placed, Values, sizes_by_label
 from bayesmc.engines.grid.sources import Label, is_previous, previous
 from bayesmc.errors import BudgetError, ParameterError
 from bayesmc.factors.named import Named, aligned, without_ones
@@ -56,16 +55,10 @@ class GridModel(GridSlices):
     With ``logs`` all tables are log densities.
     """
 
-    def __init__(
-        self,
-        slices: Slices,
-        axes: Axes,
-        static: Mapping[str, np.ndarray],
-        max_bytes: float,
-        logs: bool = False,
-    ) -> None:
-        super().__init__(slices, axes, static, max_bytes, logs)
-        self._kept: dict[Any, Factor] = {}
+    @cached_property
+    def _kept(self) -> dict[Any, Factor]:
+        """Tables that do not change."""
+        return {}
 
     def factors(self, before: Placed | None, now: Placed) -> list[Factor]:
         """Every density of a slice over its scalars and those of the slice before, parents first."""
@@ -82,6 +75,14 @@ class GridModel(GridSlices):
                 found.append(self._factor(name, before, now, base, False, seen.mask))
         return found
 
+    def is_fixed(self, name: str, before: Placed | None, row: Row) -> bool:
+        """Whether a density on its cells is that of any other slice in which the same is hidden."""
+        sources = self.sources(before is None, name)
+        seen = any(n in row.seen for n in sources.now) or (
+            before is not None and any(n in before.row.seen for n in sources.before)
+        )
+        return not (sources.timed or seen)
+
     # ---- private -------------------------------------------------------------------------------
 
     def _factor(
@@ -89,10 +90,7 @@ class GridModel(GridSlices):
         mask: np.ndarray | None = None,
     ) -> Factor:  # fmt: skip
         first = before is None
-        sources = self.sources(first, name)
-        fixed = mask is None and hidden and not sources.timed
-        fixed = fixed and not any(n in now.row.seen for n in sources.now)
-        fixed = fixed and (before is None or not any(n in before.row.seen for n in sources.before))
+        fixed = mask is None and hidden and self.is_fixed(name, before, now.row)
         key = (first, before is not None and before.row.t == 0, name, ends_of(before))
         if fixed and key in self._kept:
             return self._kept[key]
@@ -105,8 +103,8 @@ class GridModel(GridSlices):
         self, name: str, before: Placed | None, now: Placed, base: Values, hidden: bool,
         mask: np.ndarray | None,
     ) -> Factor:  # fmt: skip
-        labels = _both(before, now)
-        sizes = {**_sizes(before, PREVIOUS), **_sizes(now)}
+        sizes = sizes_by_label(before, now)
+        labels = tuple(sizes)
         reach = self._reach(before is None, name, before, now)
         scope = [x for x in labels if x in reach]
         count = math.prod(sizes[x] for x in scope)
@@ -246,14 +244,3 @@ class Block(NamedTuple):
     scale: np.ndarray | None
     invalid: np.ndarray | None
     problem: ParameterError | None
-
-
-def _both(before: Placed | None, now: Placed) -> tuple[Label, ...]:
-    was = () if before is None else tuple(previous(x) for x in before.labels)
-    return (*was, *now.labels)
-
-
-def _sizes(placed: Placed | None, suffix: str = "") -> dict[Label, int]:
-    if placed is None:
-        return {}
-    return {(previous(s.label) if suffix else s.label): s.size for s in placed.scalars}

@@ -132,11 +132,14 @@ def rows_of(
     )
     parts = [np.broadcast_to(a, lead + a.shape[-2:]) for a in (moved, noise)]
     rows = np.concatenate(parts, axis=-1)
-    if absent is None:
-        return rows
+    return rows if absent is None else without_absent(rows, absent)
+
+
+def without_absent(rows: np.ndarray, absent: np.ndarray) -> np.ndarray:
+    """Rows of what some elements lack as noise of their own, which tells nothing; overwrites them."""
     p = absent.shape[-1]
-    fresh = np.zeros((*lead, rows.shape[-2], p))
     rows[..., :p, :] = np.where(absent[..., None], 0.0, rows[..., :p, :])
+    fresh = np.zeros((*rows.shape[:-1], p))
     index = np.arange(p)
     fresh[..., index, index] = absent
     return np.concatenate([rows, fresh], axis=-1)

@@ -17,8 +17,9 @@ import numpy as np
 from bayesmc.dbn import PREVIOUS, TIME, SeriesProblem
 from bayesmc.engines.filtering import in_slice
 from bayesmc.engines.kalman.slices import Layout, always_unknown
-from bayesmc.engines.slice_steps import plates_apart, summed
+from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.network import Observed
+from bayesmc.network.forward import summed
 from bayesmc.network.noiseless import point_log_density
 
 

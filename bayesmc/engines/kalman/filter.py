@@ -1,4 +1,8 @@
-"""``KalmanFilter``: exact filtering and smoothing of linear-Gaussian templates."""
+"""``KalmanFilter``: exact filtering and smoothing of linear-Gaussian templates; what such filters share.
+
+A family says how the numbers of a slice come about from those of the slice before, as a mean and as
+coefficients of independent normals (``expected``), and why it refuses (``_own_refusal``, ``refused_row``).
+"""
 
 from __future__ import annotations
 
@@ -8,19 +12,202 @@ from typing import ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import SeriesProblem
-from bayesmc.engines.filtering import hand_over
-from bayesmc.engines.kalman.answers import filter_answers
-from bayesmc.engines.kalman.base import GaussianFilter
+from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
+from bayesmc.engines.filtering import (
+    Asked,
+    FilterEngine,
+    Queries,
+    answer_so_far,
+    hand_over,
+    quiet,
+)
 from bayesmc.engines.kalman.covariances import rows_of
-from bayesmc.engines.kalman.data import Pattern, SeriesData
+from bayesmc.engines.kalman.data import SeriesData
 from bayesmc.engines.kalman.levels import why_not_matched
-from bayesmc.engines.kalman.passes import Filtered, State, forward
+from bayesmc.engines.kalman.passes import (
+    Ahead,
+    Expected,
+    Filtered,
+    RowTaker,
+    backward,
+    contradicts,
+    forward,
+    impossible_row,
+)
+from bayesmc.engines.kalman.posterior import (
+    GaussianBelief,
+    GaussianSeries,
+    GaussianState,
+    filter_answers,
+    smooth_answers,
+)
 from bayesmc.engines.kalman.reading import Linear, read_linear, reads_time, why_not_gaussian
-from bayesmc.engines.kalman.rows import Expected, Memory, contradicts, impossible_row
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import DegeneracyError, UnsupportedError
 from bayesmc.linalg.square_root import multiplied
+from bayesmc.network.node import nodes_read
+from bayesmc.progress import Progress
+from bayesmc.results.predictive import warn_of_misfit
+
+
+class GaussianFilter(FilterEngine):
+    """Base of ``KalmanFilter``, ``ExtendedKalmanFilter`` and ``UnscentedKalmanFilter``."""
+
+    belief: ClassVar[type] = GaussianBelief
+
+    def refusal(self, problem: SeriesProblem) -> str | None:
+        common = super().refusal(problem)
+        if common is not None:
+            return common
+        with quiet():
+            why = self._own_refusal(problem, self._data(problem))
+        return None if why is None else f"{type(self).__name__}: {why}"
+
+    def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
+        reason = super().unable(problem, asked)
+        silent = set(self.unanswered(problem)) if asked.queries and reason is None else set()
+        for query, function in asked.queries.items():
+            for name in nodes_read(function):
+                if name in silent:
+                    return (
+                        f"queries={{{query!r}: ...}} reads {name!r}, which takes no continuous values, and a "
+                        "Gaussian belief does not answer for it"
+                    )
+        return reason
+
+    def unanswered(self, problem: SeriesProblem) -> tuple[str, ...]:
+        silent = {n for layout in self._data(problem).layouts for n in layout.silent}
+        return tuple(n for n in problem.slices.dynamic if n in silent)
+
+    def describe(self, problem: SeriesProblem) -> dict[str, str]:
+        data, found = self._data(problem), {}
+        layout = data.layouts[1]
+        for name in problem.slices.template.later:
+            if name in problem.slices.template.inputs:
+                found[name] = "input"
+            elif name in problem.slices.template.static:
+                found[name] = "static, known"
+            elif name in layout.computed:
+                found[name] = "computed"
+            elif name in layout.certain:
+                found[name] = "observed, depends on nothing hidden"
+            elif name in layout.seen:
+                found[name] = "observed, updates the Gaussian belief"
+            elif name in problem.series.observed:
+                found[name] = "Gaussian, observed in part"
+            elif name in layout.drawn:
+                found[name] = "Gaussian"
+            elif name in layout.silent:
+                found[name] = "not answered for: takes no continuous values"
+            else:
+                found[name] = "computed from Gaussian nodes"
+        return found
+
+    def filter(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        keep: str | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> GaussianSeries:
+        if keep is not None:
+            raise UnsupportedError(
+                f"keep={keep!r}: {type(self).__name__} has no particles; ask its result for mean, var and "
+                "cov, or use a ParticleFilter"
+            )
+        data = self._data(problem)
+        try:
+            found = self._passed(problem, data, False, progress)
+        except KeyboardInterrupt as stop:
+            return answer_so_far(stop, self)
+        answers = filter_answers(self, problem, data, found, queries)
+        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 3)
+        return answers
+
+    def smooth(
+        self,
+        problem: SeriesProblem,
+        seed: np.random.SeedSequence,
+        *,
+        lag: int | None = None,
+        queries: Queries | None = None,
+        progress: bool | None = None,
+    ) -> GaussianSeries:
+        data = self._data(problem)
+        found = self._passed(problem, data, True, progress)
+        smoothed = backward(data.layouts[0], found, lag)
+        kind = "smooth" if lag is None else "fixed-lag"
+        answers = smooth_answers(self, problem, data, found, smoothed, kind, queries)
+        warn_of_misfit(answers.predictive, type(self).__name__, answers.start, 3)
+        return answers
+
+    def most_likely(
+        self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
+    ) -> dict[str, np.ndarray]:
+        """Smoothed means, which are the mode of a Gaussian trajectory."""
+        found = self.smooth(problem, seed, progress=progress)
+        return {n: found.mean(n) for n in self._data(problem).layouts[0].rows}
+
+    def _bound(
+        self, belief: GaussianBelief, dbn: DynamicBayesNet, slices: Slices
+    ) -> GaussianBelief:
+        taken = belief.state.taken
+        old = taken.layout
+        layout = Layout(slices, old.apart, old.first, old.before, old.unknown)
+        taker = RowTaker(self, slices, read_static(slices, belief.static))
+        return belief.bound(dbn, slices, GaussianState(taker, taken._replace(layout=layout)))
+
+    def _absorbed(self, belief: GaussianBelief, slices: Slices, row: Row) -> GaussianBelief:
+        taker, before = belief.state or (None, None)
+        if taker is None:
+            taker = RowTaker(self, slices, read_static(slices, belief.static))
+        with quiet():
+            taken = taker.take(row, before)
+        return belief.after(slices, row, taken.log_density, GaussianState(taker, taken))
+
+    # ---- for the families ----------------------------------------------------------------------
+
+    def refused_row(self, layout: Layout, values: Mapping[str, np.ndarray]) -> str | None:
+        """See ``passes.Family``."""
+        raise NotImplementedError
+
+    def expected(self, ahead: Ahead) -> Expected:
+        """See ``passes.Family``."""
+        raise NotImplementedError
+
+    def _own_refusal(self, problem: SeriesProblem, data: SeriesData) -> str | None:
+        raise NotImplementedError
+
+    def _forward(
+        self,
+        problem: SeriesProblem,
+        data: SeriesData,
+        smoothing: bool,
+        advance: Callable[[int], None],
+    ) -> Filtered:
+        """All slices given the rows up to them."""
+        raise NotImplementedError
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _passed(
+        self, problem: SeriesProblem, data: SeriesData, smoothing: bool, progress: bool | None
+    ) -> Filtered:
+        key = f"gaussian filter {self!r}, smoothing {smoothing}"
+        found = problem.cache.get(key)
+        if found is None:
+            with Progress(problem.steps, self.label, progress) as bar, quiet():
+                found = self._forward(problem, data, smoothing, bar.advance)
+            problem.cache[key] = found
+        return found
+
+    def _data(self, problem: SeriesProblem) -> SeriesData:
+        if "kalman data" not in problem.cache:
+            with quiet():
+                problem.cache["kalman data"] = SeriesData(problem)
+        return problem.cache["kalman data"]
 
 
 @dataclass(frozen=True)
@@ -111,14 +298,8 @@ class KalmanFilter(GaussianFilter):
             problem.cache["kalman matrices"] = (*found, None)[:2]
         return problem.cache["kalman matrices"]
 
-    def expected(
-        self,
-        layout: Layout,
-        values: Mapping[str, np.ndarray],
-        state: State,
-        pattern: Pattern,
-        memory: Memory,
-    ) -> Expected:
+    def expected(self, ahead: Ahead) -> Expected:
+        layout, values, pattern, memory = ahead.layout, ahead.values, ahead.pattern, ahead.memory
         timeless = memory(("timeless", layout), lambda: not reads_time(layout))
 
         def read() -> Linear:
@@ -131,11 +312,11 @@ class KalmanFilter(GaussianFilter):
 
         whole = timeless and pattern.given is None  # what is seen in part may differ in every row
         found = memory(("chosen", layout), choose) if whole else choose()
-        mean = found.offset + multiplied(found.moves, state.mean)
-        rows = rows_of(found.moves, found.noise, state.factor, pattern.absent)
+        mean = found.offset + multiplied(found.moves, ahead.mean)
+        rows = rows_of(found.moves, found.noise, ahead.factor, pattern.absent)
 
         def terms() -> np.ndarray:
-            return np.abs(found.offset) + multiplied(np.abs(found.moves), np.abs(state.mean))
+            return np.abs(found.offset) + multiplied(np.abs(found.moves), np.abs(ahead.mean))
 
         return Expected(mean, rows, terms)
 

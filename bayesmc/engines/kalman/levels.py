@@ -1,27 +1,133 @@
 """A slice of any shape as a Gaussian, level by level: what nonlinear filters share.
 
 The nodes of a slice are taken in levels: first those that read the slice before alone, then those that read
-them, and so on. A *rule* looks at the nodes of one level as one function of what they read and makes it
-linear, with whatever it takes for the error as noise of its own: by derivatives (``extended``) or by sigma
-points (``unscented``). What comes out are rows of coefficients of independent normals, as the
-Kalman filter has them.
+them, and so on. A *rule* looks at the nodes of one level as one function of what they read (a program, where
+it can be followed) and makes it linear, with whatever it takes for the error as noise of its own: by
+derivatives or by sigma points (``nonlinear``). What comes out are rows of coefficients of independent
+normals, as the Kalman filter has them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS
 from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.kalman.data import Pattern
-from bayesmc.engines.kalman.followed import Followed
-from bayesmc.engines.kalman.passes import State
+from bayesmc.engines.kalman.covariances import without_absent
+from bayesmc.engines.kalman.passes import Ahead
 from bayesmc.engines.kalman.reading import is_affine, typical_sizes
 from bayesmc.engines.kalman.slices import Layout, Moments, covariance_root, put_noise
 from bayesmc.errors import BayesmcError, TraceError
+from bayesmc.expression import Expression, Leaf, Program, broadcast, expressions_of, leaf, ordered
+from bayesmc.expression import rebuilt as made_of
+from bayesmc.network import Model
+from bayesmc.network.expressions import Opaque, density
+from bayesmc.passes.derivatives import jumps, tangent
+from bayesmc.passes.mean import mean
+
+
+class Followed:
+    """Nodes whose functions can be followed, as functions of what they read in the end.
+
+    Parameters
+    ----------
+    model : Model
+    nodes : sequence of str
+    reads : iterable of str
+        Nodes whose values move.
+    known : iterable of str
+        Nodes whose values are known.
+
+    Raises
+    ------
+    TraceError
+        A function cannot be followed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.kalman.levels import Followed
+    >>> net = bmc.BayesNet()
+    >>> net.add("x", bmc.Normal(0.0, 1.0))
+    >>> net.add("y", lambda x: bmc.Normal(np.sin(x), 0.1))
+    >>> y = Followed(net.model(), ["y"], ["x"], [])
+    >>> y.slopes({"x": np.array(0.0)}, {"x": np.ones(1)})
+    [array([1.])]
+    """
+
+    def __init__(
+        self, model: Model, nodes: Sequence[str], reads: Iterable[str], known: Iterable[str]
+    ) -> None:
+        self.nodes = [model[n] for n in nodes]
+        self.reads = tuple(reads)
+        given = {n for n in (*self.reads, *known) if n in model.nodes}
+        cut = frozenset(n for n in given if model[n].kind == "deterministic")
+        self.results = []
+        for name in nodes:
+            found = density(model, name, cut)
+            if isinstance(found, Opaque):
+                raise TraceError(found.reason)
+            self.results.append(found.result)
+        self._program = Program([e for r in self.results for e in expressions_of(r)])
+
+    def __call__(self, values: Mapping[str, np.ndarray]) -> list[Any]:
+        """A distribution for each node, or its value if it is deterministic."""
+        found = iter(self._program(values))
+        return [made_of(result, found) for result in self.results]
+
+    def slopes(
+        self, values: Mapping[str, np.ndarray], directions: Mapping[str, np.ndarray]
+    ) -> list[np.ndarray] | None:
+        """How the means move as what is read does.
+
+        Parameters
+        ----------
+        values : dict
+            Without a batch.
+        directions : dict
+            Of each node that is read, shape (directions, *value shape).
+
+        Returns
+        -------
+        list of ndarray or None
+            For each node, shape (directions, *value shape); None where a mean has no derivative that is
+            known, or jumps just there.
+        """
+        if self._slopes is None:
+            return None
+        count = len(next(iter(directions.values())))
+        moved = {_moved(n): d for n, d in directions.items()}
+        *found, jumped = self._slopes({**values, **moved})
+        if np.any(jumped):
+            return None
+        return [
+            np.broadcast_to(slope, (count, *node.value_shape))
+            for slope, node in zip(found, self.nodes, strict=True)
+        ]
+
+    # ---- private -------------------------------------------------------------------------------
+
+    @cached_property
+    def _slopes(self) -> Program | None:
+        try:
+            means = [
+                broadcast(mean(r) if node.is_stochastic else r, node.value_shape)
+                for node, r in zip(self.nodes, self.results, strict=True)
+            ]
+            directions = {
+                n.name: leaf(_moved(n.name), n.shape)
+                for n in ordered(*means)
+                if isinstance(n, Leaf) and n.name in self.reads
+            }
+            slopes: list[Expression] = [tangent(m, directions) for m in means]
+            return Program([*slopes, jumps(means, self.reads)])
+        except TraceError:
+            return None
 
 
 class Made(NamedTuple):
@@ -41,32 +147,19 @@ class Made(NamedTuple):
     fresh: np.ndarray
 
 
-class Rule(Protocol):
-    """How a level is made linear."""
-
-    def __call__(self, level: Level, mean: np.ndarray, rows: np.ndarray) -> Made:
-        """``mean``, shape (*lead, c), and ``rows``, shape (*lead, c, k), are of the numbers that it reads."""
-        ...
+#: makes a level linear, given mean ``(*lead, c)`` and rows ``(*lead, c, k)`` of the numbers that it reads
+Rule = Callable[["Level", np.ndarray, np.ndarray], Made]
 
 
-def expected_slice(
-    layout: Layout,
-    values: Mapping[str, np.ndarray],
-    state: State,
-    pattern: Pattern,
-    rule: Rule,
-    plan: Plan,
-) -> tuple[np.ndarray, np.ndarray]:
+def expected_slice(ahead: Ahead, rule: Rule, plan: Plan) -> tuple[np.ndarray, np.ndarray]:
     """Mean of the numbers that a pattern chooses, and their coefficients of the noise."""
+    layout, pattern = ahead.layout, ahead.pattern
     n, total = layout.n_prev, layout.n_prev + layout.p + layout.n
     lead = layout.lead
     mean, rows = np.zeros((*lead, total)), np.zeros((*lead, total, n))
-    mean[..., :n], rows[..., :n, :] = state.mean, state.factor
-    known = dict(values)
-    for name in layout.computed:
-        known[name] = layout.model.evaluate(name, known)[0]
+    mean[..., :n], rows[..., :n, :] = ahead.mean, ahead.factor
     for part in plan.levels:
-        level = Level(layout, part, known)
+        level = Level(layout, part, ahead.values)
         made = rule(level, mean[..., part.reads], rows[..., part.reads, :])
         rows = np.concatenate([rows, np.zeros((*lead, total, made.fresh.shape[-1]))], axis=-1)
         mean[..., part.places] = made.mean
@@ -76,16 +169,6 @@ def expected_slice(
     if pattern.absent is not None:
         rows = without_absent(rows, pattern.absent)
     return mean[..., chosen], rows
-
-
-def without_absent(rows: np.ndarray, absent: np.ndarray) -> np.ndarray:
-    """Rows of what some elements lack as noise of their own, which tells nothing."""
-    p = absent.shape[-1]
-    rows[..., :p, :] = np.where(absent[..., None], 0.0, rows[..., :p, :])
-    fresh = np.zeros((*rows.shape[:-1], p))
-    index = np.arange(p)
-    fresh[..., index, index] = absent
-    return np.concatenate([rows, fresh], axis=-1)
 
 
 class Part(NamedTuple):
@@ -219,14 +302,15 @@ class Level:
         batch = points.shape[:1]
         if part.followed is not None:
             results = zip(part.followed.nodes, part.followed(values), strict=True)
-            ordered = [layout.moments_of(node, result, batch) for node, result in results]
+            ordered = [layout.moments(node, result, batch) for node, result in results]
             return np.concatenate([m.mean for m in ordered], axis=-1), ordered
         found = {}
         for name in part.order:
             if name in layout.silent:
                 values[name] = layout.model.evaluate(name, values)[0]
                 continue
-            made = layout.moments(name, values, batch)
+            result, own = layout.model.evaluate(name, values)
+            made = layout.moments(layout.model[name], result, batch, own)
             if name in part.nodes:
                 found[name] = made
             if not layout.model[name].is_stochastic:
@@ -319,6 +403,11 @@ def why_not_matched(layout: Layout) -> str | None:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _moved(name: str) -> str:
+    """The leaf for how a node's value moves."""
+    return f"move of {name}"
 
 
 def _why_no_moments(result: Any) -> str | None:

@@ -1,4 +1,4 @@
-"""What depends on the data: means and log densities of all slices, given their covariances.
+"""What depends on the data: means, innovations and log densities of all slices, given their covariances.
 
 Given the gains the mean of a slice is affine in the mean of the slice before, so the one thing that goes
 slice by slice is a small product. What leads to it, and everything that follows from it, is done for many
@@ -8,10 +8,11 @@ slices at once, those of one pattern together.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.distributions.noiseless import ALLOWED, FLOOR, ROUNDED
@@ -24,15 +25,87 @@ from bayesmc.engines.kalman.covariances import (
     stacked_fields,
 )
 from bayesmc.engines.kalman.data import Pattern, SeriesData
-from bayesmc.engines.kalman.innovations import Innovations
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.linalg.square_root import Conditioned, log_densities, multiplied, standardised, went_in
+from bayesmc.results.predictive import Predictive
 
 #: slices of one kind on end from which on they share their matrices
 _RUN = 64
 #: otherwise, slices and numbers that are worked on at once
 _CHUNK = 1024
 _ENTRIES = 1 << 21
+
+
+class Innovations:
+    """Standardised innovations of all slices, written as the slices pass.
+
+    Parameters
+    ----------
+    layout : Layout
+        Of any slice.
+    names : iterable of str
+        Observed nodes.
+    steps : int
+
+    Attributes
+    ----------
+    nis : ndarray, shape (time, *lead)
+        Squares of the innovations, normalised by their joint covariance.
+    df : ndarray of int, shape (time, *lead)
+        Numbers that were observed.
+    """
+
+    def __init__(self, layout: Layout, names: Iterable[str], steps: int) -> None:
+        self.layout, shape = layout, (steps, *layout.lead)
+        self.nis = np.zeros(shape)
+        self.df = np.zeros(shape, dtype=np.intp)
+        self._of = {n: np.full((*shape, layout.size(n)), np.nan) for n in names}
+
+    def put(
+        self, at: Any, layout: Layout, pattern: Pattern, root: np.ndarray, eta: np.ndarray
+    ) -> None:
+        """Those of slices ``at`` (an index, or an array of them): roots, and what they standardise to."""
+        p = len(pattern.observed)
+        if not p:
+            return
+        self.nis[at] = np.vecdot(eta, eta)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            off = multiplied(root, eta) / np.sqrt(np.vecdot(root, root))
+        self.df[at] = p
+        if pattern.absent is not None:
+            self.df[at] = p - pattern.absent.sum(axis=-1)
+            off = np.where(pattern.absent, np.nan, off)
+        for name, place in layout.seen.items():
+            if name in self._of:
+                self._of[name][at] = off[..., place]
+        given = pattern.observed[layout.p :] - layout.p
+        for name in (n for n in layout.rows if n in self._of and len(given)):
+            place = layout.rows[name]
+            own = np.flatnonzero((given >= place.start) & (given < place.stop))
+            rows = self._of[name][at]
+            rows[..., given[own] - place.start] = off[..., layout.p + own]
+            self._of[name][at] = rows
+
+    def first(self, steps: int) -> Innovations:
+        """Of the first so many slices."""
+        found = Innovations(self.layout, (), steps)
+        found.nis, found.df = self.nis[:steps], self.df[:steps]
+        found._of = {n: v[:steps] for n, v in self._of.items()}
+        return found
+
+    def of(self, name: str) -> np.ndarray | None:
+        """A node's, each number by its own standard deviation, shape ``(time, *plates, *event)``; or None."""
+        if name not in self._of:
+            return None
+        return self.layout.unpacked(self.layout.slices.first[name], self._of[name])
+
+    def predictive(self) -> Predictive:
+        """The same as ranks: rows of a Gaussian are the less likely the larger their NIS."""
+        seen = self.df > 0
+        df = np.maximum(self.df, 1)
+        ranks = np.where(seen, special.chdtrc(df, self.nis), np.nan)
+        deficits = np.where(seen, 0.5 * (self.nis - self.df) / df, np.nan)
+        return Predictive(ranks, deficits, {n: special.ndtr(self.of(n)) for n in self._of})
 
 
 class Means(NamedTuple):
@@ -97,8 +170,8 @@ def absorbed(
     if angles is not None:
         off = np.where(angles, wrap_angle(off), off)
     off, seen = _present(pattern, off)
-    eta = standardised(found.root, off)
-    after = mean[..., p:] + multiplied(found.gain, eta)
+    eta = _solved(_single(found.root), off)
+    after = mean[..., p:] + _times(found.gain, eta)
     after = _placed(layout, pattern, after, given)
     log = log_densities(found.root, eta, seen, found.certain)
     if found.certain is not None:
@@ -119,11 +192,9 @@ class _Part(NamedTuple):
     kinds: np.ndarray
     offset: np.ndarray
     moves: np.ndarray
-    root: np.ndarray
-    gain: np.ndarray
+    made: Conditioned
     row: np.ndarray
     given: np.ndarray | None
-    certain: np.ndarray | None
 
 
 class _Work:
@@ -192,16 +263,15 @@ class _Work:
 
         moves = linear.moves if len(linear.moves) == 1 else linear.moves[slices - 1]
         offset = linear.offset if len(linear.offset) == 1 else linear.offset[slices - 1]
+        certain = certain_of(records)
+        if certain is not None:
+            certain = self._wide(certain, 1, inverse)
+        made = Conditioned(whole("root"), whole("gain"), np.zeros(0), None, certain)
         return _Part(
             slices, pattern, kinds, offset[..., pattern.chosen],
-            self._wide(moves[..., pattern.chosen, :], 2), whole("root"), whole("gain"),
-            self._row(layout, pattern, slices),
-            None if self.data.given is None else self.data.given[0][slices], self._certain(records, inverse),
+            self._wide(moves[..., pattern.chosen, :], 2), made, self._row(layout, pattern, slices),
+            None if self.data.given is None else self.data.given[0][slices],
         )  # fmt: skip
-
-    def _certain(self, records: list[Any], inverse: np.ndarray) -> np.ndarray | None:
-        found = certain_of(records)
-        return None if found is None else self._wide(found, 1, inverse)
 
     def _wide(self, array: np.ndarray, tail: int, inverse: np.ndarray | None = None) -> np.ndarray:
         """With axes for the plates apart, and one entry per slice where there are several."""
@@ -216,8 +286,8 @@ class _Work:
         look = part.moves[..., :p, :]
         if pattern.absent is not None:
             look = np.where(pattern.absent[..., None], 0.0, look)
-        root = _single(part.root)
-        gain = part.gain[..., :c, :]
+        root = _single(part.made.root)
+        gain = part.made.gain[..., :c, :]
         each = root if root.ndim == 2 else root[..., None, :, :]
         scaled = np.matrix_transpose(_solved(each, np.matrix_transpose(look)))
         matrices = part.moves[..., p : p + c, :] - gain @ scaled
@@ -231,24 +301,22 @@ class _Work:
 
     def _write(self, part: _Part, previous: np.ndarray) -> None:
         """Everything that follows from the means of the slices before."""
-        layout, p = self.data.layouts[1], len(part.pattern.observed)
+        layout, pattern, made = self.data.layouts[1], part.pattern, part.made
         expected = part.offset + _times(part.moves, previous)
-        off, seen = _present(part.pattern, part.row - expected[..., :p])
-        eta = _solved(_single(part.root), off)
-        after = expected[..., p:] + _times(part.gain, eta)
-        self.found.means[part.slices] = _placed(layout, part.pattern, after, part.given)
-        log = log_densities(part.root, eta, seen, part.certain)
-        if part.certain is not None:
-            terms = np.abs(part.offset) + _times(np.abs(part.moves), np.abs(previous))
-            seen_as = expected[..., :p], terms[..., :p]
-            wrong = _contradicts(part.certain, part.root, eta, part.row, *seen_as)
-            log = np.where(wrong, -np.inf, log)
+
+        def terms() -> np.ndarray:
+            return np.abs(part.offset) + _times(np.abs(part.moves), np.abs(previous))
+
+        after, eta, log = absorbed(
+            layout, pattern, made, expected, part.row, part.given, terms=terms
+        )
+        self.found.means[part.slices] = after
         self.found.increments[part.slices] += log
-        self.found.innovations.put(part.slices, layout, part.pattern, part.root, eta)
+        self.found.innovations.put(part.slices, layout, pattern, made.root, eta)
         if self.found.shifts is not None:
             records = [self.covariances.conditioned[k] for k in part.kinds]
             inverse = np.searchsorted(part.kinds, self.covariances.which[part.slices])
-            turn = stacked_fields(records, "turn")[..., :p]
+            turn = stacked_fields(records, "turn")[..., : len(pattern.observed)]
             self.found.shifts[part.slices] = _times(self._wide(turn, 2, inverse), eta)
 
     def _row(self, layout: Layout, pattern: Pattern, slices: np.ndarray) -> np.ndarray:

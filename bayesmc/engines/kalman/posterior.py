@@ -2,71 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.dbn import DynamicBayesNet, Slices
-from bayesmc.distributions.circular import wrap_angle
-from bayesmc.engines.beliefs import OnlineBelief
-from bayesmc.engines.filtering import refuse_forecast
-from bayesmc.engines.kalman.innovations import Innovations
-from bayesmc.engines.kalman.queries import View, expectation, quantiles
-from bayesmc.engines.kalman.rows import RowTaker, Taken
+from bayesmc.dbn import SeriesProblem
+from bayesmc.engines.averages import naming
+from bayesmc.engines.beliefs import SliceBelief
+from bayesmc.engines.filtering import Queries, refuse_forecast
+from bayesmc.engines.kalman.data import SeriesData
+from bayesmc.engines.kalman.means import Innovations
+from bayesmc.engines.kalman.passes import Filtered, RowTaker, Smoothed, Taken
+from bayesmc.engines.kalman.queries import Spreads, View, expectation, on_circle, quantiles
 from bayesmc.engines.kalman.slices import Layout
 from bayesmc.errors import QueryError, UnknownNodeError, UnsupportedError
 from bayesmc.network import CompiledNode
 from bayesmc.results import SeriesPosterior
-
-
-@dataclass(frozen=True, eq=False)
-class Spreads:
-    """Covariances of the unknown numbers of every slice, kept as roots.
-
-    Attributes
-    ----------
-    roots : ndarray, shape (kinds, [*lead], n, n)
-    which : ndarray of int, shape (time,)
-        Which root is a slice's.
-    noise : ndarray, shape (time, [*lead], c, c), or None
-        Covariance of the first c numbers that a root multiplies, where it is not the identity.
-    """
-
-    roots: np.ndarray
-    which: np.ndarray
-    noise: np.ndarray | None = None
-
-    def covariances(self) -> np.ndarray:
-        """Of all slices, shape (time, [*lead], n, n)."""
-        if self.noise is None:
-            return (self.roots @ np.matrix_transpose(self.roots))[self.which]
-        left, alone, noise = self._parts(self.noise)
-        return left @ noise @ np.matrix_transpose(left) + alone[self.which]
-
-    def variances(self) -> np.ndarray:
-        """Their diagonals, shape (time, [*lead], n)."""
-        if self.noise is None:
-            return np.vecdot(self.roots, self.roots)[self.which]
-        left, alone, noise = self._parts(self.noise)
-        return np.vecdot(left @ noise, left) + alone.diagonal(0, -2, -1)[self.which]
-
-    def last(self, steps: int) -> Spreads:
-        """Of the last so many slices."""
-        noise = None if self.noise is None else self.noise[-steps:]
-        return Spreads(self.roots, self.which[-steps:], noise)
-
-    def _parts(self, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Roots on that noise by slice, covariances by the rest by kind, and the noise, of one dimension."""
-        c = noise.shape[-1]
-        left, rest = self.roots[..., :c], self.roots[..., c:]
-        ndim = max(left.ndim, noise.ndim)
-        left, alone, noise = (
-            a.reshape(len(a), *(1,) * (ndim - a.ndim), *a.shape[1:])
-            for a in (left, rest @ np.matrix_transpose(rest), noise)
-        )
-        return left[self.which], alone, noise
 
 
 class GaussianSeries(SeriesPosterior):
@@ -102,8 +54,6 @@ class GaussianSeries(SeriesPosterior):
     ((3,), [1, 1, 1], (3,))
     """
 
-    layout: Layout
-    spreads: Spreads
     view: View
     normalised: Innovations | None = None
 
@@ -184,34 +134,37 @@ class GaussianSeries(SeriesPosterior):
         ------
         UnknownNodeError, UnsupportedError, QueryError
         """
-        places = [self._place(n) for n in names]
-        return joined(self.layout, places, self.spreads.covariances(), self.steps)
+        for name in names:
+            self._node(name)
+            if name in self._tables:
+                raise QueryError(f"cov({name!r}): the node has states, not numbers")
+        return self.view.cov(names)
 
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
-        cut = super().last(steps, kind)
-        found = GaussianSeries(
-            self.model, self.engine, kind, None, tables=cut._tables, means=cut._means,
-            variances=cut._variances, queries=cut.queries, steps=steps, start=cut.start,
-        )  # fmt: skip
-        found.layout, found.spreads = self.layout, self.spreads.last(steps)
-        found.queries_mcse = cut.queries_mcse
-        found.view = self.view.last(steps, found.spreads)
+        found = object.__new__(GaussianSeries)
+        found.__dict__.update(super().last(steps, kind).__dict__)
+        found.view = self.view.last(steps)
         return found
 
     def _node(self, name: str) -> CompiledNode:
-        if name in self.layout.silent:
-            raise _no_answer(name)
+        if name in self.view.layout.silent:
+            raise UnsupportedError(
+                f"{name!r} takes no continuous values, and a Gaussian belief does not answer for it; use a "
+                "ParticleFilter"
+            )
         return super()._node(name)
 
-    def _place(self, name: str) -> np.ndarray | int:
-        """Places of a node's numbers among the unknown ones, or how many known ones it has."""
-        self._node(name)
-        return place_of(self.layout, name, name in self._tables)
+
+class GaussianState(NamedTuple):
+    """What a belief goes on with: what takes rows in (None out of a pickle), and the last one taken in."""
+
+    taker: RowTaker | None
+    taken: Taken
 
 
-class GaussianBelief(OnlineBelief):
+class GaussianBelief(SliceBelief):
     """A Gaussian belief about one slice, as ``start`` and ``step`` of the Kalman filters give it.
 
     Attributes
@@ -234,163 +187,109 @@ class GaussianBelief(OnlineBelief):
     (0, 0.64, 0.2)
     """
 
-    def __init__(
-        self,
-        dbn: DynamicBayesNet | None,
-        static: Mapping[str, Any],
-        t: int = -1,
-        taker: RowTaker | None = None,
-        taken: Taken | None = None,
-        log_marginal_likelihood: Any = 0.0,
-        inputs: Mapping[str, np.ndarray] | None = None,
-    ) -> None:
-        self.dbn, self.static, self.t = dbn, dict(static), t
-        self.taker, self.taken = taker, taken
-        self.log_marginal_likelihood = log_marginal_likelihood
-        self.inputs = dict(inputs or {})
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Pickles travel without functions; ``start(dbn, belief=...)`` gives them back."""
-        return {**self.__dict__, "dbn": None, "taker": None}
-
-    @property
-    def slices(self) -> Slices | None:
-        """What rows are read against; None before the first."""
-        return None if self.taken is None else self.taken.layout.slices
-
     @property
     def layout(self) -> Layout:
         """Where the numbers stand."""
-        return self._slice.layout
-
-    @property
-    def vector(self) -> np.ndarray:
-        """Means of the unknown numbers, shape (*plates, n)."""
-        return self._slice.mean
-
-    @property
-    def factor(self) -> np.ndarray:
-        """Lower root of their covariance, shape ([*plates], n, n)."""
-        return self._slice.factor
-
-    @property
-    def known(self) -> dict[str, np.ndarray]:
-        """Values of nodes that are known."""
-        return self._slice.known
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Nodes that are answered for."""
-        return (*self.layout.rows, *self.known)
-
-    def mean(self, name: str) -> np.ndarray:
-        """Mean, shape ``(*plates, *event)``; an angle's lies in [-pi, pi)."""
-        place = self._place(name)
-        if isinstance(place, int):
-            return np.asarray(self.known[name], dtype=float)
-        node = self.layout.model[name]
-        return self.layout.unpacked(node, on_circle(self.layout, name, self.vector[..., place]))
-
-    def var(self, name: str) -> np.ndarray:
-        """Variance, shape ``(*plates, *event)``."""
-        place = self._place(name)
-        if isinstance(place, int):
-            return np.zeros(np.shape(self.known[name]))
-        rows = self.factor[..., place, :]
-        shape = (*self.layout.lead, len(place))
-        return self.layout.unpacked(
-            self.layout.model[name], np.broadcast_to(np.vecdot(rows, rows), shape)
-        )
-
-    def std(self, name: str) -> np.ndarray:
-        """Standard deviation, shape ``(*plates, *event)``."""
-        return np.sqrt(self.var(name))
+        return self._posterior.view.layout
 
     def cov(self, *names: str) -> np.ndarray:
         """Joint covariance, shape ``(*plates, d, d)``, of nodes one after the other."""
-        places = [self._place(n) for n in names]
-        whole = self.factor @ np.matrix_transpose(self.factor)
-        return joined(self.layout, places, whole[None], 1)[0]
-
-    def expectation(self, function: Callable[..., Any]) -> np.ndarray:
-        """Mean of a function of nodes of the slice; see ``GaussianSeries.expectation``."""
-        return expectation(self._view, function)[0][0]
-
-    def probability(self, function: Callable[..., Any]) -> np.ndarray:
-        """Probability of an event (a function that returns booleans)."""
-        return expectation(self._view, function, event=True)[0][0]
-
-    def quantile(self, name: str, q: Any) -> np.ndarray:
-        """Quantiles, shape ``(*q.shape, *plates, *event)``."""
-        return quantiles(self.mean(name)[None], self.std(name)[None], q, name)[0]
+        return self._posterior.cov(*names)[0]
 
     @property
-    def _view(self) -> View:
-        spreads = Spreads(self.factor[None], np.zeros(1, dtype=np.intp))
-        known = {n: np.asarray(v)[None] for n, v in self.known.items()}
-        return View(self.layout, self.vector[None], spreads, known)
+    def _of_functions(self) -> GaussianSeries:
+        return self._posterior  # what is averaged is numbers: an unpickled belief has them, too
 
-    def __repr__(self) -> str:
-        if self.taken is None:
-            return "GaussianBelief(nothing absorbed yet)"
-        return f"GaussianBelief(t={self.t}, {', '.join(self.names)})"
+    def _without_functions(self) -> GaussianState:
+        return self.state._replace(taker=None)
 
-    # ---- private -------------------------------------------------------------------------------
-
-    @property
-    def _slice(self) -> Taken:
-        if self.taken is None:
-            raise QueryError(
-                "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
-            )
-        return self.taken
-
-    def _place(self, name: str) -> np.ndarray | int:
-        layout = self.layout
-        if name in layout.silent:
-            raise _no_answer(name)
-        if name not in layout.rows and name not in self.known:
-            raise UnknownNodeError(f"there is no node {name!r}; answered are {list(self.names)}")
-        return place_of(layout, name, layout.model[name].domain is not None)
+    def _answered(self) -> GaussianSeries:
+        taken = self.state.taken
+        layout = taken.layout
+        spreads = Spreads(taken.factor[None], np.zeros(1, dtype=np.intp))
+        nodes = layout.slices.first
+        known = {n: np.broadcast_to(v, nodes[n].value_shape)[None] for n, v in taken.known.items()}
+        view = View(layout, taken.mean[None], spreads, known)
+        return _series(view, None, "filter", None, self.t)
 
 
-def _no_answer(name: str) -> UnsupportedError:
-    return UnsupportedError(
-        f"{name!r} takes no continuous values, and a Gaussian belief does not answer for it; use a "
-        "ParticleFilter"
-    )
+def filter_answers(
+    engine: Any,
+    problem: SeriesProblem,
+    data: SeriesData,
+    found: Filtered,
+    queries: Queries | None = None,
+) -> GaussianSeries:
+    """Every slice given the rows up to it; of the first so many, where no more were passed."""
+    spreads = Spreads(found.factors, found.which)
+    return _answers(engine, problem, data, "filter", found, found.means, spreads, queries)
 
 
-def on_circle(layout: Layout, name: str, value: np.ndarray) -> np.ndarray:
-    """Angles in [-pi, pi); other numbers as they are."""
-    angles = layout.angles_of(name)
-    return np.where(angles, wrap_angle(value), value) if angles.any() else value
+def smooth_answers(
+    engine: Any,
+    problem: SeriesProblem,
+    data: SeriesData,
+    found: Filtered,
+    smoothed: Smoothed,
+    kind: str,
+    queries: Queries | None = None,
+) -> GaussianSeries:
+    """Every slice given later rows, too."""
+    layout, roots = data.layouts[0], found.factors
+    left = roots[..., : layout.carried][found.which]
+    if left.ndim == 3:  # the same in all elements of the plates apart
+        left = left.reshape(len(left), *(1,) * len(layout.lead), *left.shape[1:])
+    means = found.means + np.matvec(left, smoothed.noise)
+    spreads = Spreads(roots, found.which, smoothed.spread)
+    return _answers(engine, problem, data, kind, found, means, spreads, queries)
 
 
-def place_of(layout: Layout, name: str, is_table: bool) -> np.ndarray | int:
-    """Places of a node's numbers among the unknown ones, or how many known ones it has."""
-    if is_table:
-        raise QueryError(f"cov({name!r}): the node has states, not numbers")
-    place = layout.rows.get(name)
-    return layout.size(name) if place is None else np.arange(place.start, place.stop)
+# ---- private ------------------------------------------------------------------------------------
 
 
-def joined(
-    layout: Layout, places: list[np.ndarray | int], whole: np.ndarray, steps: int
-) -> np.ndarray:
-    """Covariance of some numbers, known ones with zeros, shape (steps, *lead, d, d)."""
-    sizes = [p if isinstance(p, int) else len(p) for p in places]
-    total, at = sum(sizes), 0
-    here: list[int] = []
-    there: list[int] = []
-    for place, size in zip(places, sizes, strict=True):
-        if not isinstance(place, int):
-            here += range(at, at + size)
-            there += place.tolist()
-        at += size
-    found = np.zeros((steps, *layout.lead, total, total))
-    part = whole[..., there, :][..., there]
-    wide = part.reshape(len(part), *(1,) * (found.ndim - part.ndim), *part.shape[1:])
-    index = np.asarray(here, dtype=np.intp)
-    found[..., index[:, None], index] = wide
+def _answers(
+    engine: Any, problem: SeriesProblem, data: SeriesData, kind: str, filtered: Filtered,
+    means: np.ndarray, spreads: Spreads, queries: Queries | None,
+) -> GaussianSeries:  # fmt: skip
+    layout, steps, series = data.layouts[0], len(means), problem.series
+    known = {n: o.value[:steps] for n, o in series.observed.items() if o.mask is None}
+    known |= {n: o.value for n, o in series.static.items()} | data.computed(steps)
+    nodes = layout.slices.first
+    known = {n: np.broadcast_to(v, (steps, *nodes[n].value_shape)) for n, v in known.items()}
+    view = View(layout, means, spreads, known)
+    found = _series(view, engine, kind, filtered.increments, series.start)
+    found.normalised = filtered.innovations
+    found.predictive = filtered.innovations.predictive()
+    for name, function in (queries or {}).items():
+        with naming(name):
+            found.queries[name], found.queries_mcse[name] = expectation(view, function)
+    return found
+
+
+def _series(
+    view: View, engine: Any, kind: str, increments: np.ndarray | None, start: int
+) -> GaussianSeries:
+    """Tables, means and variances of all nodes: known ones, and those of the vector."""
+    layout, mean = view.layout, view.mean
+    tables, means, variances = {}, {}, {}
+    for name, value in view.known.items():
+        node = layout.slices.first[name]
+        if name in layout.slices.template.static:
+            continue
+        if node.domain is not None:
+            tables[name] = np.eye(node.domain.size)[value.astype(np.intp)]
+        else:
+            means[name], variances[name] = value.astype(float), np.zeros(value.shape)
+    spread = view.spreads.variances()
+    wide = spread.reshape(len(spread), *(1,) * (mean.ndim - spread.ndim), *spread.shape[1:])
+    full = np.broadcast_to(wide, mean.shape)
+    for name, place in layout.rows.items():
+        node = layout.slices.first[name]
+        means[name] = layout.unpacked(node, on_circle(layout, name, mean[..., place]))
+        variances[name] = layout.unpacked(node, full[..., place])
+    found = GaussianSeries(
+        layout.slices.first, engine, kind, increments, tables=tables, means=means,
+        variances=variances, steps=len(mean), start=start,
+    )  # fmt: skip
+    found.view = view
     return found

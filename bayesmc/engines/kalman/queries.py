@@ -1,4 +1,4 @@
-"""Expectations of functions of nodes under Gaussian beliefs, and probabilities of events.
+"""What Gaussian beliefs say of nodes: joint covariances, quantiles, expectations of functions and events.
 
 One unknown number is averaged over a line, several over point sets with a stated error; values that are known
 go in as they are.
@@ -6,9 +6,8 @@ go in as they are.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import ndtri
@@ -22,41 +21,100 @@ from bayesmc.network.node import nodes_read
 from bayesmc.results.posterior import quantile_levels
 
 
-class Spread(Protocol):
-    """Covariances of some slices."""
+class Spreads(NamedTuple):
+    """Covariances of the unknown numbers of every slice, kept as roots.
+
+    Attributes
+    ----------
+    roots : ndarray, shape (kinds, [*lead], n, n)
+    which : ndarray of int, shape (time,)
+        Which root is a slice's.
+    noise : ndarray, shape (time, [*lead], c, c), or None
+        Covariance of the first c numbers that a root multiplies, where it is not the identity.
+    """
+
+    roots: np.ndarray
+    which: np.ndarray
+    noise: np.ndarray | None = None
 
     def covariances(self) -> np.ndarray:
-        """Of the unknown numbers, shape (steps, [*lead], n, n)."""
-        ...
+        """Of all slices, shape (time, [*lead], n, n)."""
+        if self.noise is None:
+            return (self.roots @ np.matrix_transpose(self.roots))[self.which]
+        left, alone, noise = self._parts(self.noise)
+        return left @ noise @ np.matrix_transpose(left) + alone[self.which]
+
+    def variances(self) -> np.ndarray:
+        """Their diagonals, shape (time, [*lead], n)."""
+        if self.noise is None:
+            return np.vecdot(self.roots, self.roots)[self.which]
+        left, alone, noise = self._parts(self.noise)
+        return np.vecdot(left @ noise, left) + alone.diagonal(0, -2, -1)[self.which]
+
+    def last(self, steps: int) -> Spreads:
+        """Of the last so many slices."""
+        noise = None if self.noise is None else self.noise[-steps:]
+        return Spreads(self.roots, self.which[-steps:], noise)
+
+    def _parts(self, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Roots on that noise by slice, covariances by the rest by kind, and the noise, of one dimension."""
+        c = noise.shape[-1]
+        left, rest = self.roots[..., :c], self.roots[..., c:]
+        ndim = max(left.ndim, noise.ndim)
+        left, alone, noise = (
+            a.reshape(len(a), *(1,) * (ndim - a.ndim), *a.shape[1:])
+            for a in (left, rest @ np.matrix_transpose(rest), noise)
+        )
+        return left[self.which], alone, noise
 
 
-@dataclass(frozen=True, eq=False)
-class View:
+class View(NamedTuple):
     """Gaussian beliefs about some slices, as functions of nodes are averaged over them.
 
     Attributes
     ----------
     layout : Layout
     mean : ndarray, shape (steps, *lead, n)
-    spreads : object
-        Whose ``covariances()`` are those of the unknown numbers, shape (steps, [*lead], n, n).
+    spreads : Spreads
+        Of the unknown numbers.
     known : dict
-        Node -> stored values, shape (steps, *value_shape); static ones without time.
+        Node -> stored values, shape (steps, *value_shape).
     """
 
     layout: Layout
     mean: np.ndarray
-    spreads: Spread
+    spreads: Spreads
     known: Mapping[str, np.ndarray]
 
-    def last(self, steps: int, spreads: Spread) -> View:
-        """Of the last so many slices, with their covariances."""
-        nodes = self.layout.slices.first
-        known = {
-            n: v[-steps:] if v.ndim > len(nodes[n].value_shape) else v
-            for n, v in self.known.items()
-        }
-        return View(self.layout, self.mean[-steps:], spreads, known)
+    def last(self, steps: int) -> View:
+        """Of the last so many slices."""
+        known = {n: v[-steps:] for n, v in self.known.items()}
+        return View(self.layout, self.mean[-steps:], self.spreads.last(steps), known)
+
+    def cov(self, names: Sequence[str]) -> np.ndarray:
+        """Joint covariances of nodes, one after the other, known ones with zeros, (steps, *lead, d, d)."""
+        layout, at = self.layout, 0
+        here: list[int] = []
+        there: list[int] = []
+        for name in names:
+            size, place = layout.size(name), layout.rows.get(name)
+            if place is not None:
+                here += range(at, at + size)
+                there += range(place.start, place.stop)
+            at += size
+        found = np.zeros((len(self.mean), *layout.lead, at, at))
+        within = np.asarray(there, dtype=np.intp)
+        part = self.spreads.covariances()[..., within[:, None], within]
+        wide = part.reshape(len(part), *(1,) * (found.ndim - part.ndim), *part.shape[1:])
+        index = np.asarray(here, dtype=np.intp)
+        found[..., index[:, None], index] = wide
+        return found
+
+
+def on_circle(layout: Layout, name: str, value: np.ndarray) -> np.ndarray:
+    """Angles in [-pi, pi); other numbers as they are."""
+    angles = layout.angles_of(name)
+    return np.where(angles, wrap_angle(value), value) if angles.any() else value
 
 
 def expectation(
@@ -156,16 +214,11 @@ def _called(
         node = layout.slices.first[name]
         if name in layout.rows:
             size = layout.size(name)
-            value = numbers[..., start : start + size]
-            angles = layout.angles_of(name)
-            if angles.any():
-                value = np.where(angles, wrap_angle(value), value)
+            value = on_circle(layout, name, numbers[..., start : start + size])
             value = layout.unpacked(node, value)
             start += size
         else:
-            known = view.known[name]
-            timed = known.ndim > len(node.value_shape)
-            value = known[at] if timed else np.broadcast_to(known, (len(at), *known.shape))
+            value = view.known[name][at]
         arguments.append(node.decode(value))
     with marking_invalid(), np.errstate(all="ignore"):
         values = np.asarray(called(function, arguments))

@@ -174,7 +174,7 @@ def _composed(layout: Layout, known: dict[str, np.ndarray], batch: tuple[int, ..
     for name in layout.placed:
         place = layout.place(name)
         result, gains = _at_zero(layout, name, values)
-        found = layout.moments_of(layout.model[name], result, batch)
+        found = layout.moments(layout.model[name], result, batch)
         own = slice(spent, spent + found.mean.shape[-1])
         offset[..., place] = found.mean
         matrix = _matrix(layout, name, gains, batch)

@@ -11,7 +11,7 @@ Reading coefficients is elsewhere (``reading``); so is everything that happens o
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -205,20 +205,15 @@ class Layout:
         value = value.reshape(value.shape[:count] + shape)
         return value.transpose(*range(count), *(count + k for k in np.argsort(order)))
 
-    def moments(self, name: str, values: Mapping[str, np.ndarray], batch: Shape) -> Moments:
-        """What a function makes of its parents' values, which have batches that broadcast to ``batch``.
+    def moments(
+        self, node: CompiledNode, result: Any, batch: Shape, own: Shape | None = None
+    ) -> Moments:
+        """What a function makes of parents with a batch ``own`` that broadcasts to ``batch``.
 
         Raises
         ------
         ParameterError
         """
-        result, own = self.model.evaluate(name, values)
-        return self.moments_of(self.model[name], result, batch, own)
-
-    def moments_of(
-        self, node: CompiledNode, result: Any, batch: Shape, own: Shape | None = None
-    ) -> Moments:
-        """Of a distribution or values, of parents with a batch ``own`` that broadcasts to ``batch``."""
         full, own = batch + node.value_shape, batch if own is None else own
         if not isinstance(result, Distribution):
             return Moments(self.packed(node, np.broadcast_to(result, full)), None)

@@ -44,7 +44,7 @@ import numpy as np
 
 from bayesmc.dbn import PREVIOUS, Series, Slices
 from bayesmc.engines.particles.layers import LOCATION, Layer, is_bounded, layers_of
-from bayesmc.engines.particles.particles import Layout, Particles, along_plates, evenly_weighted
+from bayesmc.engines.particles.smc import Layout, Particles, along_plates, evenly_weighted
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.network.forward import Pass, Step, summed
 from bayesmc.resampling import multinomial, systematic

@@ -9,20 +9,12 @@ import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet, Slices
 from bayesmc.engines.beliefs import OnlineBelief
+from bayesmc.engines.particles.answers import Answers, numbers_of
 from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.errors import function_errors, node_errors
+from bayesmc.engines.particles.errors import ByFamily, node_errors
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import Families, evidence_error
-from bayesmc.engines.particles.particles import Bare, Particles
-from bayesmc.engines.particles.queries import (
-    at_scouts,
-    covariance,
-    evaluated,
-    expectation,
-    numbers_of,
-    probability,
-    quantiles,
-)
+from bayesmc.engines.particles.smc import Bare, Particles
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode
@@ -136,14 +128,11 @@ class ParticleBelief(OnlineBelief):
 
         Its shape; of each state's probability, for labels.
         """
-        families, block = self.families, self._block
-        assert families is not None
-        if not callable(what):
-            return node_errors(block, [families], self._node(what))[0]
-        now, layout, model = self._particles, self._step.layout, self._step.slices.first
-        values = evaluated(layout, now, model, what)
-        there = at_scouts(layout, now, families, model, what)
-        return function_errors(block, [families], [values], [there])[0]
+        if callable(what):
+            return self._answers.mcse(what)[0]
+        node, block = self._node(what), self._block
+        assert self.families is not None
+        return node_errors(ByFamily(block, [self.families]), block, node)[0]
 
     def particles(self, name: str) -> np.ndarray:
         """Values of all particles, ``(particles, *plates, *event)``, not weighted."""
@@ -180,24 +169,19 @@ class ParticleBelief(OnlineBelief):
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Mean of a function of nodes of the slice, whose arguments have a leading axis of particles."""
-        step = self._step
-        return expectation(step.layout, self._particles, step.slices.first, function)
+        return self._answers.expectation(function)[0]
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probability of an event: a function of nodes of the slice that returns booleans."""
-        step = self._step
-        return probability(step.layout, self._particles, step.slices.first, function)
+        return self._answers.probability(function)[0]
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(*q.shape, *plates, *event)``; those of angles are cut opposite the mean."""
-        node, now = self._node(name), self._particles
-        return quantiles(self._step.layout, now, node, now.values[name], q)
+        return self._answers.quantile(self._node(name).name, q)[0]
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrix of all numbers of the named nodes, in order; of one number, its variance."""
-        now = self._particles
-        found = [(self._node(name), now.values[name]) for name in names]
-        return covariance(self._step.layout, now, found)
+        return self._answers.cov(*(self._node(name).name for name in names))[0]
 
     def __repr__(self) -> str:
         if self.now is None:
@@ -214,6 +198,11 @@ class ParticleBelief(OnlineBelief):
                 "the belief has absorbed nothing yet (t is -1); step(belief, row) takes in slice 0"
             )
         return self.now
+
+    @property
+    def _answers(self) -> Answers:
+        step, known = self._step, [] if self.families is None else [self.families]
+        return Answers(step.layout, step.slices.first, [self._particles], known)
 
     @property
     def _block(self) -> Block:

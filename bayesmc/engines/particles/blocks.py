@@ -13,9 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.particles import Layout, Particles
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import circular_variance
+
+#: numbers of all particles of slices that are looked at side by side: what costs is calling NumPy
+NUMBERS = 1 << 16
 
 
 class Moments(NamedTuple):
@@ -194,20 +197,23 @@ class Block:
     def _moments(self, node: CompiledNode, rows: np.ndarray) -> Moments:
         mean = self.weighted(rows)
         off = self._array(("off", node.name), rows.shape)
-        weighted = self._array(("weighted", node.name), rows.shape)
+        weighted, weights = (
+            self._array(("weighted", node.name), rows.shape),
+            self.weights[:, :, None],
+        )
         angles = None if node.angles is None else self._angles(node, rows)
         if angles is not None:
             cosine, sine = self.weighted(np.cos(rows)), self.weighted(np.sin(rows))
             mean = np.where(angles, np.arctan2(sine, cosine), mean)
         np.subtract(rows, mean[..., None], out=off)
-        np.multiply(off, self.weights[:, :, None], out=weighted)
+        np.multiply(off, weights, out=weighted)
         variance = np.vecdot(weighted, off) / self.total[..., None]
         if angles is not None:
             variance = np.where(angles, circular_variance(cosine, sine), variance)
             length = np.exp(-0.5 * variance)[..., None]
             with np.errstate(divide="ignore", invalid="ignore"):
                 off[...] = np.where(angles[..., None], np.sin(off) / length, off)
-            np.multiply(off, self.weights[:, :, None], out=weighted)
+            np.multiply(off, weights, out=weighted)
         return Moments(mean, variance, off, weighted)
 
     def _array(self, key: Any, shape: tuple[int, ...], dtype: Any = float) -> np.ndarray:
@@ -222,3 +228,13 @@ class Block:
         event = np.broadcast_to(node.angles, node.event_shape).reshape(-1)
         times = rows.shape[2] // max(event.size, 1)
         return np.tile(event, times).reshape(1, 1, -1)
+
+
+def alike(one: Particles, other: Particles) -> bool:
+    """Whether two slices can stand side by side: laid out alike, and none drawn anew."""
+    if len(one.weights) != len(other.weights) or one.rejuvenated is not False:
+        return False
+    for name, own in one.values.items():
+        if own.ndim != other.values[name].ndim:
+            return False
+    return other.rejuvenated is False

@@ -30,11 +30,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.errors import LAST, deviations, unseen
-from bayesmc.engines.particles.particles import Particles
-from bayesmc.network import CompiledNode
-from bayesmc.results.shares import is_share
+from bayesmc.engines.particles.errors import LAST, Variances
+from bayesmc.engines.particles.smc import Particles
 
 #: how far from a slice others are looked at, and for how many slices each of these stands
 _OFFSETS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 10, 12, 16, 20, 28, 36, 52, 68, 100, 132])
@@ -45,8 +42,8 @@ _RUN = 3
 _NEARBY = 21
 
 
-class Sharing:
-    """Who shares particles with whom.
+class Sharing(Variances):
+    """Who shares particles with whom; variances by that.
 
     Parameters
     ----------
@@ -75,23 +72,10 @@ class Sharing:
             )
             pair = self._groups[k - 1], self._groups[k]
             self._links.append(_linked(*pair, filtered[k]) if linked else None)
+        #: independent draws that a slice's trajectories are worth, at most
+        self.worth = np.minimum(self.even, self.count)
 
-    @property
-    def worth(self) -> np.ndarray:
-        """Independent draws that a slice's trajectories are worth, at most, shape (time, elements)."""
-        return np.minimum(self.even, self.count)
-
-    def variances(self, off: np.ndarray) -> np.ndarray:
-        """Variances of means from which values lie off by so much.
-
-        Parameters
-        ----------
-        off : ndarray, shape (time, elements, numbers, trajectories)
-
-        Returns
-        -------
-        ndarray, shape (time, elements, numbers)
-        """
+    def variances(self, off: np.ndarray, weighted: np.ndarray | None = None) -> np.ndarray:
         steps, elements = self.even.shape
         squares = np.square(off, dtype=float).sum(axis=-1) / self.count**2
         columns = off.swapaxes(2, 3).reshape(steps, elements * self.count, -1).astype(float)
@@ -150,38 +134,6 @@ class Sharing:
         alone |= _near_runs(lost)
         total = np.where(alone, np.inf, np.maximum(total, squares))
         return np.where(squares > 0, total, 0.0)
-
-
-def node_errors(sharing: Sharing, block: Block, node: CompiledNode) -> np.ndarray:
-    """Errors of a node's smoothed means, or of its states' probabilities where they have labels, time first.
-
-    Parameters
-    ----------
-    sharing : Sharing
-    block : Block
-        Trajectories, in all slices.
-    node : CompiledNode
-    """
-    labelled = node.domain is not None and node.domain.labels is not None
-    more: tuple[int, ...] = (node.domain.size,) if labelled and node.domain is not None else ()
-    if any(p not in node.plates for p in block.layout.apart):  # it hangs on nothing that was drawn
-        return np.zeros((len(block.slices), *node.value_shape, *more))
-    off, shares, step = deviations(block, node)
-    found = sharing.variances(off)
-    if shares is not None:
-        found = np.maximum(found, step**2 * unseen(shares, sharing.worth[..., None]))
-    return block.unturned(np.sqrt(found), node, more)
-
-
-def function_errors(sharing: Sharing, values: np.ndarray) -> np.ndarray:
-    """The same of what a function says of each trajectory, ``(time, trajectories, *apart, *rest)``."""
-    means, (steps, elements) = values.mean(axis=1), sharing.even.shape
-    off = values - means[:, None]
-    found = sharing.variances(off.reshape(steps, sharing.count, elements, -1).transpose(0, 2, 3, 1))
-    if is_share(values):
-        flat = means.reshape(steps, elements, -1)
-        found = np.maximum(found, unseen(flat, sharing.worth[..., None]))
-    return np.sqrt(found).reshape(means.shape)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
-"""Errors of means: by how far the families of a slice differ.
+"""Errors of means: variances by family, what is rare beside them, and where nobody can tell.
 
 Each family's part of a weighted mean is nearly independent of the others', so the sum of their squares is its
-variance (``genealogy`` says why), with a correction for what the mean owes to the family itself.
+variance (``genealogy`` says why), with a correction for what the mean owes to the family itself. Those of
+trajectories are told by who shares particles (``coalescence``).
 """
 
 from __future__ import annotations
@@ -20,47 +21,144 @@ from bayesmc.results.shares import is_share, steps
 #: no more than these either, nobody knows
 ENOUGH, LAST = 8.0, 3.5
 
+#: what is found at values of scouts, for each slice; None where they cannot be asked
+There = Sequence[np.ndarray | None]
 
-def node_errors(block: Block, families: Sequence[Families], node: CompiledNode) -> np.ndarray:
+
+class Variances:
+    """What tells the variances of means over the particles of some slices.
+
+    Attributes
+    ----------
+    worth : ndarray, shape (slices, elements)
+        Equally weighted particles that those of a slice are worth.
+    """
+
+    worth: np.ndarray
+
+    def variances(self, off: np.ndarray, weighted: np.ndarray | None = None) -> np.ndarray:
+        """Variances of means from which values lie off by so much, the last axis summed over.
+
+        ``weighted`` are these times the weights, where they are known.
+        """
+        raise NotImplementedError
+
+    def missed(
+        self, found: np.ndarray, means: np.ndarray | None, there: There, step: float = 0.0
+    ) -> None:
+        """Add to variances what no particle has met; ``step`` is what a state more or less is."""
+
+    def at_scouts(self, node: CompiledNode) -> There:
+        """Values of a node where scouts are, for each slice."""
+        return [None] * len(self.worth)
+
+
+class ByFamily(Variances):
+    """Variances by the families of a filter.
+
+    Parameters
+    ----------
+    block : Block
+    families : sequence of Families
+        Of each slice.
+    """
+
+    def __init__(self, block: Block, families: Sequence[Families]) -> None:
+        self.block, self.families = block, families
+        self.worth = block.flat([p.ess for p in block.slices])
+        bounds = np.array([f.bounds for f in families]).swapaxes(0, 1)  # origins first, then slices
+        rows = block.weights.shape[0] * block.weights.shape[1]
+        bounds = bounds.reshape(*bounds.shape[:3], -1).swapaxes(2, 3).reshape(2, rows, -1)
+        weights, total = block.weights.reshape(rows, 1, -1), block.total.reshape(rows, 1, 1)
+        old = family_sums(weights, bounds[OLD]) / total
+        few = 1.0 / np.vecdot(old, old)[:, 0] < ENOUGH
+        self.few = slice(None) if few.all() else few if few.any() else None  # no copies of much
+        self.total, self.old = total, (bounds[OLD], old)
+        if self.few is not None:
+            at = bounds[YOUNG][self.few]
+            self.young = at, family_sums(weights[self.few], at) / total[self.few]
+
+    def variances(self, off: np.ndarray, weighted: np.ndarray | None = None) -> np.ndarray:
+        weighted = off * self.block.weights[:, :, None] if weighted is None else weighted
+        weighted = weighted.reshape(-1, *off.shape[2:])
+        bounds, shares = self.old
+        found = _by_shares(family_sums(weighted, bounds) / self.total, shares)
+        if self.few is not None:
+            bounds, shares = self.young
+            parts = family_sums(weighted[self.few], bounds) / self.total[self.few]
+            young = _by_shares(parts, shares)
+            was = found[self.few]
+            found[self.few] = np.maximum(np.where(np.isinf(was), 0.0, was), young)
+        return found.reshape(off.shape[:3])
+
+    def missed(
+        self, found: np.ndarray, means: np.ndarray | None, there: There, step: float = 0.0
+    ) -> None:
+        """States that particles leave out; and all, where a filter has lost sight."""
+        for k, (own, values) in enumerate(zip(self.families, there, strict=True)):
+            if own.scouts is not None and means is not None and own.scouts.share:
+                off: Any = step or np.inf
+                if values is not None and not step:
+                    off = values.reshape(len(values), -1).mean(axis=0) - means[k, 0]
+                found[k, 0] += (own.scouts.share * off) ** 2
+            if own.lost is not None:
+                found[k, own.lost.where.reshape(-1)] = np.inf
+
+    def at_scouts(self, node: CompiledNode) -> There:
+        return [None if f.scouts is None else f.scouts.values.get(node.name) for f in self.families]
+
+
+def node_errors(by: Variances, block: Block, node: CompiledNode) -> np.ndarray:
     """Errors of a node's means, or of its states' probabilities where they have labels.
 
     Shape ``(slices, *plates, *event)``, or ``(slices, *plates, states)``.
     """
     labelled = node.domain is not None and node.domain.labels is not None
     more: tuple[int, ...] = (node.domain.size,) if labelled and node.domain is not None else ()
-    if block.rows(node) is None:
+    if block.rows(node) is None:  # the same for all particles
         return np.zeros((len(block.slices), *node.value_shape, *more))
-    off, shares, step = deviations(block, node)
-    moments = None if node.domain is not None else block.moments(node)
-    weighted = off * block.weights[:, :, None] if moments is None else moments.weighted
-    found = _variances(block, families, weighted)
-    if shares is not None:
-        worth = block.flat([p.ess for p in block.slices])[..., None]
-        found = np.maximum(found, step**2 * unseen(shares, worth))
-    for k, own in enumerate(families):
-        if own.scouts is None:
-            continue
-        if shares is not None:
-            found[k] += (step * own.scouts.share) ** 2
-        elif node.angles is None and node.name in own.scouts.values:
-            there = own.scouts.values[node.name]
-            assert moments is not None
-            found[k, 0] += _left_out(
-                own.scouts.share, there.reshape(len(there), -1), moments.mean[k, 0]
-            )
-    return block.unturned(np.sqrt(_lost(block, families, found)), node, more)
-
-
-def deviations(block: Block, node: CompiledNode) -> tuple[np.ndarray, np.ndarray | None, float]:
-    """By how much values lie off a mean; the shares that stand behind it, and what a state more or less is.
-
-    Shapes ``(slices, elements, numbers, particles)`` and without the last axis; of labels, each state is a
-    number. Without states there are no shares.
-    """
     if node.domain is None:
         moments = block.moments(node)
         assert moments is not None
-        return moments.off, None, 1.0
+        found = by.variances(moments.off, moments.weighted)
+        by.missed(found, moments.mean if node.angles is None else None, by.at_scouts(node))
+    else:
+        off, shares, step = _of_states(block, node)
+        found = np.maximum(by.variances(off), step**2 * _unseen(shares, by.worth))
+        by.missed(found, shares, by.at_scouts(node), step)
+    return block.unturned(np.sqrt(found), node, more)
+
+
+def function_errors(
+    by: Variances, block: Block, values: Sequence[np.ndarray], there: There
+) -> np.ndarray:
+    """Errors of means of what a function says of each particle, shape ``(slices, *apart, *rest)``.
+
+    Parameters
+    ----------
+    values : sequence of ndarray, shape (particles, *apart, *rest)
+    there : sequence of ndarray or None
+        The function at values of scouts, if it can be asked.
+    """
+    rows = block.turned(values)
+    mean = block.weighted(rows)
+    found = by.variances(rows - mean[..., None])
+    if is_share(values[0]):  # an event that no particle has seen may happen
+        found = np.maximum(found, _unseen(mean, by.worth))
+    by.missed(found, mean, there)
+    return np.sqrt(found).reshape(len(values), *values[0].shape[1:])
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _of_states(block: Block, node: CompiledNode) -> tuple[np.ndarray, np.ndarray, float]:
+    """By how much values lie off a mean; the shares behind it, and what a state more or less is.
+
+    Shapes ``(slices, elements, numbers, particles)`` and without the last axis; of labels, each state is a
+    number.
+    """
+    assert node.domain is not None
     codes, shares = block.rows(node), block.state_shares(node)
     assert codes is not None and shares is not None
     if node.domain.labels is None:
@@ -73,67 +171,12 @@ def deviations(block: Block, node: CompiledNode) -> tuple[np.ndarray, np.ndarray
     return off.reshape(*off.shape[:2], lanes, -1), shares.reshape(*shares.shape[:2], lanes), 1.0
 
 
-def function_errors(
-    block: Block,
-    families: Sequence[Families],
-    values: Sequence[np.ndarray],
-    elsewhere: Sequence[np.ndarray | None],
-) -> np.ndarray:
-    """Errors of means of what a function says of each particle, shape ``(slices, *apart, *rest)``.
-
-    Parameters
-    ----------
-    values : sequence of ndarray, shape (particles, *apart, *rest)
-    elsewhere : sequence of ndarray or None
-        The function at values of scouts, if it can be asked.
-    """
-    rows = block.turned(values)
-    mean = block.weighted(rows)
-    weighted = (rows - mean[..., None]) * block.weights[:, :, None]
-    found = _variances(block, families, weighted)
-    if is_share(values[0]):  # an event that no particle has seen may happen
-        worth = block.flat([p.ess for p in block.slices])[..., None]
-        found = np.maximum(found, unseen(mean, worth))
-    for k, (own, there) in enumerate(zip(families, elsewhere, strict=True)):
-        if own.scouts is not None:
-            flat = None if there is None else there.reshape(len(there), -1)
-            found[k, 0] += _left_out(own.scouts.share, flat, mean[k, 0])
-    return np.sqrt(_lost(block, families, found)).reshape(len(values), *values[0].shape[1:])
-
-
-def unseen(share: np.ndarray, ess: Any) -> np.ndarray:
+def _unseen(share: np.ndarray, worth: np.ndarray) -> np.ndarray:
     """Variance of a share that (nearly) no particle, or every one, has: Agresti and Coull (1998)."""
+    ess = worth[..., None]
     centre = (share * ess + 2.0) / (ess + 4.0)
     rare = np.minimum(share, 1.0 - share) * ess < 1.0
     return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _variances(block: Block, families: Sequence[Families], weighted: np.ndarray) -> np.ndarray:
-    """Variances ``(slices, elements, numbers)`` of means, by weights times what values lie off them."""
-    rows, (numbers, n) = weighted.shape[0] * weighted.shape[1], weighted.shape[2:]
-    bounds = np.array([f.bounds for f in families]).swapaxes(0, 1)  # origins first, then slices
-    bounds = bounds.reshape(*bounds.shape[:3], -1).swapaxes(2, 3).reshape(2, rows, -1)
-    weighted, weights = weighted.reshape(rows, numbers, n), block.weights.reshape(rows, 1, n)
-    total = block.total.reshape(rows, 1, 1)
-    found, even = _of_origin(weighted, weights, total, bounds[OLD])
-    few = even < ENOUGH
-    if few.any():
-        at: Any = slice(None) if few.all() else few  # no copies of what is large
-        young, _ = _of_origin(weighted[at], weights[at], total[at], bounds[YOUNG][at])
-        found[at] = np.maximum(np.where(np.isinf(found[at]), 0.0, found[at]), young)
-    return found.reshape(len(block.slices), -1, numbers)
-
-
-def _of_origin(
-    weighted: np.ndarray, weights: np.ndarray, total: np.ndarray, bounds: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Variances by the families of one origin, and how many even ones these are worth, rows first."""
-    shares = family_sums(weights, bounds) / total
-    parts = family_sums(weighted, bounds) / total
-    return _by_shares(parts, shares), 1.0 / np.vecdot(shares, shares)[:, 0]
 
 
 def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
@@ -146,18 +189,3 @@ def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
     free = np.maximum(even - 1.0, LAST - 1.0)
     found = (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=-1) * (free / (free - 2.0))
     return np.where(even < LAST, np.inf, found)
-
-
-def _lost(block: Block, families: Sequence[Families], found: np.ndarray) -> np.ndarray:
-    """Infinite where a filter has lost sight."""
-    for k, own in enumerate(families):
-        if own.lost is not None:
-            found[k, own.lost.where.reshape(-1)] = np.inf
-    return found
-
-
-def _left_out(share: float, values: np.ndarray | None, mean: np.ndarray) -> Any:
-    """Square of what a mean owes to states that particles leave out."""
-    if values is None:
-        return 0.0 if share == 0.0 else np.full(np.shape(mean), np.inf)
-    return (share * (values.mean(axis=0) - mean)) ** 2

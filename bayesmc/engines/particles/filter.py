@@ -19,43 +19,33 @@ from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
 from bayesmc.engines.particles.optimal import OptimalPlan
 from bayesmc.engines.particles.options import (
+    BUDGET,
     NOT_SMOOTHED,
-    check_budget,
+    START,
+    TOLERANCE,
     check_choice,
     check_count,
     check_kind,
-    check_threshold,
+    check_numbers,
     check_together,
+    collapsed,
     described,
+    enough,
     looks_told,
     not_backwards,
+    price,
     read_by,
     read_functions,
     refused,
-    warn_of_what_is_not_guided,
-)
-from bayesmc.engines.particles.record import FilteredParticles
-from bayesmc.engines.particles.recovery import Recovery
-from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
-from bayesmc.engines.particles.sample_size import (
-    BUDGET,
-    START,
-    TOLERANCE,
-    collapsed,
-    enough,
-    price,
     uncertain,
     warn_of_a_lonely_step,
+    warn_of_what_is_not_guided,
 )
-from bayesmc.engines.particles.smoothing import (
-    Backwards,
-    backwards,
-    by_lag,
-    filtered_by,
-    quiet,
-    seen_in_full,
-    static_of,
-)
+from bayesmc.engines.particles.record import FilteredParticles, filtered_by
+from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.rejuvenation import Injection, Rejuvenation
+from bayesmc.engines.particles.smc import quiet
+from bayesmc.engines.particles.smoothing import Backwards, backwards, by_lag
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
 from bayesmc.errors import DegeneracyError, LowEssWarning, UnsupportedError
@@ -195,8 +185,7 @@ class ParticleFilter(FilterEngine):
     def __post_init__(self) -> None:
         if self.particles is not None:
             check_count("particles", self.particles, "such as 10_000")
-        check_budget(self.tolerance, self.budget)
-        check_threshold(self.ess_threshold)
+        check_numbers(self)
         scheme_of(self.resampling)
         check_choice("on_degeneracy", self.on_degeneracy, "raise", "rejuvenate")
         check_kind("adapt", self.adapt, KLD)
@@ -248,7 +237,7 @@ class ParticleFilter(FilterEngine):
     def unable(self, problem: SeriesProblem, asked: Asked) -> str | None:
         if asked.what in ("smooth", "fixed-lag") and (self.adapt or self.recovery):
             return NOT_SMOOTHED
-        sums = endless(problem.slices, seen_in_full(problem)) if asked.what == "smooth" else ()
+        sums = endless(problem.slices, problem.seen) if asked.what == "smooth" else ()
         return not_backwards(sums[0]) if sums else super().unable(problem, asked)
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
@@ -300,7 +289,7 @@ class ParticleFilter(FilterEngine):
         if lag is not None:
             found, filtered = by_lag(sized, problem, seed, lag, queries or {}, progress)
         else:
-            sums = endless(problem.slices, seen_in_full(problem))
+            sums = endless(problem.slices, problem.seen)
             if sums:
                 raise UnsupportedError(not_backwards(sums[0]))
             asked = Backwards(trajectories, backward == "rejection")
@@ -394,7 +383,7 @@ class ParticleFilter(FilterEngine):
         """All slices, one by one."""
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
-        step = self.step_of(problem.slices, static_of(problem), kept)
+        step = self.step_of(problem.slices, problem.known_static, kept)
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _sized(self, particles: int) -> ParticleFilter:

@@ -13,9 +13,8 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.particles.kld import KLD
-from bayesmc.engines.particles.particles import BLOCK, Layout, Particles, Selection
 from bayesmc.engines.particles.rejuvenation import Injection
-from bayesmc.engines.particles.smc import SMCStep
+from bayesmc.engines.particles.smc import BLOCK, Layout, Particles, Selection, SMCStep
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import DegeneracyError
 from bayesmc.network.forward import Pass, Step, WeighDrawn

@@ -31,10 +31,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bayesmc.engines.particles.drift import SEEMS, Drift
-from bayesmc.engines.particles.forgetting import Lost, Sight
-from bayesmc.engines.particles.particles import Particles
-from bayesmc.engines.particles.rare_states import Scouts
+from bayesmc.engines.particles.smc import Layout, Particles
 
 #: families of an origin, and founders of each, at least, where there are particles enough
 GROUPS, LEAST = 32, 4
@@ -60,11 +57,73 @@ FEW, TAIL = 0.05, 0.7
 LONG = 0.2
 #: variance between two origins beyond which the families that are left are too few to tell
 MOST = 1.0
-
-#: share of the belief in states without particles, over that of all particles, up to which it is an error
-LEFT_OUT = 0.1
+#: sum of the moves of a mean, in units of its spread, from which on particles seem to be missing
+SEEMS = 2.8
 
 OLD, YOUNG = 0, 1
+
+
+class Lost(NamedTuple):
+    """Particles of a slice that could not be trusted, and what has happened since.
+
+    Attributes
+    ----------
+    where : ndarray of bool, shape (*apart,)
+        Elements that are lost.
+    wide : tuple of ndarray, shapes (many, numbers)
+        Variances of the numbers of each node then; of finite nodes, 1.
+    gone : tuple of ndarray, shapes (many, numbers)
+        Variances of what was random since.
+    since : int
+        Slice of the last measurement.
+    roots : ndarray of int or None, shape (particles, *apart)
+        Whom each particle descends from there; None where everybody has itself.
+    """
+
+    where: np.ndarray
+    wide: tuple[np.ndarray, ...]
+    gone: tuple[np.ndarray, ...]
+    since: int
+    roots: np.ndarray | None = None
+
+
+class Drift(NamedTuple):
+    """Moves of the means of numbers so far, in units of their spreads.
+
+    Attributes
+    ----------
+    moves : ndarray, shape (2, elements, numbers)
+        Their sums, and the variances of these.
+    worst : ndarray, shape (*apart,)
+        The largest sum of moves of any number, in units of what is expected of it.
+    largest : float
+        That of the elements.
+    limit : float
+        From which on particles are missing.
+    """
+
+    moves: np.ndarray
+    worst: Any
+    largest: float
+    limit: float
+
+
+class Scouts(NamedTuple):
+    """Those who are where no particle is.
+
+    Attributes
+    ----------
+    values : dict
+        All nodes of the slice, shape ``(scouts, *plates, *event)``.
+    log_weights : ndarray, shape (scouts,)
+        Relative to those of all particles together.
+    share : float
+        The sum of their weights, less that of the particles in such states.
+    """
+
+    values: dict[str, np.ndarray]
+    log_weights: np.ndarray
+    share: float
 
 
 class Families(NamedTuple):
@@ -108,27 +167,30 @@ class Families(NamedTuple):
     doubted: Any = -LONGEST
 
 
-def begun(now: Particles, sight: Sight) -> Families:
+def rested(now: Particles) -> Any:
+    """Whether a slice rests on particles enough for its error to be told."""
+    return now.ess >= min(RESTS, 0.9 * len(now.weights))
+
+
+def begun(now: Particles, layout: Layout) -> Families:
     """Families of the particles of the first slice, which were drawn independently."""
-    n, lead = sight.layout.particles, sight.layout.lead
+    n, lead = layout.particles, layout.lead
     groups = min(GROUPS, max(n // LEAST, 2), n)
     bounds, shares = _even(len(now.weights), groups, len(lead))
-    rested = np.asarray(now.ess) >= min(RESTS, 0.9 * len(now.weights))
     return Families(
         np.array(np.broadcast_to(bounds, (2, groups + 1, *lead))),
         np.array(np.broadcast_to(shares, (2, groups, *lead))),
         np.zeros((2, groups, *lead)),
         np.zeros((2, 2, *lead)),
         np.full((2, *lead), now.t),
-        np.where(rested, 0.0, np.inf),
-        sight.after(None, ~rested, now),
+        np.zeros(lead),
     )
 
 
 def followed(
-    families: Families, earlier: Particles, now: Particles, steady: bool, sight: Sight
-) -> Families:
-    """The families one slice later.
+    families: Families, earlier: Particles, now: Particles, steady: bool
+) -> tuple[Families, Any]:
+    """The families one slice later, and the variance of the log evidence that is settled on the way.
 
     Parameters
     ----------
@@ -138,52 +200,17 @@ def followed(
         Of the slice before, and of this one.
     steady : bool
         Whether resampling leaves neighbours together the particles that their weight demands, but for one.
-    sight : Sight
     """
-    found = families
     gained: Any = 0.0
     if now.ancestors is not None:
-        found = _moved(families, earlier, now, steady)
+        families = _moved(families, earlier, now, steady)
         some = now.resampled if isinstance(now.resampled, bool) else now.resampled.any()
         if some and now.t % STRIDE == 0:
-            found, gained = _looked_at(found, now)
-    poor: Any = now.ess < min(RESTS, 0.9 * len(now.weights))
-    if poor if isinstance(poor, bool) else poor.any():
-        gained = np.where(poor, np.inf, gained)
+            families, gained = _looked_at(families, now)
     if now.rejuvenated is not False:
-        found, more = _renewed(found, earlier, now)
+        families, more = _renewed(families, earlier, now)
         gained = gained + more
-    if isinstance(gained, float) and found.lost is None:
-        return found
-    lost = sight.after(families.lost, np.isinf(gained), now)
-    return found._replace(settled=families.settled + gained, lost=lost)
-
-
-def drifted(families: Families, drift: Drift | None, now: Particles, sight: Sight) -> Families:
-    """The families, where particles are missing if rows go on pulling the same way."""
-    families = families._replace(drift=drift)
-    if drift is None or not drift.largest > SEEMS:
-        return families
-    doubted = families.doubted > now.t - LONGEST
-    missing = (drift.worst > drift.limit) | ((drift.worst > SEEMS) & doubted)
-    if not np.any(missing):
-        return families
-    lost = sight.after(families.lost, missing, now, here=True)
-    return families._replace(settled=np.where(missing, np.inf, families.settled), lost=lost)
-
-
-def scouted(families: Families, scouts: Scouts | None, now: Particles, sight: Sight) -> Families:
-    """The families, where scouts have been to states that no particle has.
-
-    What the particles leave out is lost where it is no longer small.
-    """
-    if scouts is None and families.scouts is None:
-        return families
-    families = families._replace(scouts=scouts)
-    if scouts is None or scouts.share <= LEFT_OUT:
-        return families
-    lost = sight.after(families.lost, True, now, here=True)
-    return families._replace(settled=np.asarray(np.inf), lost=lost)
+    return families, gained
 
 
 def evidence_error(families: Families, now: Particles) -> Any:

@@ -180,13 +180,9 @@ class LookAhead:
 
     def along(self, flags: np.ndarray, node: CompiledNode) -> np.ndarray:
         """What is said of every block, shape ``(*batch, *apart)``, laid along a node's values."""
-        first = flags.ndim - len(self.apart)
-        order = [first + self.apart.index(p) for p in node.plates if p in self.apart]
-        moved = flags.transpose(*range(first), *order)
-        sizes = [
-            n if p in self.apart else 1 for p, n in zip(node.plates, node.plate_shape, strict=True)
-        ]
-        return moved.reshape(*flags.shape[:first], *sizes, *(1,) * len(node.event_shape))
+        more = len(node.plates) - len(self.apart) + len(node.event_shape)
+        wide = flags.reshape(*flags.shape, *(1,) * more)
+        return np.moveaxis(wide, *self._places(node, flags.ndim - len(self.apart)))
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -325,20 +321,15 @@ class LookAhead:
         self, node: CompiledNode, noise: Any, lead: tuple[int, ...], size: int
     ) -> np.ndarray:
         """Covariance of a node given the block where that is expected."""
-        if node.event_shape:
-            cov = self._spread_out(node, np.asarray(noise, dtype=float), lead, 2)
-            inner = node.event_shape[-1]
-            cov = cov.reshape(*lead, size // inner, inner, inner)[0]
-            full = np.zeros((*cov.shape[:-3], size, size))
-            for k in range(size // inner):
-                part = slice(k * inner, (k + 1) * inner)
-                full[..., part, part] = cov[..., k, :, :]
-            return full
-        var = self._spread_out(node, np.asarray(noise, dtype=float), lead, 0)
-        full = np.zeros((*lead[1:], size, size))
-        index = np.arange(size)
-        full[..., index, index] = var.reshape(*lead, size)[0]
-        return full
+        inner = node.event_shape[-1] if node.event_shape else 1
+        cov = self._spread_out(
+            node, np.asarray(noise, dtype=float), lead, 2 * bool(node.event_shape)
+        )
+        cov = cov.reshape(*lead, size // inner, inner, inner)[0]
+        full = np.zeros((*lead[1:], size // inner, inner, size // inner, inner))
+        each = np.arange(size // inner)
+        full[..., each, :, each, :] = np.moveaxis(cov, -3, 0)
+        return full.reshape(*lead[1:], size, size)
 
     def _spread_out(
         self, node: CompiledNode, array: np.ndarray, lead: tuple[int, ...], event_ndim: int
@@ -347,11 +338,13 @@ class LookAhead:
         event = array.shape[array.ndim - event_ndim :]
         batch = lead[: len(lead) - len(self.lead)]
         full = np.broadcast_to(array, (*batch, *node.plate_shape, *event))
-        order = [node.plates.index(p) for p in self.apart]
-        order += [k for k, p in enumerate(node.plates) if p not in self.apart]
-        first = len(batch)
-        tail = range(first + len(node.plates), full.ndim)
-        return full.transpose(*range(first), *(first + k for k in order), *tail)
+        front, own = self._places(node, len(batch))
+        return np.moveaxis(full, own, front)
+
+    def _places(self, node: CompiledNode, first: int) -> tuple[list[int], list[int]]:
+        """Where plates apart lie: after so many axes of the batch, and among the node's plates there."""
+        own = [first + node.plates.index(p) for p in self.apart]
+        return list(range(first, first + len(own))), own
 
     def _flat(
         self, node: CompiledNode, value: np.ndarray, lead: tuple[int, ...] | None = None
@@ -367,18 +360,12 @@ class LookAhead:
         batch = joined.shape[: joined.ndim - 1 - len(self.lead)]
         for name, size in zip(self.block, self.sizes, strict=True):
             node = self.model[name]
-            others = [
-                n for p, n in zip(node.plates, node.plate_shape, strict=True) if p not in self.apart
-            ]
-            part = joined[..., at : at + size].reshape(
-                *batch, *self.lead, *others, *node.event_shape
-            )
+            plates = zip(node.plates, node.plate_shape, strict=True)
+            others = [n for p, n in plates if p not in self.apart]
+            part = joined[..., at : at + size]
+            part = part.reshape(*batch, *self.lead, *others, *node.event_shape)
             at += size
-            back = [*self.apart, *(p for p in node.plates if p not in self.apart)]
-            first = len(batch)
-            order = [first + back.index(p) for p in node.plates]
-            tail = range(first + len(node.plates), part.ndim)
-            part = np.ascontiguousarray(part.transpose(*range(first), *order, *tail))
+            part = np.ascontiguousarray(np.moveaxis(part, *self._places(node, len(batch))))
             part.flags.writeable = False
             found[name] = part
         return found

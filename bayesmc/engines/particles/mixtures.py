@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.engines.particles.linearisation import Belief, LookAhead, spread_varies
 from bayesmc.engines.particles.looking import CASES, components_of
 from bayesmc.network import Model
@@ -63,9 +64,8 @@ class ByCase:
 
     def draw(self, state: Pass, cases: Cases) -> np.ndarray:
         """Put a draw of the block among the values; its log density, shape ``(*batch, *apart)``."""
-        edges = np.cumsum(np.exp(cases.log_shares), axis=0)
-        point = state.rng.random(edges.shape[1:]) * edges[-1]
-        chosen = np.minimum((edges <= point).sum(axis=0), len(edges) - 1)
+        uniform = state.rng.random(cases.log_density.shape)
+        chosen = pick(np.exp(cases.log_shares), uniform)
         mean, cov = cases.beliefs[0].mean, cases.beliefs[0].cov
         for k, belief in enumerate(cases.beliefs[1:], start=1):
             mean = np.where((chosen == k)[..., None], belief.mean, mean)

@@ -1,9 +1,10 @@
-"""Options of a particle filter: what is wrong with them, and what they do to each node."""
+"""Options of a particle filter: what is wrong with them, what they do to each node, how many particles do."""
 
 from __future__ import annotations
 
+import math
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -12,10 +13,13 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.particles.auxiliary import PluggedIn
+from bayesmc.engines.particles.genealogy import Families
 from bayesmc.engines.particles.optimal import guidance
+from bayesmc.engines.particles.record import FilteredParticles
+from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.proposal import FUNCTION, as_function, check_specification
 from bayesmc.engines.slice_steps import SlicePlan, SliceProposals, plates_apart
-from bayesmc.errors import ProposalWarning, UnknownNodeError, did_you_mean
+from bayesmc.errors import LowEssWarning, ProposalWarning, UnknownNodeError, did_you_mean
 from bayesmc.kernels.proposal import names_of
 from bayesmc.network import Observed
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled, whole
@@ -26,6 +30,34 @@ NOT_SMOOTHED = (
     "ParticleFilter: particles whose number changes (adapt=), or that begin anew (recovery=), are not "
     "smoothed; leave these out, and declare what can happen in the transition"
 )
+
+#: particles of a filter that is not told how many, at least, and at most
+START, MOST = 1000, 100_000
+#: those of the first short run; each next one has four times as many
+FIRST, TIMES = 250, 4
+#: error of the log evidence that is aimed at
+TOLERANCE = 0.5
+#: particles times slices that a run may take, and those whose particles are kept
+BUDGET, KEPT = 30_000_000, 5_000_000
+#: what a particle that looks at the row costs, in particles that do not: 4 where what is seen is affine in
+#: what is hidden, 19 for Poisson counts; measured once, so that the same call gives the same answer anywhere
+GUIDED = 20
+#: error of a short run up to which it says how many particles are enough; beyond it is no longer normal
+TRUSTED = 1.5
+#: variance that is aimed at, as a share of the tolerance's
+AIM = 0.6
+#: error of the log evidence above which a warning says so
+LARGE = 1.0
+#: the same where the number of particles is given
+LARGE_GIVEN = 3.0
+#: slices that rest on a single particle which are no accident any more, and their share of all
+SEVERAL, OFTEN = 3, 0.005
+#: equally weighted particles below which a slice rests on a single one
+COLLAPSED = 2.0
+#: and those below which a slice is named as one that is hard to explain
+FEW = 30.0
+#: share of such slices from which on a warning says so
+MANY = 0.1
 
 
 def not_backwards(name: str) -> str:
@@ -45,26 +77,23 @@ def check_count(option: str, given: Any, what: str, call: str = "ParticleFilter"
         )
 
 
-def check_budget(tolerance: Any, budget: Any) -> None:
-    """What a number of particles is chosen by."""
-    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)) or not tolerance > 0:
-        raise ValueError(
-            f"ParticleFilter(tolerance={tolerance!r}): give an error of the log evidence above 0, such as "
-            "0.5"
-        )
-    if isinstance(budget, bool) or not isinstance(budget, (int, np.integer)) or budget < 1:
-        raise ValueError(
-            f"ParticleFilter(budget={budget!r}): give a number of particles times slices, such as 30_000_000"
-        )
-
-
-def check_threshold(given: Any) -> None:
-    """A share of the particles."""
-    if isinstance(given, bool) or not isinstance(given, (int, float)) or not given >= 0:
-        raise ValueError(
-            f"ParticleFilter(ess_threshold={given!r}): give a share of the particles, 0 (never resample) "
-            "to 1 (always)"
-        )
+def check_numbers(engine: Any) -> None:
+    """Options that are one number."""
+    whole, real = (int, np.integer), (int, float)
+    share = "a share of the particles, 0 (never resample) to 1 (always)"
+    for option, kinds, is_good, what in (
+        ("tolerance", real, lambda x: x > 0, "an error of the log evidence above 0, such as 0.5"),
+        (
+            "budget",
+            whole,
+            lambda x: x >= 1,
+            "a number of particles times slices, such as 30_000_000",
+        ),
+        ("ess_threshold", real, lambda x: x >= 0, share),
+    ):
+        given = getattr(engine, option)
+        if isinstance(given, bool) or not isinstance(given, kinds) or not is_good(given):
+            raise ValueError(f"ParticleFilter({option}={given!r}): give {what}")
 
 
 def check_choice(
@@ -159,7 +188,7 @@ def refused(engine: Any, problem: SeriesProblem, asked: SliceProposals | None) -
     known = {*problem.slices.template.static, *problem.series.observed}
     if asked is not None:
         seen = problem.series.observed
-        asked.check(seen.keys(), {n for n, o in seen.items() if o.mask is None})
+        asked.check(seen.keys(), problem.seen)
     for model in (problem.slices.first, problem.slices.later):
         inside = {n for n in model.nodes if n not in problem.slices.dynamic} | known
         reason = refuse_unsampled(model, inside, "ParticleFilter") or refuse_noiseless(
@@ -221,8 +250,8 @@ def looks_told(engine: Any, problem: SeriesProblem, treated: Mapping[str, str]) 
         for name, why in told.unheard.items():
             found[name] += f"; guides nothing: {why}"
     if engine.auxiliary is True and problem.steps > 1:
-        static = {n: o.value for n, o in problem.series.static.items()}
-        stage = PluggedIn(SlicePlan(slices, plates_apart(slices), static), engine.particles)
+        plan = SlicePlan(slices, plates_apart(slices), problem.known_static)
+        stage = PluggedIn(plan, engine.particles)
         full = {n: Observed(o.value[1]) for n, o in seen.items()}
         for name, how in stage.treated(problem.series.row(1)._replace(seen=full)).items():
             found[name] += f"; {how} by the look ahead"
@@ -248,3 +277,156 @@ def warn_of_what_is_not_guided(engine: Any, slices: Slices, seen: Collection[str
             ProposalWarning,
             stacklevel=4,
         )
+
+
+def enough(
+    tried: Callable[[int, int], float], tolerance: float, slices: int, budget: int, keep: bool
+) -> int:
+    """Particles with which the error of the log evidence is likely to be as small as is asked.
+
+    Parameters
+    ----------
+    tried : callable
+        ``(particles, unit) -> error`` of a run with a random stream of its own.
+    tolerance : float
+    slices : int
+        Times the elements of plates that are filtered separately, and the price of a particle.
+    budget : int
+        Particles times slices.
+    keep : bool
+        Whether particles of all slices are held, which takes memory.
+
+    Returns
+    -------
+    int
+        A power of two times ``START``, or the most that the budget allows; ``START`` at least. The answer is
+        that of a run of its own, so what chose the number has no part in it, and the evidence is unbiased.
+    """
+    most = affordable(slices, budget, keep)
+    particles, unit = FIRST, 1
+    while particles < most:
+        error = tried(particles, unit)
+        if error <= TRUSTED:
+            wanted = particles * (error / tolerance) ** 2 / AIM
+            doublings = math.ceil(math.log2(max(wanted / START, 1.0)))
+            return min(START * 2**doublings, most)
+        particles, unit = particles * TIMES, unit + 1
+    return most
+
+
+def price(engine: Any) -> int:
+    """What a particle of a slice costs, in draws from its own density."""
+    guided = isinstance(engine.proposal, str) or engine.auxiliary is True
+    return GUIDED if guided else 1
+
+
+def affordable(slices: int, budget: int, keep: bool) -> int:
+    """The most particles that are tried where nobody says how many."""
+    share = min(budget, KEPT) if keep else budget
+    return max(START, min(MOST, share // max(slices, 1)))
+
+
+def collapsed(filtered: FilteredParticles) -> str | None:
+    """What is said where many slices rest on what is little more than one particle.
+
+    A surprising row now and then does that to any filter, and the next rows mend it.
+    """
+    assert filtered.weight_ess is not None and filtered.counts is not None
+    ess = filtered.weight_ess.reshape(filtered.steps, -1)
+    most = int(filtered.counts.max())
+    poor = ess < min(COLLAPSED, 0.9 * most)
+    share = poor.mean(axis=0)
+    worst = int(share.argmax())
+    if share[worst] <= MANY:
+        return None
+    own = ess[:, worst]
+    at = int(own.argmin())
+    return (
+        f"in {int(poor[:, worst].sum())} of {len(own)} slices the {most} particles are worth less than "
+        f"{COLLAPSED:g} equally weighted ones (weight_ess; {own[at]:.1f} in slice {filtered.start + at}), so "
+        "means, spreads and the evidence rest on one of them: use more particles, a proposal= that looks at "
+        "the observations, or less narrow noise"
+    )
+
+
+def uncertain(filtered: FilteredParticles, engine: Any) -> str | None:
+    """What is said where the log evidence is not known well.
+
+    Who gives a number of particles may ask for states alone, which few may follow well: then it takes a
+    larger error; or a first row that next to no particle explains, since what is missing there is never found
+    again, or several rows of that kind.
+    """
+    assert filtered.counts is not None and filtered.weight_ess is not None
+    given = engine.particles is not None
+    errors = np.atleast_1d(np.asarray(filtered.log_marginal_likelihood_mcse, dtype=float))
+    worst = float(errors.max())
+    if not worst > (LARGE_GIVEN if given else LARGE):
+        return None
+    ess = filtered.weight_ess.reshape(filtered.steps, -1)[:, int(errors.reshape(-1).argmax())]
+    at = int(ess.argmin())
+    if math.isinf(worst):
+        weighed = np.flatnonzero(ess < 0.999 * filtered.counts)
+        if given:
+            at = int(weighed[0]) if len(weighed) else at
+            single = np.count_nonzero(ess < COLLAPSED)
+            if ess[at] >= COLLAPSED and single < max(SEVERAL, OFTEN * len(ess)):
+                return None
+            at = at if ess[at] < COLLAPSED else int(ess.argmin())
+        said = "cannot tell how far their log evidence is off (log_marginal_likelihood_mcse is infinite)"
+    else:
+        said = f"leave an error of {worst:.1f} in the log evidence (log_marginal_likelihood_mcse)"
+    why = (
+        f"weight_ess is {ess[at]:.1f} in slice {filtered.start + at}"
+        if ess[at] < FEW
+        else "particles that later rows ask for were rare among those of earlier slices"
+    )
+    return (
+        f"{int(filtered.counts.max())} particles {said}, and figures after rows that are hard to explain may "
+        f"be off as well ({why}); use {_more(filtered, engine)}, a "
+        "proposal= that looks at the observations, or a model to which such rows are less of a surprise"
+    )
+
+
+def warn_of_a_lonely_step(
+    before: Particles | None, families: Families | None, now: Particles
+) -> None:
+    """The first step that leaves little more than one particle says so; later ones know by the error."""
+    if before is not None and families is not None and np.isinf(families.settled).any():
+        return
+    worst = float(np.min(now.ess))
+    if worst >= min(COLLAPSED, 0.9 * len(now.weights)):
+        return
+    warnings.warn(
+        f"ParticleFilter: step leaves {len(now.weights)} particles that are worth {worst:.1f} equally "
+        f"weighted ones in slice {now.t}: from here on the belief cannot tell how far it is off "
+        "(log_marginal_likelihood_mcse is infinite); give a larger number of particles, or a proposal= that "
+        "looks at the observations",
+        LowEssWarning,
+        stacklevel=4,
+    )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _more(filtered: FilteredParticles, engine: Any) -> str:
+    """How to have more particles, by what set their number."""
+    assert filtered.counts is not None
+    if engine.particles is not None or engine.adapt is not None:
+        return "more particles"
+    count, keep = int(filtered.counts.max()), filtered.held is not None
+    if count >= MOST:
+        return (
+            f"more particles than the {MOST:_} that are tried at most, such as "
+            f"ParticleFilter({4 * MOST:_})"
+        )
+    assert filtered.log_marginal_increments is not None
+    slices = math.prod(filtered.log_marginal_increments.shape) * price(engine)
+    if count < affordable(slices, engine.budget, keep):
+        return (
+            f"a number of your own, such as ParticleFilter({4 * count:_}) (short runs found {count:_} "
+            "enough)"
+        )
+    if keep and engine.budget > KEPT:
+        return "more particles, whose number is held down where all slices are kept (smooth, keep=)"
+    return f"a larger budget= than {engine.budget:_}"

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.dbn import PREVIOUS, Row, SeriesProblem
-from bayesmc.engines.particles.particles import Particles, along_plates
+from bayesmc.engines.particles.smc import Particles, along_plates
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import UnsupportedError
 from bayesmc.network import Observed
@@ -113,7 +114,8 @@ class Replicates:
             return {}
         held = before if isinstance(before, Particles) else None
         drawn = before.values if isinstance(before, Particles) else before(self.rng, ROWS + JUDGES)
-        chosen = None if held is None else self._ancestors(held, ROWS + JUDGES)
+        lots = (ROWS + JUDGES, *self.lead)
+        chosen = None if held is None else pick(held.weights, self.rng.random(lots))
         found = {}
         for name in self.slices.interface:
             value = drawn[name]
@@ -130,20 +132,6 @@ class Replicates:
             judges = np.tile(taken[ROWS:], (ROWS + 1, *(1,) * (taken.ndim - 1)))
             found[name + PREVIOUS] = taken[:ROWS], judges
         return found
-
-    def _ancestors(self, held: Particles, count: int) -> np.ndarray:
-        """Particles drawn in proportion to their weights, shape (count, *lead)."""
-        if not self.lead:
-            sums = held.weights.cumsum()
-            return sums.searchsorted(self.rng.random(count) * sums[-1], side="right").clip(
-                max=len(sums) - 1
-            )
-        weights = held.weights.reshape(len(held.weights), -1)
-        found = np.empty((count, weights.shape[1]), dtype=np.intp)
-        for k, column in enumerate(weights.T):
-            sums = column.cumsum()
-            found[:, k] = sums.searchsorted(self.rng.random(count) * sums[-1], side="right")
-        return np.minimum(found, len(weights) - 1).reshape(count, *self.lead)
 
     def _drawn(self, row: Row, before: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
         """Rows drawn without looking at the one that came, shape (rows, *plates, *event) by node."""

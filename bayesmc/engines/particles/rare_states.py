@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.particles import Particles
+from bayesmc.engines.particles.genealogy import Scouts
+from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError
 from bayesmc.network import CompiledNode, Model
@@ -32,24 +34,6 @@ STATES = 16
 NODES = 4
 #: particles below which a state is rare
 RARE = 4
-
-
-class Scouts(NamedTuple):
-    """Those who are where no particle is.
-
-    Attributes
-    ----------
-    values : dict
-        All nodes of the slice, shape ``(scouts, *plates, *event)``.
-    log_weights : ndarray, shape (scouts,)
-        Relative to those of all particles together.
-    share : float
-        The sum of their weights, less that of the particles in such states.
-    """
-
-    values: dict[str, np.ndarray]
-    log_weights: np.ndarray
-    share: float
 
 
 class Scouting:
@@ -122,12 +106,11 @@ class Scouting:
         before, carried = {}, -math.log(SCOUTS) - float(now.increment)
         if earlier is not None:
             weights = np.where(_among(earlier.values, unmet), 0.0, earlier.weights)
-            sums = weights.cumsum()
-            if not sums[-1] > 0:
+            share = float(weights.sum() / earlier.total)
+            if not share > 0:
                 return []
-            carried += math.log(sums[-1] / earlier.total)
-            at = sums.searchsorted(rng.random(SCOUTS) * sums[-1], side="right")
-            at = at.clip(max=len(sums) - 1)
+            carried += math.log(share)
+            at = pick(weights, rng.random(SCOUTS))
             for name in self.slices.interface:
                 value = earlier.values[name]
                 shared = value.ndim == len(self.slices.later[name].value_shape)
@@ -176,13 +159,12 @@ class _Put:
         densities = [self.model.log_density(name, dist, codes) for codes in each]
         logs = np.stack([np.broadcast_to(log, state.batch) for log in densities])
         level = np.maximum(logs.max(axis=0), -1e300)
-        sums = np.exp(logs - level).cumsum(axis=0)
-        picked = (state.rng.random(state.batch) * sums[-1] >= sums).sum(axis=0)
-        chosen = self.codes.astype(kind)[picked.clip(max=len(self.codes) - 1)]
+        weights = np.exp(logs - level)
+        chosen = self.codes.astype(kind)[pick(weights, state.rng.random(state.batch))]
         chosen.flags.writeable = False
         state.values[name] = chosen
         with np.errstate(divide="ignore"):
-            state.weigh(level + np.log(sums[-1]))
+            state.weigh(level + np.log(weights.sum(axis=0)))
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -224,10 +206,8 @@ def _together(parties: Sequence[Scouts], there: float, rng: np.random.Generator)
     if top == -math.inf:
         return None
     weights = np.exp(log - top)
-    sums = weights.cumsum()
-    whole = top + math.log(sums[-1])
-    at = sums.searchsorted((rng.random() + np.arange(SCOUTS)) / SCOUTS * sums[-1], side="right")
-    at = at.clip(max=len(sums) - 1)
+    whole = top + math.log(weights.sum())
+    at = pick(weights, (rng.random() + np.arange(SCOUTS)) / SCOUTS)
     names = parties[0].values
     values = {n: np.concatenate([p.values[n] for p in parties])[at] for n in names}
     even = np.full(SCOUTS, whole - math.log(SCOUTS))

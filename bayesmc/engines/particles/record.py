@@ -1,37 +1,40 @@
-"""What a run keeps of its particles: answers of constant size, or the particles themselves."""
+"""The run of a filter over a series, and what it keeps: answers of constant size, or the particles."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.averages import naming
-from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
-from bayesmc.engines.particles import coalescence
-from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.errors import function_errors, node_errors
-from bayesmc.engines.particles.genealogy import Families, evidence_error
-from bayesmc.engines.particles.particles import Layout, Particles
-from bayesmc.engines.particles.queries import (
-    at_scouts,
-    covariance,
-    evaluated,
-    expectation,
-    probability,
-    quantiles,
+from bayesmc.engines.filtering import (
+    Queries,
+    first_slices,
+    observed_answers,
+    pass_slices,
+    refuse_forecast,
 )
+from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
+from bayesmc.engines.particles.blocks import NUMBERS, Block, alike
+from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
+from bayesmc.engines.particles.filter_step import FilterStep
+from bayesmc.engines.particles.genealogy import Families, evidence_error
+from bayesmc.engines.particles.predictive import Replicates
+from bayesmc.engines.particles.smc import Layout, Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
+from bayesmc.progress import Progress
+from bayesmc.randomness import Purpose, stream
 from bayesmc.results import SeriesPosterior
 from bayesmc.results.predictive import Predictive
 
-#: slices that are written together, at most, and numbers of all their particles: what costs is calling NumPy
-TOGETHER, NUMBERS = 100, 1 << 16
+#: slices that are written together, at most, and those that are though half as many would stay in cache
+TOGETHER, FEW = 100, 6
 
 
 class Waiting(NamedTuple):
@@ -82,7 +85,8 @@ class Record:
         self.problem, self.layout, self.asked, self.tracker = problem, layout, queries, tracker
         self._nodes = [problem.model[n] for n in problem.hidden]
         numbers = sum(max(1, math.prod(n.value_shape)) for n in self._nodes) or 1
-        self.together = max(1, min(TOGETHER, NUMBERS // (layout.particles * numbers)))
+        many = NUMBERS // (layout.particles * numbers)
+        self.together = min(TOGETHER, max(1, many // 2, min(FEW, many)))
         self._waiting: list[Waiting] = []
         self._written: list[Written] = []
         self._room: dict[Any, np.ndarray] = {}
@@ -96,7 +100,7 @@ class Record:
         for name, function in self.asked.items():
             with naming(name):
                 values[name] = evaluated(self.layout, particles, self.problem.model, function)
-        if self._waiting and not self._fits(particles):
+        if self._waiting and not alike(self._waiting[-1].particles, particles):
             self.write()
         self._waiting.append(Waiting(k, particles, row, families, values))
         if len(self._waiting) >= self.together:
@@ -126,6 +130,7 @@ class Record:
         slices = [w.particles for w in waiting]
         block = Block(self.layout, slices, room=self._room)
         families = self._followed(waiting, block)
+        by = ByFamily(block, families) if families else None
         rows: Rows = {what: {} for what in _KINDS}
         for node in self._nodes:
             name = node.name
@@ -133,17 +138,17 @@ class Record:
                 rows["tables"][name] = block.table(node)
             else:
                 rows["means"][name], rows["variances"][name] = block.mean_and_variance(node)
-            if families:
-                rows["errors"][name] = node_errors(block, families, node)
+            if by is not None:
+                rows["errors"][name] = node_errors(by, block, node)
         for name, function in self.asked.items():
             values = [w.values[name] for w in waiting]
             mean = block.weighted(block.turned(values))
             rows["queries"][name] = mean.reshape(len(values), *values[0].shape[1:])
-            if families:
+            if by is not None:
                 model = self.problem.model
                 pairs = zip(slices, families, strict=True)
                 there = [at_scouts(self.layout, p, f, model, function) for p, f in pairs]
-                rows["query errors"][name] = function_errors(block, families, values, there)
+                rows["query errors"][name] = function_errors(by, block, values, there)
         rows["filter"] = _diagnosed(slices, self.layout.lead)
         return Written(
             rows, families if self.keep else families[-1:], slices if self.keep else slices[-1:]
@@ -156,7 +161,7 @@ class Record:
         steps: int | None = None,
         predictive: Predictive | None = None,
         filtered: FilteredParticles | None = None,
-        sharing: coalescence.Sharing | None = None,
+        sharing: Variances | None = None,
     ) -> FilteredParticles:
         """The answers of all slices, or of the first so many; with the figures of a filter, or those here."""
         self.write()
@@ -174,7 +179,7 @@ class Record:
         if self.keep:
             particles = [p for w in self._written for p in w.particles]
             known = [f for w in self._written for f in w.families]
-            held = Held(self.layout, particles[:k], known[:k], sharing)
+            held = Answers(self.layout, self.problem.model, particles[:k], known[:k], sharing)
         return FilteredParticles(
             self.problem.model,
             engine,
@@ -193,7 +198,7 @@ class Record:
         )
 
     def smoothed(
-        self, engine: Any, sharing: coalescence.Sharing, filtered: FilteredParticles
+        self, engine: Any, sharing: Variances, filtered: FilteredParticles
     ) -> FilteredParticles:
         """The answers of trajectories, with their errors: infinite where the filter's are."""
         self.write()
@@ -202,23 +207,15 @@ class Record:
         block, model = Block(self.layout, slices, whole=True), self.problem.model
         rows = self._written[0].rows  # of all slices at once
         for node in self._nodes:
-            errors = coalescence.node_errors(sharing, block, node)
+            errors = node_errors(sharing, block, node)
             lost = np.isinf(filtered.mean_errors[node.name])
             rows["errors"][node.name] = np.where(lost, np.inf, errors)
         for name, function in self.asked.items():
             values = [evaluated(self.layout, p, model, function) for p in slices]
-            rows["query errors"][name] = coalescence.function_errors(sharing, np.stack(values))
+            rows["query errors"][name] = function_errors(sharing, block, values, [])
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
     # ---- private -------------------------------------------------------------------------------
-
-    def _fits(self, particles: Particles) -> bool:
-        """Whether a slice can be written with those that wait: laid out alike, and none drawn anew."""
-        last = self._waiting[-1].particles
-        if len(particles.weights) != len(last.weights):
-            return False
-        ranks, alike = ([v.ndim for v in p.values.values()] for p in (particles, last))
-        return ranks == alike and last.rejuvenated is False and particles.rejuvenated is False
 
     def _followed(self, waiting: Sequence[Waiting], block: Block) -> list[Families]:
         """The families of slices that wait."""
@@ -232,16 +229,6 @@ class Record:
         names = {n: None for w in self._written for n in w.rows[what]}
         pieces = {n: [w.rows[what][n] for w in self._written if n in w.rows[what]] for n in names}
         return first_slices({n: np.concatenate(rows) for n, rows in pieces.items()}, steps)
-
-
-class Held(NamedTuple):
-    """The particles of all slices, and what their errors are told by."""
-
-    layout: Layout
-    particles: list[Particles]
-    families: list[Families]
-    #: of trajectories that were drawn backwards
-    sharing: coalescence.Sharing | None = None
 
 
 class FilteredParticles(SeriesPosterior):
@@ -282,7 +269,7 @@ class FilteredParticles(SeriesPosterior):
         diagnostics: Mapping[str, np.ndarray],
         errors: tuple[Any, Mapping[str, np.ndarray], Mapping[str, np.ndarray]],
         predictive: Predictive | None = None,
-        held: Held | None = None,
+        held: Answers | None = None,
     ) -> None:
         super().__init__(model, engine, kind, diagnostics["increments"], **answers)
         self.log_marginal_likelihood_mcse, self.mean_errors, mcse = errors
@@ -301,16 +288,7 @@ class FilteredParticles(SeriesPosterior):
         """As of any series; with ``keep="particles"`` a function of nodes has errors, too."""
         if not callable(what):
             return super().mcse(what)
-        held = self._kept("mcse of a function")
-        values = [evaluated(held.layout, p, self.model, what) for p in held.particles]
-        if held.sharing is not None:
-            return coalescence.function_errors(held.sharing, np.stack(values))
-        rows = []
-        for own, families, value in zip(held.particles, held.families, values, strict=True):
-            there = at_scouts(held.layout, own, families, self.model, what)
-            block = Block(held.layout, [own])
-            rows.append(function_errors(block, [families], [value], [there])[0])
-        return np.stack(rows)
+        return self._kept("mcse of a function").mcse(what)
 
     def particles(self, name: str) -> np.ndarray:
         """Particles of all slices, shape ``(time, particles, *plates, *event)``, not weighted."""
@@ -341,6 +319,13 @@ class FilteredParticles(SeriesPosterior):
             rows.append(np.broadcast_to(np.where(p.rejuvenated, -1, found), shape))
         return np.stack(rows)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Pickles travel without functions."""
+        state = super().__getstate__()
+        if self.held is not None:
+            state["held"] = self.held._replace(model=state["model"])
+        return state
+
     def last(self, steps: int, kind: str) -> SeriesPosterior:
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
@@ -348,32 +333,23 @@ class FilteredParticles(SeriesPosterior):
 
     def expectation(self, function: Callable[..., Any]) -> np.ndarray:
         """Means of a function of nodes of a slice, time first; see ``ParticleBelief.expectation``."""
-        held = self._kept("expectation")
-        return np.stack([expectation(held.layout, p, self.model, function) for p in held.particles])
+        return self._kept("expectation").expectation(function)
 
     def probability(self, function: Callable[..., Any]) -> np.ndarray:
         """Probabilities of an event (a function that returns booleans), time first."""
-        held = self._kept("probability")
-        return np.stack([probability(held.layout, p, self.model, function) for p in held.particles])
+        return self._kept("probability").probability(function)
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         """Quantiles, shape ``(time, *q.shape, *plates, *event)``."""
         held = self._kept("quantile")
-        node = self._node(name)
-        rows = [quantiles(held.layout, p, node, p.values[name], q) for p in held.particles]
-        return np.stack(rows)
+        return held.quantile(self._node(name).name, q)
 
     def cov(self, *names: str) -> np.ndarray:
         """Covariance matrices of all numbers of the named nodes, time first; of one number, its variance."""
         held = self._kept("cov")
-        nodes = [self._node(name) for name in names]
-        rows = [
-            covariance(held.layout, p, [(n, p.values[n.name]) for n in nodes])
-            for p in held.particles
-        ]
-        return np.stack(rows)
+        return held.cov(*(self._node(name).name for name in names))
 
-    def _alike(self, what: str) -> Held:
+    def _alike(self, what: str) -> Answers:
         """What is held, where each slice has as many particles."""
         held = self._kept(what)
         if any(len(p.weights) != held.layout.particles for p in held.particles):
@@ -382,10 +358,51 @@ class FilteredParticles(SeriesPosterior):
             )
         return held
 
-    def _kept(self, what: str) -> Held:
+    def _kept(self, what: str) -> Answers:
         if self.held is None:
             raise self._not_kept(what)
         return self.held
+
+
+def filtered_by(
+    engine: Any,
+    step: FilterStep,
+    problem: SeriesProblem,
+    seed: np.random.SeedSequence,
+    keep: bool,
+    queries: Queries,
+    progress: bool | None,
+    unit: int = 0,
+    look_back: Callable[[int, Particles, Families], None] | None = None,
+) -> FilteredParticles:
+    """All slices, one by one, with a random stream; Ctrl-C goes on, with the answer so far.
+
+    Runs of another ``unit`` than 0, which only say how many particles are needed, compare no rows.
+    """
+    record = Record(problem, step.layout, queries, keep, Tracker(step))
+    rng, rows = stream(seed, Purpose.FILTER, unit), problem.series
+    check = stream(seed, Purpose.CHECK, unit)
+    looks = Replicates(problem, step.plan, check) if unit == 0 else None
+    now: Particles | None = None
+
+    def move(k: int) -> None:
+        nonlocal now
+        row, old = rows.row(k), now
+        if looks is not None:
+            looks.look(k, old, row)
+        now = step(old, row, rng)
+        record.add(k, now, row)
+        if look_back is not None:
+            record.write()
+            assert record.families is not None
+            look_back(k, now, record.families)
+        if old is not None and not keep and look_back is None and record.is_written:
+            step.recycle(old)
+
+    with Progress(problem.steps, engine.label, progress) as bar, quiet():
+        so_far = partial(record.posterior, engine, "filter")
+        pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
+        return record.posterior(engine, predictive=None if looks is None else looks.found())
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.particles import Particles, Selection
 from bayesmc.engines.particles.recovery import Recovery
+from bayesmc.engines.particles.smc import Particles, Selection
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import Propose
 from bayesmc.engines.slice_steps import SlicePlan, check_target
 from bayesmc.errors import ModelError
 from bayesmc.kernels.proposal import Key, Proposal, blaming, names_of
-from bayesmc.network import Model, Observed
+from bayesmc.network import Model
 from bayesmc.network.forward import Pass, Step, summed
 
 
@@ -145,9 +146,7 @@ class Injection:
     ) -> np.ndarray:
         """Positions in the slice before, for what looks at that."""
         if self._looks_back:
-            sums = np.cumsum(earlier.weights)
-            found = np.searchsorted(sums, rng.random(lost.size) * sums[-1], side="right")
-            return np.minimum(found, len(sums) - 1)
+            return pick(earlier.weights, rng.random(lost.size))
         return lost if selection.ancestors is None else selection.ancestors[lost]
 
     def _begun(
@@ -215,15 +214,7 @@ def start_weights(selection: Selection, lost: np.ndarray) -> np.ndarray:
 class Aimed(Propose):
     """Draws from a proposal for a given density, which may be narrower than the node's support."""
 
-    def __init__(
-        self,
-        model: Model,
-        observed: Mapping[str, Observed],
-        proposal: Proposal,
-        apart: tuple[str, ...] = (),
-    ) -> None:
-        super().__init__(model, observed, proposal, apart)
-        self._compared = set(proposal.names)
+    warns = False
 
 
 class Unweighed(Aimed):

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import DynamicBayesNet
+from bayesmc.dbn.series import read_series
 from bayesmc.dbn.unroll import indexed
 from bayesmc.distributions import marking_invalid
 from bayesmc.errors import BudgetError, ModelError, UnknownNodeError, UnsupportedError
@@ -312,7 +313,7 @@ def _unrolled(
     dbn: DynamicBayesNet, observations: Mapping[str, Any] | None, inputs: Mapping[str, Any] | None
 ) -> tuple[BayesNet, dict[str, Any], int]:
     """The plain net of a series, its evidence, and the number of slices."""
-    _, series = dbn.read(observations, inputs)
+    _, series = read_series(dbn, observations, inputs)
     net = dbn.unroll(series.steps, inputs)
     return net, dbn.unrolled_evidence(observations or {}), series.steps
 

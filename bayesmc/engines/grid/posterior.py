@@ -1,21 +1,33 @@
-"""What a run on a grid keeps: answers about every slice, with densities unless told otherwise."""
+"""What a grid filter says: of every slice of a run, of one slice as its rows come in, and as draws."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bayesmc.categorical import pick
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.averages import as_event, naming
+from bayesmc.engines.beliefs import SliceBelief
 from bayesmc.engines.exact.exact import readable_bytes
 from bayesmc.engines.filtering import Answers as Seen
-from bayesmc.engines.filtering import Queries, first_slices, observed_answers, refuse_forecast
+from bayesmc.engines.filtering import (
+    Queries,
+    first_slices,
+    observed_answers,
+    quiet,
+    refuse_forecast,
+)
 from bayesmc.engines.grid.answers import Answers
 from bayesmc.engines.grid.moves import Cells, GridMover
-from bayesmc.engines.grid.slice import quiet
+from bayesmc.engines.grid.slice import Placed
 from bayesmc.engines.grid.tables import GridModel
+from bayesmc.engines.particles.predictive import Draws
+from bayesmc.engines.particles.smc import along_plates
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError
 from bayesmc.network import Model
 from bayesmc.results import SeriesPosterior
@@ -215,14 +227,10 @@ class GridPosterior(SeriesPosterior):
     def last(self, steps: int, kind: str) -> GridPosterior:
         """The last so many slices by themselves."""
         refuse_forecast(self, kind)
-        cut = super().last(steps, kind)
-        found = GridPosterior(
-            self.model, self.engine, kind, None, self._grids,
-            {n: v[-steps:] for n, v in self._densities.items()},
-            tables=cut._tables, means=cut._means, variances=cut._variances, queries=cut.queries,
-            steps=steps, start=cut.start,
-        )  # fmt: skip
-        found.queries_mcse = cut.queries_mcse
+        found = object.__new__(GridPosterior)
+        found.__dict__.update(super().last(steps, kind).__dict__)
+        found._grids = self._grids
+        found._densities = {n: v[-steps:] for n, v in self._densities.items()}
         found.answers = None if self.answers is None else self.answers[-steps:]
         return found
 
@@ -233,6 +241,83 @@ class GridPosterior(SeriesPosterior):
                 'summaries" is given, finite ones have probabilities(name), others are given one by grid='
             )
         return kept[name]
+
+
+class GridState(NamedTuple):
+    """What a belief goes on with: what moves it (None out of a pickle), its cells, and those before."""
+
+    mover: GridMover | None
+    cells: Cells
+    before: Cells | None
+
+
+class GridBelief(SliceBelief):
+    """Probabilities of cells of one slice.
+
+    Attributes
+    ----------
+    t : int
+        The slice; -1 before anything was absorbed.
+    log_marginal_likelihood : float or ndarray
+        Log density of all rows absorbed so far; one for each element of plates filtered separately.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc import GridFilter
+    >>> dbn = bmc.DynamicBayesNet()
+    >>> dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    >>> dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+    >>> engine = GridFilter({"x": (-8.0, 8.0, 200)})
+    >>> belief = engine.step(engine.start(dbn), {"y": 0.8})
+    >>> belief.t, float(belief.mean("x").round(4)), belief.density("x").shape
+    (0, 0.64, (200,))
+    """
+
+    def density(self, name: str) -> np.ndarray:
+        """Density at the points of the grid, shape ``(*plates, *cells)``; NaN where the node is seen."""
+        return self._posterior.density(name)[0]
+
+    def grid(self, name: str) -> Any:
+        """The points of a node's grid; of a vector a tuple, one per component."""
+        return self._posterior.grid(name)
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _without_functions(self) -> GridState:
+        return self.state._replace(mover=None)
+
+    def _answered(self) -> GridPosterior:
+        mover, cells, before = self.state
+        model = mover.model
+        record = GridRecord(model, model.slices.dynamic, 1, {}, True)
+        record.add(0, answers_of(mover, before, cells, cells.probs))
+        return record.posterior(None, "filter", None)
+
+
+def draws_of(model: GridModel, cells: Cells | None) -> Draws | None:
+    """Draws from a belief, of the nodes that the next slice reads; None before slice 0."""
+    return None if cells is None else partial(_drawn, model, cells)
+
+
+def values_at(
+    model: GridModel, placed: Placed, name: str, at: tuple[np.ndarray, ...]
+) -> np.ndarray:
+    """A node's values at cells, whose positions along every axis have shape ``(count, *apart)``.
+
+    Elements of plates that are filtered separately have cells of their own; where the node is seen the first
+    axis may be 1.
+    """
+    node, value = model.slices.later[name], placed.values[name]
+    batch = value.ndim - len(node.value_shape)
+    axes = [k for k in range(batch) if value.shape[k] > 1]
+    each = np.broadcast_to(value, value.shape[:batch] + node.value_shape)
+    each = each.reshape(-1, *node.value_shape)
+    if not axes:
+        return each
+    sizes = [value.shape[k] for k in axes]
+    index = np.ravel_multi_index([at[k] for k in axes], sizes)
+    return along_plates(each, index, node.plates, model.apart) if model.apart else each[index]
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -254,3 +339,24 @@ def _check_kept(name: str, shape: tuple[int, ...], max_bytes: float) -> None:
             "raise max_bytes=",
             int(count),
         )
+
+
+def _drawn(
+    model: GridModel, cells: Cells, rng: np.random.Generator, count: int
+) -> dict[str, np.ndarray]:
+    """Values of so many draws, first axis, of each node; without that axis where it is seen."""
+    at = _positions(cells, model.lead, rng, count)
+    found = {n: values_at(model, cells.placed, n, at) for n in model.slices.interface}
+    return {n: v[0] if len(v) == 1 else v for n, v in found.items()}
+
+
+def _positions(
+    cells: Cells, lead: tuple[int, ...], rng: np.random.Generator, count: int
+) -> tuple[np.ndarray, ...]:
+    """Cells in proportion to their probabilities: along every axis positions, shape (count, *lead)."""
+    shape = cells.placed.shape
+    if not shape:
+        return ()
+    probs = np.broadcast_to(cells.probs, (*shape, *lead)).reshape(math.prod(shape), -1)
+    flat = pick(probs, rng.random((probs.shape[1], count)).T)
+    return tuple(np.unravel_index(flat.reshape(count, *lead), shape))

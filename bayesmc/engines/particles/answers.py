@@ -1,0 +1,168 @@
+"""What the particles of some slices say of functions, of quantiles and of covariances, slice by slice."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from bayesmc.engines.averages import as_event, called
+from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors
+from bayesmc.engines.particles.genealogy import Families
+from bayesmc.engines.particles.smc import Layout, Particles
+from bayesmc.errors import QueryError, UnknownNodeError
+from bayesmc.network import CompiledNode, Model
+from bayesmc.network.node import nodes_read
+from bayesmc.results.posterior import quantile_levels
+
+
+class Answers(NamedTuple):
+    """Particles of slices, and what their errors are told by; all answers have the slices first."""
+
+    layout: Layout
+    model: Model
+    particles: list[Particles]
+    families: list[Families]
+    #: of trajectories that were drawn backwards
+    sharing: Variances | None = None
+
+    def expectation(
+        self, function: Callable[..., Any], read: Callable[[Any], Any] = np.asarray
+    ) -> np.ndarray:
+        """Weighted means of a function's values as ``read`` has them, ``(slices, *what one value has)``."""
+        return np.stack([self._mean(p, read(self._at(p, function))) for p in self.particles])
+
+    def probability(self, event: Callable[..., Any]) -> np.ndarray:
+        """Weighted shares of the particles for which an event holds."""
+        return self.expectation(event, as_event)
+
+    def mcse(self, function: Callable[..., Any]) -> np.ndarray:
+        """Errors of a function's means."""
+        values = [self._at(p, function) for p in self.particles]
+        if self.sharing is not None:
+            block = Block(self.layout, self.particles)
+            return function_errors(self.sharing, block, values, [])
+        found = []
+        for own, families, value in zip(self.particles, self.families, values, strict=True):
+            there = at_scouts(self.layout, own, families, self.model, function)
+            block = Block(self.layout, [own])
+            found.append(function_errors(ByFamily(block, [families]), block, [value], [there])[0])
+        return np.stack(found)
+
+    def quantile(self, name: str, q: Any) -> np.ndarray:
+        """Quantiles of a node that is not made of labels, shape ``(slices, *q.shape, *plates, *event)``."""
+        node, levels = self.model[name], quantile_levels(name, q)
+        return np.stack([self._quantiles(p, node, levels) for p in self.particles])
+
+    def cov(self, *names: str) -> np.ndarray:
+        """Weighted covariances of all numbers of some nodes; of one number, its variance."""
+        if not names:
+            raise UnknownNodeError("cov(): name at least one node")
+        if self.layout.apart:
+            raise QueryError(
+                f"cov: elements of plate {self.layout.apart[0]!r} are filtered separately, each with weights "
+                "of its own; use var, or expectation of a product"
+            )
+        return np.stack([self._covariance(p, names) for p in self.particles])
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _at(self, particles: Particles, function: Callable[..., Any]) -> np.ndarray:
+        return evaluated(self.layout, particles, self.model, function)
+
+    def _mean(self, particles: Particles, values: np.ndarray) -> np.ndarray:
+        """Mean of values that have the particles first, then the plates filtered separately."""
+        more = (1,) * (values.ndim - particles.weights.ndim)
+        total = np.asarray(particles.total)
+        weights = particles.weights.reshape(particles.weights.shape + more)
+        return (weights * values).sum(axis=0) / total.reshape(total.shape + more)
+
+    def _numbers(self, particles: Particles, node: CompiledNode) -> np.ndarray:
+        """A node's values, of labels none, with an axis of particles."""
+        value = particles.values[node.name]
+        value = value if node.domain is None else numbers_of(node)[value]
+        return np.broadcast_to(value, (len(particles.weights), *node.value_shape))
+
+    def _quantiles(self, now: Particles, node: CompiledNode, levels: Any) -> np.ndarray:
+        layout, numbers = self.layout, self._numbers(now, node)
+        if node.angles is not None:  # an order needs a cut: opposite the mean
+            mean = Block(layout, [now]).mean_and_variance(node)[0][0]
+            near = mean + np.remainder(numbers - mean + np.pi, 2 * np.pi) - np.pi
+            numbers = np.where(node.angles, near, numbers)
+        at = [node.plates.index(p) for p in layout.apart if p in node.plates]
+        shape = [len(now.weights)] + [1] * (numbers.ndim - 1)
+        for axis, size in zip(at, layout.lead, strict=False):
+            shape[1 + axis] = size
+        weights = now.weights.transpose(0, *(1 + k for k in np.argsort(at))).reshape(shape)
+        weights = np.broadcast_to(weights, numbers.shape)
+        return np.quantile(numbers, levels, axis=0, weights=weights, method="inverted_cdf")
+
+    def _covariance(self, now: Particles, names: tuple[str, ...]) -> np.ndarray:
+        n = len(now.weights)
+        columns = [self._numbers(now, self.model[name]).reshape(n, -1) for name in names]
+        flat, shares = np.concatenate(columns, axis=1).astype(float), now.weights / now.total
+        flat = flat - shares @ flat
+        matrix = (flat * shares[:, None]).T @ flat
+        return matrix[0, 0] if matrix.size == 1 else matrix
+
+
+def evaluated(
+    layout: Layout,
+    particles: Particles,
+    model: Model,
+    function: Callable[..., Any],
+) -> np.ndarray:
+    """A function's values, particles first."""
+    arguments = []
+    for name in nodes_read(function):
+        if name not in particles.values:
+            raise UnknownNodeError(
+                f"a query reads {name!r}, of which there are no particles; there are those of "
+                f"{list(particles.values)}"
+            )
+        node = model[name]
+        shape = (len(particles.weights), *node.value_shape)
+        arguments.append(node.decode(np.broadcast_to(particles.values[name], shape)))
+    values = np.asarray(called(function, arguments))
+    if not values.ndim or len(values) != len(particles.weights):
+        raise QueryError(
+            f"a query returns shape {values.shape}; it must return one value per particle, the axis of "
+            f"{len(particles.weights)} particles first"
+        )
+    if layout.apart and values.shape[1 : 1 + len(layout.apart)] != layout.lead:
+        raise QueryError(
+            f"a query returns shape {values.shape}; plates {layout.apart} are filtered separately, so their "
+            "axes follow that of the particles"
+        )
+    return values
+
+
+def at_scouts(
+    layout: Layout,
+    particles: Particles,
+    families: Families,
+    model: Model,
+    function: Callable[..., Any],
+) -> np.ndarray | None:
+    """A function at values of those who are where no particle is; None where it reads more of them."""
+    if families.scouts is None or not set(nodes_read(function)) <= families.scouts.values.keys():
+        return None
+    values = dict(families.scouts.values)
+    count = len(next(iter(values.values())))
+    few = particles._replace(values=values, weights=np.ones(count))
+    return evaluated(layout, few, model, function)
+
+
+def numbers_of(node: CompiledNode) -> np.ndarray:
+    """The numbers that a finite node's states stand for.
+
+    Raises
+    ------
+    QueryError
+    """
+    assert node.domain is not None
+    if node.domain.labels is not None:
+        raise QueryError(f"{node.name!r} has labels, which have no mean; use probabilities")
+    return np.asarray(node.domain.numbers, dtype=float)
