@@ -27,11 +27,9 @@ from bayesmc.expression import (
     broadcast,
     elementwise,
     gather,
-    leaf,
     ordered,
     pick,
     reduction,
-    replaced,
     reshape,
 )
 from bayesmc.expression.functions import Repeated, product
@@ -130,16 +128,15 @@ def refuse_beyond_affine(root: Expression, names: Iterable[str]) -> None:
     TraceError
         It is not affine, or not seen to be; the message names the operation.
     """
-    wanted = set(names)
-    instead: dict[Expression, Expression] = {}  # a call is affine where what it is linear in is
+    wanted = frozenset(names)
     for node in ordered(root):
-        if isinstance(node, Call) and node.leaves & wanted:
-            (operand, *_) = (a for a in node.operands if a.leaves & wanted)
-            refuse_unless_linear(node, operand)
-            affine(replaced(operand, instead), wanted)
-            instead[node] = leaf(f"call {len(instead)}", node.shape)
-            wanted.add(f"call {len(instead) - 1}")
-    affine(replaced(root, instead), wanted)
+        varying = [k for k, a in enumerate(node.operands) if a.leaves & wanted]
+        if not varying or isinstance(node, Pick):
+            continue
+        if isinstance(node, Call):
+            refuse_unless_linear(node, node.operands[varying[0]])
+        elif not _keeps_affine(node, varying):
+            raise TraceError(f"{_name(node)} is not affine")
 
 
 def as_product(node: Call, operand: Expression) -> Expression:
@@ -198,6 +195,24 @@ def refuse_unless_linear(node: Call, operand: Expression) -> Repeated:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _keeps_affine(node: Expression, varying: list[int]) -> bool:
+    """Whether a value is affine where those operands are that vary."""
+    if isinstance(node, Elementwise):
+        allowed = _AFFINE_IN.get(node.function, ())
+        return tuple(varying) in allowed
+    if isinstance(node, Gather):
+        return varying == [0]
+    return isinstance(node, Reduction) and node.ufunc is np.add
+
+
+#: function -> the operands that may vary together
+_AFFINE_IN: dict[Any, tuple[tuple[int, ...], ...]] = {
+    **dict.fromkeys((as_float, np.negative), ((0,),)),
+    **dict.fromkeys((np.add, np.subtract), ((0,), (1,), (0, 1))),
+    np.multiply: ((0,), (1,)), np.divide: ((0,),), np.where: ((1,), (2,), (1, 2)),
+}  # fmt: skip
 
 
 def _forms(root: Expression, wanted: frozenset[str], found: dict[Expression, Affine]) -> Affine:

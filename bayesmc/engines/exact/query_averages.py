@@ -29,6 +29,8 @@ from bayesmc.structure import Variable, configure
 _ENTRIES = 1 << 22
 #: components of continuous nodes that an event may depend on
 _DIRECTIONS = 256
+#: of these, moved in one evaluation
+_AT_ONCE = 16
 #: share of the largest margin below which rounding decides whether an event is true
 _CLOSE = 1e-9
 
@@ -134,8 +136,10 @@ def _joint_average(
     assert found is not None
 
     def exceeds(blocks: np.ndarray) -> np.ndarray:
-        (value,) = program({n: gaussian.values(n, blocks, columns[n]) for n in continuous})
-        return query.fitted(value, (count,))
+        lead, rows = blocks.shape[:-1], blocks.reshape(-1, blocks.shape[-1])
+        values = {n: gaussian.values(n, rows, columns[n]) for n in continuous}
+        (value,) = program({n: v.reshape(lead + v.shape[1:]) for n, v in values.items()})
+        return query.fitted(value, lead)
 
     return np.tensordot(weights, _chances(exceeds, found, plain), axes=1)
 
@@ -149,7 +153,7 @@ def _followed(
     def asked(*values: Any) -> Any:
         return query.raw({**stored, **dict(zip(means, values, strict=True))})
 
-    found = trace(asked, given)
+    found = trace(asked, given, is_steady=True)  # it was called on single draws, too
     if not isinstance(found, Expression):
         raise TraceError(f"it returns {type(found).__name__}")
     return found
@@ -217,15 +221,16 @@ def _chances(
             "with resample(draws)",
             8 * count * width**2,
         )
-    centre = exceeds(found.mean)
     spread = np.sqrt(np.diagonal(found.cov, axis1=1, axis2=2))
     scale = np.where(spread > 0, spread, 1.0)
-    slopes = np.empty((width, *centre.shape))
+    steps = np.arange(width)
+    moved = np.repeat(found.mean[None], width + 1, axis=0)  # as it is, and each component by itself
+    moved[1 + steps, :, steps] += scale.T
+    cuts = range(0, width + 1, _AT_ONCE)
+    margins = np.concatenate([exceeds(moved[k : k + _AT_ONCE]) for k in cuts])
+    centre = margins[0]
     with np.errstate(invalid="ignore"):
-        for k in range(width):
-            moved = found.mean.copy()
-            moved[:, k] += scale[:, k]
-            slopes[k] = exceeds(moved) - centre
+        slopes = margins[1:] - centre
     slopes = np.where(np.isfinite(slopes), slopes, 0.0)
     unit = np.abs(slopes).max(axis=0, initial=0.0)  # the sign is all that counts, in any unit
     unit = np.where(unit > 0, unit, 1.0)
