@@ -83,7 +83,12 @@ def infer(
     reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
     if reason is not None:
         raise UnsupportedError(_with_alternative(reason, chosen, problem))
-    return chosen.run(problem, seed_sequence(rng), keep, progress, resume)
+    found = chosen.run(problem, seed_sequence(rng), keep, progress, resume)
+    if not isinstance(found, Posterior):
+        raise TypeError(
+            f"{type(chosen).__name__}.run returned {type(found).__name__}; an engine returns a Posterior"
+        )
+    return found
 
 
 def explained(

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.mcmc.starts import start_states
+from bayesmc.errors import ModelError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.redrawn import renewals
 from bayesmc.network.forward import Pass, run
@@ -32,6 +33,7 @@ class SweepSampler:
     def __init__(self, target: Target, kernels: Sequence[Kernel]) -> None:
         self.target = target
         self.kernels = list(kernels)
+        self._checked = 0
         problem = target.problem
         bare = replace(problem.model, potentials={})  # none reads what is drawn forward
         steps = fast_steps(bare, problem.observed, problem.inputs)
@@ -49,6 +51,9 @@ class SweepSampler:
         memory = list(state["memory"])
         for i, kernel in enumerate(self.kernels):
             new, memory[i] = kernel.step(values, memory[i], rng, warmup)
+            if i >= self._checked:  # each kernel once
+                _check_moved(kernel, new, values)
+                self._checked = i + 1
             values.update(new)
             self.target.refresh(values, kernel.names)
         return {**state, "values": {n: values[n] for n in state["values"]}, "memory": memory}
@@ -101,3 +106,22 @@ class SweepSampler:
 def block_name(kernel: Kernel) -> str:
     """What a kernel's acceptance rate stands under."""
     return ", ".join(kernel.names)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _check_moved(kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, Any]) -> None:
+    """Refuse what is no move of a kernel's nodes: of a kernel that somebody wrote, this may be."""
+    step = f"{type(kernel).__name__}.step"
+    for name in kernel.names:
+        if name not in new:
+            raise ModelError(f"{step} moves {name!r} (names), but returned only {', '.join(new)}")
+        shape = np.shape(new[name])
+        if shape != values[name].shape:
+            raise ModelError(
+                f"{step} returned shape {shape} for node {name!r}, whose state has shape "
+                f"{values[name].shape}: chains first, then plates"
+            )
+        if not np.isfinite(new[name]).all():
+            raise ModelError(f"{step} returned {name!r} with values that are not finite")
