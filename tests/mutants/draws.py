@@ -115,8 +115,7 @@ MUTANTS = [
     Mutant(
         "weights are forgotten in a quantile",
         (Edit("bayesmc.results.draws:DrawsPosterior.quantile",
-              'np.quantile(flat, levels, axis=0, weights=weights, method="inverted_cdf")',
-              "np.quantile(flat, levels, axis=0)"),),
+              "weights=weights, method=method", 'method="linear"'),),
         estimated(median, MEDIAN, 40),
         "repeated_test, 40 runs of 2000 draws",
     ),
