@@ -165,8 +165,8 @@ def test_summaries_agree_with_draws(kind: str) -> None:
             if not _is_labelled(node):
                 np.testing.assert_allclose(sums.mean(name), kept.mean(name), rtol=1e-7, atol=1e-7)
                 np.testing.assert_allclose(sums.var(name), kept.var(name), rtol=1e-6, atol=1e-7)
-            if kept.weights is not None:
-                np.testing.assert_allclose(sums.mcse(name), kept.mcse(name), rtol=1e-5, atol=1e-9)
+            if kept.weights is not None:  # of what is certain, roots of rounded squares: 3e-9 and 0
+                np.testing.assert_allclose(sums.mcse(name), kept.mcse(name), rtol=1e-5, atol=1e-8)
 
 
 @pytest.mark.parametrize("kind", ["discrete", "plates", "hybrid"])

@@ -121,6 +121,8 @@ def test_particle_filters_have_no_bias(variant: str, kind: str) -> None:
         if not spread <= EVEN:
             continue  # the mean over a few runs would have no error to judge by
         estimate, right = unbiased(case, engine)
+        if not sum(np.size(value) for value in right.values()):
+            continue  # all of it was observed
         found = repeated_test(estimate, right, replications=RUNS, **options)
         assert found, (case.dbn, found)
         tried += 1
