@@ -22,7 +22,7 @@ from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.kernels.proposed import Proposed, ProposedBlock
 from bayesmc.kernels.random_walk import AdaptiveWalk, may_be_drawn_anew, parts_of
-from bayesmc.kernels.redrawn import Redrawn, redrawn_kernels
+from bayesmc.kernels.redrawn import Redrawn, redrawn_kernels, waiting
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts, refuse_unsampled
 from bayesmc.network.sameness import same
@@ -327,7 +327,8 @@ def plan_of(problem: Problem, proposal: Mapping[Key, Any], chains: int) -> Plan:
             ensemble = _members(target, size, chains)
             anew = AFRESH if may_be_drawn_anew(target, continuous) else 0.0
             kernels.append(BlockWalk(target, continuous, ensemble, alone=not kernels, anew=anew))
-    kernels += redrawn_kernels(target, {n: Blanket(target, n) for n in rest}, kernels)
+    if waiting(target):  # blankets of all nodes are not made for nothing
+        kernels += redrawn_kernels(target, {n: Blanket(target, n) for n in rest}, kernels)
     return Plan(problem, target, kernels, ensemble, refusal)
 
 
