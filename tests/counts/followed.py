@@ -10,6 +10,7 @@ import contextlib
 import functools
 import io
 import re
+import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -96,14 +97,17 @@ def of_references() -> None:
 def of_docs() -> None:
     """Runs the snippets of the pages."""
     for page in sorted((REPOSITORY / "docs").glob("*.md")):
-        run_page(page)
+        with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+            run_page(page)  # which writes files
 
 
 def of_examples() -> None:
     """Runs the tests of the examples."""
     tests = sorted(str(path) for path in (REPOSITORY / "tests").glob("test_examples*.py"))
     with contextlib.redirect_stdout(io.StringIO()):
-        code = pytest.main(["-q", "-p", "no:xdist", *tests])
+        code = pytest.main(
+            ["-q", "-p", "no:xdist", "--assert=plain", "-p", "no:hypothesispytest", *tests]
+        )
     if code:
         raise RuntimeError(f"the tests of the examples fail: pytest says {code}")
 
