@@ -80,25 +80,29 @@ def unconstrained_density(
     (['rate'], {'rate': array(1.)}, (np.float64(-6.484906649788), array([3.])))
     """
     nodes = _laid_out(target, names)
-    terms = target.terms_of([n.name for n in nodes]) if nodes else ()
+    if not nodes:
+        raise UnsupportedError("no hidden node is continuous: there are no unconstrained numbers")
+    terms = target.terms_of([n.name for n in nodes])
     parts = {n.name: leaf(f"{FREE} of {n.name}", (n.size,)) for n in nodes}
     above: dict[str, Expression] = {}
     volumes = {}
     for node in nodes:
         given = {**_known(target, node.bounds), **above}
         above[node.name], volumes[node.name] = node.expressions(parts[node.name], given)
-    elements = [_elements(target, term, above) for term in terms]
+    plain = [_elements(target, term, above) for term in terms]
     whole = {n.name for n in nodes if n.elements is None}
-    sums = [
-        reduction(np.add, _elements(target, t, above, True) if t.name in whole else e, [0])
-        for t, e in zip(terms, elements, strict=True)
+    used = [
+        _elements(target, t, above, True) if t.name in whole else e
+        for t, e in zip(terms, plain, strict=True)
     ]
-    (root,) = stable([_total([*sums, *volumes.values()])])
+    used = stable([*used, *volumes.values()])
+    sums = [reduction(np.add, e, range(len(e.shape))) for e in used]
+    root = _total(sums)
     slopes = _slopes(root, sums, terms, list(parts.values()))
     once = _on_one_leaf(nodes, parts)
     density = UnconstrainedDensity(target, nodes, *map(once, guarded([root, slopes])))
-    plain = map(once, guarded([*elements, *volumes.values()]))
-    hold_against_model(density, terms, list(plain))
+    plain = [once(e) for e in guarded([*plain, *volumes.values()])]
+    hold_against_model(density, terms, plain, [once(e) for e in guarded(used)])
     return density
 
 

@@ -24,12 +24,16 @@ _SPREADS = (0.0, 0.1, 0.3, 1.0, 1.0, 2.0, 3.0, 5.0)
 _FAR = 30.0
 #: how far log factors may be off, relative to themselves and to their largest part
 _RTOL = 1e-9
-#: how far the sum may be off, relative to the sum of sizes, where log factors are written in other ways
-_OF_SUM = 1e-7
+#: how far those may be that are written for free numbers far out: where probabilities are near 0 or 1 the
+#: model's own lose digits
+_WRITTEN = 1e-7
 
 
 def hold_against_model(
-    density: UnconstrainedDensity, terms: Sequence[Term], plain: Sequence[Expression]
+    density: UnconstrainedDensity,
+    terms: Sequence[Term],
+    plain: Sequence[Expression],
+    used: Sequence[Expression],
 ) -> None:
     """Refuse a log density that gives something else than the model's own functions.
 
@@ -40,37 +44,45 @@ def hold_against_model(
     plain : sequence of Expression
         Of each term the log factors that count, then each node's log change of volume, of free numbers, as
         they are written.
+    used : sequence of Expression
+        The same as they are added up.
 
     Raises
     ------
     UnsupportedError
         Says which term differs, or is zero at all points.
     """
-    program = Program([*plain, density.root])
-    seen = dict.fromkeys((t.name for t in terms), not terms)
-    seen_sum = False
+    program = Program([*plain, *used])
+    names = [t.name for t in terms]
+    seen, agreed = [False] * len(terms), [False] * len(plain)
     for u, values in _points(density):
         found = [np.asarray(v) for v in program({**values, FREE: u})]
-        logs, volumes, total = found[: len(terms)], found[len(terms) : -1], found[-1]
-        for term, log in zip(terms, logs, strict=True):
-            wanted = _counted(term, values)
-            if wanted is not None:
-                seen[term.name] |= _compare(term, log, wanted)
-        volume = sum(float(v) for v in volumes)
+        given, written = found[: len(plain)], found[len(plain) :]
+        wanted = [_counted(term, values) for term in terms]
+        # parameters out of range: where its own density is zero, a node's value may be anything
+        nowhere = [
+            w is not None and t.name in density.names and not np.isfinite(w).all()
+            for t, w in zip(terms, wanted, strict=True)
+        ]
+        for k, own in enumerate(wanted):
+            if own is not None and nowhere[k] >= any(nowhere):
+                seen[k] |= _compare(terms[k], given[k], own)
+        if any(nowhere):
+            continue
+        volume = sum(float(v) for v in given[len(terms) :])
         if not np.isclose(volume, density.log_volume(u, values), rtol=1e-8, atol=1e-8):
             raise UnsupportedError("the change of volume differs from that of the maps")
-        parts = sum(float(log.sum()) for log in logs) + volume
-        size = 1.0 + sum(float(np.abs(log).sum()) for log in logs) + abs(volume)
-        if np.isfinite(parts) and abs(float(total) - parts) <= _OF_SUM * size:
-            seen_sum = True
-    for name, is_seen in seen.items():
+        for k, (a, b) in enumerate(zip(given, written, strict=True)):
+            agreed[k] |= _is_written(a, b)
+    for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
             raise UnsupportedError(
                 f"the density of {name!r} is zero, or no number, at all points where it was tried, so that "
                 "its expression cannot be held against its function"
             )
-    if terms and not seen_sum:
-        raise UnsupportedError("the sum of the terms, written for free numbers, differs from them")
+    if not all(agreed):
+        name = [*names, *density.names][agreed.index(False)]
+        raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -120,9 +132,13 @@ def _compare(term: Term, found: np.ndarray, wanted: np.ndarray) -> bool:
     ------
     UnsupportedError
     """
-    found = np.broadcast_to(found, wanted.shape)
+    if found.shape != wanted.shape:
+        raise UnsupportedError(
+            f"of {term.name!r} {found.size} elements are counted in place of {wanted.size}"
+        )
     finite = np.isfinite(wanted)
-    near = np.abs(found - wanted) <= _RTOL * (1.0 + np.abs(wanted))
+    with np.errstate(all="ignore"):
+        near = np.abs(found - wanted) <= _RTOL * (1.0 + np.abs(wanted))
     agree = np.where(finite, near, ~np.isfinite(found))
     if agree.all():
         return bool(finite.any()) or not finite.size
@@ -131,3 +147,11 @@ def _compare(term: Term, found: np.ndarray, wanted: np.ndarray) -> bool:
         f"what was read of {term.name!r} gives {found[at]:.9g} at element {at} of those that count, and its "
         f"function {wanted[at]:.9g}"
     )
+
+
+def _is_written(plain: np.ndarray, used: np.ndarray) -> bool:
+    """Whether all log factors agree that are finite as they are written, and some are."""
+    finite = np.isfinite(plain)
+    with np.errstate(all="ignore"):
+        near = np.abs(used - plain) <= _WRITTEN * (1.0 + np.abs(plain))
+    return bool(near[finite].all() and (finite.any() or not finite.size))
