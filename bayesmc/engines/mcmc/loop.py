@@ -19,7 +19,6 @@ from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
-from bayesmc.results.sums import stored_dtype
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, picklable
 State = Mapping[str, Any]
@@ -222,7 +221,7 @@ class Kept:
         alike: dict[np.dtype[Any], list[str]] = {}
         for name in self.names:
             node, value = self.model[name], values[name]
-            dtype = stored_dtype(node, value)
+            dtype = node.stored_dtype(value)
             if value.ndim == len(node.value_shape):
                 self.stored[name] = np.array(value, dtype=dtype)[None, None]
                 continue
