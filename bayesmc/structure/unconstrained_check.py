@@ -8,7 +8,7 @@ sum of these.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.expression import Expression, Program
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
+from bayesmc.structure.summing import Summed
 from bayesmc.structure.target import Term, Values
 
 #: points, and how far the free numbers of each are from zero
@@ -34,6 +35,7 @@ def hold_against_model(
     terms: Sequence[Term],
     plain: Sequence[Expression],
     used: Sequence[Expression],
+    tables: Sequence[Summed] = (),
 ) -> None:
     """Refuse a log density that gives something else than the model's own functions.
 
@@ -46,6 +48,8 @@ def hold_against_model(
         they are written.
     used : sequence of Expression
         The same as they are added up.
+    tables : sequence of Summed
+        Terms for all states of nodes that are summed out.
 
     Raises
     ------
@@ -69,6 +73,8 @@ def hold_against_model(
                 seen[k] |= _compare(terms[k], given[k], own)
         if any(nowhere):
             continue
+        sums = {t.name: float(log.sum()) for t, log in zip(terms, given, strict=False)}
+        _check_tables(tables, sums, u, values)
         volume = sum(float(v) for v in given[len(terms) :])
         if not np.isclose(volume, density.log_volume(u, values), rtol=1e-8, atol=1e-8):
             raise UnsupportedError("the change of volume differs from that of the maps")
@@ -155,3 +161,24 @@ def _is_written(plain: np.ndarray, used: np.ndarray) -> bool:
     with np.errstate(all="ignore"):
         near = np.abs(used - plain) <= _WRITTEN * (1.0 + np.abs(plain))
     return bool(near[finite].all() and (finite.any() or not finite.size))
+
+
+def _check_tables(
+    tables: Sequence[Summed], sums: Mapping[str, float], u: np.ndarray, values: Values
+) -> None:
+    """Refuse tables that give other sums than the terms at the states that nodes have.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    for summed in tables:
+        wanted = sum(sums[t.name] for t in summed.terms)
+        roots = [summed.rest] if summed.table is None else [summed.rest, summed.table]
+        rest, *table = Program(roots)({**values, FREE: u})
+        shape = () if summed.table is None else summed.table.shape
+        wide = np.broadcast_to(table[0], shape) if table else None
+        found = summed.at(values, np.broadcast_to(rest, summed.rest.shape), wide)
+        if np.isfinite(wanted) and not abs(found - wanted) <= _WRITTEN * (1.0 + abs(wanted)):
+            names = ", ".join([*summed.labels, *summed.listed[0]])
+            raise UnsupportedError(f"the sum over the states of {names} differs from its terms")

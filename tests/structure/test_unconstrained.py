@@ -16,7 +16,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.expression import elementwise
 from bayesmc.network import pose
-from bayesmc.structure import free_nodes, unconstrained
+from bayesmc.structure import free_nodes, free_terms, unconstrained
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
 from bayesmc.testing import session
@@ -328,17 +328,17 @@ def of_stale_data(found: Target, expressions: Any) -> Any:
     return KNOWN(replace(found, known=stale), expressions)
 
 
-EXPRESSIONS, ELEMENTS = free_nodes.FreeNode.expressions, unconstrained._elements
-KNOWN = unconstrained._known
+EXPRESSIONS, ELEMENTS = free_nodes.FreeNode.expressions, unconstrained.elements
+KNOWN = free_terms.known_values
 
 
 @pytest.mark.parametrize(
     ("where", "what", "fault", "told"),
     [
         (free_nodes.FreeNode, "expressions", without_jacobian, "change of volume"),
-        (unconstrained, "_elements", without_mask, "'y'"),
-        (unconstrained, "_elements", not_broadcast, "'x'"),
-        (unconstrained, "_known", of_stale_data, "'y'"),
+        (unconstrained, "elements", without_mask, "'y'"),
+        (unconstrained, "elements", not_broadcast, "'x'"),
+        (free_terms, "known_values", of_stale_data, "'y'"),
     ],
 )
 def test_faults_are_seen_before_first_use(where: Any, what: str, fault: Any, told: str) -> None:
