@@ -156,7 +156,7 @@ def _slopes(
     try:
         found = gradient(root, names)
     except TraceError as error:
-        for total, term in zip(sums, terms, strict=True):
+        for total, term in zip(sums, terms, strict=False):  # volumes follow
             try:
                 gradient(total, names)
             except TraceError as own:
