@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import Expression, Program
+from bayesmc.passes.arrays import for_arrays
 from bayesmc.structure.free_nodes import FreeNode
 from bayesmc.structure.target import Target, Values
 
@@ -119,11 +120,11 @@ class UnconstrainedDensity:
 
     @cached_property
     def _value(self) -> Program:
-        return Program([self.root])
+        return Program(for_arrays([self.root]))
 
     @cached_property
     def _both(self) -> Program:
-        return Program([self.root, self.slopes])
+        return Program(for_arrays([self.root, self.slopes]))
 
     @cached_property
     def _others(self) -> tuple[str, ...]:

@@ -101,9 +101,7 @@ def unconstrained_density(
     root = _total([*kept, *sums[len(terms) :], *(table.total for table in tables)])
     slopes = _slopes(root, sums, terms, list(parts.values()))
     once = _on_one_leaf(nodes, parts)
-    density = UnconstrainedDensity(
-        target, nodes, *map(once, guarded([root, slopes])), tuple(finite)
-    )
+    density = UnconstrainedDensity(target, nodes, once(root), once(slopes), tuple(finite))
     plain = [once(e) for e in guarded([*plain, *volumes.values()])]
     hold_against_model(
         density,
