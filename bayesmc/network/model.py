@@ -88,18 +88,16 @@ class CompiledNode:
     def has_foreign_parents(self) -> bool:
         return any(link.foreign for _, link in self.links)
 
+    def called(self, values: Mapping[str, np.ndarray]) -> tuple[Any, Shape]:
+        """What its function returns for stored values of its parents, and the batch shape of those."""
+        arguments, batch = arguments_of(self.links, values)
+        return call(self.declaration, arguments, batch + self.plate_shape, self.links), batch
+
     def record(self) -> Node:
         """The public, frozen view."""
         states = self.domain.states if self.domain is not None and self.is_discrete else None
-        return Node(
-            self.name,
-            self.parents,
-            self.plates,
-            self.event_shape,
-            states,
-            self.is_discrete,
-            self.kind,
-        )
+        shown = self.name, self.parents, self.plates, self.event_shape
+        return Node(*shown, states, self.is_discrete, self.kind)
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
         """Stored values as user values."""
@@ -158,15 +156,13 @@ class Model:
         node = self.nodes[name]
         if node.declaration.value is not None:
             return node.declaration.value, ()
-        arguments, batch = arguments_of(node.links, values)
         if node.table is not None:
-            return lookup(node, values), batch
-        result = call(node.declaration, arguments, batch + node.plate_shape, node.links)
+            return lookup(node, values), arguments_of(node.links, values)[1]
+        result, batch = node.called(values)
         if isinstance(result, Distribution):
             fit(node.declaration, result, batch, node.plate_shape)
             return result, batch
-        shape = batch + node.plate_shape + node.event_shape
-        return deterministic_fit(node.declaration, result, batch, node.plate_shape, shape), batch
+        return deterministic_fit(node, result, batch), batch
 
     def log_density(self, name: str, distribution: Distribution, stored: np.ndarray) -> np.ndarray:
         """Log density of stored values, shape the broadcast of batch and plates; NaN never passes."""
@@ -350,15 +346,13 @@ def invalid_error(
     return ParameterError(f"node {node.name!r}{at}: {dist.problem}", index)
 
 
-def deterministic_fit(
-    declaration: Declaration, result: Any, batch: Shape, plates: Shape, shape: Shape
-) -> np.ndarray:
-    """A deterministic node's value broadcast to its full ``shape``; one that does not fit is refused."""
-    array = np.asarray(result)
+def deterministic_fit(node: CompiledNode, result: Any, batch: Shape) -> np.ndarray:
+    """A deterministic node's value broadcast to its full shape; one that does not fit is refused."""
+    array, shape = np.asarray(result), batch + node.value_shape
     if isinstance(result, Distribution) or not broadcasts_to(array.shape, shape):
         raise ShapeError(
-            f"node {declaration.name!r}: the function returns shape {array.shape}, which does not fit "
-            f"{shape} (batch {batch} of the parents, plates {declaration.plates} of sizes {plates}); "
+            f"node {node.name!r}: the function returns shape {array.shape}, which does not fit "
+            f"{shape} (batch {batch} of the parents, plates {node.plates} of sizes {node.plate_shape}); "
             "declare the axes that are elements with plates="
         )
     return read_only(np.broadcast_to(array, shape))
