@@ -9,7 +9,7 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -138,6 +138,10 @@ class Model:
 
     def __getitem__(self, name: str) -> CompiledNode:
         return self.nodes[name]
+
+    def parents(self, name: str) -> tuple[str, ...]:
+        """The nodes that a node's function, or a potential's, receives."""
+        return self.nodes[name].parents if name in self.nodes else self.potentials[name][0].parents
 
     def without_functions(self) -> Model:
         """The same model for results that are stored: it describes nodes but evaluates none."""
@@ -272,6 +276,25 @@ class Model:
             draws = node.domain.from_support(draws)
         draws.flags.writeable = False
         return draws
+
+
+def deterministic_above(model: Model, name: str, known: Container[str]) -> list[str]:
+    """Deterministic nodes above one that are not known, those first on which others depend."""
+    found: dict[str, None] = {}
+    todo = [(name, False)]
+    while todo:
+        above, is_done = todo.pop()
+        if is_done:
+            found[above] = None
+            continue
+        if above != name:
+            todo.append((above, True))
+        todo += [
+            (p, False)
+            for p in model.parents(above)
+            if model[p].kind == "deterministic" and p not in known and p not in found
+        ]
+    return list(found)
 
 
 def potential_shape(sizes: Mapping[str, int], potential: Potential) -> Shape:
