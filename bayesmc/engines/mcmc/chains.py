@@ -64,7 +64,7 @@ class ChainEngine(Engine):
     warmup: int | None
     chains: int | None
     thinning: int = 1
-    ess: float = 1000.0
+    ess: float = 1000
     start: Mapping[str, Any] | None = None
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
@@ -86,6 +86,14 @@ class ChainEngine(Engine):
             )
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(type(self).__name__, self.start))
+
+    def __repr__(self) -> str:
+        """What was said, and the effective size where that says how many draws there are."""
+        said = {f.name: getattr(self, f.name) for f in fields(self) if f.repr}  # type: ignore[arg-type]
+        if self.draws is not None:
+            said.pop("ess", None)
+        shown = ", ".join(f"{n}={v!r}" for n, v in said.items() if v is not None)
+        return f"{type(self).__name__}({shown})"
 
     def sampler(self, problem: Problem) -> Sampler:
         """What moves the chains of a posed problem."""
