@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from bayesmc.lowering.ufuncs import kind_of
 from bayesmc.shapes import Shape
 
 _DTYPES = {REAL: np.dtype(float), WHOLE: np.dtype(np.int64), TRUTH: np.dtype(bool)}
+#: sets of shapes that are remembered
+_SHAPES = 64
 #: ways in which leaves may have a batch or not that are compiled
 _WAYS = 4
 
@@ -64,36 +67,64 @@ class Compiled:
         self.leaves = [n for n in ordered(*roots) if isinstance(n, Leaf)]
         self.program = Program(roots)
         self._ways: dict[frozenset[str], Way] = {}
+        self._shapes: dict[tuple[Shape, ...], _Shapes] = {}
+        self._dtypes = [_DTYPES[kind_of(n)] for n in self.leaves]
         names = frozenset(n.name for n in self.leaves)
         Kernel(self.roots, names)  # refuses what has no machine code
         self._names = names
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> list[np.ndarray]:
-        batches = {}
-        for node in self.leaves:
-            shape = np.shape(values[node.name])
-            batches[node.name] = shape[: len(shape) - len(node.shape)]
+        given = [values[node.name] for node in self.leaves]
+        key = tuple([np.shape(v) for v in given])
+        shapes = self._shapes.get(key)
+        if shapes is None:
+            if len(self._shapes) >= _SHAPES:
+                self._shapes.clear()
+            shapes = self._shapes[key] = self._shaped(key)
+        if not shapes.entries:
+            return self.program(values)
+        for k, shape in shapes.widened:
+            given[k] = np.broadcast_to(np.reshape(given[k], shape[0]), shape[1])
+        arrays = [
+            v
+            if type(v) is np.ndarray and v.dtype is d and v.flags.c_contiguous
+            else np.ascontiguousarray(v, d)
+            for v, d in zip(given, self._dtypes, strict=True)
+        ]
+        found = [np.empty(shape, dtype) for shape, dtype in shapes.results]
+        if shapes.way.run(shapes.entries, arrays, found):
+            return self.program(values)
+        if shapes.of_own:
+            for k, (at, shape) in shapes.of_own:
+                found[k] = found[k][at].reshape(shape)
+        return found
+
+    def _shaped(self, key: Sequence[Shape]) -> _Shapes:
+        """What is to be done with values of these shapes."""
+        batches = {
+            n.name: s[: len(s) - len(n.shape)] for n, s in zip(self.leaves, key, strict=True)
+        }
         batch = np.broadcast_shapes(*batches.values()) if batches else ()
         entries = math.prod(batch)
-        if not entries:
-            return self.program(values)
         way = self.way(frozenset(n for n, b in batches.items() if math.prod(b) > 1))
-        given = []
-        for node in way.kernel.leaves:
-            value, own = values[node.name], batches[node.name]
-            if node.name in way.kernel.varying and own != batch:
-                value = np.broadcast_to(np.reshape(value, own + node.shape), batch + node.shape)
-            given.append(np.ascontiguousarray(value, _DTYPES[kind_of(node)]))
-        found = [
-            np.empty((batch if r.leaves & way.kernel.varying else ()) + r.shape, r.dtype)
-            for r in self.roots
+        varying = way.kernel.varying
+        widened = [
+            (k, (batches[n.name] + n.shape, batch + n.shape))
+            for k, n in enumerate(self.leaves)
+            if n.name in varying and batches[n.name] != batch
         ]
-        if way.run(entries, given, found):
-            return self.program(values)
-        return [
-            _of_own(f, batch, np.broadcast_shapes(*(batches[n] for n in r.leaves)), r.shape)
-            for f, r in zip(found, self.roots, strict=True)
-        ]
+        results, of_own = [], []
+        for k, root in enumerate(self.roots):
+            have = batch if root.leaves & varying else ()
+            own = np.broadcast_shapes(*(batches[n] for n in root.leaves))
+            results.append((have + root.shape, root.dtype))
+            if have != own:
+                lead = max(len(have) - len(own), 0)
+                at = (0,) * lead + tuple(
+                    slice(0, 1) if n == 1 else slice(None) for n in own[: len(have) - lead]
+                )
+                of_own.append((k, (at, own + root.shape)))
+        return _Shapes(entries, way, widened, results, of_own)
 
     def way(self, varying: frozenset[str]) -> Way:
         """The function where these leaves have values for each entry, and the others have one for all."""
@@ -120,8 +151,6 @@ class Way:
         self.kernel = Kernel(roots, varying)
         self.loaded: Loaded = loaded(self.kernel.text, self.kernel.foreign)
         self._constants = list(self.kernel.constants.values())
-        self._sizes = [n.size for n in self.kernel.kept]
-        self._fixed = [_address(c) for c in self._constants]
         self._own = threading.local()
 
     def run(self, entries: int, given: Sequence[np.ndarray], found: Sequence[np.ndarray]) -> int:
@@ -134,34 +163,45 @@ class Way:
             Values of the leaves, in the kernel's order and types, in C order.
         found : sequence of ndarray
         """
-        table = np.array(
-            [*map(_address, given), *self._fixed, *self._memory(), *map(_address, found)], np.uintp
-        )
-        return self.loaded.call(entries, _address(table))
-
-    def _memory(self) -> list[int]:
-        """Addresses of what is kept of one entry, each thread's own."""
         own = self._own
-        if not hasattr(own, "addresses"):
-            own.arrays = [np.empty(size, np.float64) for size in self._sizes]
-            own.addresses = [_address(a) for a in own.arrays]
-        return own.addresses
+        if not hasattr(own, "table"):
+            own.arrays = [np.empty(n.size) for n in self.kernel.kept]
+            fixed = [_address(a) for a in (*self._constants, *own.arrays)]
+            own.table = np.array([*[0] * len(given), *fixed, *[0] * len(found)], np.uintp)
+            own.address = _address(own.table)
+        table = own.table
+        for k, array in enumerate(given):
+            table[k] = _address(array)
+        last = len(table) - len(found)
+        for k, array in enumerate(found):
+            table[last + k] = _address(array)
+        return self.loaded.call(entries, own.address)
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
+class _Shapes(NamedTuple):
+    """Calls with values of certain shapes.
+
+    Attributes
+    ----------
+    entries : int
+    way : Way
+    widened : list
+        Leaves that must be broadcast: place, its own shape and that of the whole batch.
+    results : list
+        Shapes and types.
+    of_own : list
+        Results that depend on less than the whole batch: place, index and shape.
+    """
+
+    entries: int
+    way: Way
+    widened: list[tuple[int, tuple[Shape, Shape]]]
+    results: list[tuple[Shape, np.dtype]]
+    of_own: list[tuple[int, tuple[tuple[Any, ...], Shape]]]
+
+
 def _address(array: np.ndarray) -> int:
     return array.__array_interface__["data"][0]
-
-
-def _of_own(found: np.ndarray, batch: Shape, own: Shape, shape: Shape) -> np.ndarray:
-    """A result with the batch of the leaves that it depends on."""
-    have = found.shape[: found.ndim - len(shape)]
-    if have == own:
-        return found
-    if math.prod(own) == 1 and not have:
-        return found.reshape(own + shape)
-    lead = len(have) - len(own)
-    at = (0,) * lead + tuple(slice(0, 1) if n == 1 else slice(None) for n in own)
-    return found[at]

@@ -93,9 +93,12 @@ def laid_out(roots: Sequence[Expression]) -> Layout:
     if written > _WRITTEN:
         raise TraceError(f"{written} elements to be written out, more than {_WRITTEN}")
     readers: dict[Expression, int] = dict.fromkeys(found.nodes, 0)
+    spread: set[Expression] = set()  # read several times by one that has more elements
     for node in found.nodes:
         for operand in node.operands:
             readers[operand] += 1
+            if node.size > operand.size:
+                spread.add(operand)
     for root in roots:
         readers[root] += 1
     weights: dict[Expression, int] = {}
@@ -103,7 +106,10 @@ def laid_out(roots: Sequence[Expression]) -> Layout:
         _demand(node, found)
     for node in found.nodes:
         weights[node] = _weight(node, found, weights)
-        if not is_few(node) and node.operands and readers[node] > 1 and weights[node] > 2:
+        is_shared = (readers[node] > 1 and weights[node] > 2) or (
+            node in spread and weights[node] > 4
+        )
+        if not is_few(node) and node.operands and is_shared:
             found.kept.add(node)
         if node in found.kept:
             weights[node] = 1
