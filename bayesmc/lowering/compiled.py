@@ -11,13 +11,12 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression, Leaf, Program, ordered
-from bayesmc.lowering.code import REAL, TRUTH, WHOLE
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import Loaded, is_available, loaded
 from bayesmc.lowering.ufuncs import kind_of
+from bayesmc.lowering.writer import DTYPES
 from bayesmc.shapes import Shape
 
-_DTYPES = {REAL: np.dtype(float), WHOLE: np.dtype(np.int64), TRUTH: np.dtype(bool)}
 #: sets of shapes that are remembered
 _SHAPES = 64
 #: ways in which leaves may have a batch or not that are compiled
@@ -68,7 +67,7 @@ class Compiled:
         self.program = Program(roots)
         self._ways: dict[frozenset[str], Way] = {}
         self._shapes: dict[tuple[Shape, ...], _Shapes] = {}
-        self._dtypes = [_DTYPES[kind_of(n)] for n in self.leaves]
+        self._dtypes = [DTYPES[kind_of(n)] for n in self.leaves]
         names = frozenset(n.name for n in self.leaves)
         Kernel(self.roots, names)  # refuses what has no machine code
         self._names = names
@@ -83,8 +82,8 @@ class Compiled:
             shapes = self._shapes[key] = self._shaped(key)
         if not shapes.entries:
             return self.program(values)
-        for k, shape in shapes.widened:
-            given[k] = np.broadcast_to(np.reshape(given[k], shape[0]), shape[1])
+        for k, (own, whole) in shapes.widened:
+            given[k] = np.broadcast_to(np.reshape(given[k], own), whole)
         arrays = [
             v
             if type(v) is np.ndarray and v.dtype is d and v.flags.c_contiguous
@@ -99,6 +98,31 @@ class Compiled:
                 found[k] = found[k][at].reshape(shape)
         return found
 
+    def bound(self, values: Mapping[str, np.ndarray]) -> Bound:
+        """The function of the one leaf that has no value here, for callers in C.
+
+        Parameters
+        ----------
+        values : mapping
+            The other leaves, without a batch.
+
+        Raises
+        ------
+        TraceError
+            More than one leaf has no value, or none.
+        """
+        free = [n for n in self.leaves if n.name not in values]
+        if len(free) != 1:
+            raise TraceError(f"{len(free)} leaves have no values, not one")
+        way = self.way(frozenset([free[0].name]))
+        given = [
+            np.zeros(n.shape, d)
+            if n is free[0]
+            else np.array(np.broadcast_to(values[n.name], n.shape), d, order="C")
+            for n, d in zip(self.leaves, self._dtypes, strict=True)
+        ]
+        return Bound(way, given, len(self.roots))
+
     def _shaped(self, key: Sequence[Shape]) -> _Shapes:
         """What is to be done with values of these shapes."""
         batches = {
@@ -106,7 +130,8 @@ class Compiled:
         }
         batch = np.broadcast_shapes(*batches.values()) if batches else ()
         entries = math.prod(batch)
-        way = self.way(frozenset(n for n, b in batches.items() if math.prod(b) > 1))
+        many = frozenset(n for n, b in batches.items() if math.prod(b) > 1)
+        way = self.way(many or self._names)
         varying = way.kernel.varying
         widened = [
             (k, (batches[n.name] + n.shape, batch + n.shape))
@@ -165,9 +190,7 @@ class Way:
         """
         own = self._own
         if not hasattr(own, "table"):
-            own.arrays = [np.empty(n.size) for n in self.kernel.kept]
-            fixed = [_address(a) for a in (*self._constants, *own.arrays)]
-            own.table = np.array([*[0] * len(given), *fixed, *[0] * len(found)], np.uintp)
+            own.table, own.kept = self.table(len(found))
             own.address = _address(own.table)
         table = own.table
         for k, array in enumerate(given):
@@ -176,6 +199,37 @@ class Way:
         for k, array in enumerate(found):
             table[last + k] = _address(array)
         return self.loaded.call(entries, own.address)
+
+    def table(self, results: int) -> tuple[np.ndarray, list[np.ndarray]]:
+        """Addresses of all arguments, those of leaves and results still open, and the memory behind some."""
+        kept = [np.empty(n.size) for n in self.kernel.kept]
+        fixed = [_address(a) for a in (*self._constants, *kept)]
+        leaves = len(self.kernel.leaves)
+        return np.array([*[0] * leaves, *fixed, *[0] * results], np.uintp), kept
+
+
+class Bound:
+    """A function of one array in C, and what it reads besides.
+
+    Not for two threads at once: each binds its own.
+
+    Attributes
+    ----------
+    address : int
+        Of ``int32_t f(int64_t entries, const double *x, double *result0, ..., void **arguments)``. It reads
+        ``entries`` arrays one after the other and writes as many of each result. It returns 0; anything else
+        means that the results must not be used (an index outside of a table, an angle above 10^6).
+    arguments : int
+        The address that it is given as its last argument, valid as long as this object lives.
+    """
+
+    def __init__(self, way: Way, given: Sequence[np.ndarray], results: int) -> None:
+        self._way, self._given = way, given
+        self._table, self._kept = way.table(results)
+        for k, array in enumerate(given):
+            self._table[k] = _address(array)
+        self.address: int = way.loaded.direct
+        self.arguments: int = _address(self._table)
 
 
 # ---- private ------------------------------------------------------------------------------------

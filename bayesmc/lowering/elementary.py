@@ -47,6 +47,19 @@ def elementary(code: Code, name: str, *args: Number) -> Number:
     return code.call(full, *args)
 
 
+def log_sum_exp(code: Code, terms: list[Number]) -> Number:
+    """The logarithm of the sum of some numbers' exponentials."""
+    top = terms[0]
+    for term in terms[1:]:
+        top = code.call("llvm.maximum.f64", top, term)
+    is_finite = _absolute(code, top) < math.inf
+    level = code.where(is_finite, top, 0.0)
+    total = code.number(0.0)
+    for term in terms:
+        total = total + elementary(code, "exp", term - level)
+    return elementary(code, "log", total) + level
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 

@@ -25,6 +25,7 @@ from bayesmc.expression import (
     Reduction,
     ordered,
 )
+from bayesmc.expression.functions import Repeated
 from bayesmc.expression.scatter import Gathered, Scattered
 from bayesmc.lowering.ufuncs import is_cheap, is_lowerable
 from bayesmc.shapes import Shape
@@ -129,6 +130,16 @@ def is_given(node: Expression) -> bool:
     return isinstance(node, (Leaf, Constant))
 
 
+def cumulated_axis(node: Call) -> int | None:
+    """The axis of a ``np.cumsum``; None where it is something else."""
+    made = node.call
+    if not isinstance(made, Repeated) or made.function is not np.cumsum or made.slots[:1] != [0]:
+        return None
+    axis = made.kwargs.get("axis", made.args[1] if len(made.args) > 1 else None)
+    is_plain = not set(made.kwargs) - {"axis"} and len(made.args) < 3
+    return len(node.shape) + axis if is_plain and isinstance(axis, int) and axis < 0 else None
+
+
 def strides_of(positions: np.ndarray) -> tuple[int, Shape] | None:
     """``(first, steps along each axis)`` of positions that are evenly spaced; else None."""
     if not positions.size:
@@ -155,7 +166,8 @@ def _check(node: Expression) -> None:
         raise TraceError(f"{node.detail} of numbers of type {node.dtype} has no machine code")
     if isinstance(node, Reduction) and node.ufunc not in STARTS:
         raise TraceError(f"{node.ufunc.__name__}.reduce has no machine code")
-    if isinstance(node, Call) and not isinstance(node.call, (Scattered, Gathered)):
+    is_sum = isinstance(node, Call) and isinstance(node.call, (Scattered, Gathered))
+    if isinstance(node, Call) and not is_sum and cumulated_axis(node) is None:
         raise TraceError(f"{node.detail} has no machine code")
 
 

@@ -18,7 +18,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from bayesmc.lowering.kernel import ENTRY
+from bayesmc.lowering.kernel import DIRECT, ENTRY
 from bayesmc.lowering.ufuncs import SCIPY
 
 #: objects in the cache, beyond which the oldest half goes
@@ -39,6 +39,8 @@ class Loaded:
     ----------
     address : int
         Of ``int32 f(int64 entries, void** arguments)``.
+    direct : int
+        Of the function of the one leaf that varies; 0 if there is none.
     call : callable
         The same from Python.
     was_cached : bool
@@ -51,6 +53,7 @@ class Loaded:
         self._engine.add_object_file(binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         self.address: int = self._engine.get_function_address(ENTRY)
+        self.direct: int = self._engine.get_function_address(DIRECT)
         kind = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p)
         self.call = kind(self.address)
         self.was_cached = was_cached

@@ -25,7 +25,7 @@ from bayesmc.expression import (
     trace,
 )
 from bayesmc.expression.functions import product
-from bayesmc.lowering import Compiled, compiled, kernel, layout
+from bayesmc.lowering import Compiled, compiled, kernel, writer
 from bayesmc.passes.derivatives import gradient
 from tests.expression.random_functions import ARGUMENTS, random_arguments, random_function
 from tests.expression.test_random_functions import BATCHES, close, stand_ins
@@ -223,7 +223,7 @@ def _seen(monkeypatch: pytest.MonkeyPatch) -> bool:
 
 
 def test_a_leaf_that_is_not_broadcast_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = kernel.Kernel._read
+    made = writer.Writer.read
 
     def wrong(self: Any, node: Any, flat: Any) -> Any:
         varying, self.varying = self.varying, frozenset()
@@ -232,27 +232,27 @@ def test_a_leaf_that_is_not_broadcast_is_seen(monkeypatch: pytest.MonkeyPatch) -
         finally:
             self.varying = varying
 
-    monkeypatch.setattr(kernel.Kernel, "_read", wrong)
+    monkeypatch.setattr(writer.Writer, "read", wrong)
     assert _seen(monkeypatch)
 
 
 def test_a_stale_constant_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = kernel.Kernel._table
+    made = writer.Writer._table
 
     def wrong(self: Any, key: Any, values: np.ndarray, kind: str) -> int:
         return made(self, key, values + 1 if kind == "double" else values, kind)
 
-    monkeypatch.setattr(kernel.Kernel, "_table", wrong)
+    monkeypatch.setattr(writer.Writer, "_table", wrong)
     assert _seen(monkeypatch)
 
 
 def test_a_mask_that_is_ignored_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = kernel.lowered
+    made = writer.lowered
 
     def wrong(code: Any, node: Any, values: Any) -> Any:
         return values[1] if node.function is np.where else made(code, node, values)
 
-    monkeypatch.setattr(kernel, "lowered", wrong)
+    monkeypatch.setattr(writer, "lowered", wrong)
     assert _seen(monkeypatch)
 
 
@@ -262,8 +262,7 @@ def test_a_value_that_is_not_kept_anew_is_seen(monkeypatch: pytest.MonkeyPatch) 
     root = reduction(np.add, elementwise(np.multiply, elementwise(np.exp, x), m), [0])
     values = {"x": np.random.default_rng(0).normal(size=(5, 40, 3)), "m": np.ones(3)}
     compare([root], values)
-    monkeypatch.setattr(layout, "STARTS", layout.STARTS)
-    monkeypatch.setattr(kernel, "STARTS", {**kernel.STARTS, np.add: 1.0})
+    monkeypatch.setattr(writer, "STARTS", {**writer.STARTS, np.add: 1.0})
     with pytest.raises(AssertionError):
         compare([root], values)
 
