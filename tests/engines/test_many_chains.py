@@ -229,7 +229,7 @@ def test_superchains_start_as_one_and_apart_from_each_other(
 
     def all_at_one_point(*args: Any, **options: Any) -> Any:
         found = real(*args, **options)
-        inside = {n for n in plan_of(problem).target.chain}
+        inside = set(plan_of(problem).target.chain)
         return {n: np.repeat(v[:1], len(v), axis=0) if n in inside else v for n, v in found.items()}
 
     monkeypatch.setattr(sweep, "start_states", all_at_one_point)
