@@ -125,6 +125,7 @@ def _with_seen(target: Target, name: str, value: np.ndarray) -> np.ndarray:
     seen = target.seen(name)
     if seen is None:
         return value
+    assert seen.mask is not None  # of a node in the chain
     mask = np.reshape(seen.mask, np.shape(seen.mask) + (1,) * len(target.model[name].event_shape))
     return np.where(mask, seen.value, value)
 
