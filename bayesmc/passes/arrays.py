@@ -39,7 +39,7 @@ def for_arrays(roots: Iterable[Expression]) -> list[Expression]:
 def expit_by_exp(x: Any) -> np.ndarray:
     """``scipy.special.expit`` to some units in the last place, four times as fast."""
     found = np.negative(x)
-    out = {"out": found} if isinstance(found, np.ndarray) else {}
+    out: dict[str, Any] = {"out": found} if isinstance(found, np.ndarray) else {}
     found = np.add(np.exp(found, **out), 1.0, **out)
     return np.reciprocal(found, **out)
 
@@ -47,7 +47,7 @@ def expit_by_exp(x: Any) -> np.ndarray:
 def log_expit_by_exp(x: Any) -> np.ndarray:
     """``scipy.special.log_expit`` to 1e-16, less than a last digit where it is near 0; twice as fast."""
     found = np.abs(x)
-    out = {"out": found} if isinstance(found, np.ndarray) else {}
+    out: dict[str, Any] = {"out": found} if isinstance(found, np.ndarray) else {}
     found = np.log(np.add(np.exp(np.negative(found, **out), **out), 1.0, **out), **out)
     return np.subtract(np.minimum(x, 0.0), found, **out)
 

@@ -32,9 +32,9 @@ def chosen(condition: Expression, a: Expression, b: Expression) -> Expression | 
     """
     if not isinstance(condition, Constant):
         return None
-    if _is(b, np.where) and isinstance(b.operands[0], Constant):
+    if _is(b, np.where):
         other, inside, _ = b.operands
-        if np.logical_or(condition.value, other.value).all():
+        if isinstance(other, Constant) and np.logical_or(condition.value, other.value).all():
             return chosen(condition, a, inside) or tidy(np.where, condition, a, inside)
     if isinstance(a, Elementwise) and isinstance(b, Elementwise) and len(a.operands) == 1:
         if a.function is b.function and a.operands[0].dtype == b.operands[0].dtype == float:

@@ -47,7 +47,7 @@ def _normal(low: Any, high: Any, loc: Any, scale: Any) -> Any:
 
 
 def _log_normal(low: Any, high: Any, loc: Any, scale: Any) -> Any:
-    return _normal(*(_log_or_below(b) for b in (low, high)), loc, scale)
+    return _normal(_log_or_below(low), _log_or_below(high), loc, scale)
 
 
 def _log_or_below(bound: Any) -> Any:
@@ -65,8 +65,10 @@ def _of_hazards(first: Any, last: Any, is_open: Any) -> Any:
 
 
 def _exponential(low: Any, high: Any, rate: Any) -> Any:
-    ends = (rate * np.where(np.isinf(b), 0.0, np.maximum(b, 0.0)) for b in (low, high))
-    return _of_hazards(*ends, np.isinf(high))
+    def hazard(bound: Any) -> Any:
+        return rate * np.where(np.isinf(bound), 0.0, np.maximum(bound, 0.0))
+
+    return _of_hazards(hazard(low), hazard(high), np.isinf(high))
 
 
 def _weibull(low: Any, high: Any, concentration: Any, scale: Any) -> Any:
