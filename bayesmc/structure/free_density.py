@@ -43,11 +43,11 @@ class UnconstrainedDensity:
     slopes: Expression = field(repr=False)
     summed: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(node.name for node in self.nodes)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many free numbers there are."""
         return sum(node.size for node in self.nodes)
