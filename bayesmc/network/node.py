@@ -178,6 +178,31 @@ def bind(
     return tuple(positional + keyword), _with_keywords(function, len(positional), keyword)
 
 
+def decorating(
+    function: Callable[..., Any] | None,
+    name: str | None,
+    add: Callable[..., None],
+    rest: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> Any:
+    """A decorator that declares a function by ``add``, or what that returns for one that is given."""
+    if function is not None and not callable(function):
+        raise ModelError(
+            f"net.node({function!r}): it decorates a function; give the node's name with name="
+        )
+
+    def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+        own = name if name is not None else getattr(f, "__name__", "<lambda>")
+        if own == "<lambda>":
+            raise ModelError(
+                "this function has no name to give the node (a lambda or partial); use name= or net.add"
+            )
+        add(own, f, *rest, **options)
+        return f
+
+    return declare if function is None else declare(function)
+
+
 def checked_rows(name: str, table: np.ndarray) -> np.ndarray:
     """Rows renormalised where they are off by rounding; worse ones raise with their index."""
     from_one = np.abs(table.sum(axis=-1) - 1)
