@@ -91,9 +91,9 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     if partly.any() and not node.splits:
         at = first_index(missing & np.expand_dims(partly, event))
         raise EvidenceError(
-            f"evidence on {node.name!r}: of one vector the entry at {at if len(at) > 1 else at[0]} is missing "
-            "and others are not, which is not supported; split the vector into nodes of its parts, leave all of it out, or "
-            "put in what stands for no reading (of ranges: robotics.clean_ranges)"
+            f"evidence on {node.name!r}: of one vector the entry at {at if len(at) > 1 else at[0]} is "
+            "missing and others are not, which is not supported; split the vector into nodes of its parts, "
+            "leave all of it out, or put in what stands for no reading (of ranges: robotics.clean_ranges)"
         )
     if every.all() and array.size:
         return None
