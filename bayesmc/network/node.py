@@ -281,21 +281,31 @@ def nodes_read(function: Callable[..., Any]) -> tuple[str, ...]:
 
 def topological_order(parents: Mapping[str, Sequence[str]]) -> list[str]:
     """Names with every parent before its children, otherwise as declared (Kahn 1962)."""
-    graph = dict.fromkeys(parents, ())
-    sorter: graphlib.TopologicalSorter[str] = graphlib.TopologicalSorter(graph)
+    waiting = {name: len(set(above)) for name, above in parents.items()}
+    children: dict[str, list[str]] = {name: [] for name in parents}
     for name, above in parents.items():
-        sorter.add(name, *dict.fromkeys(above))
+        for parent in set(above):
+            children[parent].append(name)
+    order = [name for name, count in waiting.items() if count == 0]
+    for name in order:  # which grows
+        for child in children[name]:
+            waiting[child] -= 1
+            if waiting[child] == 0:
+                order.append(child)
+    if len(order) == len(parents):
+        return order
     try:
-        return list(sorter.static_order())
+        graphlib.TopologicalSorter(parents).prepare()
+        raise AssertionError
     except graphlib.CycleError as error:
         cycle = error.args[1][1:]  # parent before child
-        start = cycle.index(min(cycle))
-        path = [*cycle[start:], *cycle[: start + 1]]
-        raise CycleError(
-            f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
-            "(for time, use a dynamic net with _prev arguments)",
-            path,
-        ) from None
+    start = cycle.index(min(cycle))
+    path = [*cycle[start:], *cycle[: start + 1]]
+    raise CycleError(
+        f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
+        "(for time, use a dynamic net with _prev arguments)",
+        path,
+    )
 
 
 def ancestors(parents: Mapping[str, Sequence[str]], names: Iterable[str]) -> set[str]:
