@@ -1,0 +1,236 @@
+"""What Hamiltonian chains learn while they warm up: the length of a step, and a metric.
+
+The warmup has a beginning, in which every chain finds the mass with a step of its own; windows of doubling
+length, at the end of each of which the metric becomes the variance (or covariance) of that window's draws
+of all chains; and an end for the step alone. Metric and step are then common to all chains and frozen.
+
+Nothing here has units: the first metric comes from the gradients where chains start, and is what later ones
+are shrunk towards, as Stan shrinks towards a thousandth of the identity.
+
+References
+----------
+Hoffman and Gelman (2014), JMLR 15, sec. 3.2 (dual averaging) and algorithm 4 (the first step); Stan Reference
+Manual, version 2.36, chapter "MCMC Sampling", section "Automatic parameter tuning" (windows, regularisation).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+
+from bayesmc.kernels.no_u_turn import DIVERGENT, Gradient, Place, Scale, energy_of, leapfrog
+
+#: sweeps of the beginning, of the first window, and of the end; shares of a warmup too short for them
+_FAST, _WINDOW, _END = 75, 25, 50
+_SHORT = (0.15, 0.10)
+#: a warmup below which no metric is learnt
+_LEAST = 20
+#: sweeps at which windows end where the warmup has no known length
+_OPEN = 10_000_000
+#: constants of dual averaging: shrinkage towards ten times the first step, early steps, decay
+_GAMMA, _EARLY, _KAPPA, _AHEAD = 0.05, 10.0, 0.75, math.log(10.0)
+#: doublings (or halvings) in search of a first step
+_SEARCH = 60
+#: draws that the metric from before counts for, and the share of it that it is shrunk towards
+_PRIOR, _SHRUNK = 5.0, 1e-3
+#: ratio of scales of the first metric to their median, at most
+_RANGE = 1e6
+
+Metric = Literal["diagonal", "dense"]
+
+
+def windows(warmup: int | None) -> tuple[int, ...]:
+    """Sweeps after which the metric is renewed; the first is where the beginning ends.
+
+    Parameters
+    ----------
+    warmup : int or None
+        Sweeps of the whole warmup; None where that is not known: then windows go on doubling.
+
+    Examples
+    --------
+    >>> from bayesmc.kernels.hamiltonian_warmup import windows
+    >>> windows(1000), windows(100), windows(10), windows(None)[:4]
+    ((75, 100, 150, 250, 450, 950), (15, 90), (), (75, 100, 150, 250))
+    """
+    if warmup is not None and warmup < _LEAST:
+        return ()
+    fast, size, last = _FAST, _WINDOW, _END
+    if warmup is not None and fast + size + last > warmup:
+        fast, last = (int(share * warmup) for share in _SHORT)
+        size = warmup - fast - last
+    limit = _OPEN if warmup is None else warmup - last
+    ends = [fast]
+    while ends[-1] < limit:
+        # a window that would leave the next one without room takes its place
+        ends.append(limit if ends[-1] + 3 * size > limit else ends[-1] + size)
+        size *= 2
+    return tuple(ends)
+
+
+class StepSize:
+    """Dual averaging of the logarithm of a step's length towards a mean acceptance.
+
+    A memory is a dict: ``log`` and ``average`` (chains,), ``centre``, ``bias`` (chains,), ``count``.
+
+    Parameters
+    ----------
+    target : float
+        The mean acceptance that is wanted.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.hamiltonian_warmup import StepSize
+    >>> learning = StepSize(0.8)
+    >>> memory = learning.start(np.zeros(2))
+    >>> for _ in range(2000):
+    ...     memory = learning.learnt(memory, np.exp(-np.exp(memory["log"])), pooled=True)
+    >>> learning.frozen(memory)["log"].round(1)  # the step at which exp(-step) is 0.8
+    array([-1.5, -1.5])
+    """
+
+    def __init__(self, target: float) -> None:
+        self.target = target
+
+    def start(self, log: np.ndarray) -> dict[str, Any]:
+        """The memory before the first step, given a first length for each chain."""
+        zeros = np.zeros_like(log)
+        return {"log": log, "average": log, "centre": log + _AHEAD, "bias": zeros, "count": 0}
+
+    def learnt(
+        self, memory: dict[str, Any], acceptance: np.ndarray, pooled: bool
+    ) -> dict[str, Any]:
+        """The memory after a sweep; ``pooled`` where all chains are to take the same step."""
+        error = self.target - np.where(np.isnan(acceptance), 0.0, acceptance)
+        if pooled:
+            error = np.full_like(error, error.mean())
+        count = memory["count"] + 1
+        share = 1.0 / (count + _EARLY)
+        bias = (1.0 - share) * memory["bias"] + share * error
+        log = memory["centre"] - bias * math.sqrt(count) / _GAMMA
+        weight = count**-_KAPPA
+        average = (1.0 - weight) * memory["average"] + weight * log
+        return {**memory, "log": log, "average": average, "bias": bias, "count": count}
+
+    def frozen(self, memory: dict[str, Any]) -> dict[str, Any]:
+        """The memory at the end of the warmup: one length for all chains."""
+        log = memory["average"] if memory["count"] else memory["log"]
+        log = np.full_like(log, log.mean())
+        return {**memory, "log": log, "average": log}
+
+
+def first_steps(
+    gradient: Gradient,
+    place: Place,
+    log: np.ndarray,
+    scale: Scale,
+    rng: np.random.Generator,
+    target: float,
+    pooled: bool,
+) -> np.ndarray:
+    """Logarithms of lengths of a step, of each chain or of all together, about which one step is accepted.
+
+    Lengths are doubled while a step is accepted with more than the wanted chance, or halved while it is not.
+    """
+    rows = np.arange(len(log))
+    slope = scale.pulled(place.slope)
+    up = np.zeros(len(log), dtype=bool)
+    going = np.ones(len(log), dtype=bool)
+    for turn in range(_SEARCH):
+        momenta = rng.standard_normal(place.u.shape)
+        half = 0.5 * np.exp(log)[:, None]
+        _, moved, _, ahead, _ = leapfrog(gradient, place.u, momenta, slope, half, scale, rows)
+        change = energy_of(momenta, place.log) - energy_of(moved, ahead)
+        chance = np.exp(np.minimum(np.where(np.isnan(change), -DIVERGENT, change), 0.0))
+        accepted = np.full_like(going, chance.mean() > target) if pooled else chance > target
+        if turn == 0:
+            up = accepted
+        going &= accepted == up
+        if not going.any():
+            break
+        log = np.where(going, log + np.where(up, math.log(2.0), -math.log(2.0)), log)
+    return log
+
+
+class MetricLearning:
+    """Variances or covariances of the draws of all chains, window by window.
+
+    A memory is a dict: ``first`` (the inverse metric from the start, shape (size,)), ``root`` (see
+    ``Scale``), and of the present window ``count``, ``mean`` and ``square`` (sums of squares, or of
+    products, about the mean).
+
+    Parameters
+    ----------
+    kind : "diagonal" or "dense"
+    """
+
+    def __init__(self, kind: Metric) -> None:
+        self.kind = kind
+
+    def start(self, slope: np.ndarray) -> dict[str, Any]:
+        """The memory before the first step, given gradients at the starting points, shape (chains, size).
+
+        Where a density is Normal, the mean square of its gradients is the inverse of its variance; far out
+        all of them are too large in proportion, which the step makes good.
+        """
+        size = slope.shape[1]
+        square = np.square(slope).mean(axis=0)
+        fine = np.isfinite(square) & (square > 0)
+        middle = float(np.median(square[fine])) if fine.any() else 1.0
+        square = np.where(fine, square, middle)
+        first = 1.0 / np.clip(square, middle / _RANGE**2, middle * _RANGE**2)
+        root = np.sqrt(first)
+        return {
+            "first": first,
+            "root": root if self.kind == "diagonal" else np.diag(root),
+            **self._empty(size),
+        }
+
+    def learnt(self, memory: dict[str, Any], u: np.ndarray) -> dict[str, Any]:
+        """The memory with one more draw of every chain (Welford's update, for several at once)."""
+        fine = np.isfinite(u).all(axis=1)
+        u = u if fine.all() else u[fine]
+        if not len(u):
+            return memory
+        count = memory["count"] + len(u)
+        before = u - memory["mean"]
+        mean = memory["mean"] + before.sum(axis=0) / count
+        after = u - mean
+        square = (before * after).sum(axis=0) if self.kind == "diagonal" else before.T @ after
+        return {**memory, "count": count, "mean": mean, "square": memory["square"] + square}
+
+    def renewed(self, memory: dict[str, Any]) -> dict[str, Any]:
+        """The memory with a metric from the window that ends, and a new window."""
+        count, size = memory["count"], len(memory["first"])
+        if count < 2:
+            return {**memory, **self._empty(size)}
+        share = count / (count + _PRIOR)
+        found = share * memory["square"] / (count - 1)
+        prior = (1.0 - share) * _SHRUNK * memory["first"]
+        root = memory["root"]
+        if self.kind == "diagonal":
+            root = np.sqrt(found + prior)
+        else:
+            try:
+                root = _root_of(found + np.diag(prior))
+            except np.linalg.LinAlgError:  # rounding: keep what was there
+                pass
+        if not np.isfinite(root).all():
+            root = memory["root"]
+        return {**memory, "root": root, **self._empty(size)}
+
+    def _empty(self, size: int) -> dict[str, Any]:
+        shape = (size,) if self.kind == "diagonal" else (size, size)
+        return {"count": 0, "mean": np.zeros(size), "square": np.zeros(shape)}
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _root_of(cov: np.ndarray) -> np.ndarray:
+    """Cholesky factor of a covariance, taken of the correlation, so that units do not matter."""
+    scale = np.sqrt(np.diagonal(cov))
+    return scale[:, None] * np.linalg.cholesky(cov / np.outer(scale, scale))
