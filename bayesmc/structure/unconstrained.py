@@ -1,0 +1,223 @@
+"""The log posterior density as a function of unconstrained numbers, with its gradient.
+
+Continuous nodes become free numbers through the maps of their supports (``free_nodes``), every term is an
+expression of them (``Term.expression``), and their sum with the changes of volume is one expression, whose
+gradient is taken in reverse mode. Before its first use it is held against the model's own functions.
+
+References
+----------
+Stan Reference Manual, version 2.36, chapter "Constraint Transforms"; Griewank and Walther (2008), Evaluating
+Derivatives, 2nd ed., sec. 3.2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+
+import numpy as np
+
+from bayesmc.errors import TraceError, UnsupportedError
+from bayesmc.expression import (
+    Elementwise,
+    Expression,
+    Family,
+    Leaf,
+    broadcast,
+    expressions_of,
+    leaf,
+    mapped,
+    pick,
+    reduction,
+)
+from bayesmc.expression.graph import cast, substituted
+from bayesmc.network.expressions import Opaque, log_density_of, stored_leaf
+from bayesmc.passes.arithmetic import ZERO, add, is_all, tidy
+from bayesmc.passes.derivatives import gradient
+from bayesmc.passes.guarded import guarded
+from bayesmc.passes.log_density import has_own_form
+from bayesmc.passes.logarithms import stable
+from bayesmc.passes.ranges import in_range
+from bayesmc.structure.free_density import FREE, UnconstrainedDensity
+from bayesmc.structure.free_nodes import FreeNode, free_node
+from bayesmc.structure.target import Target, Term
+from bayesmc.structure.unconstrained_check import hold_against_model
+
+__all__ = ["FREE", "UnconstrainedDensity", "unconstrained_density"]
+
+#: terms that are added up one by one; more are laid side by side
+_FEW = 8
+
+
+def unconstrained_density(
+    target: Target, names: Iterable[str] | None = None
+) -> UnconstrainedDensity:
+    """The log density of some continuous nodes given all others, on unconstrained numbers.
+
+    Parameters
+    ----------
+    target : Target
+    names : iterable of str, optional
+        Nodes of the chain that move; all continuous ones by default. The terms that they enter count.
+
+    Raises
+    ------
+    UnsupportedError
+        A term cannot be followed, has no closed form or no derivative, or differs from the model's own
+        functions at probe points.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> from bayesmc.network import pose
+    >>> from bayesmc.structure.target import target_of
+    >>> from bayesmc.structure.unconstrained import unconstrained_density
+    >>> net = bmc.BayesNet(plates={"point": 3})
+    >>> net.add("rate", bmc.Exponential(1.0))
+    >>> net.add("y", lambda rate: bmc.Poisson(rate), plates="point")
+    >>> density = unconstrained_density(target_of(pose(net, {"y": [1, 2, 3]})))
+    >>> density.labels, density.constrain(np.array([0.0])), density.with_gradient(np.array([0.0]))
+    (['rate'], {'rate': array(1.)}, (np.float64(-6.484906649788), array([3.])))
+    """
+    nodes = _laid_out(target, names)
+    terms = target.terms_of([n.name for n in nodes]) if nodes else ()
+    parts = {n.name: leaf(f"{FREE} of {n.name}", (n.size,)) for n in nodes}
+    above: dict[str, Expression] = {}
+    volumes = {}
+    for node in nodes:
+        given = {**_known(target, node.bounds), **above}
+        above[node.name], volumes[node.name] = node.expressions(parts[node.name], given)
+    elements = [_elements(target, term, above) for term in terms]
+    whole = {n.name for n in nodes if n.elements is None}
+    sums = [
+        reduction(np.add, _elements(target, t, above, True) if t.name in whole else e, [0])
+        for t, e in zip(terms, elements, strict=True)
+    ]
+    (root,) = stable([_total([*sums, *volumes.values()])])
+    slopes = _slopes(root, sums, terms, list(parts.values()))
+    once = _on_one_leaf(nodes, parts)
+    density = UnconstrainedDensity(target, nodes, *map(once, guarded([root, slopes])))
+    plain = map(once, guarded([*elements, *volumes.values()]))
+    hold_against_model(density, terms, list(plain))
+    return density
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _laid_out(target: Target, names: Iterable[str] | None) -> tuple[FreeNode, ...]:
+    """The nodes that move, one after the other."""
+    found: list[FreeNode] = []
+    wanted = None if names is None else set(names)
+    for name in target.chain:
+        node = target.model[name]
+        free = not node.is_discrete and node.domain is None
+        if free if wanted is None else name in wanted:
+            start = found[-1].start + found[-1].size if found else 0
+            found.append(free_node(target, name, start))
+    return tuple(found)
+
+
+def _known(target: Target, expressions: Iterable[Expression]) -> dict[str, Expression]:
+    """Values that never change, of the leaves of expressions."""
+    found: dict[str, Expression] = {}
+    for name in frozenset().union(*(e.leaves for e in expressions)):
+        if name in target.known and target.is_known(name):
+            own = stored_leaf(target.model, target.model[name])
+            found[name] = cast(np.broadcast_to(target.known[name], own.shape), own.dtype)
+    return found
+
+
+def _elements(
+    target: Target, term: Term, above: Mapping[str, Expression], is_inside: bool = False
+) -> Expression:
+    """The log factors of a term that count, one after the other.
+
+    Parameters
+    ----------
+    is_inside : bool
+        Whether its node is inside of its support, wherever the free numbers are.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    whole = term.expression
+    if whole is None:
+        raise UnsupportedError(_why_not(term))
+    given = {**_known(target, [whole, *expressions_of(term.read.result)]), **above}  # type: ignore[union-attr]
+    log = broadcast(substituted(whole, given), term.shape)
+    if not term.is_potential:
+        family = term.read.result  # type: ignore[union-attr]
+        if is_inside and not (isinstance(family, Family) and has_own_form(family)):
+            log = _of_support(log)
+        condition = in_range(mapped(family, lambda e: stable([substituted(e, given)])[0]))
+        log = broadcast(tidy(np.where, condition, log, -np.inf), term.shape)
+    return pick([log], np.arange(log.size) if term.mask is None else np.flatnonzero(term.mask))
+
+
+def _why_not(term: Term) -> str:
+    kind = "potential" if term.is_potential else "node"
+    if isinstance(term.read, Opaque):
+        return f"{kind} {term.name!r} is not followed: {term.read.reason}"
+    try:
+        log_density_of(term.model, term.name)
+    except TraceError as error:
+        return f"{kind} {term.name!r}: {error}"
+    return f"{kind} {term.name!r} has no closed form"
+
+
+def _of_support(log: Expression) -> Expression:
+    """A log density inside of its support."""
+    if isinstance(log, Elementwise) and log.function is np.where:
+        _, inside, outside = log.operands
+        if is_all(outside, -np.inf) and inside.shape == log.shape:
+            return inside
+    return log
+
+
+def _total(numbers: Sequence[Expression]) -> Expression:
+    if len(numbers) > _FEW:
+        return reduction(np.add, pick(numbers, np.arange(len(numbers))), [0])
+    total: Expression = ZERO
+    for number in numbers:
+        total = add(total, number)
+    return total
+
+
+def _slopes(
+    root: Expression,
+    sums: Sequence[Expression],
+    terms: Sequence[Term],
+    parts: Sequence[Leaf],
+) -> Expression:
+    """The derivatives by all free numbers, one after the other.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    names = [part.name for part in parts]
+    try:
+        found = gradient(root, names)
+    except TraceError as error:
+        for total, term in zip(sums, terms, strict=True):
+            try:
+                gradient(total, names)
+            except TraceError as own:
+                kind = "potential" if term.is_potential else "node"
+                raise UnsupportedError(f"{kind} {term.name!r}: {own}") from own
+        raise UnsupportedError(str(error)) from error
+    each = [found.get(p.name, broadcast(ZERO, p.shape)) for p in parts]
+    return pick(stable(each), np.arange(sum(p.size for p in parts)))
+
+
+def _on_one_leaf(
+    nodes: Sequence[FreeNode], parts: Mapping[str, Leaf]
+) -> Callable[[Expression], Expression]:
+    """Puts parts of one array in place of the free numbers of each node."""
+    whole = leaf(FREE, (sum(n.size for n in nodes),))
+    places = {
+        parts[n.name].name: pick([whole], n.start + np.arange(n.size)) for n in nodes if n.size
+    }
+    return lambda root: substituted(root, places)
