@@ -85,6 +85,7 @@ class Hamiltonian(Kernel):
     """
 
     label = "Hamiltonian"
+    band = None
 
     def __init__(
         self,

@@ -37,6 +37,8 @@ _SEARCH = 60
 _PRIOR, _SHRUNK = 5.0, 1e-3
 #: ratio of scales of the first metric to their median, at most
 _RANGE = 1e6
+#: variance between chains, over that within, above which they have not met
+_APART = 4.0
 
 Metric = Literal["diagonal", "dense"]
 
@@ -159,8 +161,8 @@ class MetricLearning:
     """Variances or covariances of the draws of all chains, window by window.
 
     A memory is a dict: ``first`` (the inverse metric from the start, shape (size,)), ``root`` (see
-    ``Scale``), and of the present window ``count``, ``mean`` and ``square`` (sums of squares, or of
-    products, about the mean).
+    ``Scale``), and of the present window ``count``, ``mean`` (of each chain) and ``square`` (sums of squares,
+    or of products, about these).
 
     Parameters
     ----------
@@ -176,7 +178,6 @@ class MetricLearning:
         Where a density is Normal, the mean square of its gradients is the inverse of its variance; far out
         all of them are too large in proportion, which the step makes good.
         """
-        size = slope.shape[1]
         square = np.square(slope).mean(axis=0)
         fine = np.isfinite(square) & (square > 0)
         middle = float(np.median(square[fine])) if fine.any() else 1.0
@@ -186,29 +187,29 @@ class MetricLearning:
         return {
             "first": first,
             "root": root if self.kind == "diagonal" else np.diag(root),
-            **self._empty(size),
+            **self._empty(*slope.shape),
         }
 
     def learnt(self, memory: dict[str, Any], u: np.ndarray) -> dict[str, Any]:
-        """The memory with one more draw of every chain (Welford's update, for several at once)."""
-        fine = np.isfinite(u).all(axis=1)
-        u = u if fine.all() else u[fine]
-        if not len(u):
+        """The memory with one more draw of every chain (Welford's update)."""
+        if not np.isfinite(u).all():
             return memory
-        count = memory["count"] + len(u)
-        before = u - memory["mean"]
-        mean = memory["mean"] + before.sum(axis=0) / count
-        after = u - mean
-        square = (before * after).sum(axis=0) if self.kind == "diagonal" else before.T @ after
+        count = memory["count"] + 1
+        away = u - memory["mean"]
+        mean = memory["mean"] + away / count
+        left = u - mean
+        square = (away * left).sum(axis=0) if self.kind == "diagonal" else away.T @ left
         return {**memory, "count": count, "mean": mean, "square": memory["square"] + square}
 
     def renewed(self, memory: dict[str, Any]) -> dict[str, Any]:
         """The memory with a metric from the window that ends, and a new window."""
-        count, size = memory["count"], len(memory["first"])
-        if count < 2:
-            return {**memory, **self._empty(size)}
+        found = self._spread(memory)
+        chains, size = memory["mean"].shape
+        count = chains * memory["count"]
+        if found is None:
+            return {**memory, **self._empty(chains, size)}
         share = count / (count + _PRIOR)
-        found = share * memory["square"] / (count - 1)
+        found = share * found
         prior = (1.0 - share) * _SHRUNK * memory["first"]
         root = memory["root"]
         if self.kind == "diagonal":
@@ -220,11 +221,31 @@ class MetricLearning:
                 pass
         if not np.isfinite(root).all():
             root = memory["root"]
-        return {**memory, "root": root, **self._empty(size)}
+        return {**memory, "root": root, **self._empty(chains, size)}
 
-    def _empty(self, size: int) -> dict[str, Any]:
+    def _spread(self, memory: dict[str, Any]) -> np.ndarray | None:
+        """Variances or covariances of the window's draws; None of too few.
+
+        Chains that have not met, as where they name components differently, say nothing of how far a step may
+        go: what lies between them counts only where it is not far more than what lies within.
+        """
+        count, mean = memory["count"], memory["mean"]
+        chains = len(mean)
+        if count < 2:
+            return None
+        within = memory["square"] / (chains * (count - 1))
+        if chains == 1:
+            return np.asarray(within)
+        away = mean - mean.mean(axis=0)
+        inside = within if within.ndim == 1 else np.diagonal(within)
+        met = np.square(away).sum(axis=0) <= _APART * (chains - 1) * inside
+        away = away * met
+        between = np.square(away).sum(axis=0) if within.ndim == 1 else away.T @ away
+        return np.asarray((1.0 - 1.0 / count) * within + between / (chains - 1))
+
+    def _empty(self, chains: int, size: int) -> dict[str, Any]:
         shape = (size,) if self.kind == "diagonal" else (size, size)
-        return {"count": 0, "mean": np.zeros(size), "square": np.zeros(shape)}
+        return {"count": 0, "mean": np.zeros((chains, size)), "square": np.zeros(shape)}
 
 
 # ---- private ------------------------------------------------------------------------------------

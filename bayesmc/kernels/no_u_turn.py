@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -159,10 +159,29 @@ def energy_of(momenta: np.ndarray, log: np.ndarray) -> np.ndarray:
 # ---- private ------------------------------------------------------------------------------------
 
 
+#: whitened momenta of the first leaf of a tree and of its last, and the sum of all, each ``(rows, size)``
+Tree = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+def turning_back(first: Tree, second: Tree) -> np.ndarray:
+    """Whether two neighbouring trees make one that turns, or turn across where they meet, shape (rows,).
+
+    Leaves stand in the order of growth.
+    """
+    whole = first[2] + second[2]
+    into, out_of = first[2] + second[0], second[2] + first[1]
+    least = np.minimum(np.vecdot(first[0], whole), np.vecdot(second[1], whole))
+    least = np.minimum(least, np.vecdot(first[0], into))
+    least = np.minimum(least, np.vecdot(second[0], into))
+    least = np.minimum(least, np.vecdot(first[1], out_of))
+    least = np.minimum(least, np.vecdot(second[1], out_of))
+    return ~(least > 0)
+
+
 class _Forest:
     """The trees of all chains; ``going`` has what is known of those that go on, chains first.
 
-    Of each tree: ``ends`` (two ends; numbers, momenta and whitened gradients), the sum of its momenta and the
+    Of each tree: both ``ends`` (numbers, momenta and whitened gradients), the sum of its momenta and the
     logarithm of its weight.
     """
 
@@ -177,15 +196,15 @@ class _Forest:
         chains = len(place.u)
         self.gradient, self.scale, self.rng = gradient, scale, rng
         self.u, self.log, self.slope = (part.copy() for part in place)
-        self.energy, self.acceptance = np.empty(chains), np.zeros(chains)
-        self.leaves, self.depth = np.zeros(chains), np.zeros(chains, dtype=int)
+        self.acceptance, self.leaves = np.zeros(chains), np.zeros(chains)
+        self.depth = np.zeros(chains, dtype=int)
         self.divergent = np.zeros(chains, dtype=bool)
         momenta = rng.standard_normal(place.u.shape)
         self.energy = energy_of(momenta, place.log)
-        end = np.stack([place.u, momenta, scale.pulled(place.slope)], axis=1)
+        ends = np.stack([place.u, momenta, scale.pulled(place.slope)], axis=1)
         self.going: dict[str, np.ndarray] = {
             "rows": np.arange(chains),
-            "ends": np.stack([end, end], axis=1),
+            "ends": np.stack([ends, ends], axis=1),
             "sum": momenta,
             "weight": np.zeros(chains),
             "step": step,
@@ -200,113 +219,86 @@ class _Forest:
     def double(self, depth: int) -> bool:
         """Double all trees, each forwards or backwards in time; whether any goes on."""
         going = self.going
-        count = len(going["rows"])
+        ends, count = going["ends"], len(going["rows"])
         side = (self.rng.random(count) < 0.5).astype(int)
-        going["side"] = side
-        end = going["ends"][np.arange(count), side]
-        going["outer"] = going["ends"][np.arange(count), 1 - side, 1]
-        going["inner"] = end[:, 1]
-        new = self._subtree(end, depth)
-        if new is None:
+        at = np.arange(count)
+        grown = ends[at, side]
+        going |= {"side": side, "outer": ends[at, 1 - side, 1], "inner": grown[:, 1]}
+        going |= {"end": grown[:, 0], "momenta": grown[:, 1], "pull": grown[:, 2]}
+        tree = self._subtree(depth)
+        if tree is None:
             return False
         going = self.going
         rows = going["rows"]
         self.depth[rows] += 1
-        taken = -self.rng.standard_exponential(len(rows)) < new["weight"] - going["weight"]
+        taken = -self.rng.standard_exponential(len(rows)) < going["new"] - going["weight"]
         at = rows[taken]
-        self.u[at], self.log[at] = new["u"][taken], new["log"][taken]
-        self.slope[at] = new["slope"][taken]
-        going["weight"] = np.logaddexp(going["weight"], new["weight"])
-        old = np.stack([going["outer"], going["inner"], going["sum"]], axis=1)
-        turned = turning_back(old, new["tree"])
-        going["sum"] = going["sum"] + new["tree"][:, 2]
-        going["ends"][np.arange(len(rows)), going["side"]] = new["end"]
+        self.u[at], self.log[at] = going["u"][taken], going["log"][taken]
+        self.slope[at] = going["slope"][taken]
+        turned = turning_back((going["outer"], going["inner"], going["sum"]), tree)
+        if turned.all():
+            return False
+        going["weight"] = np.logaddexp(going["weight"], going["new"])
+        going["sum"] = going["sum"] + tree[2]
+        at = np.arange(len(rows))
+        for k, name in enumerate(("end", "momenta", "pull")):
+            going["ends"][at, going["side"], k] = going[name]
         self._keep(~turned)
-        return bool(len(self.going["rows"]))
+        return True
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _subtree(self, end: np.ndarray, depth: int) -> dict[str, Any] | None:
+    def _subtree(self, depth: int) -> Tree | None:
         """A new balanced subtree from the ends of trees on; chains in which it turns or diverges end.
 
-        Returns its ``tree`` (momenta of its first and last leaf, and their sum), its new ``end``, its
-        ``weight``, and the leaf that was drawn: ``u``, ``log``, ``slope``. None where all chains have ended.
+        What grows leaves the arrays with the chains that end. None where all have.
         """
         going = self.going
-        # what grows leaves the arrays with the chains that end
-        going["end"] = end
+        count = len(going["rows"])
         going["half"] = 0.5 * ((2 * going["side"] - 1) * going["step"])[:, None]
-        chances = -self.rng.standard_exponential((len(end), 1 << depth))
-        going["chances"] = chances
-        going["new"] = np.full(len(end), -np.inf)
-        pending: list[np.ndarray] = []
+        going["chances"] = -self.rng.standard_exponential((count, 1 << depth))
+        pending: list[Tree] = []
         for leaf in range(1 << depth):
-            tree, bad = self._leaf(leaf)
-            carry = leaf
+            bad = self._leaf(leaf)
+            momenta = self.going["momenta"]
+            tree, carry = (momenta, momenta, momenta), leaf
             while carry & 1:
                 before = pending.pop()
                 bad |= turning_back(before, tree)
-                tree = np.stack([before[:, 0], tree[:, 1], before[:, 2] + tree[:, 2]], axis=1)
+                tree = before[0], tree[1], before[2] + tree[2]
                 carry >>= 1
             pending.append(tree)
             if bad.any():
-                pending = [tree[~bad] for tree in pending]
-                self._keep(~bad)
-                if not len(self.going["rows"]):
+                if bad.all():
                     return None
-        going = self.going
-        drawn = {name: going[name] for name in ("u", "log", "slope", "end")}
-        return {**drawn, "weight": going["new"], "tree": pending[0]}
+                pending = [(a[~bad], b[~bad], c[~bad]) for a, b, c in pending]
+                self._keep(~bad)
+        return pending[0]
 
-    def _leaf(self, leaf: int) -> tuple[np.ndarray, np.ndarray]:
-        """One more leaf of every subtree: as a tree, and which diverge."""
+    def _leaf(self, leaf: int) -> np.ndarray:
+        """One more leaf of every subtree; which of them diverge."""
         going = self.going
-        rows, end = going["rows"], going["end"]
-        u, momenta, slope, log, plain = leapfrog(
-            self.gradient, end[:, 0], end[:, 1], end[:, 2], going["half"], self.scale, rows
-        )
-        error = energy_of(momenta, log) - going["energy"]
-        weight = -error
+        rows = going["rows"]
+        u, momenta, pull, log, slope = leapfrog(
+            self.gradient, going["end"], going["momenta"], going["pull"], going["half"], self.scale, rows
+        )  # fmt: skip
+        going["end"], going["momenta"], going["pull"] = u, momenta, pull
+        weight = going["energy"] - energy_of(momenta, log)
         self.acceptance[rows] += np.exp(np.minimum(weight, 0.0))
         self.leaves[rows] += 1
-        bad = ~(error <= DIVERGENT)
-        self.divergent[rows[bad]] = True
-        going["end"] = np.stack([u, momenta, slope], axis=1)
+        bad = ~(weight >= -DIVERGENT)
+        self.divergent[rows] |= bad
         if leaf == 0:
-            going["new"], going["u"], going["log"], going["slope"] = weight, u, log, plain
-        else:
-            going["new"] = np.logaddexp(going["new"], weight)
-            taken = going["chances"][:, leaf] < weight - going["new"]
-            for name, value in (("u", u), ("slope", plain)):
-                going[name] = np.where(taken[:, None], value, going[name])
+            going |= {"new": weight, "u": u, "log": log, "slope": slope}
+            return bad
+        going["new"] = np.logaddexp(going["new"], weight)
+        taken = going["chances"][:, leaf] < weight - going["new"]
+        if taken.any():
             going["log"] = np.where(taken, log, going["log"])
-        return np.stack([momenta, momenta, momenta], axis=1), bad
+            going["u"] = np.where(taken[:, None], u, going["u"])
+            going["slope"] = np.where(taken[:, None], slope, going["slope"])
+        return bad
 
     def _keep(self, mask: np.ndarray) -> None:
         if not mask.all():
             self.going = {name: value[mask] for name, value in self.going.items()}
-
-
-def turning_back(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Whether two neighbouring trees make one that turns, or turn across where they meet.
-
-    Parameters
-    ----------
-    first, second : ndarray, shape (rows, 3, size)
-        Whitened momenta of the first leaf and of the last, and the sum of all, in the order of growth.
-
-    Returns
-    -------
-    ndarray of bool, shape (rows,)
-    """
-    whole = first[:, 2] + second[:, 2]
-    into, out_of = first[:, 2] + second[:, 0], second[:, 2] + first[:, 1]
-    dots = (
-        np.vecdot(first[:, 0], whole),
-        np.vecdot(second[:, 1], whole),
-        np.vecdot(first[:, 0], into),
-        np.vecdot(second[:, 0], into),
-        np.vecdot(first[:, 1], out_of),
-        np.vecdot(second[:, 1], out_of),
-    )
-    return ~(np.minimum.reduce(dots) > 0)

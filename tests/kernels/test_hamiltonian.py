@@ -15,6 +15,7 @@ import pytest
 
 from bayesmc import diagnostics
 from bayesmc.errors import DensityError
+from bayesmc.kernels import hamiltonian_warmup
 from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import MetricLearning, first_steps, windows
 from bayesmc.kernels.no_u_turn import Place, Scale
@@ -160,6 +161,25 @@ def test_chains_find_the_mass_with_steps_of_their_own() -> None:
         values, memory = warmed(kernel, start, 200, rng)
         assert np.abs(values["x"]).max() < 60.0
         assert np.ptp(memory["step"]["log"]) == 0.0
+
+
+@pytest.mark.parametrize("metric", ["diagonal", "dense"])
+@pytest.mark.parametrize("apart", [hamiltonian_warmup._APART, np.inf])
+def test_chains_in_two_modes(metric: Any, apart: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chains at two hills, as those that name components differently, take steps that suit one."""
+    monkeypatch.setattr(hamiltonian_warmup, "_APART", apart)
+    rng = np.random.default_rng(SHIFT)
+
+    def both(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = u - np.where(u[:, :1] > 0, 40.0, -40.0) * np.array([1.0, 0.0, 1.0])
+        return -0.5 * np.vecdot(off, off), -off
+
+    start = 40.0 * np.array([1.0, 0.0, 1.0]) * np.array([[1.0], [1.0], [-1.0], [-1.0]])
+    kernel = Hamiltonian(OfNumbers(both, 3), warmup=200, metric=metric)
+    _, memory = warmed(kernel, start + rng.standard_normal((4, 3)), 200, rng)
+    root = memory["metric"]["root"]
+    found = root if metric == "diagonal" else np.sqrt(np.diagonal(root @ root.T))
+    assert bool(np.all(np.abs(np.log(found)) < 0.5)) == np.isfinite(apart)
 
 
 def test_windows() -> None:

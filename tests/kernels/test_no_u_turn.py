@@ -80,11 +80,11 @@ class Unweighted(no_u_turn._Forest):
     """Leaves are drawn whatever they weigh."""
 
     def _leaf(self, leaf: int) -> Any:
-        tree, bad = super()._leaf(leaf)
+        bad = super()._leaf(leaf)
         going = self.going
         taken = going["chances"][:, leaf] < -np.log(leaf + 1.0)
-        going["u"] = np.where(taken[:, None], going["end"][:, 0], going["u"])
-        return tree, bad
+        going["u"] = np.where(taken[:, None], going["end"], going["u"])
+        return bad
 
 
 class Forwards(no_u_turn._Forest):
@@ -116,11 +116,11 @@ class Stale(no_u_turn._Forest):
 class WholeTrees(no_u_turn._Forest):
     """Only whole trees are looked at, so that a tree may have stopped earlier from another of its leaves."""
 
-    def _subtree(self, end: np.ndarray, depth: int) -> Any:
+    def _subtree(self, depth: int) -> Any:
         looked = no_u_turn.turning_back
-        no_u_turn.turning_back = lambda first, second: np.zeros(len(first), dtype=bool)
+        no_u_turn.turning_back = lambda first, second: np.zeros(len(first[0]), dtype=bool)
         try:
-            return super()._subtree(end, depth)
+            return super()._subtree(depth)
         finally:
             no_u_turn.turning_back = looked
 
@@ -259,9 +259,9 @@ def test_trees_are_those_of_the_definition() -> None:
 def test_criterion_looks_at_neighbours() -> None:
     """Two trees whose outer ends agree with the whole, and which turn where they meet."""
     ahead, back = np.array([1.0, 0.0]), np.array([-1.0, 0.0])
-    first = np.stack([ahead, back, 3 * ahead])[None]
-    second = np.stack([back, ahead, 3 * ahead])[None]
-    straight = np.stack([ahead, ahead, 3 * ahead])[None]
+    first = ahead[None], back[None], 3 * ahead[None]
+    second = back[None], ahead[None], 3 * ahead[None]
+    straight = ahead[None], ahead[None], 3 * ahead[None]
     assert turning_back(first, second)[0]
     assert not turning_back(straight, straight)[0]
 

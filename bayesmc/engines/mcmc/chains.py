@@ -18,6 +18,7 @@ from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing
 from bayesmc.engines.mcmc.loop import Kept, Loop, Patience, Sampler
 from bayesmc.engines.mcmc.missed import missed_ends, never_left
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.proposal import check_targets
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
@@ -118,6 +119,10 @@ class ChainEngine(Engine):
         except MemoryError as error:
             raise no_memory(self, self.draws * self.chains, names) from error
         posterior = self._posterior(problem, sampler, held, loop.last.noted(problem))
+        made = loop.divergences(posterior._chains_and_draws[1])
+        if made is not None:
+            before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
+            posterior.divergences = made if before is None else np.hstack([before, made])
         self._warn(posterior, sampler, finished)
         return posterior
 
@@ -213,6 +218,9 @@ class ChainEngine(Engine):
         found += never_left(posterior)
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
+        assert posterior.checkpoint is not None
+        state = posterior.checkpoint.state
+        found += faulty_trajectories(posterior, getattr(sampler, "kernels", []), state)
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 
