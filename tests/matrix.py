@@ -156,7 +156,7 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
     "Gibbs": (by(bmc.Gibbs(200, warmup=100, chains=32, debug=True)), dict.fromkeys(KINDS, 0.85)),
     "HamiltonianMonteCarlo": (
         by(bmc.HamiltonianMonteCarlo(200, warmup=200, chains=32)),
-        {"discrete": 0, "plates": 0.3, "hybrid": 0.3, "hybrid plates": 0.3, "gaussian": 0.8},
+        {"discrete": 0.5, "plates": 0.4, "hybrid": 0.4, "hybrid plates": 0.6, "gaussian": 0.4},
     ),
     "MetropolisHastings": (
         by(bmc.MetropolisHastings(200, warmup=200, chains=32)),

@@ -27,10 +27,9 @@ from bayesmc.errors import (
 )
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
-from bayesmc.network.declaring import DeclaredPlates
+from bayesmc.network.declaring import DeclaredPlates, ModelStore
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, topological_order
-from bayesmc.network.store import ModelStore
 from bayesmc.shapes import owned
 
 if TYPE_CHECKING:

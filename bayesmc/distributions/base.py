@@ -45,6 +45,8 @@ class Distribution:
     """
 
     is_discrete: ClassVar[bool] = False
+    #: whether it has marginals of some components, and can draw the others given those
+    splits: ClassVar[bool] = False
     #: parameter name -> number of axes that one parameter value has (0 for a scalar)
     parameter_ndim: ClassVar[dict[str, int]] = {}
 
@@ -116,6 +118,9 @@ class Distribution:
     def log_prob_unchecked(self, x: np.ndarray) -> np.ndarray:
         """``log_prob`` of an array, where the caller has silenced floating-point warnings."""
         return self._log_prob(x)
+
+    def log_prob_of(self, x: np.ndarray, present: np.ndarray) -> np.ndarray:
+        raise faults.no_marginals(self)
 
     @property
     def mean(self) -> np.ndarray:

@@ -15,7 +15,7 @@ import numpy as np
 from bayesmc.categorical import edges
 from bayesmc.errors import BayesmcError, ParameterError
 from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.align import Aligner
+from bayesmc.network.calling import Aligner
 from bayesmc.network.forward import Pass, Step, step_for, summed, with_potentials
 from bayesmc.structure import Table, constants_of, tabulate
 

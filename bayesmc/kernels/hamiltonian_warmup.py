@@ -27,8 +27,8 @@ _FAST, _WINDOW, _END = 75, 25, 50
 _SHORT = (0.15, 0.10)
 #: a warmup below which no metric is learnt
 _LEAST = 20
-#: sweeps at which windows end where the warmup has no known length
-_OPEN = 10_000_000
+#: the end of the beginning of a warmup of no known length, and how often it may double
+_OPEN, _DOUBLINGS = 20, 20
 #: constants of dual averaging: shrinkage towards ten times the first step, early steps, decay
 _GAMMA, _EARLY, _KAPPA, _AHEAD = 0.05, 10.0, 0.75, math.log(10.0)
 #: doublings (or halvings) in search of a first step
@@ -49,21 +49,24 @@ def windows(warmup: int | None) -> tuple[int, ...]:
     Parameters
     ----------
     warmup : int or None
-        Sweeps of the whole warmup; None where that is not known: then windows go on doubling.
+        Sweeps of the whole warmup; None where it may end at a hundred, or at any doubling of that: then windows
+        double, and each end leaves a fifth of the sweeps so far to the step.
 
     Examples
     --------
     >>> from bayesmc.kernels.hamiltonian_warmup import windows
     >>> windows(1000), windows(100), windows(10), windows(None)[:4]
-    ((75, 100, 150, 250, 450, 950), (15, 90), (), (75, 100, 150, 250))
+    ((75, 100, 150, 250, 450, 950), (15, 90), (), (20, 40, 80, 160))
     """
-    if warmup is not None and warmup < _LEAST:
+    if warmup is None:
+        return tuple(_OPEN << k for k in range(_DOUBLINGS))
+    if warmup < _LEAST:
         return ()
     fast, size, last = _FAST, _WINDOW, _END
-    if warmup is not None and fast + size + last > warmup:
+    if fast + size + last > warmup:
         fast, last = (int(share * warmup) for share in _SHORT)
         size = warmup - fast - last
-    limit = _OPEN if warmup is None else warmup - last
+    limit = warmup - last
     ends = [fast]
     while ends[-1] < limit:
         # a window that would leave the next one without room takes its place

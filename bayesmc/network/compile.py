@@ -11,7 +11,6 @@ import numpy as np
 
 from bayesmc.distributions import Density, Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.distributions.components import splits
 from bayesmc.errors import (
     BayesmcError,
     BroadcastError,
@@ -21,8 +20,7 @@ from bayesmc.errors import (
     ShapeError,
     StateError,
 )
-from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.calling import call
+from bayesmc.network.calling import Aligner, RowAligner, call
 from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
@@ -235,7 +233,7 @@ def _discover_stochastic(
         support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
         noiseless=_is_noiseless(dist, batch + plates, len(batch)),
-        splits=splits(dist),
+        splits=dist.splits,
         reach=None if varies else support.at_most,
     )
     value = reachable(node, dist, shape, count, rng)

@@ -35,7 +35,7 @@ from bayesmc.network.agreement import (
     hold_against,
     hold_form,
 )
-from bayesmc.network.align import Aligner, RowAligner
+from bayesmc.network.calling import Aligner, RowAligner
 from bayesmc.network.model import CompiledNode, Model, potential_shape
 from bayesmc.network.node import Numbered, identity
 from bayesmc.network.readings import (

@@ -25,14 +25,10 @@ from bayesmc.errors import (
     ParameterError,
     ShapeError,
 )
-from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.calling import call
+from bayesmc.network.calling import Aligner, RowAligner, call
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
-
-#: configurations of finite parents up to which a deterministic node is tabulated
-_DETERMINISTIC_TABLE = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +104,10 @@ class CompiledNode:
     def decode(self, stored: np.ndarray) -> np.ndarray:
         """Stored values as user values."""
         return self.domain.decode(stored) if self.domain is not None else stored
+
+    def stored_dtype(self, values: np.ndarray) -> np.dtype:
+        """The type that draws are kept in: the smallest for positions of a finite node."""
+        return values.dtype if self.domain is None else self.domain.dtype
 
 
 @dataclass(frozen=True, eq=False)

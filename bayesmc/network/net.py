@@ -12,13 +12,16 @@ import numpy as np
 
 from bayesmc.errors import DuplicateNodeError, EvidenceError, ModelError, UnknownNodeError
 from bayesmc.network.declaring import (
+    Declared,
     DeclaredPlates,
     Parents,
+    check_parents,
     declared,
     declared_function,
     declared_potential,
     declared_table,
     settled_sizes,
+    unknown,
 )
 from bayesmc.network.evidence import read_inputs, read_question
 from bayesmc.network.factor_graph import FactorGraph
@@ -26,7 +29,6 @@ from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model
 from bayesmc.network.node import Declaration, Node, Potential, without_noise
-from bayesmc.network.store import Declared, check_parents, unknown
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
 

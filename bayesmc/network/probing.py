@@ -16,8 +16,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support, is_half_line
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import BayesmcError, UnsupportedError
-from bayesmc.network.align import Aligner
-from bayesmc.network.calling import call
+from bayesmc.network.calling import Aligner, call
 from bayesmc.network.model import CompiledNode, Model, arguments_of, invalid_error
 from bayesmc.network.node import Declaration
 from bayesmc.shapes import Shape, broadcasts_to, read_only

@@ -32,7 +32,7 @@ from bayesmc.expression import (
     reshape,
     trace,
 )
-from bayesmc.network.align import Aligner, RowAligner
+from bayesmc.network.calling import Aligner, RowAligner
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Numbered
 from bayesmc.passes.log_density import family_of

@@ -17,7 +17,7 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network import Model
-from bayesmc.network.align import Aligner
+from bayesmc.network.calling import Aligner
 from bayesmc.network.node import nodes_read
 from bayesmc.plates import PlateArray
 from bayesmc.shapes import Shape, broadcasts_to, masks, nearly_equal, unused_sizes

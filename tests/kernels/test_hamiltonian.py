@@ -192,7 +192,7 @@ def test_windows() -> None:
         ends = windows(warmup)
         assert list(ends) == sorted(set(ends))
         assert ends[-1] == warmup - (50 if warmup >= 150 else int(0.1 * warmup))
-    assert windows(None)[:6] == (75, 100, 150, 250, 450, 850)
+    assert windows(None)[:6] == (20, 40, 80, 160, 320, 640)
 
 
 @pytest.mark.parametrize("pooled", [False, True])

@@ -15,11 +15,12 @@ from typing import Any, Protocol
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
+from bayesmc.engines.mcmc.convergence import forgotten
+from bayesmc.engines.mcmc.length import Lengths
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
-from bayesmc.results.sums import stored_dtype
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, picklable
 State = Mapping[str, Any]
@@ -30,13 +31,15 @@ class Sampler(Protocol):
 
     Notes
     -----
-    Four attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
+    Some attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
     members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
     ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
-    Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them, and
-    ``divergences(state)`` how many trajectories of each chain diverged since the warmup, or None.
+    Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
+    ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged, and
+    ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None.
+    ``superchains`` (0) is set before the start, where so many groups of consecutive chains are to start as one.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
     which is exact if ``step`` writes into no array of the state it is given.
@@ -77,12 +80,13 @@ class Loop:
         sampler: Sampler,
         rng: np.random.Generator,
         problem: Problem,
-        chains: int,
-        warmup: int,
+        lengths: Lengths,
         thinning: int,
     ) -> None:
-        self.sampler, self.rng = sampler, rng
-        self.chains, self.warmup, self.thinning = chains, warmup, thinning
+        self.sampler, self.rng, self.model = sampler, rng, problem.model
+        self.lengths, self.thinning = lengths, thinning
+        #: sweeps of the warmup, once it has ended
+        self.warmup = lengths.warmup
         self.observed = problem.observed
         seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
         #: stored values that no chain moves
@@ -103,17 +107,35 @@ class Loop:
             return copy.deepcopy(self.last.state)
         with marking_invalid(), np.errstate(all="ignore"):
             try:
-                state = self.sampler.start(self.rng, self.chains)
+                state = self.sampler.start(self.rng, self.lengths.chains)
             except (DensityError, ParameterError) as error:
                 error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
                 raise
             self.phase = " (warmup)"
-            for _ in range(self.warmup):
-                stop.check()
-                state = self._stepped(state, True)
-                bar.advance()
+            for end in self.lengths.ends():
+                state, window = self._warmed(state, end, bar, stop)
+                if window is not None and forgotten(window, self.model, self.lengths.superchains):
+                    break
+            self.warmup = self.sweep
             self.sweep, self.phase = 0, ""
             return self.sampler.end_warmup(state)
+
+    def _warmed(
+        self, state: State, end: int, bar: Progress, stop: Patience
+    ) -> tuple[State, Mapping[str, np.ndarray] | None]:
+        """The state after some more sweeps, and the second half of the warmup so far if it is judged."""
+        judged = end < self.lengths.warmup
+        window: Kept | None = None
+        while self.sweep < end:
+            stop.check()
+            state = self._stepped(state, True)
+            bar.advance()
+            if judged and self.sweep > end // 2:
+                values = self.sampler.moving(state)  # type: ignore[attr-defined]
+                if window is None:
+                    window = Kept(self.model, tuple(values), self.lengths.chains, end - end // 2)
+                window.add(values)
+        return state, None if window is None else window.frozen()
 
     def draw(
         self,
@@ -159,7 +181,8 @@ class Loop:
         count = getattr(self.sampler, "divergences", None)
         if count is None or not isinstance(held, Kept) or count(state) is None:
             return None
-        self.diverged = [count(state)]
+        if not self.diverged:
+            self.diverged.append(count(state))
         return count
 
     def _stepped(self, state: State, warmup: bool) -> State:
@@ -210,6 +233,12 @@ class Kept:
         self.room += draws
         self.draws = draws
 
+    def more(self, draws: int) -> None:
+        """Make room for some further draws after those in place."""
+        stored = self.frozen()
+        self.stored, self._moving, self._together, self.room = {}, [], [], draws
+        self.begin_with(stored, self.draws)
+
     def add(self, values: Mapping[str, np.ndarray]) -> None:
         """Take in one draw of every chain."""
         if not self.stored:
@@ -242,7 +271,7 @@ class Kept:
         alike: dict[np.dtype[Any], list[str]] = {}
         for name in self.names:
             node, value = self.model[name], values[name]
-            dtype = stored_dtype(node, value)
+            dtype = node.stored_dtype(value)
             if value.ndim == len(node.value_shape):
                 self.stored[name] = np.array(value, dtype=dtype)[None, None]
                 continue
@@ -260,6 +289,7 @@ class Kept:
             for name, array in self.stored.items():
                 if array.shape[1:2] == (self.room,):
                     array[:, : self.draws] = self._earlier[name]
+            self._earlier = {}
 
 
 class Patience(AbstractContextManager["Patience"]):

@@ -45,6 +45,8 @@ class SweepSampler:
         self.acceptance_band = {block_name(k): k.band for k in self.kernels}
         #: where the user wants chains to start: node -> stored values, shape (chains, *plates, *event)
         self.given: Values = {}
+        #: groups of consecutive chains that start as one; 0 where each starts by itself
+        self.superchains = 0
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
         return self._started(rng, chains, chains)
@@ -67,6 +69,10 @@ class SweepSampler:
 
     def values(self, state: Mapping[str, Any], rng: np.random.Generator) -> Values:
         return self.completed(state["values"], state["chains"], rng)
+
+    def moving(self, state: Mapping[str, Any]) -> Values:
+        """Values of the nodes that chains move, and of what follows from them."""
+        return state["values"]
 
     def acceptance(self, state: Mapping[str, Any]) -> dict[str, np.ndarray]:
         rates = {
@@ -93,8 +99,13 @@ class SweepSampler:
 
     def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:
         """A state of ``rows`` rows for ``chains`` chains."""
-        values = start_states(self.target, rows, rng, self.given_rows(rows))
+        given = self.given_rows(rows)
+        starts = rows if given or not self.superchains else self.superchains
+        values = start_states(self.target, starts, rng, given)
         inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
+        if starts < rows:
+            inside = {n: np.repeat(v, rows // starts, axis=0) for n, v in inside.items()}
+            values = {**values, **inside}
         memory = [kernel.start(values, rows) for kernel in self.kernels]
         return {"values": inside, "memory": memory, "chains": chains}
 
