@@ -49,8 +49,8 @@ def windows(warmup: int | None) -> tuple[int, ...]:
     Parameters
     ----------
     warmup : int or None
-        Sweeps of the whole warmup; None where it may end at a hundred, or at any doubling of that: then windows
-        double, and each end leaves a fifth of the sweeps so far to the step.
+        Sweeps of the whole warmup; None where it may end at a hundred, or at any doubling of that: then
+        windows double, and each end leaves a fifth of the sweeps so far to the step.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""``bmc.log_density``: the log posterior of a net as a plain function of unconstrained numbers, for others' code.
+"""``bmc.log_density``: the log posterior of a net as a plain function of free numbers, for others' code.
 
 The function is made of the model's expression graph (``unconstrained``); this room puts a question to it, and
 speaks user values.
@@ -96,7 +96,8 @@ class LogDensity:
         return self._density.unconstrain(stored)
 
     def __reduce__(self) -> Any:
-        return log_density_again, self._question
+        net, *known = self._question
+        return log_density_again, (net.copy(), *known)  # a copy has nothing compiled
 
     def __repr__(self) -> str:
         shown = ", ".join(self.labels[:6]) + (", ..." if self.size > 6 else "")
@@ -125,8 +126,8 @@ def log_density(
     What ``blackjax``, ``nutpie`` or ``scipy.optimize`` take: hidden continuous nodes become free numbers
     (logarithms of positive ones, log odds of shares, stick breaking of simplices, log-Cholesky factors of
     covariances), with the change of volume in the density. Hidden finite nodes are summed out: labels of a
-    plate element by element, others by their joint states, at most 512. Elements that nothing observed depends
-    on count too.
+    plate element by element, others by their joint states, at most 512. Of continuous nodes those count, too,
+    on which nothing observed depends, but not elements of data that are missing and that nothing hangs on.
 
     Parameters
     ----------
@@ -179,15 +180,14 @@ def log_density_again(net: Any, evidence: Any, inputs: Any) -> LogDensity:
 
 def _density_of(problem: Problem) -> UnconstrainedDensity:
     model = problem.model
-    hidden = [
-        n
-        for n, node in model.nodes.items()
-        if node.kind == "stochastic"
-        and (n not in problem.observed or problem.observed[n].mask is not None)
-    ]
-    free = [n for n in hidden if not model[n].is_discrete and model[n].domain is None]
-    target = target_of(problem, free)
-    finite = [n for n in target.chain if n not in free]
+
+    def is_free(name: str) -> bool:
+        node = model[name]
+        return node.kind == "stochastic" and not node.is_discrete and node.domain is None
+
+    hidden = [n for n in model.nodes if is_free(n) and n not in problem.observed]
+    target = target_of(problem, hidden)
+    finite = [n for n in target.chain if not is_free(n)]
     try:
         return unconstrained_density(target, None, finite)
     except UnsupportedError as error:

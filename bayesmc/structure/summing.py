@@ -20,8 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bayesmc.errors import TraceError, UnsupportedError
-from bayesmc.expression import Constant, Expression, constant, elementwise, pick, reduction
-from bayesmc.passes.adjoints import scattered
+from bayesmc.expression import Constant, Expression, constant, elementwise, pick, reduction, reshape
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.logarithms import stable
 from bayesmc.passes.reads import element_read
@@ -286,8 +285,18 @@ class _Component:
                 rest = add(rest, reduction(np.add, pick([whole], np.flatnonzero(at < 0)), [0]))
             inside = np.flatnonzero(at >= 0)
             if inside.size:
-                table = add(table, scattered(pick([whole], inside), at[inside], (size,)))
+                table = add(table, _added_up(pick([whole], inside), at[inside], size))
         return rest, table
+
+
+def _added_up(entries: Expression, at: np.ndarray, size: int) -> Expression:
+    """Sums of entries by the element that they belong to, each element's laid side by side."""
+    counts = np.bincount(at, minlength=size)
+    order = np.argsort(at, kind="stable")
+    column = np.arange(at.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    places = np.full((size, counts.max()), at.size)  # where there is no entry, the zero behind them
+    places[at[order], column] = order
+    return reduction(np.add, pick([entries, reshape(ZERO, (1,))], places), [1])
 
 
 def _stacked(numbers: Sequence[Expression]) -> Expression:

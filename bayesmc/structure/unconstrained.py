@@ -101,9 +101,8 @@ def unconstrained_density(
     root = _total([*kept, *sums[len(terms) :], *(table.total for table in tables)])
     slopes = _slopes(root, sums, terms, list(parts.values()))
     once = _on_one_leaf(nodes, parts)
-    density = UnconstrainedDensity(
-        target, nodes, *map(once, guarded([root, slopes])), tuple(finite)
-    )
+    both = [once(e) for e in guarded([root, slopes])]
+    density = UnconstrainedDensity(target, nodes, both[0], both[1], tuple(finite))
     plain = [once(e) for e in guarded([*plain, *volumes.values()])]
     hold_against_model(
         density,
@@ -156,7 +155,7 @@ def _slopes(
     try:
         found = gradient(root, names)
     except TraceError as error:
-        for total, term in zip(sums, terms, strict=True):
+        for total, term in zip(sums, terms, strict=False):  # volumes follow
             try:
                 gradient(total, names)
             except TraceError as own:

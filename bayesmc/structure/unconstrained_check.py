@@ -17,7 +17,7 @@ from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.expression import Expression, Program
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.summing import Summed
-from bayesmc.structure.target import Term, Values
+from bayesmc.structure.target import Target, Term, Values
 
 #: points, and how far the free numbers of each are from zero
 _SPREADS = (0.0, 0.1, 0.3, 1.0, 1.0, 2.0, 3.0, 5.0)
@@ -106,7 +106,7 @@ def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]
         values: Values = dict(target.known)
         for name in others:
             assert states is not None
-            values[name] = states[name][k % len(states[name])]
+            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
         u = rng.normal(size=density.size) * spread
         if states is not None and k % 2:  # reachable ones, moved a little
             row = {n: states[n][k % len(states[n])] for n in density.names}
@@ -119,6 +119,15 @@ def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]
         except BayesmcError:
             continue
         yield u, values
+
+
+def _with_seen(target: Target, name: str, value: np.ndarray) -> np.ndarray:
+    seen = target.seen(name)
+    if seen is None:
+        return value
+    assert seen.mask is not None  # of a node in the chain
+    mask = np.reshape(seen.mask, np.shape(seen.mask) + (1,) * len(target.model[name].event_shape))
+    return np.where(mask, seen.value, value)
 
 
 def _counted(term: Term, values: Values) -> np.ndarray | None:
