@@ -173,7 +173,9 @@ def _at_best(problem: Problem) -> Trial:
     engine, counted = Gibbs(), _counted(problem)
     try:
         engine.sampler(counted)
-        units = _run(replace(engine, draws=_FEW, warmup=_FEW, chains=_CHAINS), counted)[1] / (2 * _FEW)
+        units = _run(replace(engine, draws=_FEW, warmup=_FEW, chains=_CHAINS), counted)[1] / (
+            2 * _FEW
+        )
     except BayesmcError as error:
         return Trial(engine, 0.0, f"its pilot failed: {error}")
     words = f"{units / _CHAINS:.3g} evaluations of a density for each draw, at the least"

@@ -15,8 +15,8 @@ import numpy as np
 
 from bayesmc.engines.base import Engine
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
-from bayesmc.engines.mcmc.length import Lengths, lengths_of, size_of
-from bayesmc.engines.mcmc.loop import Kept, Loop, Patience, Sampler, State
+from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
+from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left
 from bayesmc.engines.mcmc.question import difference
 from bayesmc.engines.proposal import check_targets
@@ -34,7 +34,7 @@ from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.evidence import store
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
+from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunningChains
 from bayesmc.shapes import first_index
 
 #: share of accepted proposals outside of which a random walk is ill adapted
@@ -64,7 +64,7 @@ class ChainEngine(Engine):
     warmup: int | None
     chains: int | None
     thinning: int = 1
-    ess: float = 1000.0
+    ess: float = 1000
     start: Mapping[str, Any] | None = None
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
@@ -82,10 +82,18 @@ class ChainEngine(Engine):
             check_count(self, "chains", self.chains, "4")
         if isinstance(self.ess, bool) or not isinstance(self.ess, (int, float)) or not self.ess > 0:
             raise ValueError(
-                f"{type(self).__name__}(ess={self.ess!r}): give the effective size that is wanted, such as 1000"
+                f"{type(self).__name__}(ess={self.ess!r}): give an effective size, such as 1000"
             )
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(type(self).__name__, self.start))
+
+    def __repr__(self) -> str:
+        """What was said, and the effective size where that says how many draws there are."""
+        said = {f.name: getattr(self, f.name) for f in fields(self) if f.repr}  # type: ignore[arg-type]
+        if self.draws is not None:
+            said.pop("ess", None)
+        shown = ", ".join(f"{n}={v!r}" for n, v in said.items() if v is not None)
+        return f"{type(self).__name__}({shown})"
 
     def sampler(self, problem: Problem) -> Sampler:
         """What moves the chains of a posed problem."""
@@ -96,7 +104,7 @@ class ChainEngine(Engine):
         return ()
 
     def continues(self, other: Any) -> bool:
-        """Whether this engine goes on as ``other`` would have: its options but how many draws are the same."""
+        """Whether this engine goes on as ``other`` would have: all but how many draws is the same."""
         if type(other) is not type(self):
             return False
         options = [f.name for f in fields(self) if f.compare and f.name not in ("draws", "ess")]  # type: ignore[arg-type]
@@ -110,24 +118,26 @@ class ChainEngine(Engine):
         keep : "draws", "summaries" or sequence of str
             As in ``infer``.
         """
-        nodes = problem.model.nodes.items()
-        free: Sequence[str] | None = [n for n, c in nodes if c.kind != "input"]
-        if not isinstance(keep, str):
-            free = keep
-        return lengths_of(
+        if self.draws is not None:
+            chains = LEAST if self.chains is None else self.chains
+            return Lengths(chains, WARMUP if self.warmup is None else self.warmup, self.draws)
+        kept: Sequence[str] | None = keep
+        if isinstance(keep, str):
+            nodes = problem.model.nodes.items()
+            kept = [n for n, c in nodes if c.kind != "input"] if keep == "draws" else None
+        return chosen(
             problem,
-            self.draws,
             self.warmup,
             self.chains,
             self.ess,
             judges=self.judges,
             ensembles=self.ensembles,
-            kept=None if keep == "summaries" else free,
+            kept=kept,
         )
 
     def effort(self, problem: Problem) -> str:
         """How many chains it would run, and how long, in words."""
-        return self.lengths(problem).words(size_of(problem))
+        return in_words(self.lengths(problem), problem)
 
     def run(
         self,
@@ -168,14 +178,14 @@ class ChainEngine(Engine):
                 if isinstance(resume, (ChainsPosterior, ChainsSums)):
                     loop.warmup = resume.warmup
 
-                def made() -> ChainsPosterior | ChainsSums:
-                    point = loop.last.noted(problem)
-                    return self._posterior(problem, sampler, held, point, lengths, loop.warmup)
+                def reached(ess: float) -> float:
+                    made = self._posterior(problem, sampler, held, loop)
+                    return share_reached(made, self._forward(sampler), ess)
 
-                finished = self._drawn(loop, state, held, lengths, bar, stop, made)
+                finished = self._drawn(loop, state, held, bar, stop, reached)
         except MemoryError as error:
             raise no_memory(self, lengths.draws * lengths.chains, names) from error
-        posterior = made()
+        posterior = self._posterior(problem, sampler, held, loop)
         self._warn(posterior, sampler, finished, lengths)
         return posterior
 
@@ -184,17 +194,17 @@ class ChainEngine(Engine):
         loop: Loop,
         state: State,
         held: Kept | RunningChains,
-        lengths: Lengths,
         bar: Progress,
         stop: Patience,
-        made: Callable[[], ChainsPosterior | ChainsSums],
+        reached: Callable[[float], float],
     ) -> bool:
         """Draws made, until they are enough where it is an effective size that is asked for."""
-        before, draws = held.draws, lengths.first()
-        # what is gone on with has its own effective size, and as much again is asked for
-        wanted = None if lengths.ess is None else lengths.ess
-        if wanted is not None and before:
-            wanted += wanted * share_reached(made(), self._forward(loop.sampler), wanted)
+        lengths = loop.lengths
+        before, draws, wanted = held.draws, lengths.first(), lengths.ess
+        if (
+            wanted is not None and before
+        ):  # what is gone on with has its own, and as much again is asked for
+            wanted += wanted * reached(wanted)
         while True:
             if isinstance(held, Kept) and held.draws > before:
                 held.more(draws)
@@ -203,7 +213,7 @@ class ChainEngine(Engine):
             done = held.draws - before
             if wanted is None or done >= lengths.draws:
                 return True
-            share = share_reached(made(), self._forward(loop.sampler), wanted)
+            share = reached(wanted)
             if share >= 1:
                 return True
             draws = lengths.further(done, share)
@@ -237,10 +247,9 @@ class ChainEngine(Engine):
         problem: Problem,
         sampler: Sampler,
         held: Kept | RunningChains,
-        checkpoint: Checkpoint,
-        lengths: Lengths,
-        warmup: int,
+        loop: Loop,
     ) -> ChainsPosterior | ChainsSums:
+        checkpoint, lengths, warmup = loop.last.noted(problem), loop.lengths, loop.warmup
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}
         found: ChainsPosterior | ChainsSums
         if isinstance(held, RunningChains):

@@ -32,8 +32,6 @@ MIN_ESS, _POOLED = 100, 4
 #: chance that superchains which agree look apart, or chains that mix as if each kept to where it was; how
 #: much of the variance between chains must last to be worth a word; draws of a chain to tell it by
 _ALARM, _LASTING, _THIRDS = 1e-4, 0.02, 12
-#: numbers by which the end of a warmup is judged, at most
-_WINDOW = 1 << 18
 #: scalars looked at
 _SCALARS = 200
 #: of these, scalars judged by their R-hat, and as many by their effective size
@@ -83,32 +81,6 @@ def share_reached(
         if stored is not posterior._stored:
             return max(share, _share(_figures(posterior, stored, forward), ess))
     return share
-
-
-def forgotten(stored: Mapping[str, np.ndarray], model: Model, superchains: int) -> bool:
-    """Whether some draws of a warmup tell neither where chains started nor whether they are early or late.
-
-    Parameters
-    ----------
-    stored : dict
-        Node -> stored values, shape ``(chain, draw, *plates, *event)``.
-    """
-    columns = []
-    nodes = [model[n] for n, v in stored.items() if v.size and v.shape[1] > 1]
-    for name, index in _some(nodes, model):
-        at: tuple[Any, ...] = (slice(None), slice(None), *index)
-        values = stored[name][at]
-        if (values != values[0, 0]).any():
-            columns.append(_uncut(model[name], index, values))
-    if not columns:
-        return True
-    step = -(-len(columns) * columns[0].size // _WINDOW)
-    draws = np.stack(columns[::step], axis=-1)
-    half = draws.shape[1] // 2
-    times = np.concatenate([draws[:, :half], draws[:, -half:]])  # the early ones as a superchain
-    starts = diagnostics.chain_statistic("rhat", draws, superchains=superchains)
-    drift = diagnostics.chain_statistic("rhat", times, superchains=2)
-    return bool((np.fmax(starts, drift) <= MAX_RHAT).all())
 
 
 def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator[str]:
@@ -217,7 +189,10 @@ def _ordered(fault: str, orders: Mapping[str, str]) -> str:
 
 def _disagreement(judged: _Judged) -> Iterator[str]:
     limits = {name: judged.chance.get(name, MAX_RHAT) for name in judged.rhat}
-    over = {name: np.nan_to_num(r, nan=0.0, posinf=np.inf) - limits[name] for name, r in judged.rhat.items()}
+    over = {
+        name: np.nan_to_num(r, nan=0.0, posinf=np.inf) - limits[name]
+        for name, r in judged.rhat.items()
+    }
     worst = max(over, key=lambda name: over[name])
     rhat = judged.rhat[worst]
     if not over[worst] > 0:
@@ -239,9 +214,9 @@ def _lasting(judged: _Judged) -> Iterator[str]:
     if judged.lasting:
         worst = max(judged.lasting, key=lambda name: judged.lasting[name])
         yield (
-            f"chains keep to where they are: the means of the first and the last third of each go together for "
-            f"{worst!r} (correlation {judged.lasting[worst]:.2f} over chains), so that shares of modes are those of "
-            "the starts; use more warmup= and draws=, or another engine"
+            "chains keep to where they are: the means of the first and the last third of each go together "
+            f"for {worst!r} (correlation {judged.lasting[worst]:.2f} over chains): shares of modes are "
+            "those of the starts; use more warmup= and draws=, or another engine"
         )
 
 
@@ -258,16 +233,17 @@ def _few_draws(judged: _Judged, chains: int, draws: int, asked: float | None) ->
         needed = asked if kind == "bulk" else min(needed, asked)
     if ess < needed:
         others = _others([value < needed for value, _ in sizes.values()], judged.looked)
-        worth = f"the {chains} x {draws} draws of {worst!r} are worth {ess:.0f} independent ones ({kind} ESS, "
+        worth = f"the {chains} x {draws} draws of {worst!r} are worth {ess:.0f} independent ones ({kind} ESS,"
         if asked is not None:
             yield (
-                f"{worth}of {asked:g} that ess= asks for{others}); use more (draws=, or infer(..., resume=posterior) "
-                "adds some), another engine, or declare the model in numbers that depend less on each other"
+                f"{worth} of {needed:g} that ess={asked:g} asks for{others}); use more "
+                "(infer(..., resume=posterior) adds some), another engine, or declare the model in numbers "
+                "that depend less on each other"
             )
             return
         each = f"{MIN_ESS} per chain" if chains <= _POOLED else f"{needed:.0f}"
         yield (
-            f"{worth}under {each}{others}), too few for error bars; use more draws= "
+            f"{worth} under {each}{others}), too few for error bars; use more draws= "
             "(infer(..., resume=posterior) adds some) or thinning=, or another engine"
         )
     elif not ess >= needed:
@@ -292,14 +268,14 @@ def _figures(
     block, chains = posterior.ensemble_size, posterior._chains_and_draws[0]
     groups = posterior.superchains
     names, columns = [], []
-    for name, index in _some(_moving(posterior, forward), posterior.model):
+    for name, index in some_scalars(_moving(posterior, forward), posterior.model):
         if name not in stored:
             continue
         at: tuple[Any, ...] = (slice(None), slice(None), *index)
         values = stored[name][at]
         if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
             names.append(_scalar(posterior.model, name, index))
-            columns.append(_uncut(posterior.model[name], index, _thinned(values, block, groups)))
+            columns.append(uncut(posterior.model[name], index, _thinned(values, block, groups)))
     if not names:
         return _Judged(0, {}, {})
     share = len(columns[0]) / chains
@@ -332,7 +308,7 @@ def _by_chance(ess: float, groups: int) -> float:
 
 
 def _memory(values: np.ndarray) -> float:
-    """Correlation over chains of the means of their first and last thirds; 0 where it is chance, or little."""
+    """Correlation over chains of the means of their first and last thirds; 0 where it is chance."""
     chains, draws = values.shape
     if draws < _THIRDS or chains < 2 * _POOLED:
         return 0.0
@@ -408,7 +384,7 @@ def _moving(posterior: ChainsPosterior, forward: frozenset[str]) -> list[Compile
     ]  # fmt: skip
 
 
-def _some(nodes: list[CompiledNode], model: Model) -> Iterator[tuple[str, tuple[int, ...]]]:
+def some_scalars(nodes: list[CompiledNode], model: Model) -> Iterator[tuple[str, tuple[int, ...]]]:
     """Node and index of up to ``_SCALARS`` scalars, spread evenly over nodes and within them."""
     if len(nodes) > _SCALARS:
         picked = np.linspace(0, len(nodes) - 1, _SCALARS).round().astype(int)
@@ -440,7 +416,7 @@ def _thinned(values: np.ndarray, block: int, superchains: int = 0) -> np.ndarray
     return values[:, :whole].reshape(chains, -1, block)[:, ::step].reshape(chains, -1)
 
 
-def _uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.ndarray:
+def uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.ndarray:
     """The draws of a scalar, those of an angle near their mean: cut in two they would look faster mixed."""
     if node.angles is None or not node.angles[index[len(node.plates) :]]:
         return values

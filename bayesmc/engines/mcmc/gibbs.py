@@ -49,7 +49,7 @@ _FACTOR_SIZE = 24
 _BOXES = ("real", "interval", "circle", "real vector", "product", "integers")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gibbs(ChainEngine):
     """Markov chains that draw every node in turn from its distribution given all others.
 
@@ -103,7 +103,7 @@ class Gibbs(ChainEngine):
     chains: int | None = None
     thinning: int = 1
     debug: bool = False
-    ess: float = 1000.0
+    ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Gibbs sampling"

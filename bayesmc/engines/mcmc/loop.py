@@ -6,21 +6,26 @@ A sampler moves all chains by one sweep; what a sweep does is not known here.
 from __future__ import annotations
 
 import copy
+import math
 import signal
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.engines.mcmc.convergence import forgotten
-from bayesmc.engines.mcmc.length import Lengths
 from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
+
+#: the first sweep at which a warmup may end where that is judged
+_END = 100
+#: draws of each chain in the first round, at least, and how much longer a later round may make a run
+_ROUND, _GROWTH = 16, 3.0
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, picklable
 State = Mapping[str, Any]
@@ -38,7 +43,7 @@ class Sampler(Protocol):
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
     Two methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
     ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged.
-    ``superchains`` (0) is set before the start, where so many groups of consecutive chains are to start as one.
+    ``superchains`` (0) is set before the start, where so many groups of chains are to start as one.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
     which is exact if ``step`` writes into no array of the state it is given.
@@ -67,6 +72,52 @@ class Sampler(Protocol):
     def acceptance(self, state: State) -> Mapping[str, np.ndarray]:
         """Block -> share of proposals accepted since the warmup, shape (chain,)."""
         ...
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """What a run makes.
+
+    Attributes
+    ----------
+    chains : int
+    warmup : int
+        Sweeps; at most, where there is a ``judge``.
+    draws : int
+        Of each chain; at most, where there is an ``ess``.
+    superchains : int
+        Groups of consecutive chains that start as one; 0 where every chain starts by itself.
+    ess : float or None
+        Effective size after which nothing more is drawn.
+    judge : callable or None
+        Whether draws of a warmup, some nodes' stored values, tell nothing of their starts any more.
+    """
+
+    chains: int
+    warmup: int
+    draws: int
+    superchains: int = 0
+    ess: float | None = None
+    judge: Callable[[Mapping[str, np.ndarray]], bool] | None = None
+
+    def ends(self) -> Iterator[int]:
+        """Sweeps at which the warmup may end."""
+        end = _END
+        while self.judge is not None and end < self.warmup:
+            yield end
+            end *= 2
+        yield self.warmup
+
+    def first(self) -> int:
+        """Draws of each chain in the first round."""
+        if self.ess is None:
+            return self.draws
+        return min(max(math.ceil(self.ess / self.chains), _ROUND), self.draws)
+
+    def further(self, made: int, share: float) -> int:
+        """Draws of each chain in the next round, where those made are a share of what is wanted."""
+        needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
+        return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
 
 
 class Loop:
@@ -111,7 +162,7 @@ class Loop:
             self.phase = " (warmup)"
             for end in self.lengths.ends():
                 state, window = self._warmed(state, end, bar, stop)
-                if window is not None and forgotten(window, self.model, self.lengths.superchains):
+                if window is not None and self.lengths.judge(window):  # type: ignore[misc]
                     break
             self.warmup = self.sweep
             self.sweep, self.phase = 0, ""

@@ -123,7 +123,7 @@ class MetropolisHastings(ChainEngine):
     chains: int | None = None
     proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
     thinning: int = 1
-    ess: float = 1000.0
+    ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Metropolis-Hastings"
@@ -186,18 +186,19 @@ class MetropolisHastings(ChainEngine):
         return self
 
     def __repr__(self) -> str:
-        options = f"draws={self.draws}, warmup={self.warmup}, chains={self.chains}"
+        said = {"draws": self.draws, "warmup": self.warmup, "chains": self.chains}
+        options = [f"{n}={v}" for n, v in said.items() if v is not None]
         if self._given:
             shown = (
                 f"{k!r}: {v!r}" if isinstance(v, (str, RandomWalk)) else f"{k!r}: ..."
                 for k, v in self._given.items()
             )
-            options += f", proposal={{{', '.join(shown)}}}"
+            options.append(f"proposal={{{', '.join(shown)}}}")
         if self.thinning != 1:
-            options += f", thinning={self.thinning}"
+            options.append(f"thinning={self.thinning}")
         if self.draws is None:
-            options += f", ess={self.ess:g}"
-        return f"MetropolisHastings({options})"
+            options.append(f"ess={self.ess:g}")
+        return f"MetropolisHastings({', '.join(options)})"
 
 
 class MetropolisSampler(SweepSampler):
