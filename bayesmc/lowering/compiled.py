@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -336,4 +337,6 @@ class _Shapes(NamedTuple):
 
 
 def _address(array: np.ndarray) -> int:
+    if array.flags.writeable:  # several times faster
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))
     return array.__array_interface__["data"][0]

@@ -62,13 +62,14 @@ class Loaded:
         return ctypes.CFUNCTYPE(*types)(self._engine.get_function_address(name))
 
 
-def loaded(text: str, foreign: list[str]) -> Loaded:
+@lru_cache(maxsize=128)
+def loaded(text: str, foreign: tuple[str, ...]) -> Loaded:
     """Machine code of a text, from the cache if it is there.
 
     Parameters
     ----------
     text : str
-    foreign : list of str
+    foreign : tuple of str
         Functions that it calls and does not define.
 
     Raises

@@ -12,6 +12,7 @@ Carpenter, Clifford and Fearnhead (1999), IEE Proceedings F 146; Murray, Lee and
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Callable
 from functools import lru_cache
 
@@ -36,6 +37,7 @@ class WeightLoops:
         self._ancestors = code.function(
             "ancestors", None, whole, whole, real, real, real, *[pointer] * 2
         )
+        self._own = threading.local()
 
     def exponentials(
         self, log: np.ndarray, level: float, weights: np.ndarray
@@ -58,7 +60,7 @@ class WeightLoops:
         uniform : callable
             Draws the shift; not called where the answer is None.
         """
-        running = np.empty(len(weights))
+        running = self._room(len(weights))
         total = self._running(len(weights), weights.ctypes.data, running.ctypes.data)
         if not _SMALL < total < _LARGE:
             return None
@@ -69,6 +71,13 @@ class WeightLoops:
             len(weights), draws, scale, shift, last, running.ctypes.data, found.ctypes.data
         )
         return found[:draws]
+
+    def _room(self, size: int) -> np.ndarray:
+        """Each thread's own: fresh memory costs the machine a page at a time."""
+        held = getattr(self._own, "running", None)
+        if held is None or len(held) != size:
+            held = self._own.running = np.empty(size)
+        return held
 
 
 @lru_cache(maxsize=1)

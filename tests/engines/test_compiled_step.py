@@ -125,7 +125,8 @@ def test_options_of_resampling(options: dict[str, Any], monkeypatch: pytest.Monk
 
 
 def test_short_series_are_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "loaded", lambda *a: pytest.fail("compiled"))
+    machine.loaded.cache_clear()
+    monkeypatch.setattr(machine, "Loaded", lambda *a: pytest.fail("compiled"))
     dbn, seen = growth()
     bmc.filter(dbn, seen, engine=bmc.ParticleFilter(500), rng=0)
 
