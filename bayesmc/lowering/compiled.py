@@ -338,5 +338,5 @@ class _Shapes(NamedTuple):
 
 def _address(array: np.ndarray) -> int:
     if array.flags.writeable:  # several times faster
-        return ctypes.addressof(ctypes.c_char.from_buffer(array))
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return array.__array_interface__["data"][0]
