@@ -53,6 +53,11 @@ class UnconstrainedDensity:
         return sum(node.size for node in self.nodes)
 
     @cached_property
+    def others(self) -> tuple[str, ...]:
+        """Hidden nodes that do not move and that it depends on."""
+        return tuple(sorted(self.root.leaves - {FREE}))
+
+    @cached_property
     def labels(self) -> list[str]:
         """A name for every free number: ``sd[2]``."""
         return [label for node in self.nodes for label in node.labels]
@@ -126,13 +131,9 @@ class UnconstrainedDensity:
     def _both(self) -> Program:
         return Program(for_arrays([self.root, self.slopes]))
 
-    @cached_property
-    def _others(self) -> tuple[str, ...]:
-        return tuple(sorted(self.root.leaves - {FREE}))
-
     def _given(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None) -> Values:
         found: Values = {FREE: u}
-        for name in self._others:
+        for name in self.others:
             if values is None or name not in values:
                 raise UnsupportedError(f"the log density needs a value of node {name!r}")
             found[name] = values[name]
