@@ -100,6 +100,10 @@ def unconstrained_density(
     kept = [e for e, t in zip(used, terms, strict=False) if t.name not in inside]
     kept += used[len(terms) :]
     root = _total([*sums_of(kept), *(table.total for table in tables)])
+    for name in sorted(root.leaves & set(finite)):
+        raise UnsupportedError(
+            f"node {name!r} is to be summed out, and the bounds of a continuous node depend on it; use Gibbs"
+        )
     once = _on_one_leaf(nodes, parts)
     slopes = _slopes(root, list(zip(terms, used, strict=False)), list(parts.values()), once)
     density = UnconstrainedDensity(target, nodes, once(root), slopes, tuple(finite))

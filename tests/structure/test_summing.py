@@ -296,3 +296,12 @@ def test_copies_are_bounded() -> None:
         pytest.raises(UnsupportedError, match="Gibbs"),
     ):
         bmc.log_density(net, evidence)
+
+
+def test_bounds_that_depend_on_what_is_summed_are_refused() -> None:
+    net = bmc.BayesNet()
+    net.add("z", bmc.Bernoulli(0.5))
+    net.add("x", lambda z: bmc.Uniform(0.0, 1.0 + z))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    with pytest.raises(UnsupportedError, match="bounds of a continuous node depend on it"):
+        bmc.log_density(net, {"y": 0.5})
