@@ -86,6 +86,8 @@ def family_of(dist: d.Distribution) -> Family:
         several = isinstance(parts, (list, tuple))
         made = [family_of(c) for c in parts] if several else family_of(parts)
         return Family(d.Mixture, {"weights": as_expression(dist.weights), "components": made})
+    if isinstance(dist, d.KernelDensity):  # a normal about every point
+        return _kernels(dist)
     names = list(inspect.signature(type(dist)).parameters)
     known = type(dist) in _FORMS or type(dist).log_density is not None
     if not known or not all(hasattr(dist, n) for n in names):
@@ -102,6 +104,17 @@ def has_own_form(family: Family) -> bool:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _kernels(dist: d.KernelDensity) -> Family:
+    points, cov = as_expression(dist.points), dist.kernel_cov[..., None]
+    if dist.event_shape:
+        tril = as_expression(np.linalg.cholesky(dist.kernel_cov)[..., None, :, :])
+        parameters = {"loc": points, "cov": None, "scale_tril": tril, "scale_diag": None}
+        parts = Family(d.MvNormal, parameters)
+    else:
+        parts = Family(d.Normal, {"loc": points, "scale": as_expression(np.sqrt(cov))})
+    return Family(d.Mixture, {"weights": as_expression(dist.weights), "components": parts})
 
 
 def _log_density(family: Family, x: Any) -> Any:

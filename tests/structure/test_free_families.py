@@ -162,6 +162,19 @@ model(
     ("x", lambda a: bmc.Affine(bmc.StudentT(3.0, 0.0, 1.0), a, 2.0)),
 )
 
+model(
+    "kernels",
+    ("x", bmc.KernelDensity([0.3, 1.0, 2.5], 0.4, weights=[0.2, 0.5, 0.3])),
+    ("y", lambda x: bmc.Normal(x, 1.0)),
+    seen={"y": 1.0},
+)
+model(
+    "kernels of vectors",
+    ("x", bmc.KernelDensity(np.array([[0.3, 1.0], [2.0, -1.0], [0.5, 0.4]]), vectors=True)),
+    ("y", lambda x: bmc.Normal(x[..., 0], 1.0)),
+    seen={"y": 1.0},
+)
+
 
 @pytest.mark.parametrize("name", MODELS)
 def test_value_and_gradient(name: str) -> None:
