@@ -7,6 +7,7 @@ system, page by page.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,6 +25,10 @@ from bayesmc.expression.graph import (
 
 #: numbers from which on it pays
 LARGE = 512
+#: numbers from which on memory comes from the system, and is fetched anew by every call
+POOLED = 1 << 14
+#: bytes that a program keeps for known shapes
+MOST_BYTES = 1 << 25
 
 
 class Buffers:
@@ -83,6 +88,7 @@ class Buffers:
                 and operand.dtype == float
                 and np.shape(self._values[operand]) == shape
                 and self._is_whole(operand)
+                and not (node in self._kept and self._is_pooled(operand))
             ):
                 return operand
         return None
@@ -91,6 +97,31 @@ class Buffers:
         """Large arrays that nothing reads after a node."""
         return [n for n in self._ending.get(node, ()) if np.size(self._values[n]) >= LARGE]
 
+    def pool(self) -> tuple[dict[Expression, int], list[tuple[int, ...]]]:
+        """Results that are written to arrays which are kept from call to call, and these arrays' shapes.
+
+        One array serves several results, one after the other. What a call returns is never among them.
+        """
+        found: dict[Expression, int] = {}
+        shapes: list[tuple[int, ...]] = []
+        at_hand: dict[tuple[int, ...], list[int]] = {}
+        for node in self._nodes:
+            place = self.place_for(node)
+            if place in found:
+                found[node] = found[place]
+            elif place is None and self._is_pooled(node):
+                shape = np.shape(self._values[node])
+                free = at_hand.setdefault(shape, [])
+                if not free:
+                    free.append(len(shapes))
+                    shapes.append(shape)
+                found[node] = free.pop()
+            for over in self._ending.get(node, ()):
+                if over in found and over is not place:
+                    at_hand[shapes[found[over]]].append(found[over])
+        size = sum(8 * math.prod(shape) for shape in shapes)
+        return (found, shapes) if size <= MOST_BYTES else ({}, [])
+
     # ---- private -------------------------------------------------------------------------------
 
     def _is_whole(self, node: Expression) -> bool:
@@ -98,4 +129,14 @@ class Buffers:
         value = self._values[node]
         return (
             isinstance(value, np.ndarray) and value.size >= LARGE and bool(value.flags.c_contiguous)
+        )
+
+    def _is_pooled(self, node: Expression) -> bool:
+        return (
+            isinstance(node, Elementwise)
+            and isinstance(node.function, np.ufunc)
+            and node.dtype == float
+            and node not in self._kept
+            and self._is_whole(node)
+            and np.size(self._values[node]) >= POOLED
         )

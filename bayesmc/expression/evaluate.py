@@ -160,6 +160,10 @@ def shaped(
     scope: dict[str, Any] = {"concatenate": np.concatenate, "otherwise": otherwise}
     names: dict[Expression, str] = {}
     lines, buffers = [], Buffers(roots, values)
+    pooled, shapes = buffers.pool()
+    if pooled:  # taken out while they are in use, so that calls at a time have their own
+        scope["free"], scope["new"] = [], lambda: [np.empty(shape) for shape in shapes]
+        lines.append("pool = free.pop() if free else new()")
     for k, node in enumerate(ordered(*roots)):
         names[node] = f"t{k}"
         if isinstance(node, Leaf):
@@ -172,11 +176,15 @@ def shaped(
             place = buffers.place_for(node)
             if place is not None and right.endswith(")"):
                 right = f"{right[:-1]}, out={names[place]})"
+            elif node in pooled and right.endswith(")"):
+                right = f"{right[:-1]}, out=pool[{pooled[node]}])"
             lines.append(f"t{k} = {right}")
             if isinstance(node, Call):
                 scope[f"s{k}"] = np.shape(values[node])
                 lines.append(f"if t{k}.shape != s{k}: return otherwise(values)")
             lines += [f"{names[over]} = None" for over in buffers.over_with(node)]
+    if pooled:
+        lines.append("free.append(pool)")
     lines.append(f"return [{', '.join(names[r] for r in roots)}]")
     exec("def function(values):\n    " + "\n    ".join(lines), scope)  # noqa: S102 - names are our own
     return scope["function"]

@@ -6,7 +6,6 @@ The last pass before a program is made: of what it puts in no derivatives are kn
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 from scipy import special
@@ -32,30 +31,28 @@ def for_arrays(roots: Iterable[Expression]) -> list[Expression]:
     >>> root = elementwise(special.log_expit, leaf("x", (100,)))
     >>> made = for_arrays([root])
     >>> made, float(evaluate(made, {"x": np.full(100, -800.0)})[0][0])
-    ([<Elementwise log_expit_by_exp (100,)>], -800.0)
+    ([<Elementwise subtract (100,)>], -800.0)
     """
     return contracted(rescaled(guarded(_quick(list(roots)))))
 
 
-def expit_by_exp(x: Any) -> np.ndarray:
-    """``scipy.special.expit`` to some units in the last place, four times as fast."""
-    found = np.negative(x)
-    out: dict[str, Any] = {"out": found} if isinstance(found, np.ndarray) else {}
-    found = np.add(np.exp(found, **out), 1.0, **out)
-    return np.reciprocal(found, **out)
-
-
-def log_expit_by_exp(x: Any) -> np.ndarray:
-    """``scipy.special.log_expit`` to 1e-16, less than a last digit where it is near 0; twice as fast."""
-    found = np.abs(x)
-    out: dict[str, Any] = {"out": found} if isinstance(found, np.ndarray) else {}
-    found = np.log(np.add(np.exp(np.negative(found, **out), **out), 1.0, **out), **out)
-    return np.subtract(np.minimum(x, 0.0), found, **out)
-
-
 # ---- private ------------------------------------------------------------------------------------
 
-_QUICK = {special.expit: expit_by_exp, special.log_expit: log_expit_by_exp}
+
+def _expit(x: Expression) -> Expression:
+    """To some units in the last place, four times as fast as SciPy's."""
+    odds = elementwise(np.exp, elementwise(np.negative, x))
+    return elementwise(np.reciprocal, elementwise(np.add, odds, 1.0))
+
+
+def _log_expit(x: Expression) -> Expression:
+    """To 1e-16, less than a last digit where it is near 0; twice as fast as SciPy's."""
+    odds = elementwise(np.exp, elementwise(np.negative, elementwise(np.absolute, x)))
+    log = elementwise(np.log, elementwise(np.add, odds, 1.0))
+    return elementwise(np.subtract, elementwise(np.minimum, x, 0.0), log)
+
+
+_QUICK = {special.expit: _expit, special.log_expit: _log_expit}
 
 
 def _quick(roots: list[Expression]) -> list[Expression]:
@@ -68,7 +65,7 @@ def _quick(roots: list[Expression]) -> list[Expression]:
         same = all(a is b for a, b in zip(operands, node.operands, strict=True))
         made = node if same else node.with_operands(operands)
         if isinstance(node, Elementwise) and node.function in _QUICK and node.size >= _MANY:
-            made = elementwise(_QUICK[node.function], operands[0])
+            made = _QUICK[node.function](operands[0])
             twin = _of_negative(node)
             if twin is not None and twin in present and twin in found:
                 inner = found[twin.operands[0]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from unittest import mock
 
@@ -157,6 +158,44 @@ def test_writing_over_what_is_still_read_is_seen() -> None:
 
     with mock.patch.object(rooms.Buffers, "place_for", greedy):
         assert any(map(differs, SEEDS))
+
+
+def test_arrays_that_are_kept_from_call_to_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same values; what one call returned outlives the next; calls at a time have their own arrays."""
+    monkeypatch.setattr(rooms, "POOLED", 1)
+    assert not any(map(differs, SEEDS))
+    for seed in list(SEEDS)[:4]:
+        rng = np.random.default_rng(seed)
+        root = random_sum(rng)
+        roots = [
+            root,
+            *gradient(root, ["x", "y"]).values(),
+            elementwise(np.exp, leaf("x", (40, 20))),
+        ]
+        program, plain = Program(for_arrays(roots)), Program(roots)
+        given = [
+            {"x": rng.normal(size=(3, 40, 20)), "y": rng.normal(size=(3, 20))} for _ in range(12)
+        ]
+        wanted = [plain(values) for values in given]
+        found = [program(values) for values in given]
+        with ThreadPoolExecutor(4) as threads:
+            found += threads.map(program, given)
+        for some, right in zip(found, wanted * 2, strict=True):
+            for a, b in zip(some, right, strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_arrays_given_back_too_early_are_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Negative control: one array for all."""
+    monkeypatch.setattr(rooms, "POOLED", 1)
+    pool = rooms.Buffers.pool
+
+    def one(self: Any) -> Any:
+        found, shapes = pool(self)
+        return {n: shapes.index(shapes[k]) for n, k in found.items()}, shapes
+
+    monkeypatch.setattr(rooms.Buffers, "pool", one)
+    assert any(map(differs, SEEDS))
 
 
 def test_zeros_and_ones_take_one_sigmoid() -> None:
