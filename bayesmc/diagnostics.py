@@ -218,6 +218,40 @@ def chain_statistic(
     return np.concatenate(found).reshape(values.shape[2:])
 
 
+def normal_scores(values: np.ndarray) -> np.ndarray:
+    """Values as quantiles of a standard Normal by their ranks, those of equal ones averaged.
+
+    Parameters
+    ----------
+    values : ndarray, shape (scalar, ...)
+        Ranked within each scalar.
+
+    References
+    ----------
+    Blom (1958), Statistical Estimates and Transformed Beta-Variables; Vehtari et al. (2021), eq. 14.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> normal_scores(np.array([[3.0, 1.0, 2.0]])).round(2).tolist()
+    [[0.87, -0.87, 0.0]]
+    """
+    flat = values.reshape(len(values), -1)
+    order = np.argsort(flat, axis=1)
+    sorted_ = np.take_along_axis(flat, order, axis=1)
+    size = flat.shape[1]
+    at = np.arange(size)
+    new = np.ones(flat.shape, dtype=bool)
+    new[:, 1:] = sorted_[:, 1:] != sorted_[:, :-1]
+    first = np.maximum.accumulate(np.where(new, at, 0), axis=1)
+    ends = np.ones(flat.shape, dtype=bool)
+    ends[:, :-1] = new[:, 1:]
+    last = np.minimum.accumulate(np.where(ends, at, size)[:, ::-1], axis=1)[:, ::-1]
+    ranks = np.empty(flat.shape)
+    np.put_along_axis(ranks, order, 0.5 * (first + last) + 1.0, axis=1)
+    return scipy.special.ndtri((ranks - 0.375) / (size + 0.25)).reshape(values.shape)
+
+
 # ---- private: scalars of chains in whole blocks, shape (scalar, chain, draw) -----------------------
 
 #: R-hat above which the variance within chains is but a rounding error: rank-normalised values of chains
@@ -248,7 +282,7 @@ def _rhat(values: np.ndarray, superchains: int) -> np.ndarray:
     split = _split(values)
     folded = np.abs(split - np.median(split, axis=(1, 2), keepdims=True))
     ratio = _nested(superchains) if superchains > 1 else _between_and_within
-    found = np.maximum(ratio(_normal_scores(split)), ratio(_normal_scores(folded)))
+    found = np.maximum(ratio(normal_scores(split)), ratio(normal_scores(folded)))
     return np.where(found > _STILL, np.inf, found)
 
 
@@ -291,7 +325,7 @@ def _series(kind: str, values: np.ndarray) -> list[np.ndarray]:
     if kind == "tail_ess":
         levels = np.quantile(values, [0.05, 0.95], axis=(1, 2), keepdims=True)
         return [(values <= level).astype(float) for level in levels]
-    return [_normal_scores(values)]
+    return [normal_scores(values)]
 
 
 def _ensemble_ess(values: np.ndarray, block: int) -> np.ndarray:
@@ -338,21 +372,3 @@ def _split(values: np.ndarray) -> np.ndarray:
     """Halves of chains as chains, first halves first."""
     half = values.shape[2] // 2
     return np.concatenate([values[:, :, :half], values[:, :, -half:]], axis=1)
-
-
-def _normal_scores(values: np.ndarray) -> np.ndarray:
-    """Values as quantiles of a standard Normal by their ranks, those of equal ones averaged."""
-    flat = values.reshape(len(values), -1)
-    order = np.argsort(flat, axis=1)
-    sorted_ = np.take_along_axis(flat, order, axis=1)
-    size = flat.shape[1]
-    at = np.arange(size)
-    new = np.ones(flat.shape, dtype=bool)
-    new[:, 1:] = sorted_[:, 1:] != sorted_[:, :-1]
-    first = np.maximum.accumulate(np.where(new, at, 0), axis=1)
-    ends = np.ones(flat.shape, dtype=bool)
-    ends[:, :-1] = new[:, 1:]
-    last = np.minimum.accumulate(np.where(ends, at, size)[:, ::-1], axis=1)[:, ::-1]
-    ranks = np.empty(flat.shape)
-    np.put_along_axis(ranks, order, 0.5 * (first + last) + 1.0, axis=1)
-    return scipy.special.ndtri((ranks - 0.375) / (size + 0.25)).reshape(values.shape)

@@ -29,6 +29,7 @@ from bayesmc.expression import (
     pick,
 )
 from bayesmc.passes.arithmetic import add, is_all, multiply, rewritten, subtract, tidy
+from bayesmc.passes.choices import chosen
 
 
 def stable(roots: Iterable[Expression]) -> list[Expression]:
@@ -238,4 +239,5 @@ _RULES: Mapping[Any, Callable[..., Expression | None]] = {
     np.sqrt: _of_exp(lambda x: multiply(0.5, x)),
     np.reciprocal: _of_exp(_negative),
     np.negative: lambda x: x.operands[0] if _is(x, np.negative) else None,
+    np.where: chosen,
 }

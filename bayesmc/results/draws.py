@@ -50,6 +50,7 @@ class DrawsPosterior(Posterior):
 
     #: members that a chain's draws come from in turn; 1 for an ordinary chain
     ensemble_size: int = 1
+    superchains: int = 0
     #: log densities at the first draws when they were made, so that ``resume`` notices other functions
     densities: Mapping[str, float] | None = None
 
@@ -192,7 +193,7 @@ class DrawsPosterior(Posterior):
         values = self._scalars(what)
         if self.weights is not None or self.independent or self.ancestors is not None:
             return np.full(values.shape[2:], np.nan)
-        return diagnostics.chain_statistic("rhat", values, self.ensemble_size)
+        return diagnostics.chain_statistic("rhat", values, self.ensemble_size, self.superchains)
 
     # ---- distributions -----------------------------------------------------------------------
 
