@@ -292,17 +292,20 @@ def _figures(
     ratios = {names[at]: figure("rhat", at) for at in apart}
     if not groups:
         return _Judged(len(names), ratios, sizes)
-    chance = {names[at]: _by_chance(figure("ess", at), groups) for at in apart}
+    chance = {names[at]: _by_chance(columns[at], block, groups) for at in apart}
     lasting = {names[at]: _memory(columns[at]) for at in {*apart, *slow}}
     lasting = {name: memory for name, memory in lasting.items() if memory > 0}
     return _Judged(len(names), ratios, sizes, chance, lasting)
 
 
-def _by_chance(ess: float, groups: int) -> float:
+def _by_chance(values: np.ndarray, block: int, groups: int) -> float:
     """Nested R-hat of so many superchains that have mixed, or ``MAX_RHAT``, seldom exceeded.
 
-    The means of superchains then have the variance of ``ess / groups`` independent draws.
+    The means of superchains, of values or of their distances from the median, then have the variance of
+    ``ess / groups`` independent draws.
     """
+    far = np.abs(values - np.median(values))
+    ess = min(float(diagnostics.chain_statistic("ess", x, block)) for x in (values, far))
     limit = float(scipy.special.chdtri(groups - 1, _ALARM))
     return max(MAX_RHAT, math.sqrt(1.0 + groups / (groups - 1) * limit / max(ess, 1.0)))
 
