@@ -66,6 +66,7 @@ from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
+from bayesmc.structure.log_density import log_density
 
 if TYPE_CHECKING:
     from bayesmc import io, markov, montecarlo
@@ -142,6 +143,7 @@ __all__ = [
     "forecast",
     "infer",
     "io",
+    "log_density",
     "markov",
     "montecarlo",
     "most_likely",

@@ -174,7 +174,8 @@ class Template:
 
     def check_captured(self) -> None:
         """Refuse functions that read a name which has changed since they were declared."""
-        check_captured(self._around)
+        if self._around:
+            check_captured(self._around)
 
     @cached_property
     def _around(self) -> list[Declaration]:

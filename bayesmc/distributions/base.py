@@ -22,6 +22,7 @@ from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
 from bayesmc.expression.array import TracedCall, is_traced
 from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
+from bayesmc.states import NumberArray
 
 _mark_invalid: ContextVar[bool] = ContextVar("mark_invalid", default=False)
 
@@ -373,7 +374,7 @@ _ONES = np.ones(_FEW)
 
 
 #: types of parameters that are what they seem
-_PLAIN = frozenset({np.ndarray, np.float64, float, int})
+_PLAIN = frozenset({np.ndarray, NumberArray, np.float64, float, int})
 
 
 def _may_be_traced(parameters: Iterable[Any]) -> bool:

@@ -188,10 +188,22 @@ def _step(node: Expression) -> Step:
         return _gather(node)
     if isinstance(node, Reduction):
         axes = tuple(a - len(node.operands[0].shape) for a in node.axes)
-        reduce = node.ufunc.reduce
+        reduce = _reducing(node.ufunc)
         return lambda value: reduce(value, axis=axes)
     assert isinstance(node, Call)
     return node.call
+
+
+def _reducing(ufunc: np.ufunc) -> Callable[..., np.ndarray]:
+    return _log_sum_exp if ufunc is np.logaddexp else ufunc.reduce
+
+
+def _log_sum_exp(value: np.ndarray, axis: Any = None) -> np.ndarray:
+    """What ``np.logaddexp.reduce`` gives, with one logarithm and no more exponentials than numbers."""
+    top = np.max(value, axis=axis, keepdims=True, initial=-np.inf)
+    top = np.where(np.isfinite(top), top, 0.0)
+    total = np.sum(np.exp(value - top), axis=axis)
+    return np.log(total) + top.reshape(total.shape)
 
 
 def _elementwise(node: Elementwise) -> Step:
@@ -384,7 +396,7 @@ def _written(
                 given[j] += f".reshape({(*batch, *ones, *a.shape)})"
         return f"f{k}({', '.join(given)})"
     if isinstance(node, Reduction):
-        scope[f"f{k}"] = node.ufunc.reduce
+        scope[f"f{k}"] = _reducing(node.ufunc)
         axes = tuple(a - len(node.operands[0].shape) for a in node.axes)
         return f"f{k}({given[0]}, {axes})"
     if isinstance(node, Pick) and np.size(values[node]) <= FEW:

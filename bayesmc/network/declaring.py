@@ -347,8 +347,10 @@ class ModelStore:
 
     def check_captured(self) -> None:
         """Refuse functions that read a name which has changed since they were declared."""
-        check_captured(self._around)
-        check_captured(self.potentials.values(), "factor")
+        if self._around:
+            check_captured(self._around)
+        if self.potentials:
+            check_captured(self.potentials.values(), "factor")
 
     def probe(self, sizes: Mapping[str, int | None]) -> Model:
         """A model when nobody has given data: open plates and inputs get stand-ins."""

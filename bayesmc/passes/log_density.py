@@ -327,7 +327,8 @@ def _truncated(x: Any, base: Any, low: Any, high: Any) -> Any:
     if not isinstance(base, Family) or base.make is not d.Normal:
         raise TraceError("no closed log density of this truncation is known to derivatives")
     loc, scale = (_stand_in(base.parameters[k]) for k in ("loc", "scale"))
-    first, last = (low - loc) / scale, (high - loc) / scale
+    # a bound that is infinite moves with nothing
+    first, last = (np.where(np.isinf(b), b, (b - loc) / scale) for b in (low, high))
     # the tail that is the smaller one keeps its digits
     turned = first > 0
     near, far = np.where(turned, -last, first), np.where(turned, -first, last)

@@ -7,7 +7,7 @@ net's own forward pass from the posterior draws.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +22,6 @@ from bayesmc.resampling import systematic
 from bayesmc.results.datatree import datatree
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import (
-    Plates,
     Posterior,
     circular_variance,
     near,
@@ -168,26 +167,8 @@ class DrawsPosterior(Posterior):
 
     # ---- functions ---------------------------------------------------------------------------
 
-    def expectation(
-        self,
-        function: Callable[..., Any] | str,
-        plates: Plates = (),
-        names: Mapping[str, str] | None = None,
-    ) -> np.ndarray:
-        return self._average(self._evaluate(Query(self.model, function, plates, names)))
-
-    def probability(
-        self,
-        function: Callable[..., Any],
-        plates: Plates = (),
-        names: Mapping[str, str] | None = None,
-    ) -> np.ndarray:
-        values = self._evaluate(Query(self.model, function, plates, names))
-        if values.dtype.kind != "b":
-            raise UnsupportedError(
-                f"probability: the function returns {values.dtype} values, not booleans; use expectation"
-            )
-        return self._average(values.astype(float))
+    def _averaged(self, query: Query) -> np.ndarray:
+        return self._average(self._evaluate(query))
 
     def _mcse(self, what: str | Query) -> np.ndarray:
         values, step = self._scalars_and_step(what)

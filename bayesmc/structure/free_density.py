@@ -32,12 +32,15 @@ class UnconstrainedDensity:
         The log density, of the leaf ``FREE`` and the stored values of hidden nodes that do not move.
     slopes : Expression, shape (size,)
         Its derivatives by the free numbers.
+    summed : tuple of str
+        Finite nodes that are summed out.
     """
 
     target: Target = field(repr=False)
     nodes: tuple[FreeNode, ...] = field(repr=False)
     root: Expression = field(repr=False)
     slopes: Expression = field(repr=False)
+    summed: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,6 +78,8 @@ class UnconstrainedDensity:
         steps that follow it stay reversible.
         """
         value, slopes = self._both(self._given(u, values))
+        if slopes.shape[:-1] != value.shape:
+            slopes = np.broadcast_to(slopes, (*value.shape, self.size)).copy()
         finite = np.isfinite(value)
         if not finite.all():
             value = np.where(finite, value, -np.inf)

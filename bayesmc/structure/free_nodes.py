@@ -23,12 +23,12 @@ from bayesmc.expression import (
     Expression,
     Program,
     TracedArray,
-    as_expression,
     broadcast,
     constant,
     pick,
     reduction,
 )
+from bayesmc.expression.functions import expression_of
 from bayesmc.expression.graph import substituted
 from bayesmc.network import CompiledNode
 from bayesmc.network.expressions import Opaque
@@ -111,8 +111,8 @@ class FreeNode:
         if transform is None:
             low, high = (self._moving(substituted(b, dict(above))) for b in self.bounds)
             transform = Bounded(self.node.event_shape, low, high)
-        value = as_expression(_plain(transform.formula(u)))
-        volume = as_expression(_plain(transform.log_det_formula(u)))
+        value = expression_of(transform.formula(u))
+        volume = expression_of(transform.log_det_formula(u))
         volume = reduction(np.add, volume, range(len(volume.shape)))
         return self._with_seen(broadcast(value, (*self.lead, *self.node.event_shape))), volume
 
@@ -214,8 +214,7 @@ def free_node(target: Target, name: str, start: int) -> FreeNode:
             low, high = (b.reshape(-1)[elements] for b in (low, high))
         return FreeNode(node, start, elements, value, Bounded(node.event_shape, low, high))
     bounds = tuple(
-        broadcast(getattr(b, "expression", as_expression(b)), node.plate_shape)
-        for b in (support.low, support.high)
+        broadcast(expression_of(b), node.plate_shape) for b in (support.low, support.high)
     )
     return FreeNode(node, start, elements, value, None, bounds)
 
@@ -235,7 +234,3 @@ def _support(target: Target, node: CompiledNode) -> Support:
     raise UnsupportedError(
         f"the bounds of node {node.name!r} depend on its parents in a way that is not followed{why}"
     )
-
-
-def _plain(value: Any) -> Any:
-    return getattr(value, "expression", value)

@@ -18,27 +18,22 @@ import numpy as np
 
 from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import (
-    Elementwise,
     Expression,
-    Family,
     Leaf,
     broadcast,
-    expressions_of,
     leaf,
-    mapped,
     pick,
     reduction,
 )
-from bayesmc.expression.graph import cast, substituted
-from bayesmc.network.expressions import Opaque, log_density_of, stored_leaf
-from bayesmc.passes.arithmetic import ZERO, add, is_all, tidy
+from bayesmc.expression.graph import substituted
+from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.guarded import guarded
-from bayesmc.passes.log_density import has_own_form
 from bayesmc.passes.logarithms import stable
-from bayesmc.passes.ranges import in_range
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 from bayesmc.structure.free_nodes import FreeNode, free_node
+from bayesmc.structure.free_terms import elements, known_values
+from bayesmc.structure.summing import sum_out
 from bayesmc.structure.target import Target, Term
 from bayesmc.structure.unconstrained_check import hold_against_model
 
@@ -49,7 +44,7 @@ _FEW = 8
 
 
 def unconstrained_density(
-    target: Target, names: Iterable[str] | None = None
+    target: Target, names: Iterable[str] | None = None, summed: Iterable[str] = ()
 ) -> UnconstrainedDensity:
     """The log density of some continuous nodes given all others, on unconstrained numbers.
 
@@ -58,6 +53,8 @@ def unconstrained_density(
     target : Target
     names : iterable of str, optional
         Nodes of the chain that move; all continuous ones by default. The terms that they enter count.
+    summed : iterable of str, optional
+        Finite nodes of the chain that are summed out (``sum_out``); others are given by their values.
 
     Raises
     ------
@@ -80,25 +77,40 @@ def unconstrained_density(
     (['rate'], {'rate': array(1.)}, (np.float64(-6.484906649788), array([3.])))
     """
     nodes = _laid_out(target, names)
-    terms = target.terms_of([n.name for n in nodes]) if nodes else ()
+    if not nodes:
+        raise UnsupportedError("no hidden node is continuous: there are no unconstrained numbers")
+    finite = [n for n in target.chain if n in set(summed)]
+    terms = target.terms_of([*(n.name for n in nodes), *finite])
     parts = {n.name: leaf(f"{FREE} of {n.name}", (n.size,)) for n in nodes}
     above: dict[str, Expression] = {}
     volumes = {}
     for node in nodes:
-        given = {**_known(target, node.bounds), **above}
+        given = {**known_values(target, node.bounds), **above}
         above[node.name], volumes[node.name] = node.expressions(parts[node.name], given)
-    elements = [_elements(target, term, above) for term in terms]
+    plain = [elements(target, term, above) for term in terms]
     whole = {n.name for n in nodes if n.elements is None}
-    sums = [
-        reduction(np.add, _elements(target, t, above, True) if t.name in whole else e, [0])
-        for t, e in zip(terms, elements, strict=True)
+    used = [
+        elements(target, t, above, True) if t.name in whole else e
+        for t, e in zip(terms, plain, strict=True)
     ]
-    (root,) = stable([_total([*sums, *volumes.values()])])
+    used = stable([*used, *volumes.values()])
+    sums = [reduction(np.add, e, range(len(e.shape))) for e in used]
+    tables = sum_out(target, terms, finite, above)
+    inside = {term.name for table in tables for term in table.terms}
+    kept = [s for s, t in zip(sums, terms, strict=False) if t.name not in inside]
+    root = _total([*kept, *sums[len(terms) :], *(table.total for table in tables)])
     slopes = _slopes(root, sums, terms, list(parts.values()))
     once = _on_one_leaf(nodes, parts)
-    density = UnconstrainedDensity(target, nodes, *map(once, guarded([root, slopes])))
-    plain = map(once, guarded([*elements, *volumes.values()]))
-    hold_against_model(density, terms, list(plain))
+    both = [once(e) for e in guarded([root, slopes])]
+    density = UnconstrainedDensity(target, nodes, both[0], both[1], tuple(finite))
+    plain = [once(e) for e in guarded([*plain, *volumes.values()])]
+    hold_against_model(
+        density,
+        terms,
+        plain,
+        [once(e) for e in guarded(used)],
+        [table.mapped(lambda e: once(guarded([e])[0])) for table in tables],
+    )
     return density
 
 
@@ -116,64 +128,6 @@ def _laid_out(target: Target, names: Iterable[str] | None) -> tuple[FreeNode, ..
             start = found[-1].start + found[-1].size if found else 0
             found.append(free_node(target, name, start))
     return tuple(found)
-
-
-def _known(target: Target, expressions: Iterable[Expression]) -> dict[str, Expression]:
-    """Values that never change, of the leaves of expressions."""
-    found: dict[str, Expression] = {}
-    for name in frozenset().union(*(e.leaves for e in expressions)):
-        if name in target.known and target.is_known(name):
-            own = stored_leaf(target.model, target.model[name])
-            found[name] = cast(np.broadcast_to(target.known[name], own.shape), own.dtype)
-    return found
-
-
-def _elements(
-    target: Target, term: Term, above: Mapping[str, Expression], is_inside: bool = False
-) -> Expression:
-    """The log factors of a term that count, one after the other.
-
-    Parameters
-    ----------
-    is_inside : bool
-        Whether its node is inside of its support, wherever the free numbers are.
-
-    Raises
-    ------
-    UnsupportedError
-    """
-    whole = term.expression
-    if whole is None:
-        raise UnsupportedError(_why_not(term))
-    given = {**_known(target, [whole, *expressions_of(term.read.result)]), **above}  # type: ignore[union-attr]
-    log = broadcast(substituted(whole, given), term.shape)
-    if not term.is_potential:
-        family = term.read.result  # type: ignore[union-attr]
-        if is_inside and not (isinstance(family, Family) and has_own_form(family)):
-            log = _of_support(log)
-        condition = in_range(mapped(family, lambda e: stable([substituted(e, given)])[0]))
-        log = broadcast(tidy(np.where, condition, log, -np.inf), term.shape)
-    return pick([log], np.arange(log.size) if term.mask is None else np.flatnonzero(term.mask))
-
-
-def _why_not(term: Term) -> str:
-    kind = "potential" if term.is_potential else "node"
-    if isinstance(term.read, Opaque):
-        return f"{kind} {term.name!r} is not followed: {term.read.reason}"
-    try:
-        log_density_of(term.model, term.name)
-    except TraceError as error:
-        return f"{kind} {term.name!r}: {error}"
-    return f"{kind} {term.name!r} has no closed form"
-
-
-def _of_support(log: Expression) -> Expression:
-    """A log density inside of its support."""
-    if isinstance(log, Elementwise) and log.function is np.where:
-        _, inside, outside = log.operands
-        if is_all(outside, -np.inf) and inside.shape == log.shape:
-            return inside
-    return log
 
 
 def _total(numbers: Sequence[Expression]) -> Expression:
@@ -201,7 +155,7 @@ def _slopes(
     try:
         found = gradient(root, names)
     except TraceError as error:
-        for total, term in zip(sums, terms, strict=True):
+        for total, term in zip(sums, terms, strict=False):  # volumes follow
             try:
                 gradient(total, names)
             except TraceError as own:

@@ -8,7 +8,7 @@ sum of these.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.expression import Expression, Program
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
-from bayesmc.structure.target import Term, Values
+from bayesmc.structure.summing import Summed
+from bayesmc.structure.target import Target, Term, Values
 
 #: points, and how far the free numbers of each are from zero
 _SPREADS = (0.0, 0.1, 0.3, 1.0, 1.0, 2.0, 3.0, 5.0)
@@ -24,12 +25,17 @@ _SPREADS = (0.0, 0.1, 0.3, 1.0, 1.0, 2.0, 3.0, 5.0)
 _FAR = 30.0
 #: how far log factors may be off, relative to themselves and to their largest part
 _RTOL = 1e-9
-#: how far the sum may be off, relative to the sum of sizes, where log factors are written in other ways
-_OF_SUM = 1e-7
+#: how far those may be that are written for free numbers far out: where probabilities are near 0 or 1 the
+#: model's own lose digits
+_WRITTEN = 1e-7
 
 
 def hold_against_model(
-    density: UnconstrainedDensity, terms: Sequence[Term], plain: Sequence[Expression]
+    density: UnconstrainedDensity,
+    terms: Sequence[Term],
+    plain: Sequence[Expression],
+    used: Sequence[Expression],
+    tables: Sequence[Summed] = (),
 ) -> None:
     """Refuse a log density that gives something else than the model's own functions.
 
@@ -40,37 +46,49 @@ def hold_against_model(
     plain : sequence of Expression
         Of each term the log factors that count, then each node's log change of volume, of free numbers, as
         they are written.
+    used : sequence of Expression
+        The same as they are added up.
+    tables : sequence of Summed
+        Terms for all states of nodes that are summed out.
 
     Raises
     ------
     UnsupportedError
         Says which term differs, or is zero at all points.
     """
-    program = Program([*plain, density.root])
-    seen = dict.fromkeys((t.name for t in terms), not terms)
-    seen_sum = False
+    program = Program([*plain, *used])
+    names = [t.name for t in terms]
+    seen, agreed = [False] * len(terms), [False] * len(plain)
     for u, values in _points(density):
         found = [np.asarray(v) for v in program({**values, FREE: u})]
-        logs, volumes, total = found[: len(terms)], found[len(terms) : -1], found[-1]
-        for term, log in zip(terms, logs, strict=True):
-            wanted = _counted(term, values)
-            if wanted is not None:
-                seen[term.name] |= _compare(term, log, wanted)
-        volume = sum(float(v) for v in volumes)
+        given, written = found[: len(plain)], found[len(plain) :]
+        wanted = [_counted(term, values) for term in terms]
+        # parameters out of range: where its own density is zero, a node's value may be anything
+        nowhere = [
+            w is not None and t.name in density.names and not np.isfinite(w).all()
+            for t, w in zip(terms, wanted, strict=True)
+        ]
+        for k, own in enumerate(wanted):
+            if own is not None and nowhere[k] >= any(nowhere):
+                seen[k] |= _compare(terms[k], given[k], own)
+        if any(nowhere):
+            continue
+        sums = {t.name: float(log.sum()) for t, log in zip(terms, given, strict=False)}
+        _check_tables(tables, sums, u, values)
+        volume = sum(float(v) for v in given[len(terms) :])
         if not np.isclose(volume, density.log_volume(u, values), rtol=1e-8, atol=1e-8):
             raise UnsupportedError("the change of volume differs from that of the maps")
-        parts = sum(float(log.sum()) for log in logs) + volume
-        size = 1.0 + sum(float(np.abs(log).sum()) for log in logs) + abs(volume)
-        if np.isfinite(parts) and abs(float(total) - parts) <= _OF_SUM * size:
-            seen_sum = True
-    for name, is_seen in seen.items():
+        for k, (a, b) in enumerate(zip(given, written, strict=True)):
+            agreed[k] |= _is_written(a, b)
+    for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
             raise UnsupportedError(
                 f"the density of {name!r} is zero, or no number, at all points where it was tried, so that "
                 "its expression cannot be held against its function"
             )
-    if terms and not seen_sum:
-        raise UnsupportedError("the sum of the terms, written for free numbers, differs from them")
+    if not all(agreed):
+        name = [*names, *density.names][agreed.index(False)]
+        raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -88,7 +106,7 @@ def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]
         values: Values = dict(target.known)
         for name in others:
             assert states is not None
-            values[name] = states[name][k % len(states[name])]
+            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
         u = rng.normal(size=density.size) * spread
         if states is not None and k % 2:  # reachable ones, moved a little
             row = {n: states[n][k % len(states[n])] for n in density.names}
@@ -101,6 +119,15 @@ def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]
         except BayesmcError:
             continue
         yield u, values
+
+
+def _with_seen(target: Target, name: str, value: np.ndarray) -> np.ndarray:
+    seen = target.seen(name)
+    if seen is None:
+        return value
+    assert seen.mask is not None  # of a node in the chain
+    mask = np.reshape(seen.mask, np.shape(seen.mask) + (1,) * len(target.model[name].event_shape))
+    return np.where(mask, seen.value, value)
 
 
 def _counted(term: Term, values: Values) -> np.ndarray | None:
@@ -120,9 +147,13 @@ def _compare(term: Term, found: np.ndarray, wanted: np.ndarray) -> bool:
     ------
     UnsupportedError
     """
-    found = np.broadcast_to(found, wanted.shape)
+    if found.shape != wanted.shape:
+        raise UnsupportedError(
+            f"of {term.name!r} {found.size} elements are counted in place of {wanted.size}"
+        )
     finite = np.isfinite(wanted)
-    near = np.abs(found - wanted) <= _RTOL * (1.0 + np.abs(wanted))
+    with np.errstate(all="ignore"):
+        near = np.abs(found - wanted) <= _RTOL * (1.0 + np.abs(wanted))
     agree = np.where(finite, near, ~np.isfinite(found))
     if agree.all():
         return bool(finite.any()) or not finite.size
@@ -131,3 +162,32 @@ def _compare(term: Term, found: np.ndarray, wanted: np.ndarray) -> bool:
         f"what was read of {term.name!r} gives {found[at]:.9g} at element {at} of those that count, and its "
         f"function {wanted[at]:.9g}"
     )
+
+
+def _is_written(plain: np.ndarray, used: np.ndarray) -> bool:
+    """Whether all log factors agree that are finite as they are written, and some are."""
+    finite = np.isfinite(plain)
+    with np.errstate(all="ignore"):
+        near = np.abs(used - plain) <= _WRITTEN * (1.0 + np.abs(plain))
+    return bool(near[finite].all() and (finite.any() or not finite.size))
+
+
+def _check_tables(
+    tables: Sequence[Summed], sums: Mapping[str, float], u: np.ndarray, values: Values
+) -> None:
+    """Refuse tables that give other sums than the terms at the states that nodes have.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    for summed in tables:
+        wanted = sum(sums[t.name] for t in summed.terms)
+        roots = [summed.rest] if summed.table is None else [summed.rest, summed.table]
+        rest, *table = Program(roots)({**values, FREE: u})
+        shape = () if summed.table is None else summed.table.shape
+        wide = np.broadcast_to(table[0], shape) if table else None
+        found = summed.at(values, np.broadcast_to(rest, summed.rest.shape), wide)
+        if np.isfinite(wanted) and not abs(found - wanted) <= _WRITTEN * (1.0 + abs(wanted)):
+            names = ", ".join([*summed.labels, *summed.listed[0]])
+            raise UnsupportedError(f"the sum over the states of {names} differs from its terms")
