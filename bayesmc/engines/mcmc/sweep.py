@@ -41,6 +41,9 @@ class SweepSampler:
         by_name = dict(zip(bare.nodes, steps, strict=True))
         self._forward = [by_name[n] for n in target.forward]
         self.forward_nodes = target.forward
+        #: useful rates of acceptance, where some are
+        self.acceptance_band: dict[str, tuple[float, float] | None]
+        self.acceptance_band = {block_name(k): k.band for k in self.kernels}
         #: where the user wants chains to start: node -> stored values, shape (chains, *plates, *event)
         self.given: Values = {}
         #: groups of consecutive chains that start as one; 0 where each starts by itself
@@ -89,6 +92,11 @@ class SweepSampler:
         found = renewals(self.target, self.kernels, state["memory"])
         rows = max((len(state["values"][n]) for n in found), default=0)
         return {name: np.asarray(np.maximum(count, rows)) for name, count in found.items()}
+
+    def divergences(self, state: Mapping[str, Any]) -> np.ndarray | None:
+        """Trajectories of each chain that diverged since the warmup; None where none are made."""
+        counts = [m["divergences"] for m in state["memory"] if "divergences" in m]
+        return np.asarray(sum(counts)) if counts else None
 
     # ---- for engines whose rows are no chains --------------------------------------------------
 
