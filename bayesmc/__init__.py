@@ -53,6 +53,7 @@ from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
 from bayesmc.engines.mcmc.gibbs import Gibbs
+from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
@@ -66,6 +67,7 @@ from bayesmc.network import BayesNet, FactorGraph
 from bayesmc.plates import PlateArray, stack
 from bayesmc.pmcmc import ParticleGibbs, ParticleMetropolis
 from bayesmc.results import Marginal, Posterior, SeriesPosterior, Summary
+from bayesmc.structure.log_density import log_density
 
 if TYPE_CHECKING:
     from bayesmc import io, markov, montecarlo
@@ -95,6 +97,7 @@ __all__ = [
     "Geometric",
     "GridFilter",
     "Gibbs",
+    "HamiltonianMonteCarlo",
     "HalfCauchy",
     "HalfNormal",
     "Importance",
@@ -142,6 +145,7 @@ __all__ = [
     "forecast",
     "infer",
     "io",
+    "log_density",
     "markov",
     "montecarlo",
     "most_likely",

@@ -1,15 +1,18 @@
 """How far a sample can be trusted: effective sizes, Monte Carlo errors, tails of weights.
 
-Chains are judged by ArviZ (``arviz_stats``), imported when first needed; weighted draws by the delta
-method of self-normalised importance sampling, and their tail by ArviZ. Arrays have shape
-``(chain, draw, ...)``.
+Chains are judged by ArviZ's figures, worked out for all scalars at once: importing ArviZ takes longer than
+many a run. Weighted draws are judged by the delta method of self-normalised importance sampling, and their
+tail by ArviZ (``arviz_stats``) itself, imported when first needed. Arrays have shape ``(chain, draw, ...)``.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import scipy.fft
 import scipy.special
 
 #: below this effective size a weighted answer has no reliable error bar either
@@ -163,7 +166,9 @@ def weighted_share_count(mine: Any, heavy: Any, heaviest: float) -> Any:
     return 1.0 / np.sqrt(typical**2 + missed)
 
 
-def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray:
+def chain_statistic(
+    kind: str, values: np.ndarray, block: int = 1, superchains: int = 0
+) -> np.ndarray:
     """ArviZ's figure of every scalar of some chains, shape ``values.shape[2:]``; NaN if undefined.
 
     Parameters
@@ -178,6 +183,10 @@ def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray
         independent while draws ``block`` apart are not, so errors are those of the means of blocks, an
         effective size is a variance over a squared error (at most the number of draws). R-hat compares
         ensembles with the spread of the draws within them. Draws after the last whole block do not count.
+    superchains : int
+        Where it is 2 or more, R-hat is the nested one of so many equally large groups of consecutive chains,
+        for chains that are many and short: groups are compared with the spread within them, so that it
+        tells whether their starts are forgotten, however short each chain.
 
     Notes
     -----
@@ -186,7 +195,8 @@ def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray
 
     References
     ----------
-    Vehtari et al. (2021), Bayesian Analysis 16(2); Geyer (1992), Statistical Science 7(4).
+    Vehtari et al. (2021), Bayesian Analysis 16(2); Geyer (1992), Statistical Science 7(4); Margossian et al.
+    (2024), Nested R-hat, Bayesian Analysis, eq. 4 to 8.
 
     Examples
     --------
@@ -199,78 +209,166 @@ def chain_statistic(kind: str, values: np.ndarray, block: int = 1) -> np.ndarray
     if whole < 4 * block or not values.size:
         return np.full(values.shape[2:], np.nan)
     flat = values[:, :whole].reshape(chains, whole, -1)
+    step = max(_AT_ONCE // (chains * whole), 1)
     with np.errstate(all="ignore"):
-        found = [_figure(kind, flat[:, :, at].astype(float), block) for at in range(flat.shape[2])]
-    return np.array(found).reshape(values.shape[2:])
+        found = []
+        for at in range(0, flat.shape[2], step):
+            some = np.array(np.moveaxis(flat[..., at : at + step], -1, 0), dtype=float, order="C")
+            found.append(_figures(kind, some, block, superchains))
+    return np.concatenate(found).reshape(values.shape[2:])
 
 
-# ---- private: one scalar, shape (chain, draw), in whole blocks -----------------------------------
+def normal_scores(values: np.ndarray) -> np.ndarray:
+    """Values as quantiles of a standard Normal by their ranks, those of equal ones averaged.
+
+    Parameters
+    ----------
+    values : ndarray, shape (scalar, ...)
+        Ranked within each scalar.
+
+    References
+    ----------
+    Blom (1958), Statistical Estimates and Transformed Beta-Variables; Vehtari et al. (2021), eq. 14.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> normal_scores(np.array([[3.0, 1.0, 2.0]])).round(2).tolist()
+    [[0.87, -0.87, 0.0]]
+    """
+    flat = values.reshape(len(values), -1)
+    order = np.argsort(flat, axis=1)
+    sorted_ = np.take_along_axis(flat, order, axis=1)
+    size = flat.shape[1]
+    at = np.arange(size)
+    new = np.ones(flat.shape, dtype=bool)
+    new[:, 1:] = sorted_[:, 1:] != sorted_[:, :-1]
+    first = np.maximum.accumulate(np.where(new, at, 0), axis=1)
+    ends = np.ones(flat.shape, dtype=bool)
+    ends[:, :-1] = new[:, 1:]
+    last = np.minimum.accumulate(np.where(ends, at, size)[:, ::-1], axis=1)[:, ::-1]
+    ranks = np.empty(flat.shape)
+    np.put_along_axis(ranks, order, 0.5 * (first + last) + 1.0, axis=1)
+    return scipy.special.ndtri((ranks - 0.375) / (size + 0.25)).reshape(values.shape)
+
+
+# ---- private: scalars of chains in whole blocks, shape (scalar, chain, draw) -----------------------
 
 #: R-hat above which the variance within chains is but a rounding error: rank-normalised values of chains
 #: that move at all stay far below
 _STILL = 1e6
-#: what ArviZ calls the effective sizes
-_METHODS: dict[str, dict[str, Any]] = {
-    "ess": {"method": "bulk"},
-    "tail_ess": {"method": "tail", "prob": 0.05},
-    "mean_ess": {"method": "mean"},
-}
+#: numbers that figures are worked out of at once
+_AT_ONCE = 1 << 19
 
 
-def _figure(kind: str, values: np.ndarray, block: int) -> float:
-    if np.isnan(values).any():
-        return float("nan")
+def _figures(kind: str, values: np.ndarray, block: int, superchains: int) -> np.ndarray:
+    lost = np.isnan(values).any(axis=(1, 2))
     if kind == "rhat":
-        return _rhat(values)
-    if kind != "mcse":
-        return _ess(kind, values, block)
-    if values.min() == values.max():  # rounding makes their standard deviation positive
-        return 0.0
-    return float(values.std(ddof=1) / np.sqrt(_ess("mean_ess", values, block)))
+        found = _rhat(values, superchains)
+    elif kind != "mcse":
+        found = _ess(kind, values, block)
+    else:
+        still = np.ptp(values, axis=(1, 2)) == 0  # rounding makes their standard deviation positive
+        error = values.std(axis=(1, 2), ddof=1) / np.sqrt(_ess("mean_ess", values, block))
+        found = np.where(still, 0.0, error)
+    return np.where(lost, np.nan, found)
 
 
-def _rhat(values: np.ndarray) -> float:
-    from arviz_stats.base import array_stats
+def _rhat(values: np.ndarray, superchains: int) -> np.ndarray:
+    if values.shape[1] == 1:
+        values = _split(values)
+    if values.shape[2] < 4:
+        return np.full(len(values), np.nan)
+    split = _split(values)
+    folded = np.abs(split - np.median(split, axis=(1, 2), keepdims=True))
+    ratio = _nested(superchains) if superchains > 1 else _between_and_within
+    found = np.maximum(ratio(normal_scores(split)), ratio(normal_scores(folded)))
+    return np.where(found > _STILL, np.inf, found)
 
-    if len(values) == 1:
-        half = values.shape[1] // 2
-        values = np.concatenate([values[:, :half], values[:, -half:]])
-    figure = float(array_stats.rhat(values, chain_axis=0, draw_axis=1))
-    return float("inf") if figure > _STILL else figure
+
+def _between_and_within(values: np.ndarray) -> np.ndarray:
+    """R-hat of values that are what they are (Vehtari et al. 2021, eq. 1 to 4)."""
+    draws = values.shape[2]
+    between = values.mean(axis=2).var(axis=1, ddof=1)
+    within = values.var(axis=2, ddof=1).mean(axis=1)
+    return np.sqrt(between / within + (draws - 1) / draws)
 
 
-def _ess(kind: str, values: np.ndarray, block: int) -> float:
-    from arviz_stats.base import array_stats
+def _nested(superchains: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Nested R-hat of half-chains, first halves first (Margossian et al. 2024, eq. 4 to 8)."""
 
-    # ArviZ takes values within 1e-15 of each other for constant; scaling by a power of 2 is exact
-    values = np.ldexp(values, -np.frexp(np.ptp(values))[1])
+    def ratio(values: np.ndarray) -> np.ndarray:
+        count = len(values)
+        means = values.mean(axis=2).reshape(count, 2, superchains, -1)
+        means = np.moveaxis(means, 2, 1).reshape(count, superchains, -1)
+        within = means.var(axis=2, ddof=1).mean(axis=1) + values.var(axis=2, ddof=1).mean(axis=1)
+        return np.sqrt(1.0 + means.mean(axis=2).var(axis=1, ddof=1) / within)
+
+    return ratio
+
+
+def _ess(kind: str, values: np.ndarray, block: int) -> np.ndarray:
+    values = np.ldexp(values, -np.frexp(np.ptp(values, axis=(1, 2), keepdims=True))[1])
     if block > 1:
-        return min(_ensemble_ess(series, block) for series in _series(kind, values))
-    return float(array_stats.ess(values, chain_axis=0, draw_axis=1, **_METHODS[kind]))
-
-
-def _ensemble_ess(values: np.ndarray, block: int) -> float:
-    """Variance of the draws over the squared error of their mean, which ArviZ judges by block means."""
-    from arviz_stats.base import array_stats
-
-    if values.min() == values.max():
-        return float(values.size)
-    means = _block_means(values, block)
-    ess = float(array_stats.ess(means, chain_axis=0, draw_axis=1, method="mean"))
-    return min(float(values.var(ddof=1) * ess / means.var(ddof=1)), float(values.size))
+        found = [_ensemble_ess(series, block) for series in _series(kind, values)]
+    elif kind == "tail_ess":  # levels are those of all draws
+        found = [_ess_of_halves(_split(series)) for series in _series(kind, values)]
+    else:
+        found = [_ess_of_halves(series) for series in _series(kind, _split(values))]
+    return np.minimum.reduce(found)
 
 
 def _series(kind: str, values: np.ndarray) -> list[np.ndarray]:
     """What the figure is an effective size of the mean of (Vehtari et al. 2021, sec. 4)."""
-    from scipy.stats import rankdata
-
     if kind == "mean_ess":
         return [values]
     if kind == "tail_ess":
-        return [(values <= level).astype(float) for level in np.quantile(values, [0.05, 0.95])]
-    ranks = rankdata(values).reshape(values.shape)
-    return [scipy.special.ndtri((ranks - 0.375) / (values.size + 0.25))]
+        levels = np.quantile(values, [0.05, 0.95], axis=(1, 2), keepdims=True)
+        return [(values <= level).astype(float) for level in levels]
+    return [normal_scores(values)]
 
 
-def _block_means(values: np.ndarray, block: int) -> np.ndarray:
-    return values if block == 1 else values.reshape(len(values), -1, block).mean(axis=-1)
+def _ensemble_ess(values: np.ndarray, block: int) -> np.ndarray:
+    """Variance of the draws over the squared error of their mean, judged by block means."""
+    means = values.reshape(*values.shape[:2], -1, block).mean(axis=-1)
+    size = math.prod(values.shape[1:])
+    ratio = values.var(axis=(1, 2), ddof=1) / means.var(axis=(1, 2), ddof=1)
+    found = np.minimum(ratio * _ess_of_halves(_split(means)), size)
+    return np.where(np.ptp(values, axis=(1, 2)) == 0, float(size), found)
+
+
+def _ess_of_halves(split: np.ndarray) -> np.ndarray:
+    """Effective sizes for means of half-chains, by Geyer's initial monotone sequence."""
+    _, chains, draws = split.shape
+    size = chains * draws
+    length = scipy.fft.next_fast_len(2 * draws, real=True)
+    centred = split - split.mean(axis=2, keepdims=True)
+    power = np.abs(scipy.fft.rfft(centred, n=length, axis=2)) ** 2
+    covariance = scipy.fft.irfft(power.mean(axis=1), n=length, axis=1)[:, :draws] / draws
+    within = covariance[:, :1] * draws / (draws - 1.0)
+    total = covariance[:, :1].copy()
+    if chains > 1:
+        total += split.mean(axis=2).var(axis=1, ddof=1)[:, None]
+    rho = 1.0 - (within - covariance) / total
+    rho[:, 0] = 1.0
+    pairs = rho[:, : draws // 2 * 2].reshape(len(rho), -1, 2).sum(axis=2)
+    # the last pair that is looked at is the first without a positive sum
+    most = min(max((draws - 3) // 2, 0), pairs.shape[1] - 1)
+    ended = pairs[:, : most + 1] <= 0
+    ended[:, most] = True
+    last = ended.argmax(axis=1)
+    kept = np.arange(pairs.shape[1]) < last[:, None]
+    falling = np.minimum.accumulate(pairs, axis=1)
+    row = np.arange(len(rho))
+    even, pair = rho[row, 2 * last], pairs[row, last]
+    tau = -1.0 + 2.0 * np.where(kept, falling, 0.0).sum(axis=1)
+    tau += np.where((even > 0) | (pair >= 0), even, 0.0)
+    found = size / np.maximum(tau, 1.0 / np.log10(size))
+    found = np.where(np.isnan(rho).any(axis=1), np.nan, found)
+    return np.where(np.ptp(split, axis=(1, 2)) == 0, float(size), found)
+
+
+def _split(values: np.ndarray) -> np.ndarray:
+    """Halves of chains as chains, first halves first."""
+    half = values.shape[2] // 2
+    return np.concatenate([values[:, :, :half], values[:, :, -half:]], axis=1)

@@ -144,3 +144,51 @@ def test_rhat_sees_chains_that_disagree():
     bad = good + np.array([[0.0], [0.0], [0.0], [3.0]])
     assert diagnostics.chain_statistic("rhat", good) < 1.02
     assert diagnostics.chain_statistic("rhat", bad) > 1.3
+
+
+_ARVIZ = {
+    "ess": ("ess", {"method": "bulk"}),
+    "tail_ess": ("ess", {"method": "tail", "prob": 0.05}),
+    "mean_ess": ("ess", {"method": "mean"}),
+    "rhat": ("rhat", {}),
+    "nested": ("rhat_nested", {}),
+}
+
+
+@pytest.mark.parametrize("kind", _ARVIZ)
+def test_figures_of_few_and_odd_draws_are_arvizs(kind):
+    """Short chains, odd ones, ties, two values, heavy tails, chains apart: all as ArviZ has them."""
+    rng = np.random.default_rng(7)
+    name, options = _ARVIZ[kind]
+    for _ in range(150):
+        chains, draws = int(rng.choice([4, 8, 16])), int(rng.choice([4, 5, 7, 9, 13, 50, 101]))
+        x, r = rng.normal(size=(chains, draws)), rng.choice([-0.6, 0.0, 0.5, 0.95])
+        for k in range(1, draws):
+            x[:, k] = r * x[:, k - 1] + np.sqrt(1 - r * r) * x[:, k]
+        shapes = (np.round, lambda x: x > 1, lambda x: np.exp(3 * x), lambda x: x + x[:, :1])
+        x = shapes[rng.integers(4)](x).astype(float)
+        if kind == "nested":
+            options = {"superchain_ids": np.repeat(np.arange(chains // 2), 2)}
+            got = diagnostics.chain_statistic("rhat", x, superchains=chains // 2)
+        else:
+            got = diagnostics.chain_statistic(kind, x)
+        with np.errstate(all="ignore"):
+            scaled = np.ldexp(x, -np.frexp(np.ptp(x))[1])
+            one = float(getattr(array_stats, name)(scaled, chain_axis=0, draw_axis=1, **options))
+        if not (got == np.inf and one > 1e5):  # chains that stand still
+            np.testing.assert_allclose(got, one, rtol=1e-9)
+
+
+def test_nested_rhat_asks_whether_starts_are_forgotten():
+    """Short chains that mix have a large R-hat and a small nested one; those that remember have both."""
+    rng = np.random.default_rng(8)
+    short = np.cumsum(rng.normal(size=(64, 4, 400)), axis=1)[:, -1, ::8] * 0.5
+    slow = np.empty((64, 12))
+    slow[:, 0] = rng.normal(size=64)
+    for k in range(1, 12):
+        slow[:, k] = 0.8 * slow[:, k - 1] + 0.6 * rng.normal(size=64)
+    remembered = slow + np.repeat(rng.normal(size=8), 8)[:, None]
+    assert diagnostics.chain_statistic("rhat", slow) > 1.1
+    assert diagnostics.chain_statistic("rhat", slow, superchains=8) < 1.04
+    assert diagnostics.chain_statistic("rhat", remembered, superchains=8) > 1.2
+    assert diagnostics.chain_statistic("rhat", short, superchains=8) < 1.01

@@ -32,7 +32,7 @@ kernels
 dbn | structure | results
 network
 factors | montecarlo
-passes
+passes | lowering
 distributions
 expression
 linalg
@@ -54,7 +54,7 @@ LONG_FUNCTIONS: set[str] = set()
 TYPE_CIRCLES: set[str] = set()
 
 HEAVY = ("scipy.stats", "networkx", "arviz_stats", "arviz_base", "matplotlib", "hypothesis",
-         "tqdm", "numba", "PIL", "yaml", "pandas")  # fmt: skip
+         "tqdm", "numba", "llvmlite", "PIL", "yaml", "pandas")  # fmt: skip
 
 
 def violations(sources: dict[str, str]) -> list[str]:

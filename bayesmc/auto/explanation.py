@@ -35,6 +35,8 @@ class Explanation:
         Node -> what the engine does to it.
     table : tuple of Treatment
         The same in columns (node, kernel, why, plates, colour), for engines that move nodes one by one.
+    effort : str
+        How many chains, and how long, of engines that run some.
 
     Examples
     --------
@@ -54,9 +56,11 @@ class Explanation:
     refused: dict[str, str] = field(default_factory=dict)
     nodes: dict[str, str] = field(default_factory=dict)
     table: tuple[Treatment, ...] = ()
+    effort: str = ""
 
     def __str__(self) -> str:
         lines = [f"engine: {self.engine!r}", *(f"  because {r}" for r in self.reasons)]
+        lines += [f"  runs {self.effort}"] if self.effort else []
         lines += [f"not {name}: {why}" for name, why in self.refused.items()]
         if self.table:
             return "\n".join([*lines, *_columns(self.table)])

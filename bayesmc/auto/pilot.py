@@ -39,8 +39,8 @@ from bayesmc.shapes import Shape
 _NUMBERS = 12
 #: numbers whose arithmetic takes about as long as the call of a function
 _ELEMENTS = 2000
-#: sweeps of a pilot's warmup and draws; an ensemble's members give so many draws each
-_WARMUP, _DRAWS, _PER_MEMBER = 100, 100, 8
+#: sweeps of a pilot's warmup and draws; an ensemble's members give so many draws each; chains
+_WARMUP, _DRAWS, _PER_MEMBER, _CHAINS = 100, 100, 8, 4
 #: sweeps that tell what a sweep costs
 _FEW = 8
 #: draws of the pilot of weighting, and the share of them that must count for it to be taken
@@ -173,11 +173,13 @@ def _at_best(problem: Problem) -> Trial:
     engine, counted = Gibbs(), _counted(problem)
     try:
         engine.sampler(counted)
-        units = _run(replace(engine, draws=_FEW, warmup=_FEW), counted)[1] / (2 * _FEW)
+        units = _run(replace(engine, draws=_FEW, warmup=_FEW, chains=_CHAINS), counted)[1] / (
+            2 * _FEW
+        )
     except BayesmcError as error:
         return Trial(engine, 0.0, f"its pilot failed: {error}")
-    words = f"{units / engine.chains:.3g} evaluations of a density for each draw, at the least"
-    return Trial(engine, 1000.0 * engine.chains / units, words)
+    words = f"{units / _CHAINS:.3g} evaluations of a density for each draw, at the least"
+    return Trial(engine, 1000.0 * _CHAINS / units, words)
 
 
 def _chains(problem: Problem, engine: Any) -> Trial:
@@ -186,14 +188,14 @@ def _chains(problem: Problem, engine: Any) -> Trial:
     try:
         members = getattr(engine.sampler(counted), "ensemble", 1)
         draws = max(_DRAWS, _PER_MEMBER * members)
-        short: ChainEngine = replace(engine, draws=draws, warmup=_WARMUP)
+        short: ChainEngine = replace(engine, draws=draws, warmup=_WARMUP, chains=_CHAINS)
         posterior, units = _run(short, counted)
     except BayesmcError as error:
         return Trial(engine, 0.0, f"its pilot failed: {error}")
     sizes = [_least(posterior, n) for n in posterior.names if n in _moved(problem)]
     ess = min(sizes, default=0.0)
     units *= draws / (draws + _WARMUP)
-    words = f"{ess:.0f} effective of {draws * engine.chains} draws, {_each(units, ess)}"
+    words = f"{ess:.0f} effective of {draws * _CHAINS} draws, {_each(units, ess)}"
     return Trial(engine, 1000.0 * ess / units, words)
 
 

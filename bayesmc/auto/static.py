@@ -12,6 +12,7 @@ from bayesmc.engines.base import Engine
 from bayesmc.engines.exact.exact import Exact, readable_bytes
 from bayesmc.engines.exact.hybrid_plan import too_large_to_search
 from bayesmc.engines.filtering import FilterEngine
+from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, plan_of
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
@@ -107,9 +108,11 @@ def explained(
         if why is not None:
             refused = {type(chosen).__name__: why}
             reasons = ("it was asked for, but it cannot answer",)
-    nodes = {} if type(chosen).__name__ in refused else chosen.describe(problem)
-    table = () if type(chosen).__name__ in refused else tuple(chosen.table(problem))
-    return Explanation(chosen, tuple(reasons), refused, nodes, table)
+    if type(chosen).__name__ in refused:
+        return Explanation(chosen, tuple(reasons), refused)
+    nodes, table = chosen.describe(problem), tuple(chosen.table(problem))
+    effort = chosen.effort(problem) if isinstance(chosen, ChainEngine) else ""
+    return Explanation(chosen, tuple(reasons), refused, nodes, table, effort)
 
 
 # ---- private ------------------------------------------------------------------------------------

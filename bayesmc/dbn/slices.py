@@ -27,10 +27,9 @@ from bayesmc.errors import (
 )
 from bayesmc.network import CompiledNode, Model, Node
 from bayesmc.network.captured import check_captured
-from bayesmc.network.declaring import DeclaredPlates
+from bayesmc.network.declaring import DeclaredPlates, ModelStore
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, topological_order
-from bayesmc.network.store import ModelStore
 from bayesmc.shapes import owned
 
 if TYPE_CHECKING:
@@ -175,7 +174,8 @@ class Template:
 
     def check_captured(self) -> None:
         """Refuse functions that read a name which has changed since they were declared."""
-        check_captured(self._around)
+        if self._around:
+            check_captured(self._around)
 
     @cached_property
     def _around(self) -> list[Declaration]:

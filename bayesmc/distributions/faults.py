@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from bayesmc.distributions.transforms import Transform
-from bayesmc.errors import BayesmcError, ParameterError, ShapeError
+from bayesmc.errors import BayesmcError, ParameterError, ShapeError, UnsupportedError
 from bayesmc.shapes import Shape
 
 
@@ -23,6 +23,14 @@ class Asked(Protocol):
 
     @property
     def transform(self) -> Transform: ...
+
+
+def no_marginals(dist: Asked) -> UnsupportedError:
+    """That a family cannot say what some components of a vector are by themselves."""
+    return UnsupportedError(
+        f"{dist._family} has no marginal of some components; a vector seen in part needs an MvNormal, or a "
+        "Joint of parts that are seen in full or not at all"
+    )
 
 
 def explain_sample(dist: Asked, sample_shape: Any, error: Exception) -> None:

@@ -42,6 +42,8 @@ class Joint(Distribution):
     ((3,), [0.0, 1.0, 2.0], -2.694)
     """
 
+    splits = True
+
     def __init__(self, *parts: Any) -> None:
         self.parts = tuple(_usable(part) for part in _listed(parts))
         self._sizes = tuple(part.event_shape[0] if part.event_shape else 0 for part in self.parts)
@@ -52,6 +54,34 @@ class Joint(Distribution):
 
     def parameters(self) -> list[tuple[np.ndarray, int]]:
         return [pair for part in self.parts for pair in part.parameters()]
+
+    def log_prob_of(self, x: np.ndarray, present: np.ndarray) -> np.ndarray:
+        """Log density of some components by themselves, as ``MvNormal.log_prob_of``.
+
+        Raises
+        ------
+        UnsupportedError
+            A part that has no marginals is present in part.
+        """
+        total: Any = np.zeros(np.broadcast_shapes(x.shape[:-1], self.batch_shape))
+        for part, where in self._places():
+            if present[where].all():
+                total = total + part.log_prob_unchecked(x[..., where])
+            elif present[where].any():
+                total = total + part.log_prob_of(x[..., where], present[where])
+        return total
+
+    def completed(
+        self, rng: np.random.Generator, shape: Shape, x: np.ndarray, present: np.ndarray
+    ) -> np.ndarray:
+        """Draws of the components that are not there given those that are, as ``MvNormal.completed``."""
+        draws = self.sample_to(rng, shape)
+        part: Any
+        for part, where in self._places():
+            here = present[where]
+            if here.any() and not here.all():
+                draws[..., where] = part.completed(rng, shape, x[..., where], here)
+        return np.where(present, x, draws)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         draws = np.empty(shape + self.event_shape)

@@ -54,6 +54,7 @@ class MvNormal(Distribution):
     1.3333
     """
 
+    splits = True
     parameter_ndim = {"loc": 1, "cov": 2}
 
     def __init__(
@@ -162,6 +163,53 @@ class MvNormal(Distribution):
         mapped._require_noise()
         mapped._adopt(self)
         return mapped
+
+    def log_prob_of(self, x: np.ndarray, present: np.ndarray) -> np.ndarray:
+        """Log density of some components by themselves; the batch broadcasts.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., d)
+        present : ndarray of bool, shape (d,)
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> import bayesmc as bmc
+        >>> pose = bmc.MvNormal([0.0, 1.0], [[4.0, 1.0], [1.0, 1.0]])
+        >>> float(pose.log_prob_of(np.array([0.0, 9.0]), np.array([True, False])).round(4))
+        -1.6121
+        """
+        if present.all():
+            return self.log_prob_unchecked(x)
+        at = np.flatnonzero(present)
+        if not len(at):
+            return np.zeros(np.broadcast_shapes(x.shape[:-1], self.batch_shape))
+        part = MvNormal(self.loc[..., at], self.cov[..., at[:, None], at])
+        return part.log_prob_unchecked(x[..., at])
+
+    def completed(
+        self, rng: np.random.Generator, shape: Shape, x: np.ndarray, present: np.ndarray
+    ) -> np.ndarray:
+        """Draws, shape ``(*shape, d)``, of the components that are not there given those that are.
+
+        Parameters
+        ----------
+        x : ndarray, shape (..., d)
+            Broadcasts to the draws.
+        present : ndarray of bool, shape (d,)
+
+        References
+        ----------
+        Doucet (2010), A note on efficient conditional simulation of Gaussian distributions (a joint draw
+        moved by what was seen, less what was drawn of it).
+        """
+        draws = self.sample_to(rng, shape)
+        at, rest = np.flatnonzero(present), np.flatnonzero(~present)
+        inside, across = (self.cov[..., rows[:, None], at] for rows in (at, rest))
+        off = np.linalg.solve(inside, (x - draws)[..., at, None])[..., 0]
+        draws[..., rest] += np.matvec(across, off)
+        return np.where(present, x, draws)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         z = rng.standard_normal(shape + self.event_shape)

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from scipy import special
 
+from bayesmc.distributions.intervals import PIECES, is_finite
 from bayesmc.distributions.support import Support
 from bayesmc.errors import ShapeError, UnsupportedError
 from bayesmc.gaussian import try_cholesky
@@ -104,7 +105,8 @@ class Transform:
     -----
     ``constrain`` takes every finite u to a finite x, inside the open support as far as floating
     point can tell. ``unconstrain`` raises for no value: a bound that the open support excludes
-    gives infinite or NaN numbers, a value beyond it NaN.
+    gives infinite or NaN numbers, a value beyond it NaN. ``formula`` and ``log_det_formula`` take what stands
+    for an array, too, so that derivatives come of the same lines; bounds may be such stand-ins.
 
     Examples
     --------
@@ -124,7 +126,8 @@ class Transform:
     def constrain(self, u: Any) -> np.ndarray:
         """The value at ``u``, shape ``(..., *event_shape)`` from ``(..., *unconstrained_shape)``."""
         with np.errstate(all="ignore"):
-            return np.asarray(self._constrain(_checked(self, u, self.unconstrained_shape)))
+            at = _checked(self, u, self.unconstrained_shape)
+            return np.asarray(self._kept_inside(self.formula(at)))
 
     def unconstrain(self, x: Any) -> np.ndarray:
         """The numbers behind ``x``, shape ``(..., *unconstrained_shape)``."""
@@ -139,15 +142,21 @@ class Transform:
         of ``u`` and of the bounds.
         """
         with np.errstate(all="ignore"):
-            return np.asarray(self._log_det(_checked(self, u, self.unconstrained_shape)))
+            return np.asarray(self.log_det_formula(_checked(self, u, self.unconstrained_shape)))
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
+    def formula(self, u: Any) -> Any:
+        """The map alone, of an array or of what stands for one: far out it may round onto a bound."""
         raise NotImplementedError
+
+    def log_det_formula(self, u: Any) -> Any:
+        """The formula of ``log_abs_det_jacobian``, of an array or of what stands for one."""
+        raise NotImplementedError
+
+    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
+        """Values of the formula, those on a bound next to it."""
+        return x
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
-        raise NotImplementedError
-
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
         raise NotImplementedError
 
     def _summed(self, terms: np.ndarray) -> np.ndarray:
@@ -159,14 +168,14 @@ class Transform:
 class Identity(Transform):
     """Unbounded numbers and vectors: ``x = u``."""
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
-        return u.copy()
+    def formula(self, u: Any) -> Any:
+        return +u
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
         return x.copy()
 
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
-        return np.zeros(u.shape[: u.ndim - len(self.event_shape)])
+    def log_det_formula(self, u: Any) -> Any:
+        return np.zeros(np.shape(u)[: np.ndim(u) - len(self.event_shape)])
 
 
 class Wrapped(Transform):
@@ -175,16 +184,18 @@ class Wrapped(Transform):
     A covering of the circle, not a bijection: u and u + 2 pi are one angle, of Jacobian one.
     """
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
+    def formula(self, u: Any) -> Any:
         # an angle already in range keeps all its digits
-        x = u - 2 * np.pi * np.floor((u + np.pi) / (2 * np.pi))
+        return u - 2 * np.pi * np.floor((u + np.pi) / (2 * np.pi))
+
+    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
         return np.where(x >= np.pi, -np.pi, np.maximum(x, -np.pi))
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
-        return self._constrain(x)
+        return self._kept_inside(self.formula(x))
 
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
-        return np.zeros(u.shape[: u.ndim - len(self.event_shape)])
+    def log_det_formula(self, u: Any) -> Any:
+        return np.zeros(np.shape(u)[: np.ndim(u) - len(self.event_shape)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,32 +217,35 @@ class Bounded(Transform):
     @cached_property
     def _bounds(self) -> tuple[np.ndarray, list[int], Shape]:
         """Which bounds each element has (0 none, 1 low, 2 high, 3 both), those found, the shape."""
-        has = np.asarray(np.isfinite(self.low) + 2 * np.isfinite(self.high))
+        has = np.asarray(is_finite(self.low) + 2 * is_finite(self.high))
         return has, [int(k) for k in np.unique(has)], has.shape
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
+    def formula(self, u: Any) -> Any:
+        return self._piecewise("constrain", u)
+
+    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
         # far out exp and expit round onto a bound, or overflow
         least, greatest = self._inside
-        return np.minimum(np.maximum(self._piecewise("constrain", u), least), greatest)
+        return np.minimum(np.maximum(x, least), greatest)
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
         return self._piecewise("unconstrain", x)
 
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
+    def log_det_formula(self, u: Any) -> Any:
         return self._summed(self._piecewise("log_det", u))
 
-    def _piecewise(self, what: str, value: np.ndarray) -> np.ndarray:
+    def _piecewise(self, what: str, value: Any) -> Any:
         """Each element by the formula for the bounds that it has."""
         has, found, shape = self._bounds
         full = np.broadcast_shapes(value.shape, shape)
         if not found:
             return np.empty(full)
-        parts = [_PIECES[what][k](value, self.low, self.high) for k in found]
+        parts = [PIECES[what][k](value, self.low, self.high) for k in found]
         result = parts[0]
         for k, part in zip(found[1:], parts[1:], strict=True):
             result = np.where(has == k, part, result)
         if result.shape != full:  # the Jacobian of one bound does not depend on it: of its batch
-            result = np.array(np.broadcast_to(result, full))
+            result = np.copy(np.broadcast_to(result, full))
         return result
 
 
@@ -245,11 +259,14 @@ class StickBreaking(Transform):
     def unconstrained_shape(self) -> Shape:
         return (self.event_shape[0] - 1,)
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
+    def formula(self, u: Any) -> Any:
         log_share, log_left = self._sticks(u)
-        logs = np.concatenate([log_share, np.zeros((*u.shape[:-1], 1))], axis=-1)
-        logs[..., 1:] += log_left
-        return np.maximum(np.exp(logs), _TINY)
+        one = np.zeros((*u.shape[:-1], 1))
+        share = np.concatenate([log_share, one], axis=-1)
+        return np.exp(share + np.concatenate([one, log_left], axis=-1))
+
+    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
+        return np.maximum(x, _TINY)
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
         # the tail is added up from its end, which keeps the digits that 1 - (sum so far) would lose
@@ -258,12 +275,12 @@ class StickBreaking(Transform):
         outside = ~(np.abs(x.sum(axis=-1, keepdims=True) - 1) <= 1e-6)
         return np.where(outside | (x < 0).any(axis=-1, keepdims=True), np.nan, u)
 
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
+    def log_det_formula(self, u: Any) -> Any:
         log_share, log_left = self._sticks(u)
         # d x_k / d u_k = z_k (1 - z_k) (what is left before k): a triangular matrix
         return (log_share + log_left).sum(axis=-1)
 
-    def _sticks(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _sticks(self, u: Any) -> tuple[Any, Any]:
         """Logarithms of each share of the remainder, and of what remains after it."""
         shifted = u - self._centre()
         return special.log_expit(shifted), np.cumsum(special.log_expit(-shifted), axis=-1)
@@ -284,14 +301,20 @@ class LogCholesky(Transform):
         d = self.event_shape[0]
         return (d * (d + 1) // 2,)
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
-        d = self.event_shape[0]
-        i = np.arange(d)
-        factor = np.zeros(u.shape[:-1] + self.event_shape)
-        factor[..., *np.tril_indices(d)] = u
-        factor[..., i, i] = np.exp(np.clip(factor[..., i, i], -_LOG_ROOT, _LOG_ROOT))
-        x = np.tril(factor @ np.matrix_transpose(factor))
-        return x + np.matrix_transpose(np.tril(x, -1))  # symmetric to the last bit
+    def formula(self, u: Any) -> Any:
+        d, lead = self.event_shape[0], u.shape[:-1]
+        row, column = np.tril_indices(d)
+        logs = u[..., np.flatnonzero(row == column)]
+        roots = np.exp(np.clip(logs, -_LOG_ROOT, _LOG_ROOT))
+        parts = [u, roots, np.zeros((*lead, 1))]
+        at = np.full((d, d), row.size + d)  # the zero behind them
+        at[row, column] = np.arange(row.size)
+        at[np.arange(d), np.arange(d)] = row.size + np.arange(d)
+        factor = np.take(np.concatenate(parts, axis=-1), at, axis=-1)
+        x = np.reshape(factor @ np.matrix_transpose(factor), (*lead, d * d))
+        here = np.arange(d * d).reshape(d, d)
+        lower = np.tril(here) + np.tril(here, -1).T
+        return np.take(x, lower, axis=-1)  # symmetric to the last bit
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
         d = self.event_shape[0]
@@ -302,11 +325,12 @@ class LogCholesky(Transform):
         u = factor[..., *np.tril_indices(d)]
         return u if bad is None else np.where(bad[..., None], np.nan, u)
 
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
+    def log_det_formula(self, u: Any) -> Any:
         d = self.event_shape[0]
         row, column = np.tril_indices(d)
         # L -> L L' stretches by 2^d prod L_ii^(d - i), i from 0; the logarithm adds one L_ii each
-        return d * math.log(2.0) + u[..., row == column] @ np.arange(d + 1.0, 1.0, -1.0)
+        logs = u[..., np.flatnonzero(row == column)]
+        return d * math.log(2.0) + logs @ np.arange(d + 1.0, 1.0, -1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,24 +343,29 @@ class SideBySide(Transform):
     def unconstrained_shape(self) -> Shape:
         return (sum(_width(part.unconstrained_shape) for part in self.parts),)
 
-    def _constrain(self, u: np.ndarray) -> np.ndarray:
+    def formula(self, u: Any) -> Any:
         pieces = self._cut(u, lambda part: part.unconstrained_shape)
-        values = [part.constrain(piece) for part, piece in zip(self.parts, pieces, strict=True)]
+        values = [part.formula(piece) for part, piece in zip(self.parts, pieces, strict=True)]
         return _joined(values, [part.event_shape for part in self.parts])
+
+    def _kept_inside(self, x: np.ndarray) -> np.ndarray:
+        pieces = self._cut(x, lambda part: part.event_shape)
+        kept = [part._kept_inside(piece) for part, piece in zip(self.parts, pieces, strict=True)]
+        return _joined(kept, [part.event_shape for part in self.parts])
 
     def _unconstrain(self, x: np.ndarray) -> np.ndarray:
         pieces = self._cut(x, lambda part: part.event_shape)
         values = [part.unconstrain(piece) for part, piece in zip(self.parts, pieces, strict=True)]
         return _joined(values, [part.unconstrained_shape for part in self.parts])
 
-    def _log_det(self, u: np.ndarray) -> np.ndarray:
+    def log_det_formula(self, u: Any) -> Any:
         pieces = self._cut(u, lambda part: part.unconstrained_shape)
         total = np.zeros(u.shape[:-1])
         for part, piece in zip(self.parts, pieces, strict=True):
-            total = total + part.log_abs_det_jacobian(piece)
+            total = total + part.log_det_formula(piece)
         return total
 
-    def _cut(self, vector: np.ndarray, shape_of: Callable[[Transform], Shape]) -> list[np.ndarray]:
+    def _cut(self, vector: Any, shape_of: Callable[[Transform], Shape]) -> list[Any]:
         pieces, start = [], 0
         for part in self.parts:
             shape = shape_of(part)
@@ -344,62 +373,6 @@ class SideBySide(Transform):
             pieces.append(vector[..., start:stop] if shape else vector[..., start])
             start = stop
         return pieces
-
-
-def _free(value: Any, low: Any, high: Any) -> Any:
-    return +value
-
-
-def _above(u: Any, low: Any, high: Any) -> Any:
-    return low + np.exp(u)
-
-
-def _above_inverse(x: Any, low: Any, high: Any) -> Any:
-    return np.log(x - low)
-
-
-def _exp_log_det(u: Any, low: Any, high: Any) -> Any:
-    return +u
-
-
-def _below(u: Any, low: Any, high: Any) -> Any:
-    return high - np.exp(u)
-
-
-def _below_inverse(x: Any, low: Any, high: Any) -> Any:
-    return np.log(high - x)
-
-
-def _between(u: Any, low: Any, high: Any) -> Any:
-    # an average rather than low + (high - low) z: next to a bound of zero it keeps its digits
-    return low * _share(-u) + high * _share(u)
-
-
-def _share(u: Any) -> np.ndarray:
-    """``expit(u)`` down to the smallest double; SciPy's is zero from -709 on."""
-    share, far = special.expit(u), np.asarray(u) < -700.0
-    return np.where(far, np.exp(np.minimum(u, 0.0)), share) if far.any() else share
-
-
-def _between_inverse(x: Any, low: Any, high: Any) -> Any:
-    return np.log(x - low) - np.log(high - x)
-
-
-def _between_log_det(u: Any, low: Any, high: Any) -> Any:
-    width = np.log(0.5 * high - 0.5 * low) + math.log(2.0)  # high - low itself may overflow
-    return width + special.log_expit(u) + special.log_expit(-u)
-
-
-def _no_log_det(u: Any, low: Any, high: Any) -> Any:
-    return np.zeros_like(u)
-
-
-#: formulas for no bound, a lower one, an upper one, both
-_PIECES: dict[str, tuple[Callable[..., Any], ...]] = {
-    "constrain": (_free, _above, _below, _between),
-    "unconstrain": (_free, _above_inverse, _below_inverse, _between_inverse),
-    "log_det": (_no_log_det, _exp_log_det, _exp_log_det, _between_log_det),
-}
 
 
 def _check_event(support: Support, event_shape: Shape) -> None:
@@ -434,7 +407,7 @@ def _width(shape: Shape) -> int:
     return shape[0] if shape else 1
 
 
-def _joined(values: list[np.ndarray], shapes: list[Shape]) -> np.ndarray:
+def _joined(values: list[Any], shapes: list[Shape]) -> Any:
     """Parts along the last axis, their leading axes broadcast; a part of shape () is one column."""
     rows = [v if shape else v[..., None] for v, shape in zip(values, shapes, strict=True)]
     lead = np.broadcast_shapes(*(row.shape[:-1] for row in rows))

@@ -15,9 +15,9 @@ from bayesmc.distributions import as_distribution
 from bayesmc.errors import EvidenceError, ModelError, UnknownNodeError
 from bayesmc.kernels.proposal import Key, Parts, Proposal, names_of
 from bayesmc.network import Model, Problem
-from bayesmc.network.align import Aligner
+from bayesmc.network.calling import Aligner
+from bayesmc.network.declaring import unknown
 from bayesmc.network.node import Declaration, bind
-from bayesmc.network.store import unknown
 
 #: what every engine takes as a proposal, in words
 FUNCTION = "a function of named nodes that returns a distribution"

@@ -24,8 +24,7 @@ from bayesmc.errors import (
     UnsupportedError,
 )
 from bayesmc.network import CompiledNode, Model
-from bayesmc.network.align import Aligner
-from bayesmc.network.calling import call
+from bayesmc.network.calling import Aligner, call
 from bayesmc.network.model import arguments_of, fit
 from bayesmc.network.node import Declaration
 from bayesmc.shapes import Shape

@@ -3,7 +3,7 @@
 A closure or a global is looked up when a function is called, not when it is declared: in a loop every
 function gets the last value. What was read at declaration is noted here and compared when a question is
 asked, so that a net whose meaning has changed says so; so is what it reads inside a dict or an object, the
-one of a bound method and those of defaults included (``inside``). Functions, classes and modules may be
+one of a bound method and those of defaults included (``sameness``). Functions, classes and modules may be
 defined anew without being noticed.
 """
 
@@ -13,22 +13,34 @@ import copy
 import dis
 import functools
 import keyword
-import operator
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from types import BuiltinFunctionType, CodeType, FunctionType, MethodType, ModuleType
+from types import BuiltinFunctionType, CodeType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
 
 from bayesmc.errors import ModelError
-from bayesmc.network.inside import SMALL, Inside, Reads, inside, is_simple, reads_of
+from bayesmc.network.sameness import (
+    DEFINED,
+    SMALL,
+    Entries,
+    Reads,
+    alike,
+    changed,
+    entries_of,
+    is_simple,
+)
 
 #: functions called by functions called by ... that are looked into
 _DEPTH = 3
-#: what may be defined anew without another net being meant
-_IGNORED = (FunctionType, BuiltinFunctionType, MethodType, ModuleType, type, np.ufunc)
+#: methods that change a container, whose content the function then keeps for itself
+_CHANGERS = frozenset(
+    "append add appendleft clear discard extend insert pop popitem popleft remove reverse setdefault sort "
+    "update".split()
+)
+_LOADS = ("LOAD_GLOBAL", "LOAD_NAME", "LOAD_DEREF", "LOAD_FAST", "LOAD_ATTR", "LOAD_METHOD")
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,15 +57,18 @@ class Captured:
     cell : int, tuple or None
         Its place in the function's closure; None for a global; for what is bound to the function, as
         ``self`` and defaults are, the attribute of the function and the place in it.
-    inside : Inside or None
+    entries : Entries or None
         What can be read inside the value, as it stood at declaration.
+    reads : Reads
+        What is read there.
     """
 
     name: str
     value: Any
     function: Any
     cell: int | tuple[str, Any] | None
-    inside: Inside | None = None
+    entries: Entries | None = None
+    reads: Reads = Reads()
 
     @property
     def now(self) -> Any:
@@ -67,6 +82,12 @@ class Captured:
         except (ValueError, IndexError):
             return self.value
 
+    def change(self, now: Any) -> tuple[str, Any, Any] | None:
+        """How what the name stands for now differs: the path of the entry, what it was and what it is."""
+        if self.entries is not None:
+            return changed(self.entries, now, self.reads)
+        return None if alike(self.value, now) else ("", self.value, now)
+
     def __getstate__(self) -> dict[str, Any]:
         """Elsewhere a function may find other objects of the same meaning: only plain values travel."""
         value = self.value if _is_plain(self.value) else _Anything()
@@ -76,14 +97,13 @@ class Captured:
 def captured(function: Any) -> tuple[Captured, ...]:
     """What a function reads from around it, and what Python functions of its module read that it calls."""
     found: dict[tuple[int, str], Captured] = {}
-    _collect(function, _DEPTH, found)
-    names = [c for key, c in found.items() if key[1]]
-    if not names:
+    followed: dict[int, FunctionType] = {}
+    _collect(function, _DEPTH, found, followed)
+    if not found:
         return ()
-    followed = [reads_of(c.function.__code__) for key, c in found.items() if not key[1]]
-    reads = functools.reduce(operator.or_, followed)
-    with_inside = [c if is_simple(c.value) else _with_inside(c, reads) for c in names]
-    return tuple(c for c in with_inside if c is not None)
+    reads = functools.reduce(Reads.union, (reads_of(f.__code__) for f in followed.values()))
+    looked_into = (_looked_into(c, reads) for c in found.values())
+    return tuple(c for c in looked_into if c is not None)
 
 
 def check_captured(declarations: Iterable[Any], what: str = "node") -> None:
@@ -100,11 +120,9 @@ def check_captured(declarations: Iterable[Any], what: str = "node") -> None:
         done.add(id(declaration.captured))
         for seen in declaration.captured:
             now = seen.now
-            if now is not seen.value and not _alike(seen.value, now):
-                raise ModelError(_words(what, declaration, seen, now))
-            change = seen.inside.change(now) if seen.inside is not None else None
+            change = seen.change(now)
             if change is not None:
-                raise ModelError(_words_inside(what, declaration, seen, *change))
+                raise ModelError(_words(what, declaration, seen, now, *change))
 
 
 def redeclared(was: Iterable[Captured], now: Iterable[Captured]) -> str | None:
@@ -119,11 +137,50 @@ def redeclared(was: Iterable[Captured], now: Iterable[Captured]) -> str | None:
     for seen in now:
         known = before.get(_place(seen))
         old = known.pop(0) if known else seen
-        if old.value is not seen.value and not _alike(old.value, seen.value):
+        if not alike(old.value, seen.value):
             return (
                 f"{seen.name!r}, which was {_peek(old.value)} then and is {_peek(seen.value)} now"
             )
     return None
+
+
+@functools.lru_cache(maxsize=4096)
+def reads_of(code: CodeType) -> Reads:
+    """What code reads and writes into, functions inside it among it."""
+    steps = list(dis.get_instructions(code))
+    around: set[str] = set()
+    sets: set[str] = set()
+    attributes: set[str] = set()
+    writes: set[str] = set()
+    by_key = False
+    aliases: dict[str, str] = {}
+    for k, step in enumerate(steps):
+        before = _loaded(steps[k - 1]) if k else ()
+        name, kind = str(step.argval), step.opname
+        if kind in ("LOAD_GLOBAL", "LOAD_NAME"):
+            around.add(name)
+        elif kind in ("LOAD_ATTR", "LOAD_METHOD"):
+            attributes.add(name)
+            if name in _CHANGERS:
+                writes.update(before)
+        elif kind in ("STORE_ATTR", "DELETE_ATTR"):
+            writes.add(name)
+        elif kind in ("STORE_SUBSCR", "DELETE_SUBSCR", "STORE_SLICE"):
+            writes.update(_written(steps, k))
+        elif kind == "BINARY_SUBSCR" or (kind == "BINARY_OP" and "[" in step.argrepr):
+            by_key = True
+        if kind in ("STORE_GLOBAL", "STORE_DEREF", "DELETE_GLOBAL"):
+            sets.add(name)
+        if kind in ("STORE_FAST", "STORE_DEREF") and before:
+            aliases[name] = before[-1]
+    for _ in range(3):  # c = self.cache; c[key] = ...
+        writes |= {aliases[name] for name in writes if name in aliases}
+    keys = (c for c in code.co_consts if isinstance(c, str))
+    names = map(frozenset, (around, attributes, keys, sets, writes))
+    read, attribute, key, set_, written = names
+    found = Reads(read, attribute, key, by_key, set_, written)
+    inner = (reads_of(c) for c in code.co_consts if isinstance(c, CodeType))
+    return functools.reduce(Reads.union, inner, found)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -142,11 +199,16 @@ def _place(seen: Captured) -> tuple[str, str, str]:
     return seen.function.__module__, seen.function.__qualname__, seen.name
 
 
-def _collect(function: Any, depth: int, found: dict[tuple[int, str], Captured]) -> None:
+def _collect(
+    function: Any,
+    depth: int,
+    found: dict[tuple[int, str], Captured],
+    followed: dict[int, FunctionType],
+) -> None:
     plain = _plain_function(function)
-    if plain is None or (id(plain), "") in found:  # functions may call each other
+    if plain is None or id(plain) in followed:  # functions may call each other
         return
-    found[id(plain), ""] = Captured("", None, plain, None)
+    followed[id(plain)] = plain
     for name, value, holder, place in _bound(function, plain):
         if not is_simple(value):
             found[id(holder), str(place)] = Captured(name, _kept(value), holder, place)
@@ -154,10 +216,10 @@ def _collect(function: Any, depth: int, found: dict[tuple[int, str], Captured]) 
         key = (id(plain), name)
         if key in found:
             continue
-        if isinstance(value, _IGNORED) or isinstance(value, functools.partial):
+        if isinstance(value, (functools.partial, *DEFINED)):
             inner = _plain_function(value)
             if inner is not None and depth and inner.__globals__ is plain.__globals__:
-                _collect(value, depth - 1, found)
+                _collect(value, depth - 1, found, followed)
             continue
         found[key] = Captured(name, _kept(value), plain, cell)
 
@@ -207,47 +269,83 @@ def _bound_now(holder: Any, attribute: str, place: Any) -> Any:
     return value if place is None else value[place]
 
 
-def _with_inside(seen: Captured, reads: Reads) -> Captured | None:
+def _looked_into(seen: Captured, reads: Reads) -> Captured | None:
     """With what can be read inside it; None for what is bound and cannot change."""
-    entries = inside(seen.name, seen.value, reads)
+    if is_simple(seen.value):
+        return seen
+    entries = None
+    if seen.name not in reads.writes:
+        kind: Any = type(seen.value)
+        if not issubclass(kind, (dict, list, tuple, set)):
+            reads = _with_methods(kind, reads)
+        entries = entries_of(seen.value, reads)
     if isinstance(seen.cell, tuple) and entries is None and not isinstance(seen.value, np.ndarray):
         return None
-    return seen if entries is None else replace(seen, inside=entries)
+    return seen if entries is None else replace(seen, entries=entries, reads=reads)
+
+
+@functools.lru_cache(maxsize=1024)
+def _with_methods(kind: Any, reads: Reads) -> Reads:
+    """The reads of a function together with those of the methods and properties of a class it names."""
+    for _ in range(3):
+        before = reads
+        for name in before.attributes:
+            found = getattr(kind, name, None)
+            if isinstance(found, property):
+                found = found.fget
+            elif isinstance(found, functools.cached_property):
+                found = found.func
+            found = getattr(found, "__func__", found)
+            if isinstance(found, FunctionType):
+                reads = reads.union(reads_of(found.__code__))
+        if reads == before:
+            break
+    return reads
+
+
+def _loaded(step: dis.Instruction) -> tuple[str, ...]:
+    if not step.opname.startswith(_LOADS):
+        return ()
+    return step.argval if isinstance(step.argval, tuple) else (str(step.argval),)
+
+
+def _written(steps: list[dis.Instruction], at: int) -> Iterable[str]:
+    """Names of the container that ``container[key] = value`` writes into; of all on its line if unsure."""
+    need = 1  # the key lies on top of the container
+    for k in range(at - 1, -1, -1):
+        step = steps[k]
+        if need <= 0:
+            names = _loaded(step)
+            if names:
+                return names
+            break
+        if step.opname in ("COPY", "SWAP"):  # container[key] += value
+            break
+        need -= dis.stack_effect(step.opcode, step.arg, jump=False)
+    line = _line(steps[at])
+    return [n for s in steps for n in _loaded(s) if _line(s) == line]
+
+
+def _line(step: dis.Instruction) -> int | None:
+    return step.positions.lineno if step.positions else None
 
 
 def _around(function: FunctionType) -> Iterator[tuple[str, Any, int | None]]:
     """Names that a function reads from around it and does not set itself: value, and place in its closure."""
     code = function.__code__
-    reads, sets = _names(code)
+    reads = reads_of(code)
     for k, (name, cell) in enumerate(
         zip(code.co_freevars, function.__closure__ or (), strict=True)
     ):
-        if name not in sets:
+        if name not in reads.sets:
             try:
                 yield name, cell.cell_contents, k
             except ValueError:  # not set yet
                 continue
     names = function.__globals__
-    for name in reads - sets:
+    for name in reads.globals - reads.sets:
         if name in names:
             yield name, names[name], None
-
-
-@functools.lru_cache(maxsize=4096)
-def _names(code: CodeType) -> tuple[frozenset[str], frozenset[str]]:
-    """Globals that code reads, and names around it that it sets, functions inside it among it."""
-    reads, sets = set(), set()
-    for step in dis.get_instructions(code):
-        if step.opname in ("LOAD_GLOBAL", "LOAD_NAME"):
-            reads.add(str(step.argval))
-        elif step.opname in ("STORE_GLOBAL", "STORE_DEREF", "DELETE_GLOBAL"):
-            sets.add(str(step.argval))
-    for inner in code.co_consts:
-        if isinstance(inner, CodeType):
-            more, others = _names(inner)
-            reads |= more
-            sets |= others
-    return frozenset(reads), frozenset(sets)
 
 
 def _kept(value: Any) -> Any:
@@ -265,44 +363,27 @@ def _is_plain(value: Any) -> bool:
     return value is None or isinstance(value, (int, float, complex, str, bytes, np.generic))
 
 
-def _alike(old: Any, new: Any) -> bool:
-    """Whether two values mean the same; of objects that cannot tell, whether they hold the same."""
-    if old is new or isinstance(old, _Anything) or isinstance(new, _IGNORED):
-        return True
-    if isinstance(old, np.ndarray) or isinstance(new, np.ndarray):
-        return (
-            isinstance(new, np.ndarray)
-            and isinstance(old, np.ndarray)
-            and old.shape == new.shape
-            and _equal_arrays(old, new)
-        )
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        return old.keys() == new.keys() and all(_alike(old[k], new[k]) for k in old)
-    if isinstance(old, (list, tuple)) and isinstance(new, (list, tuple)):
-        return len(old) == len(new) and all(map(_alike, old, new))
-    try:
-        if bool(old == new) or (old != old and new != new):
-            return True
-    except Exception:  # an object's own comparison may fail as it likes
-        return False
-    plain = type(old).__eq__ is object.__eq__ and type(old) is type(new)
-    return plain and hasattr(old, "__dict__") and _alike(vars(old), vars(new))
-
-
-def _equal_arrays(old: np.ndarray, new: np.ndarray) -> bool:
-    if old.dtype.kind in "fc" and new.dtype.kind in "fc":
-        return np.array_equal(old, new, equal_nan=True)
-    return np.array_equal(old, new)
-
-
-def _words(what: str, declaration: Any, seen: Captured, now: Any) -> str:
-    name = seen.name
-    fix = f"give the function an argument {name}={name}, which keeps the value"
+def _words(
+    what: str, declaration: Any, seen: Captured, now: Any, path: str, old: Any, new: Any
+) -> str:
+    name, place = seen.name, seen.cell[0] if isinstance(seen.cell, tuple) else None
+    entry = f"{name}{path}"
+    is_inside = seen.entries is not None and (
+        now is seen.value or isinstance(seen.value, _Anything)
+    )
+    argument = _argument(name, entry, new) if is_inside else f"{name}={name}"
+    fix = f"give the function an argument {argument}, which keeps the value"
     if what == "node":
         fix += " (arguments with defaults are no parents)"
+    if is_inside and place in ("__self__", ""):
+        fix = "give every function an object of its own (copy.copy keeps its values)"
+    elif is_inside and place is not None:
+        fix = f"bind a copy, as {name}=copy.deepcopy({name}) does"
+    reads = entry if is_inside else f"{name!r} from around it"
+    was, is_ = (old, new) if is_inside else (seen.value, now)
     return (
-        f"{what} {declaration.name!r}: its function reads {name!r} from around it, which was "
-        f"{_peek(seen.value)} when it was declared and is {_peek(now)} now; {fix}, or declare the {what} anew"
+        f"{what} {declaration.name!r}: its function reads {reads}, which was {_peek(was)} when it was "
+        f"declared and is {_peek(is_)} now; {fix}, or declare the {what} anew"
     )
 
 
@@ -312,25 +393,6 @@ def _peek(value: Any) -> str:
     except Exception:
         text = f"a {type(value).__name__}"
     return text if len(text) <= 60 else text[:57] + "..."
-
-
-def _words_inside(
-    what: str, declaration: Any, seen: Captured, path: str, old: Any, now: Any
-) -> str:
-    entry = f"{seen.name}{path}"
-    place = seen.cell[0] if isinstance(seen.cell, tuple) else None
-    if place in ("__self__", ""):
-        fix = "give every function an object of its own (copy.copy keeps its values)"
-    elif place is not None:
-        fix = f"bind a copy, as {seen.name}=copy.deepcopy({seen.name}) does"
-    else:
-        fix = f"give the function an argument {_argument(seen.name, entry, now)}, which keeps the value"
-        if what == "node":
-            fix += " (arguments with defaults are no parents)"
-    return (
-        f"{what} {declaration.name!r}: its function reads {entry}, which was {_peek(old)} when it was "
-        f"declared and is {_peek(now)} now; {fix}, or declare the {what} anew"
-    )
 
 
 def _argument(name: str, entry: str, now: Any) -> str:

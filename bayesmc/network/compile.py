@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,6 @@ import numpy as np
 
 from bayesmc.distributions import Density, Distribution
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.distributions.components import splits
 from bayesmc.errors import (
     BayesmcError,
     BroadcastError,
@@ -21,13 +21,11 @@ from bayesmc.errors import (
     ShapeError,
     StateError,
 )
-from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.calling import call
+from bayesmc.network.calling import Aligner, RowAligner
 from bayesmc.network.labels import Domain, domain_with_states, states_domain
 from bayesmc.network.model import (
     CompiledNode,
     Model,
-    arguments_of,
     deterministic_fit,
     fit,
     lookup,
@@ -61,21 +59,21 @@ def compile_model(
     """Call every node once on reachable values of its parents and note what it is."""
     events = [n for d in declarations.values() for n in d.event_shape]
     shape = tuple(unused_sizes([*sizes.values(), *events], 2))[::-1]
-    nodes: dict[str, CompiledNode] = {}
-    model = Model(name, nodes, {}, dict(sizes), dict(labels), {}, shape)
+    model = Model(name, {}, {}, dict(sizes), dict(labels), {}, shape)
     rng = np.random.default_rng(20)
     with marking_invalid(), np.errstate(all="ignore"):
         for count, key in enumerate(order):
             declaration = declarations[key]
-            links = _links(declaration.parents, declaration, nodes)
+            links = _links(declaration.parents, declaration, model.nodes)
             plates = tuple(sizes[p] for p in declaration.plates)
+            bare = CompiledNode(
+                declaration, links, plates, declaration.event_shape, is_stochastic=False
+            )
             if declaration.source == "table":
-                _check_table_parents(declaration, links, nodes)
-            node, value = _discover(declaration, links, plates, model, shape, count, rng, inputs)
-            nodes[key] = node
-            model.probe[key] = value
+                _check_table_parents(bare, model)
+            model.nodes[key], model.probe[key] = _discover(model, bare, count, rng, inputs)
     for key, potential in potentials.items():
-        model.potentials[key] = (potential, _potential_links(potential, nodes))
+        model.potentials[key] = (potential, _potential_links(potential, model.nodes))
     return model
 
 
@@ -122,69 +120,50 @@ def _potential_links(
 
 
 def _discover(
-    declaration: Declaration,
-    links: tuple[tuple[str, Aligner], ...],
-    plates: Shape,
     model: Model,
-    shape: Shape,
+    bare: CompiledNode,
     count: int,
     rng: np.random.Generator,
     inputs: Mapping[str, np.ndarray],
 ) -> tuple[CompiledNode, np.ndarray]:
     """The compiled node, and reachable values of it for its children to be tried on."""
-    probe = model.probe
+    declaration, probe = bare.declaration, model.probe
     if declaration.source == "input":
         value = inputs.get(declaration.name)
         if value is None:
-            value = 1.0 + rng.random(plates + declaration.event_shape)
-        node = CompiledNode(declaration, links, plates, declaration.event_shape, False, False)
-        return node, read_only(value)
+            value = 1.0 + rng.random(bare.value_shape)
+        return bare, read_only(value)
     if declaration.source == "fixed":
         assert declaration.value is not None
-        discrete = declaration.domain is not None
-        node = CompiledNode(
-            declaration, links, plates, declaration.event_shape, discrete, False, declaration.domain
-        )
-        return node, declaration.value
-    _, batch = arguments_of(links, probe)
-    result = _call_batched(declaration, links, probe, shape, batch + plates)
-    possible = made_possible(declaration, links, plates, result, batch, model)
+        domain = declaration.domain
+        return replace(bare, is_discrete=domain is not None, domain=domain), declaration.value
+    result, batch = _called(model, bare)
+    possible = made_possible(model, bare, result, batch)
     if possible:
-        result = _call_batched(declaration, links, probe, shape, batch + plates)
-    if isinstance(result, Distribution):
-        node, value = _discover_stochastic(
-            declaration, links, plates, result, batch, shape, count, rng
-        )
-        if not possible:
-            refuse_parameters(node, result, probe, batch)
-        return node, value
-    return _discover_deterministic(
-        declaration, links, plates, result, batch, probe, shape, possible
-    )
+        result, batch = _called(model, bare)
+    if not isinstance(result, Distribution):
+        return _deterministic(model, bare, result, batch, possible)
+    node = _stochastic(bare, result, batch)
+    value = reachable(node, result, model.probe_shape, count, rng)
+    if not possible:
+        refuse_parameters(node, result, probe, batch)
+    return node, read_only(value)
 
 
-def _call_batched(
-    declaration: Declaration,
-    links: tuple[tuple[str, Aligner], ...],
-    probe: Mapping[str, np.ndarray],
-    shape: Shape,
-    lead: Shape,
-) -> Any:
+def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
     """Call on the whole probe; if that fails but one entry works, the function does not broadcast."""
-    arguments, _ = arguments_of(links, probe)
     try:
-        return call(declaration, arguments, lead, links)
+        return node.called(model.probe)
     except BayesmcError as error:
-        if not links or declaration.source == "table" or _is_plain(error):
+        if not node.links or node.declaration.source == "table" or _is_plain(error):
             raise
         try:
-            one, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
-            call(declaration, one, lead[len(lead) - len(declaration.plates) :], links)
+            node.called(entry(node, model.probe, model.probe_shape))
         except BayesmcError as alone:
             raise alone from alone.__cause__
         raise BroadcastError(
-            f"node {declaration.name!r} works on one value at a time but not on arrays of them: "
-            f"{str(error).removeprefix(f'node {declaration.name!r}: ')}; write it with NumPy "
+            f"node {node.name!r} works on one value at a time but not on arrays of them: "
+            f"{str(error).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
             "(np.where for if, axis=-1 for components), or declare vectorize=True (slow)"
         ) from error
 
@@ -194,52 +173,39 @@ def _is_plain(error: BayesmcError) -> bool:
     return isinstance(error, StateError) or isinstance(error.__cause__, IndexError)
 
 
-def _discover_stochastic(
-    declaration: Declaration,
-    links: tuple[tuple[str, Aligner], ...],
-    plates: Shape,
-    dist: Distribution,
-    batch: Shape,
-    shape: Shape,
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[CompiledNode, np.ndarray]:
-    fit(declaration, dist, batch, plates)
-    support = dist.support
+def _stochastic(bare: CompiledNode, dist: Distribution, batch: Shape) -> CompiledNode:
+    """What is to be known of a node from its distribution at the probe."""
+    declaration, support = bare.declaration, dist.support
+    fit(declaration, dist, batch, bare.plate_shape)
     domain = None
     varies = declaration.domain is not None  # known by who declares: not the same in all slices
     constant = support.is_single and not varies
     small = support.size is not None and support.size <= _DOMAIN_SIZE
     if small and constant and not dist.event_shape:
         assert support.size is not None
-        try:
-            domain = domain_with_states(
-                support.size, int(np.asarray(support.low).flat[0]), declaration.states
-            )
-        except ModelError as error:
-            raise ModelError(f"node {declaration.name!r}: {error}") from None
+        low = int(np.asarray(support.low).flat[0])
+        with _naming(bare):
+            domain = domain_with_states(support.size, low, declaration.states)
     elif declaration.states is not None:
         raise ModelError(
-            f"node {declaration.name!r}: states= need a distribution with finitely many values (at most "
+            f"node {bare.name!r}: states= need a distribution with finitely many values (at most "
             f"{_DOMAIN_SIZE}) that do not depend on the parents; {type(dist).__name__} is on "
             f"{support.describe()}"
         )
-    node = CompiledNode(
+    return CompiledNode(
         declaration,
-        links,
-        plates,
+        bare.links,
+        bare.plate_shape,
         dist.event_shape,
         bool(dist.is_discrete),
         True,
         domain,
         support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
-        noiseless=_is_noiseless(dist, batch + plates, len(batch)),
-        splits=splits(dist),
+        noiseless=_is_noiseless(dist, batch + bare.plate_shape, len(batch)),
+        splits=dist.splits,
         reach=None if varies else support.at_most,
     )
-    value = reachable(node, dist, shape, count, rng)
-    return node, read_only(value)
 
 
 def _is_noiseless(dist: Distribution, lead: Shape, batch: int) -> bool:
@@ -249,50 +215,38 @@ def _is_noiseless(dist: Distribution, lead: Shape, batch: int) -> bool:
     return bool(np.broadcast_to(dist.noiseless, lead).all(axis=tuple(range(batch))).any())
 
 
-def _discover_deterministic(
-    declaration: Declaration,
-    links: tuple[tuple[str, Aligner], ...],
-    plates: Shape,
-    result: np.ndarray,
-    batch: Shape,
-    probe: Mapping[str, np.ndarray],
-    shape: Shape,
-    possible: bool = False,
+def _deterministic(
+    model: Model, bare: CompiledNode, result: Any, batch: Shape, possible: bool
 ) -> tuple[CompiledNode, np.ndarray]:
     """Event shape from one unbatched call; a table where all parents are finite."""
-    single, _ = arguments_of(links, entry(links, probe, shape, (0,) * len(shape)))
-    one = call(declaration, single, plates, links)
-    event = one.shape[len(plates) :]
-    full = batch + plates + event
-    value = deterministic_fit(declaration, result, batch, plates, full)
+    one, _ = bare.called(entry(bare, model.probe, model.probe_shape))
+    node = replace(bare, event_shape=one.shape[len(bare.plates) :])
+    value = deterministic_fit(node, result, batch)
     undefined = not possible and value.dtype.kind == "f" and np.isnan(value).any()
-    if undefined and not overflows(declaration, links, probe, batch + plates):
-        raise DensityError(
-            f"node {declaration.name!r}: the function returns NaN on reachable values"
-        )
-    integral = value.dtype.kind in "biu"
-    labels = declaration.states
+    if undefined and not overflows(node, model.probe):
+        raise DensityError(f"node {node.name!r}: the function returns NaN on reachable values")
+    node = replace(node, is_discrete=value.dtype.kind in "biu")
+    labels, wanted = node.declaration.states, node.declaration.domain
     if labels is None and isinstance(one, StateArray):
         labels = one.states  # labels that a function passes on stay labels
-    node = CompiledNode(declaration, links, plates, event, integral, False)
-    if labels is None:
-        wanted = declaration.domain  # where other functions compute the same node, too
-        if wanted is not None and not wanted.size:
+    domain = None
+    if labels is not None:
+        if node.event_shape or not node.is_discrete or _is_beyond(value, len(labels)):
+            raise ModelError(
+                f"node {node.name!r}: with states= a deterministic node returns scalar positions "
+                f"0..{len(labels) - 1}, not {np.unique(value)[:6].tolist()}"
+            )
+        with _naming(node):
+            domain = states_domain(labels)
+    elif wanted is not None:  # where other functions compute the same node, too
+        if not wanted.size:
             return node, value
-        if wanted is not None and not links and not event and integral:
+        if not (node.links or node.event_shape) and node.is_discrete:
             return _constant_of(node, wanted, value)
-        tabulated = _tabulate_deterministic(node, None, wanted)
-        return (node, value) if tabulated is None else (tabulated, lookup(tabulated, probe))
-    if event or not integral or (value.size and not 0 <= value.min() <= value.max() < len(labels)):
-        raise ModelError(
-            f"node {declaration.name!r}: with states= a deterministic node returns scalar positions "
-            f"0..{len(labels) - 1}, not {np.unique(value)[:6].tolist()}"
-        )
-    domain = _states_of(declaration.name, labels)
-    tabulated = _tabulate_deterministic(node, domain)
+    tabulated = _tabulated(node, domain, wanted)
     if tabulated is not None:
-        return tabulated, lookup(tabulated, probe)
-    return replace(node, domain=domain, is_discrete=True), value
+        return tabulated, lookup(tabulated, model.probe)
+    return replace(node, domain=domain), value
 
 
 def _constant_of(
@@ -308,15 +262,22 @@ def _constant_of(
     return replace(node, domain=domain, table=table), read_only(table)
 
 
-def _states_of(name: str, states: tuple[Any, ...]) -> Domain:
+@contextmanager
+def _naming(node: CompiledNode) -> Iterator[None]:
+    """What is wrong with states names the node."""
     try:
-        return states_domain(states)
+        yield
     except ModelError as error:
-        raise ModelError(f"node {name!r}: {error}") from None
+        raise ModelError(f"node {node.name!r}: {error}") from None
 
 
-def _tabulate_deterministic(
-    node: CompiledNode, domain: Domain | None, wanted: Domain | None = None
+def _is_beyond(positions: np.ndarray, states: int) -> bool:
+    """Whether some are no positions of so many states."""
+    return bool(positions.size) and not 0 <= positions.min() <= positions.max() < states
+
+
+def _tabulated(
+    node: CompiledNode, domain: Domain | None, wanted: Domain | None
 ) -> CompiledNode | None:
     """``node`` with the table of its positions over all configurations of its parents, if small.
 
@@ -328,45 +289,27 @@ def _tabulate_deterministic(
     cards = tuple(d.size for d in domains if d is not None)
     if math.prod(cards) * max(math.prod(node.plate_shape), 1) > _DETERMINISTIC_TABLE:
         return None
-    values = configurations(node.links, cards)
     try:
-        arguments, batch = arguments_of(node.links, values)
-        result = call(node.declaration, arguments, batch + node.plate_shape, node.links)
+        result, _ = node.called(configurations(node.links, cards))
     except BayesmcError:
         return None  # some configuration, perhaps an impossible one, cannot be evaluated
     full = np.broadcast_to(result, cards + node.plate_shape)
     if full.dtype.kind == "f" and not np.isfinite(full).all():
         return None
-    if domain is None:
-        unique, positions = np.unique(full, return_inverse=True)
-        if (
-            wanted is not None
-            and wanted.numbers is not None
-            and np.isin(unique, wanted.numbers).all()
-        ):
-            domain, positions = wanted, np.searchsorted(wanted.numbers, unique)[positions]
-        else:
-            unique.flags.writeable = False
-            domain = Domain(len(unique), values=unique)
-        positions = positions.reshape(full.shape)
-    elif full.size and not 0 <= full.min() <= full.max() < domain.size:
-        raise ModelError(
-            f"node {node.name!r}: with states= a deterministic node returns positions "
-            f"0..{domain.size - 1}, not {np.unique(full)[:6].tolist()}"
-        )
+    if domain is not None:
+        if _is_beyond(full, domain.size):
+            raise ModelError(
+                f"node {node.name!r}: with states= a deterministic node returns positions "
+                f"0..{domain.size - 1}, not {np.unique(full)[:6].tolist()}"
+            )
+        return replace(node, domain=domain, table=full.astype(domain.dtype))
+    unique, positions = np.unique(full, return_inverse=True)
+    numbers = None if wanted is None else wanted.numbers
+    if wanted is not None and numbers is not None and np.isin(unique, numbers).all():
+        domain, positions = wanted, np.searchsorted(numbers, unique)[positions]
     else:
-        positions = full
-    return CompiledNode(
-        node.declaration,
-        node.links,
-        node.plate_shape,
-        (),
-        node.is_discrete,
-        False,
-        domain,
-        None,
-        positions.astype(domain.dtype),
-    )
+        domain = Domain(len(unique), values=read_only(unique))
+    return replace(node, domain=domain, table=positions.reshape(full.shape).astype(domain.dtype))
 
 
 def configurations(
@@ -385,26 +328,23 @@ def configurations(
     return values
 
 
-def _check_table_parents(
-    declaration: Declaration,
-    links: tuple[tuple[str, Aligner], ...],
-    nodes: Mapping[str, CompiledNode],
-) -> None:
-    assert declaration.probs is not None
-    for (parent, link), card in zip(links, declaration.probs.shape[:-1], strict=True):
+def _check_table_parents(node: CompiledNode, model: Model) -> None:
+    probs = node.declaration.probs
+    assert probs is not None
+    for (parent, link), card in zip(node.links, probs.shape[:-1], strict=True):
         if link.foreign:
             raise PlateError(
-                f"node {declaration.name!r}: the table's parent {parent!r} is in plates "
+                f"node {node.name!r}: the table's parent {parent!r} is in plates "
                 f"{link.foreign}, which the table lacks; add them to plates="
             )
-        domain = nodes[parent].domain
+        domain = model[parent].domain
         if domain is None:
             raise ShapeError(
-                f"node {declaration.name!r}: the table's parent {parent!r} has no finite set of states; "
+                f"node {node.name!r}: the table's parent {parent!r} has no finite set of states; "
                 "use a function of it that returns a distribution"
             )
         if domain.size != card:
             raise ShapeError(
-                f"node {declaration.name!r}: probs has {card} rows along the axis of parent {parent!r}, "
+                f"node {node.name!r}: probs has {card} rows along the axis of parent {parent!r}, "
                 f"which has {domain.size} states"
             )

@@ -28,19 +28,16 @@ from bayesmc.expression import (
     mapped,
     replaced,
 )
-from bayesmc.network.agreement import (
-    VARIANTS,
-    Probe,
-    deterministic_above,
-    hold_against,
-    hold_form,
-)
-from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.model import CompiledNode, Model, potential_shape
+from bayesmc.network.calling import Aligner, RowAligner
+from bayesmc.network.model import CompiledNode, Model, deterministic_above, potential_shape
 from bayesmc.network.node import Numbered, identity
 from bayesmc.network.readings import (
+    VARIANTS,
     Argument,
+    Probe,
     Reading,
+    hold_against,
+    hold_form,
     numbers_of,
     read_function,
     read_table,
@@ -325,21 +322,8 @@ def _function(model: Model, name: str) -> Any:
 
 
 def _leaves_above(model: Model, name: str, cut: frozenset[str] = frozenset()) -> frozenset[str]:
-    found, seen = set(), set()
-    todo = [name]
-    while todo:
-        above = todo.pop()
-        parents = (
-            model[above].parents if above in model.nodes else model.potentials[above][0].parents
-        )
-        for parent in parents:
-            if parent not in seen:
-                seen.add(parent)
-                if model[parent].kind == "deterministic" and parent not in cut:
-                    todo.append(parent)
-                else:
-                    found.add(parent)
-    return frozenset(found)
+    inside = [name, *deterministic_above(model, name, cut)]
+    return frozenset(p for n in inside for p in model.parents(n)).difference(inside)
 
 
 def _shared(model: Model, name: str, for_all_numbers: bool) -> Followed:

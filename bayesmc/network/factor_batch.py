@@ -21,6 +21,7 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network.captured import captured
+from bayesmc.network.declaring import Constant
 from bayesmc.network.labels import Domain, domain_with_states
 from bayesmc.network.node import Declaration, Potential, bind, plain_states
 from bayesmc.shapes import Shape, as_shape, first_index, owned
@@ -44,14 +45,14 @@ def variable_declaration(
             f"variable {name!r}: its support has many bounds; give one support for all"
         )
     return Declaration(
-        name, "variable", (), plates, states, _Constant(density), event_shape=density.event_shape
+        name, "variable", (), plates, states, Constant(density), event_shape=density.event_shape
     )
 
 
 def support_of(declaration: Declaration) -> Support:
     """The support that a variable was declared with."""
-    assert isinstance(declaration.function, _Constant)
-    return declaration.function.density.support
+    assert isinstance(declaration.function, Constant)
+    return declaration.function.distribution.support
 
 
 def domain_of(declaration: Declaration) -> Domain | None:
@@ -106,16 +107,6 @@ class _Flat:
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
         return np.zeros(np.shape(x)[: np.ndim(x) - self.event_ndim])
-
-
-class _Constant:
-    """A function of no parents that returns one density."""
-
-    def __init__(self, density: Density) -> None:
-        self.density = density
-
-    def __call__(self) -> Density:
-        return self.density
 
 
 class _LogTable:

@@ -21,7 +21,7 @@ from bayesmc.errors import (
     PlateError,
     QueryError,
 )
-from bayesmc.network.declaring import DeclaredPlates
+from bayesmc.network.declaring import Declared, DeclaredPlates
 from bayesmc.network.evidence import Observed, read_evidence, read_inputs
 from bayesmc.network.factor_batch import read_factor, variable_declaration
 from bayesmc.network.factor_scope import factor_scopes, hidden_elements
@@ -29,7 +29,6 @@ from bayesmc.network.forward import refuse_parts
 from bayesmc.network.full_conditional import full_conditional
 from bayesmc.network.graph_view import FactorRecord, GraphView, VariableRecord
 from bayesmc.network.model import Model
-from bayesmc.network.store import Declared
 
 
 class FactorGraph(Declared):

@@ -29,7 +29,7 @@ from bayesmc.expression import (
     substituted,
 )
 from bayesmc.expression.graph import as_float
-from bayesmc.network.align import Aligner, RowAligner
+from bayesmc.network.calling import Aligner, RowAligner
 from bayesmc.network.evidence import Observed
 from bayesmc.network.expressions import Opaque, density
 from bayesmc.network.model import CompiledNode, Model, potential_shape

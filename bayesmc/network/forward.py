@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 
 from bayesmc.distributions import Distribution
-from bayesmc.distributions.components import completed, log_prob_of
 from bayesmc.errors import ParameterError, UnsupportedError
 from bayesmc.network.evidence import Observed
 from bayesmc.network.model import CompiledNode, Model, invalid_error
@@ -199,9 +198,7 @@ class DrawAndWeigh:
         state.weigh(summed(total, self.node, self.apart))
         state.values[self.node.name] = values
 
-    def _in_part(
-        self, dist: Distribution, draws: np.ndarray, state: Pass
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _in_part(self, dist: Any, draws: np.ndarray, state: Pass) -> tuple[np.ndarray, np.ndarray]:
         """Vectors seen in part: the rest of them drawn given that, and the log density of what was seen."""
         parts = self.seen.parts
         assert parts is not None
@@ -211,8 +208,8 @@ class DrawAndWeigh:
             if not pattern.any():
                 continue
             here = (parts == pattern).all(axis=-1)
-            log = np.where(here, log_prob_of(dist, value, pattern), log)
-            full = completed(dist, state.rng, shape, value, pattern)
+            log = np.where(here, dist.log_prob_of(value, pattern), log)
+            full = dist.completed(state.rng, shape, value, pattern)
             draws = np.where(here[..., None], full, draws)
         return draws, log
 

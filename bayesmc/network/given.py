@@ -18,10 +18,9 @@ from bayesmc.expression import (
     constant,
     expressions_of,
 )
-from bayesmc.network.agreement import Probe, deterministic_above, hold_against
 from bayesmc.network.expressions import stored_leaf
-from bayesmc.network.model import Model
-from bayesmc.network.readings import Argument, read_function
+from bayesmc.network.model import Model, deterministic_above
+from bayesmc.network.readings import Argument, Probe, hold_against, read_function
 from bayesmc.shapes import broadcast_shapes
 
 

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.errors import EvidenceError, UnknownNodeError
+from bayesmc.network.declaring import ModelStore, unknown
 from bayesmc.network.evidence import plate_sizes, store
 from bayesmc.network.labels import by_label
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, ancestors
-from bayesmc.network.store import ModelStore, unknown
 from bayesmc.shapes import owned
 
 

@@ -9,7 +9,7 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -25,14 +25,10 @@ from bayesmc.errors import (
     ParameterError,
     ShapeError,
 )
-from bayesmc.network.align import Aligner, RowAligner
-from bayesmc.network.calling import call
+from bayesmc.network.calling import Aligner, RowAligner, call
 from bayesmc.network.labels import Domain
 from bayesmc.network.node import Declaration, Node, Potential
 from bayesmc.shapes import Shape, broadcast_shapes, broadcasts_to, first_index, read_only
-
-#: configurations of finite parents up to which a deterministic node is tabulated
-_DETERMINISTIC_TABLE = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,22 +88,24 @@ class CompiledNode:
     def has_foreign_parents(self) -> bool:
         return any(link.foreign for _, link in self.links)
 
+    def called(self, values: Mapping[str, np.ndarray]) -> tuple[Any, Shape]:
+        """What its function returns for stored values of its parents, and the batch shape of those."""
+        arguments, batch = arguments_of(self.links, values)
+        return call(self.declaration, arguments, batch + self.plate_shape, self.links), batch
+
     def record(self) -> Node:
         """The public, frozen view."""
         states = self.domain.states if self.domain is not None and self.is_discrete else None
-        return Node(
-            self.name,
-            self.parents,
-            self.plates,
-            self.event_shape,
-            states,
-            self.is_discrete,
-            self.kind,
-        )
+        shown = self.name, self.parents, self.plates, self.event_shape
+        return Node(*shown, states, self.is_discrete, self.kind)
 
     def decode(self, stored: np.ndarray) -> np.ndarray:
         """Stored values as user values."""
         return self.domain.decode(stored) if self.domain is not None else stored
+
+    def stored_dtype(self, values: np.ndarray) -> np.dtype:
+        """The type that draws are kept in: the smallest for positions of a finite node."""
+        return values.dtype if self.domain is None else self.domain.dtype
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +139,10 @@ class Model:
     def __getitem__(self, name: str) -> CompiledNode:
         return self.nodes[name]
 
+    def parents(self, name: str) -> tuple[str, ...]:
+        """The nodes that a node's function, or a potential's, receives."""
+        return self.nodes[name].parents if name in self.nodes else self.potentials[name][0].parents
+
     def without_functions(self) -> Model:
         """The same model for results that are stored: it describes nodes but evaluates none."""
         nodes = {
@@ -158,15 +160,13 @@ class Model:
         node = self.nodes[name]
         if node.declaration.value is not None:
             return node.declaration.value, ()
-        arguments, batch = arguments_of(node.links, values)
         if node.table is not None:
-            return lookup(node, values), batch
-        result = call(node.declaration, arguments, batch + node.plate_shape, node.links)
+            return lookup(node, values), arguments_of(node.links, values)[1]
+        result, batch = node.called(values)
         if isinstance(result, Distribution):
             fit(node.declaration, result, batch, node.plate_shape)
             return result, batch
-        shape = batch + node.plate_shape + node.event_shape
-        return deterministic_fit(node.declaration, result, batch, node.plate_shape, shape), batch
+        return deterministic_fit(node, result, batch), batch
 
     def log_density(self, name: str, distribution: Distribution, stored: np.ndarray) -> np.ndarray:
         """Log density of stored values, shape the broadcast of batch and plates; NaN never passes."""
@@ -278,6 +278,25 @@ class Model:
         return draws
 
 
+def deterministic_above(model: Model, name: str, known: Container[str]) -> list[str]:
+    """Deterministic nodes above one that are not known, those first on which others depend."""
+    found: dict[str, None] = {}
+    todo = [(name, False)]
+    while todo:
+        above, is_done = todo.pop()
+        if is_done:
+            found[above] = None
+            continue
+        if above != name:
+            todo.append((above, True))
+        todo += [
+            (p, False)
+            for p in model.parents(above)
+            if model[p].kind == "deterministic" and p not in known and p not in found
+        ]
+    return list(found)
+
+
 def potential_shape(sizes: Mapping[str, int], potential: Potential) -> Shape:
     """Shape of a potential's factors: the rows of its index, or its plates."""
     if potential.rows is not None:
@@ -350,15 +369,13 @@ def invalid_error(
     return ParameterError(f"node {node.name!r}{at}: {dist.problem}", index)
 
 
-def deterministic_fit(
-    declaration: Declaration, result: Any, batch: Shape, plates: Shape, shape: Shape
-) -> np.ndarray:
-    """A deterministic node's value broadcast to its full ``shape``; one that does not fit is refused."""
-    array = np.asarray(result)
+def deterministic_fit(node: CompiledNode, result: Any, batch: Shape) -> np.ndarray:
+    """A deterministic node's value broadcast to its full shape; one that does not fit is refused."""
+    array, shape = np.asarray(result), batch + node.value_shape
     if isinstance(result, Distribution) or not broadcasts_to(array.shape, shape):
         raise ShapeError(
-            f"node {declaration.name!r}: the function returns shape {array.shape}, which does not fit "
-            f"{shape} (batch {batch} of the parents, plates {declaration.plates} of sizes {plates}); "
+            f"node {node.name!r}: the function returns shape {array.shape}, which does not fit "
+            f"{shape} (batch {batch} of the parents, plates {node.plates} of sizes {node.plate_shape}); "
             "declare the axes that are elements with plates="
         )
     return read_only(np.broadcast_to(array, shape))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import graphlib
 import inspect
-from collections import deque
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from types import FunctionType
@@ -178,6 +178,31 @@ def bind(
     return tuple(positional + keyword), _with_keywords(function, len(positional), keyword)
 
 
+def decorating(
+    function: Callable[..., Any] | None,
+    name: str | None,
+    add: Callable[..., None],
+    rest: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> Any:
+    """A decorator that declares a function by ``add``, or what that returns for one that is given."""
+    if function is not None and not callable(function):
+        raise ModelError(
+            f"net.node({function!r}): it decorates a function; give the node's name with name="
+        )
+
+    def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+        own = name if name is not None else getattr(f, "__name__", "<lambda>")
+        if own == "<lambda>":
+            raise ModelError(
+                "this function has no name to give the node (a lambda or partial); use name= or net.add"
+            )
+        add(own, f, *rest, **options)
+        return f
+
+    return declare if function is None else declare(function)
+
+
 def checked_rows(name: str, table: np.ndarray) -> np.ndarray:
     """Rows renormalised where they are off by rounding; worse ones raise with their index."""
     from_one = np.abs(table.sum(axis=-1) - 1)
@@ -261,39 +286,26 @@ def topological_order(parents: Mapping[str, Sequence[str]]) -> list[str]:
     for name, above in parents.items():
         for parent in set(above):
             children[parent].append(name)
-    ready = deque(name for name, count in waiting.items() if count == 0)
-    order = []
-    while ready:
-        name = ready.popleft()
-        order.append(name)
+    order = [name for name, count in waiting.items() if count == 0]
+    for name in order:  # which grows
         for child in children[name]:
             waiting[child] -= 1
             if waiting[child] == 0:
-                ready.append(child)
-    if len(order) < len(parents):
-        path = cycle_path(parents, [n for n in parents if waiting[n] > 0])
-        raise CycleError(
-            f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
-            "(for time, use a dynamic net with _prev arguments)",
-            path,
-        )
-    return order
-
-
-def cycle_path(parents: Mapping[str, Sequence[str]], among: Iterable[str]) -> list[str]:
-    """One directed cycle, parent before child, its first name repeated at the end."""
-    left = set(among)
-    name = next(iter(sorted(left)))
-    seen: dict[str, int] = {}
-    trail: list[str] = []
-    while name not in seen:
-        seen[name] = len(trail)
-        trail.append(name)
-        name = next(p for p in parents[name] if p in left)
-    cycle = trail[seen[name] :][::-1]
+                order.append(child)
+    if len(order) == len(parents):
+        return order
+    try:
+        graphlib.TopologicalSorter(parents).prepare()
+        raise AssertionError
+    except graphlib.CycleError as error:
+        cycle = error.args[1][1:]  # parent before child
     start = cycle.index(min(cycle))
-    cycle = cycle[start:] + cycle[:start]
-    return [*cycle, cycle[0]]
+    path = [*cycle[start:], *cycle[: start + 1]]
+    raise CycleError(
+        f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
+        "(for time, use a dynamic net with _prev arguments)",
+        path,
+    )
 
 
 def ancestors(parents: Mapping[str, Sequence[str]], names: Iterable[str]) -> set[str]:

@@ -16,10 +16,8 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support, is_half_line
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import BayesmcError, UnsupportedError
-from bayesmc.network.align import Aligner
-from bayesmc.network.calling import call
-from bayesmc.network.model import CompiledNode, Model, arguments_of, invalid_error
-from bayesmc.network.node import Declaration
+from bayesmc.network.calling import Aligner
+from bayesmc.network.model import CompiledNode, Model, invalid_error
 from bayesmc.shapes import Shape, broadcasts_to, read_only
 
 #: how far draws go from the prior's middle, one after the other
@@ -38,19 +36,13 @@ _FROM_ZERO = 0.9
 _CONVEX = ("real", "interval", "simplex", "real vector", "positive definite", "product")
 
 
-def made_possible(
-    declaration: Declaration,
-    links: Links,
-    plates: Shape,
-    result: Any,
-    batch: Shape,
-    model: Model,
-) -> bool:
+def made_possible(model: Model, node: CompiledNode, result: Any, batch: Shape) -> bool:
     """Whether, where a function goes wrong on the probe, it does not at other draws, which take their place.
 
     Configurations of finite parents that are out of range stay the model's fault.
     """
-    if not batch or not depends_on_numbers(links, model.nodes):
+    plates = node.plate_shape
+    if not batch or not depends_on_numbers(node.links, model.nodes):
         return False
     if isinstance(result, Distribution) and not broadcasts_to(result.batch_shape, batch + plates):
         return False
@@ -61,10 +53,9 @@ def made_possible(
     if not wrong or (isinstance(result, Distribution) and result.problem.is_overflow):  # type: ignore[union-attr]
         return False
     anew = model.cache["drawn anew"] = model.cache.get("drawn anew", 0) + 1
-    rng = np.random.default_rng([20, anew])
     if anew > _MOST:
         return not wrong_elements(result, batch, plates).all(axis=tuple(range(len(batch)))).any()
-    return _drawn_anew(model, declaration, links, plates, result, batch, rng)
+    return _drawn_anew(model, node, result, batch, np.random.default_rng([20, anew]))
 
 
 def depends_on_numbers(links: Links, nodes: Mapping[str, CompiledNode]) -> bool:
@@ -163,39 +154,29 @@ def refuse_parameters(
     full = np.broadcast_to(dist.invalid, batch + node.plate_shape).reshape(math.prod(batch), -1)
     if dist.problem.is_overflow and not full.all(axis=0).any():
         return
-    if not dist.problem.has_grown or not overflows(
-        node.declaration, node.links, probe, batch + node.plate_shape
-    ):
+    if not dist.problem.has_grown or not overflows(node, probe):
         raise bad
 
 
-def overflows(
-    declaration: Declaration,
-    links: Links,
-    probe: Mapping[str, np.ndarray],
-    lead: Shape,
-) -> bool:
+def overflows(node: CompiledNode, probe: Mapping[str, np.ndarray]) -> bool:
     """Whether a parent is infinite already, or the function's arithmetic over- or underflows on them."""
-    if any(np.isinf(probe[name].astype(float)).any() for name, _ in links):
+    if any(np.isinf(probe[name].astype(float)).any() for name in node.parents):
         return True
-    arguments, _ = arguments_of(links, probe)
     try:
         with np.errstate(over="raise", under="raise"):
-            call(declaration, arguments, lead, links)
+            node.called(probe)
     except BayesmcError as error:
         return isinstance(error.__cause__, FloatingPointError)
     return False
 
 
 def entry(
-    links: Links,
-    probe: Mapping[str, np.ndarray],
-    shape: Shape,
-    index: Shape,
+    node: CompiledNode, probe: Mapping[str, np.ndarray], shape: Shape, index: Shape | None = None
 ) -> dict[str, np.ndarray]:
-    """The parents' values at one entry of the probe's broadcast batch, without batch axes."""
+    """The parents' values at one entry (the first) of the probe's broadcast batch, without batch axes."""
     picked = {}
-    for parent, link in links:
+    index = (0,) * len(shape) if index is None else index
+    for parent, link in node.links:
         value = probe[parent]
         batch = link.batch_shape(value)
         own = index[len(shape) - len(batch) :]
@@ -208,13 +189,7 @@ def entry(
 
 
 def _drawn_anew(
-    model: Model,
-    declaration: Declaration,
-    links: Links,
-    plates: Shape,
-    result: Any,
-    batch: Shape,
-    rng: np.random.Generator,
+    model: Model, node: CompiledNode, result: Any, batch: Shape, rng: np.random.Generator
 ) -> bool:
     """Replace, in the probe, what a function cannot take by other draws; whether it can take any at all.
 
@@ -233,12 +208,12 @@ def _drawn_anew(
         For every plate element some draw is in range.
     """
     lead = tuple(range(len(batch)))
-    wrong = wrong_elements(result, batch, plates)
+    wrong = wrong_elements(result, batch, node.plate_shape)
     fine = ~wrong.all(axis=lead)
     rows = wrong.any(axis=tuple(range(len(batch), wrong.ndim)))
     bad = np.broadcast_to(rows, model.probe_shape).copy()
     for pool, sound in _pools(model, rng):
-        found = _tried(declaration, links, pool, plates)
+        found = _tried(node, pool)
         if found is None:
             continue
         fine = fine | ~found.all(axis=0)
@@ -290,16 +265,13 @@ def _value(
     return nearer(result, draws, spread, (_DRAWS, *node.value_shape), len(node.event_shape))
 
 
-def _tried(
-    declaration: Declaration, links: Links, pool: Mapping[str, np.ndarray], plates: Shape
-) -> np.ndarray | None:
+def _tried(node: CompiledNode, pool: Mapping[str, np.ndarray]) -> np.ndarray | None:
     """Where a function goes wrong on a pool, shape ``(_DRAWS, *plates)``; None where it fails."""
     try:
-        arguments, batch = arguments_of(links, pool)
-        found = wrong_elements(call(declaration, arguments, batch + plates, links), batch, plates)
+        found = wrong_elements(*node.called(pool), node.plate_shape)
     except (BayesmcError, ValueError):
         return None
-    return np.broadcast_to(found, (_DRAWS, *plates))
+    return np.broadcast_to(found, (_DRAWS, *node.plate_shape))
 
 
 def _replaced(

@@ -1,21 +1,30 @@
-"""What functions compute of their arguments: each is read once, for all nodes that share it.
+"""What functions compute of their arguments: read once for all nodes that share it, and held against them.
 
 A reading speaks of leaves ``argument 0``, ``argument 1``, ... for what a node's parents store, and of
 ``number 0``, ... for numbers that were put into the function, as the index of a slice is. The slices of an
-unrolled template have one reading, and so do nodes that were given one function.
-"""
+unrolled template have one reading, and so do nodes that were given one function. What was read must give what
+the function gives, at probe points."""
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from bayesmc.distributions import Affine, Categorical, Density, Distribution, Mixture, Truncated
-from bayesmc.errors import TraceError
+from bayesmc.distributions import (
+    Affine,
+    Categorical,
+    Density,
+    Distribution,
+    Mixture,
+    Truncated,
+    as_distribution,
+)
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError, TraceError
 from bayesmc.expression import (
     Expression,
     Family,
@@ -28,17 +37,19 @@ from bayesmc.expression import (
     expressions_of,
     gather,
     leaf,
+    rebuilt,
     reduction,
     reshape,
     trace,
 )
-from bayesmc.network.align import Aligner, RowAligner
+from bayesmc.network.calling import Aligner, RowAligner
 from bayesmc.network.labels import Domain
+from bayesmc.network.model import CompiledNode, Model, deterministic_above
 from bayesmc.network.node import Numbered
 from bayesmc.passes.log_density import family_of
 from bayesmc.passes.templates import Template, template
 from bayesmc.plates import PlateArray
-from bayesmc.shapes import Shape
+from bayesmc.shapes import Shape, nearly_equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,6 +243,111 @@ def by_element(traced: Any, event_ndim: int = 0) -> Iterator[Expression]:
             yield from by_element(value, event_ndim)
 
 
+#: how far an expression may be off what the function gives, relative to the largest entry
+_RTOL = 1e-11
+
+
+class Probe(dict[str, np.ndarray]):
+    """Stored values of all nodes at probe points; of deterministic ones as they are asked for."""
+
+    def __init__(self, model: Model, variant: int) -> None:
+        super().__init__()
+        self.model, self.variant = model, variant
+        self._place = {n: k for k, n in enumerate(model.nodes)}
+
+    @classmethod
+    def of(cls, model: Model, variant: int) -> Probe:
+        known = model.cache.setdefault("expression probes", {})
+        if variant not in known:
+            known[variant] = cls(model, variant)
+        return known[variant]
+
+    def __missing__(self, name: str) -> np.ndarray:
+        node = self.model[name]
+        if node.kind == "deterministic":
+            for above in deterministic_above(self.model, name, self):
+                self[above] = self.model.evaluate(above, self)[0]
+            value = self.model.evaluate(name, self)[0]
+        else:
+            value = self.model.probe[name]
+            rank = value.ndim - len(node.value_shape)
+            value = VARIANTS[self.variant](value, rank, self._place[name])
+        self[name] = value
+        return value
+
+
+#: unlike batch shapes: all of the probe, one entry, mixed ranks; that a function gives the same whatever
+#: the rank is for ``validate`` to see
+VARIANTS: tuple[Callable[[np.ndarray, int, int], np.ndarray], ...] = (
+    lambda v, rank, _: v,
+    lambda v, rank, _: v[(0,) * rank],
+    lambda v, rank, k: (v, v[0], v[:, :1], v[0, 0])[k % 4] if rank == 2 else v,
+)
+
+
+def hold_against(
+    model: Model,
+    name: str,
+    result: Any,
+    program: Program,
+    given: Callable[[Probe], Mapping[str, np.ndarray]],
+    values: Probe,
+) -> None:
+    """Refuse what was read of a node or potential where its function gives something else.
+
+    Parameters
+    ----------
+    result : Family, Expression or Distribution
+    program : Program
+        Of its expressions.
+    given : callable
+        From values of all nodes to those of the program's leaves.
+    values : Probe
+
+    Raises
+    ------
+    TraceError
+    """
+    is_node = name in model.nodes
+    with marking_invalid(), np.errstate(all="ignore"):
+        try:
+            if is_node:
+                expected, batch = model.evaluate(name, values)
+                shape = batch + model[name].plate_shape
+            else:
+                expected = model.potential(name, values, total=False)
+                shape = expected.shape
+            leaves = given(values)
+        except BayesmcError:
+            return  # the function's own fault, or out of range: nothing to compare
+        try:
+            made = rebuilt(result, iter(program(leaves)))
+            if is_node and model[name].is_stochastic and not isinstance(made, Distribution):
+                made = as_distribution(made)
+        except (BayesmcError, ValueError, TypeError, IndexError) as error:
+            raise TraceError(f"what was read of it fails: {error}") from error
+        if not _agree(model.nodes.get(name), expected, made, shape):
+            raise TraceError("what was read of it gives other values than the function")
+
+
+def hold_form(model: Model, name: str, form: Expression) -> None:
+    """Refuse a family's own log density where ``log_prob`` gives something else.
+
+    Raises
+    ------
+    TraceError
+    """
+    program = Program([form])
+    for variant in range(len(VARIANTS)):
+        values = Probe.of(model, variant)
+        with marking_invalid(), np.errstate(all="ignore"):
+            dist, _ = model.evaluate(name, values)
+            expected = model.log_density(name, dist, values[name])
+            (found,) = program(values)
+        if not _near(*np.broadcast_arrays(expected, found)):
+            raise TraceError("its log_density gives other values than its log_prob")
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -286,3 +402,28 @@ def _is_scalar(base: Any) -> bool:
     if isinstance(base, Distribution):
         return not base.event_shape
     return isinstance(base, Family) and not any(_ranks(base).get(k, 0) for k in base.parameters)
+
+
+def _agree(node: CompiledNode | None, expected: Any, made: Any, shape: Shape) -> bool:
+    if isinstance(expected, Distribution) != isinstance(made, Distribution):
+        return False
+    if not isinstance(expected, Distribution):
+        full = shape if node is None else shape + node.event_shape
+        stored = np.asarray(expected)
+        value = node.decode(stored) if node is not None and node.domain is not None else stored
+        return _near(np.asarray(value), np.broadcast_to(np.asarray(made), full))
+    if type(expected) is not type(made):
+        return False
+    pairs = zip(expected.parameters(), made.parameters(), strict=True)
+    return all(n == m and _alike(a, b, shape, n) for (a, n), (b, m) in pairs)
+
+
+def _alike(a: np.ndarray, b: np.ndarray, shape: Shape, own: int) -> bool:
+    """Whether parameters are the same, whose last axes are their own and the others broadcast."""
+    if a.shape != b.shape:
+        a, b = (np.broadcast_to(x, (*shape, *x.shape[x.ndim - own :])) for x in (a, b))
+    return _near(a, b)
+
+
+def _near(a: np.ndarray, b: np.ndarray) -> bool:
+    return nearly_equal(a, b, _RTOL, 1e-3 * _RTOL)

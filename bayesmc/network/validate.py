@@ -7,7 +7,7 @@ plate and event size, on parents whose batch shapes differ but broadcast and who
 from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,21 +68,16 @@ def validate_model(model: Model) -> None:
 
 def _kind(model: Model, node: CompiledNode) -> Hashable:
     """Equal for nodes with one function, of parents whose values have the same shapes and states."""
-    parents: list[Hashable] = []
-    for name in node.parents:
-        parent = model[name]
-        domain = parent.domain
-        states: Hashable = None
-        if domain is not None:
-            values = None if domain.values is None else domain.values.tobytes()
-            states = domain.size, domain.low, values, domain.labels
-        parents.append((parent.kind, parent.plates, parent.value_shape, parent.is_discrete, states))
+    parents = tuple(
+        (p.kind, p.plates, p.value_shape, p.is_discrete, p.domain and p.domain.key)
+        for p in map(model.__getitem__, node.parents)
+    )
     own = node.declaration
     function = own.function
     what = identity(function)
     if isinstance(function, Numbered):  # a slice of a template, whose number may be any
         what = identity(function.func), function.places
-    return what, own.vectorize, node.plates, node.value_shape, tuple(parents)
+    return what, own.vectorize, node.plates, node.value_shape, parents
 
 
 def _unlike(model: Model, nodes: list[CompiledNode]) -> list[CompiledNode]:
@@ -127,23 +122,16 @@ def _check_entries(model: Model, node: CompiledNode, whole: _Signature, batch: S
     if not batch:
         return
     # backwards, so that a function that sorts the batch cannot find it sorted both times
-    first = {
-        p: _part(model.probe[p], link.batch_shape(model.probe[p]), 1) for p, link in node.links
-    }
-    arguments, short = arguments_of(node.links, first)
-    row = _signature(node, arguments, short + node.plate_shape)
+    row = _signature_at(node, _parts(node, model.probe, [1] * len(node.links)))
     for a, b in zip(whole.arrays, row.arrays, strict=True):
         if not nearly_equal(a[0, ::-1], b):
             raise BroadcastError(_broadcast_message(node, (0,), whole, row))
     if len(set(node.parents)) < 2:
         return
-    mixed = {
-        p: _part(model.probe[p], link.batch_shape(model.probe[p]), k)
-        for k, (p, link) in enumerate(dict(node.links).items())
-    }
-    arguments, batch = arguments_of(node.links, mixed)
+    mixed = _parts(node, model.probe, range(len(node.links)))
+    batch = arguments_of(node.links, mixed)[1]
     try:
-        ranks = _signature(node, arguments, batch + node.plate_shape)
+        ranks = _signature_at(node, mixed)
     except BayesmcError as error:
         if not _works_alone(node, mixed, shape):
             return  # ranks mix draws, and what they make together need not be reachable
@@ -159,18 +147,22 @@ def _works_alone(node: CompiledNode, values: Mapping[str, np.ndarray], shape: Sh
     """Whether every entry of a batch can be evaluated by itself."""
     try:
         for index in np.ndindex(shape):
-            arguments, _ = arguments_of(node.links, entry(node.links, values, shape, index))
-            _signature(node, arguments, node.plate_shape)
+            _signature_at(node, entry(node, values, shape, index))
     except BayesmcError:
         return False
     return True
 
 
-def _part(value: np.ndarray, batch: Shape, kind: int) -> np.ndarray:
-    """A value with batch axes (q, p) cut to another rank by turns: (q, p), (p,), (q, 1) or ()."""
-    if len(batch) != 2:
-        return value
-    return (value, value[0, ::-1], value[:, :1], value[0, 0, ...])[kind % 4]
+def _parts(
+    node: CompiledNode, values: Mapping[str, np.ndarray], kinds: Iterable[int]
+) -> dict[str, np.ndarray]:
+    """Parents' values with batch axes (q, p), cut to other ranks: (q, p), (p,), (q, 1) or ()."""
+    found = {}
+    for kind, (name, link) in zip(kinds, dict(node.links).items(), strict=False):
+        value = found[name] = values[name]
+        if len(link.batch_shape(value)) == 2:
+            found[name] = (value, value[0, ::-1], value[:, :1], value[0, 0, ...])[kind % 4]
+    return found
 
 
 def _compare_entries(
@@ -185,8 +177,7 @@ def _compare_entries(
         full = (0,) * (len(shape) - len(index)) + index
         at = full[len(full) - len(batch) :]
         at = tuple(i if n > 1 else 0 for i, n in zip(at, batch, strict=True))
-        arguments, _ = arguments_of(node.links, entry(node.links, values, shape, full))
-        alone = _signature(node, arguments, node.plate_shape)
+        alone = _signature_at(node, entry(node, values, shape, full))
         if whole.family != alone.family or not all(
             nearly_equal(a[at], b) for a, b in zip(whole.arrays, alone.arrays, strict=True)
         ):
@@ -196,8 +187,8 @@ def _compare_entries(
 def _check_mixing(model: Model, node: CompiledNode) -> None:
     """Perturbing one element of a shared plate must move only that element."""
     shape = model.probe_shape
-    base = entry(node.links, model.probe, shape, (0,) * len(shape))
-    other = entry(node.links, model.probe, shape, tuple(n - 1 for n in shape))
+    base = entry(node, model.probe, shape)
+    other = entry(node, model.probe, shape, tuple(n - 1 for n in shape))
     before: _Signature | None = None
     for axis, plate in enumerate(node.plates):
         sharing = [p for p in dict.fromkeys(node.parents) if plate in model.nodes[p].plates]
@@ -205,7 +196,7 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
         if size < 2 or not sharing:
             continue
         if before is None:
-            before = _signature(node, arguments_of(node.links, base)[0], node.plate_shape)
+            before = _signature_at(node, base)
         for chosen in masks(size):
             moved = dict(base)
             for parent in sharing:
@@ -213,7 +204,7 @@ def _check_mixing(model: Model, node: CompiledNode) -> None:
                     model.nodes[parent], base[parent], other[parent], plate, chosen
                 )
             try:
-                after = _signature(node, arguments_of(node.links, moved)[0], node.plate_shape)
+                after = _signature_at(node, moved)
             except BayesmcError:
                 continue  # the perturbed values may not be reachable
             rest = (slice(None),) * axis + (~chosen,)
@@ -230,7 +221,7 @@ def _check_rows(model: Model, node: CompiledNode) -> None:
     """What some rows of an index take must not move the log factors of other rows."""
     shape = model.probe_shape
     first, last = (
-        arguments_of(node.links, entry(node.links, model.probe, shape, at))[0]
+        arguments_of(node.links, entry(node, model.probe, shape, at))[0]
         for at in ((0,) * len(shape), tuple(n - 1 for n in shape))
     )
     before = _signature(node, first, node.plate_shape).arrays[0]
@@ -278,14 +269,17 @@ def _what(node: CompiledNode) -> str:
     return node.name if node.name.startswith("potential ") else f"node {node.name!r}"
 
 
-class _Signature:
+class _Signature(NamedTuple):
     """What a call returned, as arrays of shape ``lead + own axes`` that can be compared."""
 
-    __slots__ = ("arrays", "family")
+    family: str
+    arrays: list[np.ndarray]
 
-    def __init__(self, family: str, arrays: list[np.ndarray]) -> None:
-        self.family = family
-        self.arrays = arrays
+
+def _signature_at(node: CompiledNode, values: Mapping[str, np.ndarray]) -> _Signature:
+    """Of a call on stored values of the parents."""
+    arguments, batch = arguments_of(node.links, values)
+    return _signature(node, arguments, batch + node.plate_shape)
 
 
 def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
@@ -299,12 +293,9 @@ def _signature(node: CompiledNode, arguments: Any, lead: Shape) -> _Signature:
     arrays = []
     for array, own in parts:
         array = np.asarray(array)
-        tail = array.shape[array.ndim - own :] if own else ()
-        if array.shape == lead + tail:
-            arrays.append(array)
-            continue
+        full = lead + array.shape[array.ndim - own :]
         try:
-            arrays.append(np.broadcast_to(array, lead + tail))
+            arrays.append(array if array.shape == full else np.broadcast_to(array, full))
         except ValueError:
             raise BroadcastError(
                 f"{_what(node)}: a parameter of shape {array.shape} does not fit the batch and "

@@ -21,6 +21,7 @@ from bayesmc.expression import (
     reshape,
 )
 from bayesmc.expression.functions import Repeated
+from bayesmc.expression.scatter import Gathered, Places, Scattered
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.shapes import Shape
 
@@ -39,7 +40,7 @@ def scattered(part: Expression, positions: np.ndarray, shape: Shape) -> Expressi
     order = np.argsort(flat, kind="stable")
     starts = np.cumsum(counts) - counts
     return call(
-        _Scattered(_Bytes.of(order), _Bytes.of(starts), _Bytes.of(counts), shape),
+        Scattered(Places.of(order), Places.of(starts), Places.of(counts), shape),
         [reshape(part, (flat.size,))],
         shape,
         float,
@@ -48,7 +49,7 @@ def scattered(part: Expression, positions: np.ndarray, shape: Shape) -> Expressi
 
 def gathered(part: Expression, rows: Expression, shape: Shape) -> Expression:
     """Entries added up at computed rows of a table of zeros: what undoes a gather."""
-    return call(_Gathered(shape, len(rows.shape)), [part, rows], shape, float)
+    return call(Gathered(shape, len(rows.shape)), [part, rows], shape, float)
 
 
 def excluded_products(operand: Expression, axes: Sequence[int]) -> Expression:
@@ -76,57 +77,6 @@ def call_adjoints(node: Call, own: Expression) -> list[Expression | None]:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Bytes:
-    """Whole numbers that compare and hash by what they are."""
-
-    data: bytes
-
-    @classmethod
-    def of(cls, array: np.ndarray) -> _Bytes:
-        return cls(np.ascontiguousarray(array, np.intp).tobytes())
-
-    @property
-    def array(self) -> np.ndarray:
-        return np.frombuffer(self.data, np.intp)
-
-
-@dataclass(frozen=True)
-class _Scattered:
-    order: _Bytes
-    starts: _Bytes
-    counts: _Bytes
-    shape: Shape
-
-    def __call__(self, part: np.ndarray) -> np.ndarray:
-        some = self.counts.array > 0
-        sums = np.add.reduceat(part[..., self.order.array], self.starts.array[some], axis=-1)
-        found = np.zeros((*part.shape[:-1], some.size))
-        found[..., some] = sums
-        return found.reshape(*part.shape[:-1], *self.shape)
-
-
-@dataclass(frozen=True)
-class _Gathered:
-    shape: Shape
-    row_ndim: int
-
-    def __call__(self, part: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        block = self.shape[1:]
-        own = part.shape[: part.ndim - self.row_ndim - len(block)]
-        batch = np.broadcast_shapes(own, rows.shape[: rows.ndim - self.row_ndim])
-        places = rows.shape[rows.ndim - self.row_ndim :]
-        part = np.broadcast_to(part, (*batch, *places, *block))
-        at = np.broadcast_to(rows, (*batch, *places))
-        many, size = math.prod(batch), self.shape[0]
-        flat = (at.reshape(many, -1) + size * np.arange(many)[:, None]).reshape(-1)
-        columns = part.reshape(flat.size, -1)
-        found = np.empty((many * size, columns.shape[1]))
-        for k in range(columns.shape[1]):
-            found[:, k] = np.bincount(flat, columns[:, k], many * size)
-        return found.reshape(*batch, *self.shape)
 
 
 @dataclass(frozen=True)

@@ -238,6 +238,11 @@ def _pulled(
     node: Expression, own: Expression, wanted: frozenset[str], masked: bool
 ) -> list[Expression | None]:
     """What a value's adjoint adds to those of its operands."""
+    if isinstance(node, Elementwise) and node.function is np.where:
+        condition = node.operands[
+            0
+        ]  # an adjoint that is no number stays with the branch that is left out
+        return [None, tidy(np.where, condition, own, ZERO), tidy(np.where, condition, ZERO, own)]
     if isinstance(node, Elementwise):
         return [
             None if s is None or not a.leaves & wanted else _times(own, s, masked)

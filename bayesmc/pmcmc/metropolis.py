@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+from bayesmc.engines.mcmc.loop import Loop
 from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.errors import ConvergenceWarning
 from bayesmc.network import Problem
 from bayesmc.pmcmc.base import ParticleEngine, ParticleSampler
 from bayesmc.pmcmc.quasi import filter_of
 from bayesmc.pmcmc.walk import ParameterWalk
-from bayesmc.results import Checkpoint
 
 #: errors of the log likelihood beyond which a chain hardly moves, and the best to have
 _NOISY, _BEST = 2.0, 1.0
@@ -121,8 +121,8 @@ class ParticleMetropolis(ParticleEngine):
         filter = filter_of(question.trellis, self.particles or _FIRST, self.particles is None)
         return ParameterWalk(question.target, question.statics, filter)
 
-    def _posterior(self, problem: Problem, sampler: Any, held: Any, checkpoint: Checkpoint) -> Any:
-        (memory,) = checkpoint.state["memory"]
+    def _posterior(self, problem: Problem, sampler: Any, held: Any, loop: Loop) -> Any:
+        (memory,) = loop.last.state["memory"]
         error = memory["error"]
         if len(memory["looks"]) and error > _NOISY:
             wanted = memory["particles"] * (error / _BEST) ** 2
@@ -132,4 +132,4 @@ class ParticleMetropolis(ParticleEngine):
                 ConvergenceWarning,
                 stacklevel=4,
             )
-        return super()._posterior(problem, sampler, held, checkpoint)
+        return super()._posterior(problem, sampler, held, loop)

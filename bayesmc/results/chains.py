@@ -32,12 +32,17 @@ class _Chains(Posterior):
     acceptance: dict[str, np.ndarray]
     #: members that a chain's draws come from in turn; 1 for an ordinary chain
     ensemble_size: int
+    #: groups of consecutive chains, many and short, that started as one: between these R-hat compares (the
+    #: nested one); 0 where every chain is judged by itself
+    superchains: int = 0
     #: sweeps before the first draw, during which the engine adapted
     warmup: int
     checkpoint: Checkpoint | None
     #: finite node -> how often the hidden numbers below each element were drawn anew with it, at the least
     #: as often as chains started, shape (*plates,); only nodes that may wait for such numbers
     renewals: Mapping[str, np.ndarray] = MappingProxyType({})
+    #: draws whose Hamiltonian trajectory diverged, shape (chain, draw); None without such, or without draws
+    divergences: np.ndarray | None = None
     #: a sentence where chains name components differently that the model does not tell apart
     label_switching: str | None = None
 
@@ -191,7 +196,7 @@ class ChainsPosterior(_Chains, DrawsPosterior):
     def _predict(self, *arguments: Any) -> DrawsPosterior:
         drawn = super()._predict(*arguments)
         assert drawn.problem is not None
-        return ChainsPosterior(
+        found = ChainsPosterior(
             drawn.problem,
             self.engine,
             drawn._stored,
@@ -200,6 +205,8 @@ class ChainsPosterior(_Chains, DrawsPosterior):
             self.ensemble_size,
             self.warmup,
         )
+        found.superchains = self.superchains
+        return found
 
 
 class ChainsSums(_Chains, SumsPosterior):

@@ -7,7 +7,7 @@ net's own forward pass from the posterior draws.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -22,7 +22,6 @@ from bayesmc.resampling import systematic
 from bayesmc.results.datatree import datatree
 from bayesmc.results.marginal import Marginal
 from bayesmc.results.posterior import (
-    Plates,
     Posterior,
     circular_variance,
     near,
@@ -51,6 +50,7 @@ class DrawsPosterior(Posterior):
 
     #: members that a chain's draws come from in turn; 1 for an ordinary chain
     ensemble_size: int = 1
+    superchains: int = 0
     #: log densities at the first draws when they were made, so that ``resume`` notices other functions
     densities: Mapping[str, float] | None = None
 
@@ -167,26 +167,8 @@ class DrawsPosterior(Posterior):
 
     # ---- functions ---------------------------------------------------------------------------
 
-    def expectation(
-        self,
-        function: Callable[..., Any] | str,
-        plates: Plates = (),
-        names: Mapping[str, str] | None = None,
-    ) -> np.ndarray:
-        return self._average(self._evaluate(Query(self.model, function, plates, names)))
-
-    def probability(
-        self,
-        function: Callable[..., Any],
-        plates: Plates = (),
-        names: Mapping[str, str] | None = None,
-    ) -> np.ndarray:
-        values = self._evaluate(Query(self.model, function, plates, names))
-        if values.dtype.kind != "b":
-            raise UnsupportedError(
-                f"probability: the function returns {values.dtype} values, not booleans; use expectation"
-            )
-        return self._average(values.astype(float))
+    def _averaged(self, query: Query) -> np.ndarray:
+        return self._average(self._evaluate(query))
 
     def _mcse(self, what: str | Query) -> np.ndarray:
         values, step = self._scalars_and_step(what)
@@ -211,7 +193,7 @@ class DrawsPosterior(Posterior):
         values = self._scalars(what)
         if self.weights is not None or self.independent or self.ancestors is not None:
             return np.full(values.shape[2:], np.nan)
-        return diagnostics.chain_statistic("rhat", values, self.ensemble_size)
+        return diagnostics.chain_statistic("rhat", values, self.ensemble_size, self.superchains)
 
     # ---- distributions -----------------------------------------------------------------------
 

@@ -129,7 +129,7 @@ class Posterior:
         names : dict, optional
             Argument -> node, where a node's name is no identifier.
         """
-        raise self._cannot("expectation")
+        return self._averaged(Query(self.model, function, plates, names))
 
     def probability(
         self,
@@ -138,8 +138,7 @@ class Posterior:
         names: Mapping[str, str] | None = None,
     ) -> np.ndarray:
         """Posterior probability of an event: a function of named nodes that returns booleans."""
-
-        raise self._cannot("probability")
+        return self._averaged(Query(self.model, function, plates, names, is_event=True))
 
     def marginal(self, name: str, index: Any = ()) -> Marginal:
         """The marginal of a node (or of one scalar of it): histogram, kernel density, table."""
@@ -196,6 +195,9 @@ class Posterior:
         raise self._cannot("to_datatree")
 
     # ---- what a posterior of its own kind knows of a node, by name, or of a query ----------------
+
+    def _averaged(self, query: Query) -> np.ndarray:
+        raise self._cannot("probability" if query.is_event else "expectation")
 
     def _mcse(self, what: str | Query) -> np.ndarray:
         raise self._cannot("mcse")

@@ -17,10 +17,10 @@ from bayesmc.errors import (
     did_you_mean,
 )
 from bayesmc.network import Model
-from bayesmc.network.align import Aligner
+from bayesmc.network.calling import Aligner
 from bayesmc.network.node import nodes_read
 from bayesmc.plates import PlateArray
-from bayesmc.shapes import Shape, broadcasts_to, masks, nearly_equal, unused_sizes
+from bayesmc.shapes import Shape, broadcasts_to, masks, nearly_equal, read_only, unused_sizes
 from bayesmc.states import StateArray, as_numbers
 
 #: draws on which a function is tried alone
@@ -41,6 +41,8 @@ class Query:
         ``(*batch, *plates, *event)``.
     names : dict, optional
         Argument name -> node name, for nodes whose names are no identifiers.
+    is_event : bool
+        It must return booleans, whose mean is a probability.
     """
 
     def __init__(
@@ -49,7 +51,9 @@ class Query:
         function: Callable[..., Any] | str,
         plates: str | Sequence[str] = (),
         names: Mapping[str, str] | None = None,
+        is_event: bool = False,
     ) -> None:
+        self.is_event = is_event
         self.plates = (plates,) if isinstance(plates, str) else tuple(plates)
         for plate in self.plates:
             if plate not in model.sizes:
@@ -82,6 +86,10 @@ class Query:
         if self.function is not _identity and values.size:
             self._check_draws(stored, batch, values)
             self._check_plates(stored, batch)
+        if self.is_event and values.dtype.kind != "b":
+            raise UnsupportedError(
+                f"probability: the function returns {values.dtype} values, not booleans; use expectation"
+            )
         return values
 
     def raw(self, stored: Mapping[str, Any]) -> Any:
@@ -116,7 +124,7 @@ class Query:
     def _argument(self, name: str, value: np.ndarray) -> Any:
         node = self.model.nodes[name]
         if not self.plates:
-            return as_numbers(_frozen(node.decode(value)))
+            return as_numbers(read_only(node.decode(value)))
         link = Aligner(self.plates, node.plates, len(node.event_shape), node.domain)
         argument = link(value)
         return as_numbers(argument) if isinstance(argument, np.ndarray) else argument
@@ -198,9 +206,3 @@ def _arguments(function: Callable[..., Any], names: Mapping[str, str]) -> tuple[
 
 def _identity(value: Any) -> Any:
     return value.array if isinstance(value, PlateArray) else value
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    view = array.view()
-    view.flags.writeable = False
-    return view

@@ -263,7 +263,7 @@ class RunningChains:
         draws = min(_BUFFER, max(1, _BUFFER_ELEMENTS // max(numbers, 1)))
         self._size = self.ensemble * max(1, draws // self.ensemble)
         for name, node in moving.items():
-            dtype = stored_dtype(node, values[name])
+            dtype = node.stored_dtype(values[name])
             shape = (self._size, self.chains, *node.value_shape)
             self._buffers[name] = np.empty(shape, dtype=dtype)
             width = math.prod(_figures(node, values[name][None]).shape[2:])
@@ -282,11 +282,6 @@ class RunningChains:
             n: b[: self._pending].reshape(count, *b.shape[2:]) for n, b in self._buffers.items()
         }
         sums.add({**self._constant, **values}, 0.0, count)
-
-
-def stored_dtype(node: CompiledNode, values: np.ndarray) -> np.dtype:
-    """The type that draws of a node are kept in: the smallest for positions of a finite one."""
-    return values.dtype if node.domain is None else node.domain.dtype
 
 
 # ---- private ------------------------------------------------------------------------------------

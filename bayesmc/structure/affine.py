@@ -22,7 +22,6 @@ from bayesmc.expression import (
     rebuilt,
 )
 from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.agreement import deterministic_above
 from bayesmc.network.expressions import (
     Followed,
     NodeCall,
@@ -31,6 +30,7 @@ from bayesmc.network.expressions import (
     value_of,
 )
 from bayesmc.network.given import read_given
+from bayesmc.network.model import deterministic_above
 from bayesmc.passes.affine import affine
 from bayesmc.passes.arithmetic import ZERO
 from bayesmc.passes.templates import without_names

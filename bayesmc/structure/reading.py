@@ -14,8 +14,8 @@ from bayesmc.errors import BudgetError, TraceError, UnsupportedError
 from bayesmc.expression import Constant, Expression
 from bayesmc.factors.gaussian import Conditional, GaussianFactor, compressed, likelihood_rows
 from bayesmc.network import CompiledNode, Model, Observed
-from bayesmc.network.agreement import deterministic_above
 from bayesmc.network.expressions import Followed, density
+from bayesmc.network.model import deterministic_above
 from bayesmc.network.readings import by_element
 from bayesmc.passes.reads import element_read
 from bayesmc.shapes import Shape

@@ -178,7 +178,6 @@ class Forms:
 
     def __init__(self, target: Target) -> None:
         self.target = target
-        self._signatures = target.signatures
         self._numbers: dict[Hashable, int] = {}
         self._found: dict[str, Form | None] = {}
 
@@ -206,7 +205,7 @@ class Forms:
         children = [(self._number(c.term.name, roles), c.term.name) for c in blanket.children]
         own = () if blanket.own is None else (blanket.own.name,)
         parts = (*blanket.path, *own, *(name for _, name in sorted(children, key=lambda c: c[0])))
-        found = [self._signatures.of(p) for p in parts]
+        found = [self.target.signatures.of(p) for p in parts]
         signatures = tuple(s for s in found if s is not None)
         if len(signatures) < len(parts):
             return None
@@ -221,7 +220,7 @@ class Forms:
 
     def _number(self, name: str, roles: Mapping[str, Hashable]) -> int:
         """A number for what a part is, and where it reads the node and what is on its path."""
-        signature = self._signatures.of(name)
+        signature = self.target.signatures.of(name)
         if signature is None:
             return -1
         key = (signature.key, tuple(roles.get(n) for n in signature.scope))

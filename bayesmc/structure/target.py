@@ -20,7 +20,7 @@ from bayesmc.errors import BayesmcError, DensityError, TraceError
 from bayesmc.expression import Expression
 from bayesmc.network import Model, Observed, Problem
 from bayesmc.network.expressions import Followed, Opaque, density, log_density_of, log_factor_of
-from bayesmc.network.model import invalid_error
+from bayesmc.network.model import invalid_error, potential_shape
 from bayesmc.network.probing import depends_on_numbers
 from bayesmc.shapes import Shape, broadcast_shapes
 from bayesmc.structure.like_functions import FEWEST, LinkSteps, Signatures, StackedFunction, Values
@@ -425,15 +425,6 @@ def _terms(
     for name, (potential, _) in model.potentials.items():
         if not varying & set(potential.parents):
             continue
-        shape = potential_shape(model, name)
+        shape = potential_shape(model.sizes, potential)
         terms[name] = Term(model, name, potential.plates, shape, potential.parents, True)
     return terms
-
-
-def potential_shape(model: Model, name: str) -> Shape:
-    """Shape of a potential's elements: its plates, or the rows of its index."""
-    potential, _ = model.potentials[name]
-    index = getattr(potential, "index", None)
-    if index is not None:
-        return (len(index[0]),)
-    return tuple(model.sizes[p] for p in potential.plates)

@@ -21,7 +21,7 @@ from unittest import mock
 
 import pytest
 
-from bayesmc.network import store, validate
+from bayesmc.network import declaring, validate
 from bayesmc.network.expressions import Opaque, density
 from bayesmc.network.model import Model
 from references import CASES
@@ -75,7 +75,7 @@ def tallied() -> Iterator[Tally]:
         validate.validate_model(model)
         tally.add(model)
 
-    with mock.patch.object(store, "validate_model", validated), warnings.catch_warnings():
+    with mock.patch.object(declaring, "validate_model", validated), warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield tally
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bayesmc as bmc
-from bayesmc.network.align import Aligner
+from bayesmc.network.calling import Aligner
 from bayesmc.network.labels import Domain
 from bayesmc.plates import PlateArray
 from bayesmc.testing import session

@@ -14,13 +14,13 @@ from bayesmc.engines.exact.gaussian_answers import GaussianAnswers
 from bayesmc.engines.exact.hybrid_plan import Solved
 from bayesmc.engines.exact.query_averages import average, covariance, gaussian_average
 from bayesmc.engines.exact.table_answers import TableAnswers
-from bayesmc.errors import BudgetError, QueryError, UnknownNodeError, UnsupportedError
+from bayesmc.errors import BudgetError, UnknownNodeError, UnsupportedError
 from bayesmc.network import Problem
 from bayesmc.network.forward import Compute, Pass, run
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.results.draws import DrawsPosterior
 from bayesmc.results.marginal import Marginal, gaussian_marginal
-from bayesmc.results.posterior import Plates, Posterior, table_variance, whole_draws
+from bayesmc.results.posterior import Posterior, quantile_levels, table_variance, whole_draws
 from bayesmc.results.query import Query
 from bayesmc.structure import known_values
 
@@ -124,12 +124,7 @@ class ExactPosterior(Posterior):
 
     def quantile(self, name: str, q: Any) -> np.ndarray:
         node = self._numeric(name, "quantile")
-        try:
-            levels = np.asarray(q, dtype=float)
-        except (TypeError, ValueError):
-            raise QueryError(f"quantile({name!r}, {q!r}): quantiles are numbers") from None
-        if not ((levels >= 0) & (levels <= 1)).all():
-            raise QueryError(f"quantile({name!r}, {q!r}): quantiles lie between 0 and 1")
+        levels = quantile_levels(name, q)
         if self._gaussian is not None and self._is_gaussian(name):
             everywhere = tuple(slice(None) for _ in node.plates)
             spread = levels.reshape(levels.shape + (1,) * len(node.plates))
@@ -192,33 +187,17 @@ class ExactPosterior(Posterior):
 
     # ---- functions ---------------------------------------------------------------------------
 
-    def expectation(
-        self,
-        function: Callable[..., Any] | str,
-        plates: Plates = (),
-        names: Mapping[str, str] | None = None,
-    ) -> np.ndarray:
-        return self._average(Query(self.model, function, plates, names))
-
-    def probability(
-        self,
-        function: Callable[..., Any],
-        plates: Plates = (),
-        names: Mapping[str, str] | None = None,
-    ) -> np.ndarray:
-        return self._average(Query(self.model, function, plates, names), events=True)
-
-    def _average(self, query: Query, events: bool = False) -> np.ndarray:
+    def _averaged(self, query: Query) -> np.ndarray:
         """The function on every configuration of what it needs, averaged over their joint table."""
         gaussian = [n for n in query.nodes if self._is_gaussian(n)]
         if set(self._tables.missing(query.nodes)) - set(gaussian):
             self._live("expectation of a deterministic node")
         for name in query.nodes:
-            self._refuse_beyond(name, "probability" if events else "expectation")
+            self._refuse_beyond(name, "probability" if query.is_event else "expectation")
         if gaussian:
             assert self._gaussian is not None
-            return gaussian_average(self._tables, self._gaussian, query, events)
-        return average(self._tables, query, events)
+            return gaussian_average(self._tables, self._gaussian, query)
+        return average(self._tables, query)
 
     # ---- draws and diagnostics ----------------------------------------------------------------
 
@@ -233,7 +212,7 @@ class ExactPosterior(Posterior):
 
     def _shape_of(self, what: str | Query) -> tuple[int, ...]:
         if isinstance(what, Query):
-            return self._average(what).shape
+            return self._averaged(what).shape
         node = self._node(what)
         if node.domain is not None and node.domain.labels is not None:
             return (*node.plate_shape, node.domain.size)

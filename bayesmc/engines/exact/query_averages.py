@@ -35,7 +35,7 @@ _AT_ONCE = 16
 _CLOSE = 1e-9
 
 
-def average(tables: TableAnswers, query: Query, events: bool) -> np.ndarray:
+def average(tables: TableAnswers, query: Query) -> np.ndarray:
     """The mean of a function of finite nodes, and of what is computed from them, by their joint table."""
     model = tables.model
     if 0 in query.plate_shape:
@@ -55,8 +55,6 @@ def average(tables: TableAnswers, query: Query, events: bool) -> np.ndarray:
         values, cards = configure(model, tables.known_values, alone, whole, missing)
     flat = {n: _flat(values[n], cards, model[n].value_shape) for n in query.nodes}
     results = query(flat, (math.prod(cards),))
-    if events:
-        _check_boolean(results)
     sizes = query.plate_shape
     out = np.empty(sizes + results.shape[1 + len(sizes) :])
     for at in np.ndindex(sizes):
@@ -67,22 +65,20 @@ def average(tables: TableAnswers, query: Query, events: bool) -> np.ndarray:
     return out
 
 
-def gaussian_average(
-    tables: TableAnswers, gaussian: GaussianAnswers, query: Query, events: bool
-) -> np.ndarray:
+def gaussian_average(tables: TableAnswers, gaussian: GaussianAnswers, query: Query) -> np.ndarray:
     """The mean of a function, or the probability of an event, of continuous and finite nodes."""
     model = tables.model
     names = list(dict.fromkeys(query.nodes))
     others = [n for n in names if not gaussian.holds(n)]
     inside = all(set(model[n].plates) <= set(query.plates) for n in names)
-    alone = query.plates and inside and (others or events)
+    alone = query.plates and inside and (others or query.is_event)
     if not alone or _passed(tables, others):
-        return _joint_average(tables, gaussian, query, events)
+        return _joint_average(tables, gaussian, query)
     sizes = query.plate_shape
     parts = []
     for at in np.ndindex(sizes):  # element by element: each needs no other one's configurations
         where = {n: tables.element(n, query.plates, at) for n in names}
-        parts.append(_joint_average(tables, gaussian, query, events, where)[at])
+        parts.append(_joint_average(tables, gaussian, query, where)[at])
     if not parts:
         return np.zeros(sizes)
     return np.stack(parts).reshape(sizes + np.shape(parts[0]))
@@ -92,7 +88,6 @@ def _joint_average(
     tables: TableAnswers,
     gaussian: GaussianAnswers,
     query: Query,
-    events: bool,
     where: Mapping[str, Variable] | None = None,
 ) -> np.ndarray:
     """The average over the joint mixture of all that the function names, or of one element of each."""
@@ -102,6 +97,7 @@ def _joint_average(
         extra = [v for n in tables.above(others) for v in tables.elements(n)]
     else:
         extra = [where[n] for n in tables.above(others)]
+    events = query.is_event
     if not events and not others:
         # an affine function alone: its mean is its value at the mean
         means = {n: gaussian.mean(n)[None] for n in continuous}
@@ -117,8 +113,6 @@ def _joint_average(
     stored = _finite_values(tables, others, found, count)
     # with the checks that it acts draw by draw
     plain = query({**stored, **means}, (count,))
-    if events:
-        _check_boolean(plain)
     try:
         followed = _followed(query, stored, means)
         if not followed.leaves:
@@ -304,13 +298,6 @@ def _passed(tables: TableAnswers, nodes: Sequence[str]) -> tuple[str, ...]:
 def _flat(values: np.ndarray, cards: tuple[int, ...], shape: Shape) -> np.ndarray:
     """Values over all configurations, with one batch axis."""
     return np.broadcast_to(values, cards + shape).reshape((math.prod(cards), *shape))
-
-
-def _check_boolean(results: np.ndarray) -> None:
-    if results.dtype.kind != "b":
-        raise UnsupportedError(
-            f"probability: the function returns {results.dtype} values, not booleans; use expectation"
-        )
 
 
 def _too_many(count: int, entries: float) -> BudgetError:

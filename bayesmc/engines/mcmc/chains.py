@@ -7,17 +7,19 @@ these have mixed is judged in ``convergence``.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from bayesmc.engines.base import Engine
-from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing
-from bayesmc.engines.mcmc.loop import Kept, Loop, Patience, Sampler
+from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
+from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
+from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.proposal import check_targets
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
@@ -33,7 +35,7 @@ from bayesmc.network import CompiledNode, Problem
 from bayesmc.network.evidence import store
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
-from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
+from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunningChains
 from bayesmc.shapes import first_index
 
 #: share of accepted proposals outside of which a random walk is ill adapted
@@ -45,32 +47,54 @@ class ChainEngine(Engine):
 
     Attributes
     ----------
-    draws : int
-        Draws kept of every chain.
-    warmup : int
-        Sweeps before the first draw, during which the sampler adapts.
-    chains : int
+    draws : int or None
+        Draws kept of every chain; None: as many as it takes to ``ess``.
+    warmup : int or None
+        Sweeps before the first draw, during which the sampler adapts; None chooses.
+    chains : int or None
+        None chooses.
     thinning : int
         Sweeps per kept draw.
+    ess : float
+        Effective size of every number of the answer that is asked for where ``draws`` is None.
     start : dict or None
         Node -> where its chains start.
     """
 
-    draws: int
-    warmup: int
-    chains: int
+    draws: int | None
+    warmup: int | None
+    chains: int | None
     thinning: int = 1
+    ess: float = 1000
     start: Mapping[str, Any] | None = None
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
+    #: whether its kernels learn in few sweeps, so that a warmup may end as soon as starts are forgotten
+    judges: ClassVar[bool] = False
+    #: whether each chain may be an array of members itself, so that more chains are not for free
+    ensembles: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check_count(self, "draws", self.draws, "1000")
-        if isinstance(self.warmup, bool) or self.warmup != 0:
+        if self.draws is not None:
+            check_count(self, "draws", self.draws, "1000")
+        if self.warmup is not None and (isinstance(self.warmup, bool) or self.warmup != 0):
             check_count(self, "warmup", self.warmup, "1000 (or 0 for none)")
-        check_count(self, "chains", self.chains, "4")
+        if self.chains is not None:
+            check_count(self, "chains", self.chains, "4")
+        if isinstance(self.ess, bool) or not isinstance(self.ess, (int, float)) or not self.ess > 0:
+            raise ValueError(
+                f"{type(self).__name__}(ess={self.ess!r}): give an effective size, such as 1000"
+            )
         check_count(self, "thinning", self.thinning, "1")
         object.__setattr__(self, "start", frozen_start(type(self).__name__, self.start))
+
+    def __repr__(self) -> str:
+        """What was said, and the effective size where that says how many draws there are."""
+        said = {f.name: getattr(self, f.name) for f in fields(self) if f.repr}  # type: ignore[arg-type]
+        if self.draws is not None:
+            said.pop("ess", None)
+        shown = ", ".join(f"{n}={v!r}" for n, v in said.items() if v is not None)
+        return f"{type(self).__name__}({shown})"
 
     def sampler(self, problem: Problem) -> Sampler:
         """What moves the chains of a posed problem."""
@@ -81,11 +105,40 @@ class ChainEngine(Engine):
         return ()
 
     def continues(self, other: Any) -> bool:
-        """Whether this engine goes on as ``other`` would have: its options but ``draws`` are the same."""
+        """Whether this engine goes on as ``other`` would have: all but how many draws is the same."""
         if type(other) is not type(self):
             return False
-        options = [f.name for f in fields(self) if f.compare and f.name != "draws"]  # type: ignore[arg-type]
+        options = [f.name for f in fields(self) if f.compare and f.name not in ("draws", "ess")]  # type: ignore[arg-type]
         return all(getattr(self, name) == getattr(other, name) for name in options)
+
+    def lengths(self, problem: Problem, keep: Any = "draws") -> Lengths:
+        """How many chains it runs for a question, and how long.
+
+        Parameters
+        ----------
+        keep : "draws", "summaries" or sequence of str
+            As in ``infer``.
+        """
+        if self.draws is not None:
+            chains = LEAST if self.chains is None else self.chains
+            return Lengths(chains, WARMUP if self.warmup is None else self.warmup, self.draws)
+        kept: Sequence[str] | None = keep
+        if isinstance(keep, str):
+            nodes = problem.model.nodes.items()
+            kept = [n for n, c in nodes if c.kind != "input"] if keep == "draws" else None
+        return chosen(
+            problem,
+            self.warmup,
+            self.chains,
+            self.ess,
+            judges=self.judges,
+            ensembles=self.ensembles,
+            kept=kept,
+        )
+
+    def effort(self, problem: Problem) -> str:
+        """How many chains it would run, and how long, in words."""
+        return in_words(self.lengths(problem), problem)
 
     def run(
         self,
@@ -99,30 +152,82 @@ class ChainEngine(Engine):
         summed = not listed and keep == "summaries"
         free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
         names = tuple(keep) if listed else tuple(free)
+        lengths = self.lengths(problem, keep)
         if resume is not None:
-            self._refuse_another(resume, problem, names, summed)
-        sampler = self.sampler(problem)
+            lengths = self._refuse_another(resume, problem, names, summed, lengths)
+        ready = self
+        if None in (self.draws, self.warmup, self.chains):
+            ready = replace(  # type: ignore[type-var]
+                self, draws=lengths.draws, warmup=lengths.warmup, chains=lengths.chains
+            )
+        sampler = ready.sampler(problem)
         if self.start and resume is None:
-            given = read_start(type(self).__name__, problem, self.start, self.chains)
+            given = read_start(type(self).__name__, problem, self.start, lengths.chains)
             sampler.given = given  # type: ignore[attr-defined]
+        if lengths.superchains:
+            sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
         tied = self.tied(problem)
         if tied:
             _warn_of_ties(type(self).__name__, tied)
         try:
-            held = self._held(problem, sampler, names, summed, resume)
-            rng, lengths = stream(seed, Purpose.INFER), (self.chains, self.warmup, self.thinning)
-            loop = Loop(sampler, rng, problem, *lengths)
-            with Progress(self._sweeps(resume), self.label, progress) as bar, Patience() as stop:
+            held = self._held(problem, sampler, names, summed, resume, lengths)
+            rng = stream(seed, Purpose.INFER)
+            loop = Loop(sampler, rng, problem, lengths, self.thinning)
+            sweeps = lengths.draws * self.thinning + (lengths.warmup if resume is None else 0)
+            with Progress(sweeps, self.label, progress) as bar, Patience() as stop:
                 state = loop.begun(bar, resume, stop)
-                finished = loop.draw(state, held, self.draws, bar, stop)
+                if isinstance(resume, (ChainsPosterior, ChainsSums)):
+                    loop.warmup = resume.warmup
+
+                def reached(ess: float) -> float:
+                    made = self._posterior(problem, sampler, held, loop)
+                    return share_reached(made, self._forward(sampler), ess)
+
+                finished = self._drawn(loop, state, held, bar, stop, reached)
         except MemoryError as error:
-            raise no_memory(self, self.draws * self.chains, names) from error
-        posterior = self._posterior(problem, sampler, held, loop.last.noted(problem))
-        self._warn(posterior, sampler, finished)
+            raise no_memory(self, lengths.draws * lengths.chains, names) from error
+        posterior = self._posterior(problem, sampler, held, loop)
+        diverged = loop.divergences(posterior._chains_and_draws[1])
+        if diverged is not None:
+            before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
+            posterior.divergences = diverged if before is None else np.hstack([before, diverged])
+        self._warn(posterior, sampler, finished, lengths)
         return posterior
 
-    def _sweeps(self, resume: Posterior | None) -> int:
-        return self.draws * self.thinning + (self.warmup if resume is None else 0)
+    def _drawn(
+        self,
+        loop: Loop,
+        state: State,
+        held: Kept | RunningChains,
+        bar: Progress,
+        stop: Patience,
+        reached: Callable[[float], float],
+    ) -> bool:
+        """Draws made, until they are enough where it is an effective size that is asked for."""
+        lengths = loop.lengths
+        before, draws, wanted = held.draws, lengths.first(), lengths.ess
+        if (
+            wanted is not None and before
+        ):  # what is gone on with has its own, and as much again is asked for
+            wanted += wanted * reached(wanted)
+        while True:
+            if isinstance(held, Kept) and held.draws > before:
+                held.more(draws)
+            if not loop.draw(state, held, draws, bar, stop):
+                return False
+            done = held.draws - before
+            if wanted is None or done >= lengths.draws:
+                return True
+            share = reached(wanted)
+            if share >= 1:
+                return True
+            draws = lengths.further(done, share)
+            if not draws:
+                return True
+            state = loop.last.state
+
+    def _forward(self, sampler: Sampler) -> frozenset[str]:
+        return frozenset(getattr(sampler, "forward_nodes", ()))
 
     def _held(
         self,
@@ -131,14 +236,15 @@ class ChainEngine(Engine):
         names: tuple[str, ...],
         summed: bool,
         resume: Posterior | None,
+        lengths: Lengths,
     ) -> Kept | RunningChains:
         """Where draws go: new, or with those of an earlier run in it."""
         if isinstance(resume, ChainsSums):
             return resume._running.with_model(problem.model)
         if summed:
             ensemble = getattr(sampler, "ensemble", 1)
-            return RunningChains(problem.model, names, self.chains, ensemble)
-        kept = Kept(problem.model, names, self.chains, self.draws)
+            return RunningChains(problem.model, names, lengths.chains, ensemble)
+        kept = Kept(problem.model, names, lengths.chains, lengths.first())
         if isinstance(resume, ChainsPosterior):
             kept.begin_with(resume._stored, resume._shape[1])
         return kept
@@ -148,31 +254,38 @@ class ChainEngine(Engine):
         problem: Problem,
         sampler: Sampler,
         held: Kept | RunningChains,
-        checkpoint: Checkpoint,
+        loop: Loop,
     ) -> ChainsPosterior | ChainsSums:
+        checkpoint, lengths, warmup = loop.last.noted(problem), loop.lengths, loop.warmup
         acceptance = {k: np.asarray(v) for k, v in sampler.acceptance(checkpoint.state).items()}
         found: ChainsPosterior | ChainsSums
         if isinstance(held, RunningChains):
-            found = ChainsSums(problem, self, held, acceptance, self.warmup, checkpoint)
+            found = ChainsSums(problem, self, held, acceptance, warmup, checkpoint)
         else:
             found = ChainsPosterior(
                 problem,
                 self,
                 held.frozen(),
-                (self.chains, held.draws),
+                (lengths.chains, held.draws),
                 acceptance,
                 getattr(sampler, "ensemble", 1),
-                self.warmup,
+                warmup,
                 checkpoint,
             )
+            found.superchains = lengths.superchains
         if hasattr(sampler, "renewals"):
             found.renewals = sampler.renewals(checkpoint.state)
         return found
 
     def _refuse_another(
-        self, old: Posterior, problem: Problem, names: tuple[str, ...], summed: bool
-    ) -> None:
-        """Only the same question, asked the same way, can be gone on with."""
+        self,
+        old: Posterior,
+        problem: Problem,
+        names: tuple[str, ...],
+        summed: bool,
+        lengths: Lengths,
+    ) -> Lengths:
+        """Only the same question, asked the same way, can be gone on with: by the chains that it has."""
         kind = ChainsSums if summed else ChainsPosterior
         why: str | None = "this one answers another question"
         if isinstance(old, kind) and old.checkpoint is not None:
@@ -185,26 +298,32 @@ class ChainEngine(Engine):
                 point = old.checkpoint
                 why = difference(old.problem, problem, point.values, point.densities)
             elif old.checkpoint.fits(old.model, problem):
-                return
+                why = None
             if why is None:
-                return
+                groups = old.superchains
+                return replace(lengths, chains=old._chains_and_draws[0], superchains=groups)
         raise UnsupportedError(
             f"infer: resume= takes an earlier {type(self).__name__} posterior of the same net, evidence, "
             f"inputs, keep= and options (but draws), as infer returned it; {why}"
         )
 
     def _warn(
-        self, posterior: ChainsPosterior | ChainsSums, sampler: Sampler, finished: bool
+        self,
+        posterior: ChainsPosterior | ChainsSums,
+        sampler: Sampler,
+        finished: bool,
+        lengths: Lengths,
     ) -> None:
         name = type(self).__name__
         if not finished:
-            draws = posterior._chains_and_draws[1]
+            chains, draws = posterior._chains_and_draws
             message = (
-                f"{name}: interrupted; the posterior has the {draws} draws of each of {self.chains} chains "
+                f"{name}: interrupted; the posterior has the {draws} draws of each of {chains} chains "
                 "made so far, and infer(..., resume=posterior) continues them"
             )
             warnings.warn(message, InterruptWarning, stacklevel=4)
-        found = poor_mixing(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
+        forward = self._forward(sampler)
+        found = poor_mixing(posterior, forward, lengths.ess)
         band = getattr(sampler, "acceptance_band", _BAND)
         problem = posterior.problem
         timed = problem is not None and series_of(problem) is not None
@@ -212,7 +331,12 @@ class ChainEngine(Engine):
             found[0] += "; ParticleGibbs(draws) draws whole trajectories of a template at once"
         found += never_left(posterior)
         if isinstance(posterior, ChainsPosterior):
-            found += missed_ends(posterior, frozenset(getattr(sampler, "forward_nodes", ())))
+            found += missed_ends(posterior, forward)
+        assert posterior.checkpoint is not None
+        state = posterior.checkpoint.state
+        count = getattr(sampler, "divergences", None)
+        if count is not None and count(state) is not None:
+            found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 

@@ -2,7 +2,11 @@
 
 The check must stay cheap beside the run, so it looks at some scalars of every node, in very long chains at
 every k-th draw. A rough screen by batch means finds those that look worst, and only these are judged, by
-ArviZ, whose figures the warnings quote. It warns; it proves nothing.
+ArviZ's figures, which the warnings quote. It warns; it proves nothing.
+
+Of many short chains R-hat is the nested one, between superchains, which says whether starts are forgotten.
+A chain that is held by one mode is seen by its own memory: the means of its first and its last third go
+together over chains.
 """
 
 from __future__ import annotations
@@ -12,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy.special
 
 from bayesmc import diagnostics
 from bayesmc.network import CompiledNode, Model
@@ -21,12 +26,18 @@ from bayesmc.results.relabelling import ordered, pivot_of, symmetries
 
 #: R-hat above which chains disagree (Vehtari et al. 2021, sec. 5)
 MAX_RHAT = 1.01
-#: effective draws of a chain below which neither R-hat nor errors can be trusted
-MIN_ESS = 100
+#: effective draws of a chain below which neither R-hat nor errors can be trusted, and chains from which on
+#: more of them pool what they know
+MIN_ESS, _POOLED = 100, 4
+#: chance that superchains which agree look apart, or chains that mix as if each kept to where it was; how
+#: much of the variance between chains must last to be worth a word; draws of a chain to tell it by
+_ALARM, _LASTING, _THIRDS = 1e-4, 0.02, 12
 #: scalars looked at
 _SCALARS = 200
 #: of these, scalars judged by their R-hat, and as many by their effective size
 _JUDGED = 6
+#: share of the effective size that is asked for below which it may be for names that components exchange
+_HOPELESS = 0.1
 #: draws of all scalars and chains that are judged: of large scalars fewer are, though at least two
 _ELEMENTS = 250_000
 #: draws of one scalar in all chains to which more are thinned, though not below ``_DRAWS`` per chain
@@ -39,12 +50,37 @@ _BATCHES = 20
 _SAMPLE = 1000
 
 
-def poor_mixing(posterior: ChainsPosterior | ChainsSums, forward: frozenset[str]) -> list[str]:
-    """What is wrong with the chains, in words, and the remedy; nodes of ``forward`` are not looked at."""
+def poor_mixing(
+    posterior: ChainsPosterior | ChainsSums, forward: frozenset[str], ess: float | None = None
+) -> list[str]:
+    """What is wrong with the chains, in words, and the remedy; nodes of ``forward`` are not looked at.
+
+    Parameters
+    ----------
+    ess : float, optional
+        The effective size that was asked for.
+    """
     if isinstance(posterior, ChainsSums):
-        return _faults(_summed_figures(posterior, forward), posterior)
-    found = _faults(_figures(posterior, posterior._stored, forward), posterior)
-    return _but_for_labels(posterior, forward, found) if found else []
+        return _faults(_summed_figures(posterior, forward), posterior, ess)
+    found = _faults(_figures(posterior, posterior._stored, forward), posterior, ess)
+    return _but_for_labels(posterior, forward, found, ess) if found else []
+
+
+def share_reached(
+    posterior: ChainsPosterior | ChainsSums, forward: frozenset[str], ess: float
+) -> float:
+    """The smallest effective size as a share of what is asked for; of tails a few hundred are enough.
+
+    Where chains name components differently that the model does not tell apart, by their order.
+    """
+    if isinstance(posterior, ChainsSums):
+        return _share(_summed_figures(posterior, forward), ess)
+    share = _share(_figures(posterior, posterior._stored, forward), ess)
+    if share < _HOPELESS:
+        stored = _named(posterior)[0]
+        if stored is not posterior._stored:
+            return max(share, _share(_figures(posterior, stored, forward), ess))
+    return share
 
 
 def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator[str]:
@@ -67,6 +103,18 @@ def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator
         )
 
 
+def scalar_name(model: Model, name: str, index: tuple[int, ...]) -> str:
+    """A scalar's name with its plate labels, as in a summary."""
+    if not index:
+        return name
+    node = model[name]
+    labels: list[Any] = [
+        model.labels.get(plate, range(size))[i]
+        for plate, size, i in zip(node.plates, node.plate_shape, index, strict=False)
+    ]
+    return f"{name}[{', '.join(map(str, [*labels, *index[len(labels) :]]))}]"
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -76,28 +124,56 @@ class _Judged(NamedTuple):
     looked: int
     #: name of a scalar -> its R-hat
     rhat: dict[str, float]
-    #: name of a scalar -> the smaller one of its effective sizes, and which it is
-    ess: dict[str, tuple[float, str]]
+    #: name of a scalar -> its effective sizes, in bulk and in the tails (NaN where that is not known)
+    ess: dict[str, tuple[float, float]]
+    #: name of a scalar -> R-hat that superchains may have by chance
+    chance: dict[str, float] = {}
+    #: name of a scalar -> correlation over chains of means of the first and the last third, where it lasts
+    lasting: dict[str, float] = {}
 
 
-def _faults(judged: _Judged, posterior: ChainsPosterior | ChainsSums) -> list[str]:
+def _faults(
+    judged: _Judged, posterior: ChainsPosterior | ChainsSums, ess: float | None
+) -> list[str]:
     if not judged.looked:
         return []
-    return [*_disagreement(judged), *_few_draws(judged, *posterior._chains_and_draws)]
+    few = _few_draws(judged, *posterior._chains_and_draws, ess)
+    return [*_disagreement(judged), *_lasting(judged), *few]
+
+
+def _share(judged: _Judged, ess: float) -> float:
+    tails = min(ess, MIN_ESS * _POOLED)
+    shares = [min(b / ess, np.nan_to_num(t, nan=np.inf) / tails) for b, t in judged.ess.values()]
+    return float(np.nan_to_num(min(shares, default=np.inf), nan=0.0))
 
 
 def _but_for_labels(
-    posterior: ChainsPosterior, forward: frozenset[str], found: list[str]
+    posterior: ChainsPosterior, forward: frozenset[str], found: list[str], ess: float | None
 ) -> list[str]:
     """What is wrong once components that the model does not tell apart are named by their order.
 
     Where nothing is, the posterior says so, and there is no reason to warn.
     """
-    point = posterior.checkpoint
-    if posterior.problem is None or point is None:
+    stored, orders, words = _named(posterior)
+    if not words:
         return found
-    stored, words = posterior._stored, []
+    left = _faults(_figures(posterior, stored, forward), posterior, ess)
+    if left:
+        return [_ordered(fault, orders) for fault in left]
+    posterior.label_switching = "; ".join(words)
+    return []
+
+
+def _named(
+    posterior: ChainsPosterior,
+) -> tuple[Mapping[str, np.ndarray], dict[str, str], list[str]]:
+    """The draws with components named by their order; by which order of which nodes; and what to say."""
+    point = posterior.checkpoint
+    stored: Mapping[str, np.ndarray] = posterior._stored
     orders: dict[str, str] = {}
+    words: list[str] = []
+    if posterior.problem is None or point is None:
+        return stored, orders, words
     for symmetry in symmetries(posterior.problem, point.values):
         pivot = pivot_of(symmetry, posterior.model)
         if pivot is not None and pivot in stored:
@@ -112,13 +188,7 @@ def _but_for_labels(
                 f"model does not tell them apart; by the order of {pivot!r} they have mixed: ask "
                 f"relabelled({pivot!r}), or for what does not depend on names"
             )
-    if not words:
-        return found
-    left = _faults(_figures(posterior, stored, forward), posterior)
-    if left:
-        return [_ordered(fault, orders) for fault in left]
-    posterior.label_switching = "; ".join(words)
-    return []
+    return stored, orders, words
 
 
 def _ordered(fault: str, orders: Mapping[str, str]) -> str:
@@ -130,29 +200,62 @@ def _ordered(fault: str, orders: Mapping[str, str]) -> str:
 
 
 def _disagreement(judged: _Judged) -> Iterator[str]:
-    worst = max(judged.rhat, key=lambda name: np.nan_to_num(judged.rhat[name], posinf=np.inf))
+    limits = {name: judged.chance.get(name, MAX_RHAT) for name in judged.rhat}
+    over = {
+        name: np.nan_to_num(r, nan=0.0, posinf=np.inf) - limits[name]
+        for name, r in judged.rhat.items()
+    }
+    worst = max(over, key=lambda name: over[name])
     rhat = judged.rhat[worst]
-    if not rhat > MAX_RHAT:
+    if not over[worst] > 0:
         return
     still = (
-        "every chain stands still, at different values" if np.isinf(rhat) else f"above {MAX_RHAT}"
+        "every chain stands still, at different values"
+        if np.isinf(rhat)
+        else f"above {limits[worst]:.3g}"
     )
-    others = _others([value > MAX_RHAT for value in judged.rhat.values()], judged.looked)
+    others = _others([value > 0 for value in over.values()], judged.looked)
+    nested = "nested R-hat" if worst in judged.chance else "R-hat"
     yield (
-        f"the chains have not mixed: R-hat of {worst!r} is {rhat:.3f} ({still}{others}); use more warmup= "
+        f"the chains have not mixed: {nested} of {worst!r} is {rhat:.3f} ({still}{others}); use more warmup= "
         "and draws= (infer(..., resume=posterior) adds draws), or another engine"
     )
 
 
-def _few_draws(judged: _Judged, chains: int, draws: int) -> Iterator[str]:
-    worst = min(judged.ess, key=lambda name: np.nan_to_num(judged.ess[name][0], nan=np.inf))
-    ess, kind = judged.ess[worst]
-    needed = float(MIN_ESS * chains)
-    if ess < needed:
-        others = _others([value < needed for value, _ in judged.ess.values()], judged.looked)
+def _lasting(judged: _Judged) -> Iterator[str]:
+    if judged.lasting:
+        worst = max(judged.lasting, key=lambda name: judged.lasting[name])
         yield (
-            f"the {chains} x {draws} draws of {worst!r} are worth {ess:.0f} independent ones ({kind} ESS, "
-            f"under {MIN_ESS} per chain{others}), too few for error bars; use more draws= "
+            "chains keep to where they are: the means of the first and the last third of each go together "
+            f"for {worst!r} (correlation {judged.lasting[worst]:.2f} over chains): shares of modes are "
+            "those of the starts; use more warmup= and draws=, or another engine"
+        )
+
+
+def _few_draws(judged: _Judged, chains: int, draws: int, asked: float | None) -> Iterator[str]:
+    sizes = {n: (b, "bulk") if not t < b else (t, "tail") for n, (b, t) in judged.ess.items()}
+    if asked is not None and not _share(judged, asked) >= 1:
+        sizes = {n: (b, "bulk") for n, (b, _) in judged.ess.items()} | {
+            n: size for n, size in sizes.items() if size[0] < MIN_ESS * _POOLED
+        }
+    worst = min(sizes, key=lambda name: np.nan_to_num(sizes[name][0], nan=np.inf))
+    ess, kind = sizes[worst]
+    needed = float(MIN_ESS * min(chains, _POOLED))
+    if asked is not None:
+        needed = asked if kind == "bulk" else min(needed, asked)
+    if ess < needed:
+        others = _others([value < needed for value, _ in sizes.values()], judged.looked)
+        worth = f"the {chains} x {draws} draws of {worst!r} are worth {ess:.0f} independent ones ({kind} ESS,"
+        if asked is not None:
+            yield (
+                f"{worth} of {needed:g} that ess={asked:g} asks for{others}); use more "
+                "(infer(..., resume=posterior) adds some), another engine, or declare the model in numbers "
+                "that depend less on each other"
+            )
+            return
+        each = f"{MIN_ESS} per chain" if chains <= _POOLED else f"{needed:.0f}"
+        yield (
+            f"{worth} under {each}{others}), too few for error bars; use more draws= "
             "(infer(..., resume=posterior) adds some) or thinning=, or another engine"
         )
     elif not ess >= needed:
@@ -175,15 +278,16 @@ def _figures(
 ) -> _Judged:
     """What ArviZ says of those scalars that the screen finds worst; scalars that never move are left out."""
     block, chains = posterior.ensemble_size, posterior._chains_and_draws[0]
+    groups = posterior.superchains
     names, columns = [], []
-    for name, index in _some(_moving(posterior, forward), posterior.model):
+    for name, index in some_scalars(_moving(posterior, forward), posterior.model):
         if name not in stored:
             continue
         at: tuple[Any, ...] = (slice(None), slice(None), *index)
         values = stored[name][at]
         if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
-            names.append(_scalar(posterior.model, name, index))
-            columns.append(_uncut(posterior.model[name], index, _thinned(values, block)))
+            names.append(scalar_name(posterior.model, name, index))
+            columns.append(uncut(posterior.model[name], index, _thinned(values, block, groups)))
     if not names:
         return _Judged(0, {}, {})
     share = len(columns[0]) / chains
@@ -193,17 +297,41 @@ def _figures(
     slow = np.argsort(ess, kind="stable")[:many]
 
     def figure(kind: str, at: int) -> float:
-        return diagnostics.chain_statistic(kind, columns[at], block).item()
+        found = diagnostics.chain_statistic(kind, columns[at], block, groups)
+        return float(found.item() if kind == "rhat" else found.item() / share)
 
-    sizes = {at: (figure("ess", at) / share, figure("tail_ess", at) / share) for at in slow}
-    return _Judged(
-        len(names),
-        {names[at]: figure("rhat", at) for at in apart},
-        {
-            names[at]: (bulk, "bulk") if not tail < bulk else (tail, "tail")
-            for at, (bulk, tail) in sizes.items()
-        },
-    )
+    sizes = {names[at]: (figure("ess", at), figure("tail_ess", at)) for at in slow}
+    ratios = {names[at]: figure("rhat", at) for at in apart}
+    if not groups:
+        return _Judged(len(names), ratios, sizes)
+    chance = {names[at]: _by_chance(figure("ess", at), groups) for at in apart}
+    lasting = {names[at]: _memory(columns[at]) for at in {*apart, *slow}}
+    lasting = {name: memory for name, memory in lasting.items() if memory > 0}
+    return _Judged(len(names), ratios, sizes, chance, lasting)
+
+
+def _by_chance(ess: float, groups: int) -> float:
+    """Nested R-hat of so many superchains that have mixed, or ``MAX_RHAT``, seldom exceeded.
+
+    The means of superchains then have the variance of ``ess / groups`` independent draws.
+    """
+    limit = float(scipy.special.chdtri(groups - 1, _ALARM))
+    return max(MAX_RHAT, math.sqrt(1.0 + groups / (groups - 1) * limit / max(ess, 1.0)))
+
+
+def _memory(values: np.ndarray) -> float:
+    """Correlation over chains of the means of their first and last thirds; 0 where it is chance."""
+    chains, draws = values.shape
+    if draws < _THIRDS or chains < 2 * _POOLED:
+        return 0.0
+    scores = diagnostics.normal_scores(values[None])[0]
+    third = draws // 3
+    first, last = scores[:, :third].mean(axis=1), scores[:, -third:].mean(axis=1)
+    with np.errstate(all="ignore"):
+        correlation = float(np.corrcoef(first, last)[0, 1])
+        z = np.arctanh(correlation) * math.sqrt(chains - 3)
+        lasting = correlation * first.std() * last.std() / scores.var()
+    return correlation if z > scipy.special.ndtri(1 - _ALARM) and lasting > _LASTING else 0.0
 
 
 def _screen(values: np.ndarray, block: int) -> tuple[float, float]:
@@ -234,13 +362,15 @@ def _screen(values: np.ndarray, block: int) -> tuple[float, float]:
         halves = np.stack([means[..., :half].mean(axis=-1), means[..., -half:].mean(axis=-1)])
         between = halves.var(axis=(0, 2)) / of_blocks
         ess = chains * count * variance / means.var(axis=(1, 2))
+        if chains >= 2 * _POOLED:  # what batches of few draws do not show of each other
+            ess = np.fmin(ess, chains * variance / means.mean(axis=2).var(axis=1))
     return float(np.fmax(*between[:2])), float(np.fmin.reduce(ess[[0, 2, 3]]))
 
 
 def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
     """The same from sums, whose own figures are cheap and know no tails: of all scalars looked at."""
     ratios: dict[str, float] = {}
-    sizes: dict[str, tuple[float, str]] = {}
+    sizes: dict[str, tuple[float, float]] = {}
     for name, node in posterior.model.nodes.items():
         if name in forward or not posterior._running.is_batched(name):
             continue
@@ -248,11 +378,11 @@ def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
         moves = posterior.moves(name)
         for index in _spread(moves.shape, _SCALARS):
             if moves[index]:
-                scalar = _scalar(posterior.model, name, index[: len(node.value_shape)])
+                scalar = scalar_name(posterior.model, name, index[: len(node.value_shape)])
                 if len(index) > len(node.value_shape) and node.domain is not None:
                     scalar += f" == {node.domain.states[index[-1]]!r}"
                 ratios[scalar] = float(rhat[index])
-                sizes[scalar] = float(ess[index]), "bulk"
+                sizes[scalar] = float(ess[index]), np.nan
     return _Judged(len(ratios), ratios, sizes)
 
 
@@ -266,7 +396,7 @@ def _moving(posterior: ChainsPosterior, forward: frozenset[str]) -> list[Compile
     ]  # fmt: skip
 
 
-def _some(nodes: list[CompiledNode], model: Model) -> Iterator[tuple[str, tuple[int, ...]]]:
+def some_scalars(nodes: list[CompiledNode], model: Model) -> Iterator[tuple[str, tuple[int, ...]]]:
     """Node and index of up to ``_SCALARS`` scalars, spread evenly over nodes and within them."""
     if len(nodes) > _SCALARS:
         picked = np.linspace(0, len(nodes) - 1, _SCALARS).round().astype(int)
@@ -288,9 +418,9 @@ def _spread(shape: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:
         yield tuple(int(i) for i in at)
 
 
-def _thinned(values: np.ndarray, block: int) -> np.ndarray:
+def _thinned(values: np.ndarray, block: int, superchains: int = 0) -> np.ndarray:
     """Every k-th block of draws of long chains, of some chains if there are many; shape (chain, draw)."""
-    if len(values) > _CHAINS:
+    if len(values) > _CHAINS and not superchains:
         values = values[np.linspace(0, len(values) - 1, _CHAINS).round().astype(int)]
     chains, draws = values.shape
     step = max(1, min(draws // _DRAWS, -(-chains * draws // _ONE)))
@@ -298,20 +428,8 @@ def _thinned(values: np.ndarray, block: int) -> np.ndarray:
     return values[:, :whole].reshape(chains, -1, block)[:, ::step].reshape(chains, -1)
 
 
-def _uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.ndarray:
+def uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.ndarray:
     """The draws of a scalar, those of an angle near their mean: cut in two they would look faster mixed."""
     if node.angles is None or not node.angles[index[len(node.plates) :]]:
         return values
     return near(values, np.angle(np.exp(1j * values).mean()))
-
-
-def _scalar(model: Model, name: str, index: tuple[int, ...]) -> str:
-    """A scalar's name with its plate labels, as in a summary."""
-    if not index:
-        return name
-    node = model[name]
-    labels: list[Any] = [
-        model.labels.get(plate, range(size))[i]
-        for plate, size, i in zip(node.plates, node.plate_shape, index, strict=False)
-    ]
-    return f"{name}[{', '.join(map(str, [*labels, *index[len(labels) :]]))}]"

@@ -49,7 +49,7 @@ _FACTOR_SIZE = 24
 _BOXES = ("real", "interval", "circle", "real vector", "product", "integers")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gibbs(ChainEngine):
     """Markov chains that draw every node in turn from its distribution given all others.
 
@@ -61,16 +61,21 @@ class Gibbs(ChainEngine):
 
     Parameters
     ----------
-    draws : int
-        Draws kept of every chain.
-    warmup : int
-        Sweeps before that, in which widths and scales adapt.
-    chains : int
-        Chains, all in one array: many cost little more than one.
+    draws : int, optional
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
+        warning that names the node.
+    warmup : int, optional
+        Sweeps before that, in which widths and scales adapt; by default until chains have forgotten where
+        they started, 1,000 at most (with ``draws``: 1,000).
+    chains : int, optional
+        Chains, all in one array: many cost little more than one. By default as many as the model's size lets
+        run at little cost, 4 to 128, in groups that start as one (with ``draws``: 4).
     thinning : int
         Sweeps per kept draw.
     debug : bool
         Check every conjugate draw against the densities of the model (slow): an error names the node.
+    ess : float
+        Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
         Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
@@ -93,14 +98,16 @@ class Gibbs(ChainEngine):
     True
     """
 
-    draws: int = 1000
-    warmup: int = 1000
-    chains: int = 4
+    draws: int | None = None
+    warmup: int | None = None
+    chains: int | None = None
     thinning: int = 1
     debug: bool = False
+    ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Gibbs sampling"
+    judges: ClassVar[bool] = True
 
     def refusal(self, problem: Problem) -> str | None:
         parts = refuse_parts(problem.observed, "Gibbs")
@@ -127,7 +134,9 @@ class Gibbs(ChainEngine):
 
     def sampler(self, problem: Problem) -> SweepSampler:
         plan = plan_of(problem, self.debug)
-        return SweepSampler(plan.target, plan.kernels)
+        sampler = SweepSampler(plan.target, plan.kernels)
+        sampler.climbs = any(_is_slice(k) for k in plan.kernels)
+        return sampler
 
 
 @dataclass(frozen=True, eq=False)

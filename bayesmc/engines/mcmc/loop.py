@@ -6,10 +6,12 @@ A sampler moves all chains by one sweep; what a sweep does is not known here.
 from __future__ import annotations
 
 import copy
+import math
 import signal
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -19,7 +21,13 @@ from bayesmc.errors import BayesmcError, DensityError, ParameterError
 from bayesmc.network import Model, Problem
 from bayesmc.progress import Progress
 from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, RunningChains
-from bayesmc.results.sums import stored_dtype
+
+#: the first sweep at which a warmup may end where that is judged
+_END = 100
+#: draws of each chain from which on a run may be seen not to get to its effective size
+_HOPELESS = 500
+#: draws of each chain in the first round, at least, and how much longer a later round may make a run
+_ROUND, _GROWTH = 16, 3.0
 
 #: what a sampler moves: arrays, numbers and nested dicts of them, picklable
 State = Mapping[str, Any]
@@ -30,12 +38,15 @@ class Sampler(Protocol):
 
     Notes
     -----
-    Four attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
+    Some attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
     members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
     ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
-    A method is, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them.
+    Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
+    ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged, and
+    ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None.
+    ``superchains`` (0) is set before the start, where so many groups of chains are to start as one.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
     which is exact if ``step`` writes into no array of the state it is given.
@@ -66,6 +77,57 @@ class Sampler(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Lengths:
+    """What a run makes.
+
+    Attributes
+    ----------
+    chains : int
+    warmup : int
+        Sweeps; at most, where there is a ``judge``.
+    draws : int
+        Of each chain; at most, where there is an ``ess``.
+    superchains : int
+        Groups of consecutive chains that start as one; 0 where every chain starts by itself.
+    ess : float or None
+        Effective size after which nothing more is drawn.
+    judge : callable or None
+        Whether draws of a warmup, some nodes' stored values, tell nothing of their starts any more.
+    """
+
+    chains: int
+    warmup: int
+    draws: int
+    superchains: int = 0
+    ess: float | None = None
+    judge: Callable[[Mapping[str, np.ndarray]], bool] | None = None
+
+    def ends(self) -> Iterator[int]:
+        """Sweeps at which the warmup may end."""
+        end = _END
+        while self.judge is not None and end < self.warmup:
+            yield end
+            end *= 2
+        yield self.warmup
+
+    def first(self) -> int:
+        """Draws of each chain in the first round."""
+        if self.ess is None:
+            return self.draws
+        return min(max(math.ceil(self.ess / self.chains), _ROUND), self.draws)
+
+    def further(self, made: int, share: float) -> int:
+        """Draws of each chain in the next round, where those made are a share of what is wanted.
+
+        None where even all that are allowed would not do.
+        """
+        if made >= _HOPELESS and share * self.draws < 0.5 * made:
+            return 0
+        needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
+        return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
+
+
 class Loop:
     """Sweeps of one run, and the last point that it can return to."""
 
@@ -76,18 +138,21 @@ class Loop:
         sampler: Sampler,
         rng: np.random.Generator,
         problem: Problem,
-        chains: int,
-        warmup: int,
+        lengths: Lengths,
         thinning: int,
     ) -> None:
-        self.sampler, self.rng = sampler, rng
-        self.chains, self.warmup, self.thinning = chains, warmup, thinning
+        self.sampler, self.rng, self.model = sampler, rng, problem.model
+        self.lengths, self.thinning = lengths, thinning
+        #: sweeps of the warmup, once it has ended
+        self.warmup = lengths.warmup
         self.observed = problem.observed
         seen = {n: o.value for n, o in problem.observed.items() if o.mask is None}
         #: stored values that no chain moves
         self.known = {**problem.inputs, **seen}
         self.sweep = 0
         self.phase = ""
+        #: trajectories of each chain that diverged, before the first draw and after each
+        self.diverged: list[np.ndarray] = []
 
     def begun(self, bar: Progress, resume: Posterior | None, stop: Patience) -> State:
         """The state from which draws are made: after the warmup, or where an earlier run ended."""
@@ -100,17 +165,35 @@ class Loop:
             return copy.deepcopy(self.last.state)
         with marking_invalid(), np.errstate(all="ignore"):
             try:
-                state = self.sampler.start(self.rng, self.chains)
+                state = self.sampler.start(self.rng, self.lengths.chains)
             except (DensityError, ParameterError) as error:
                 error.args = (f"{error}, at iteration 0 (start)", *error.args[1:])
                 raise
             self.phase = " (warmup)"
-            for _ in range(self.warmup):
-                stop.check()
-                state = self._stepped(state, True)
-                bar.advance()
+            for end in self.lengths.ends():
+                state, window = self._warmed(state, end, bar, stop)
+                if window is not None and self.lengths.judge(window):  # type: ignore[misc]
+                    break
+            self.warmup = self.sweep
             self.sweep, self.phase = 0, ""
             return self.sampler.end_warmup(state)
+
+    def _warmed(
+        self, state: State, end: int, bar: Progress, stop: Patience
+    ) -> tuple[State, Mapping[str, np.ndarray] | None]:
+        """The state after some more sweeps, and the second half of the warmup so far if it is judged."""
+        judged = end < self.lengths.warmup
+        window: Kept | None = None
+        while self.sweep < end:
+            stop.check()
+            state = self._stepped(state, True)
+            bar.advance()
+            if judged and self.sweep > end // 2:
+                values = self.sampler.moving(state)  # type: ignore[attr-defined]
+                if window is None:
+                    window = Kept(self.model, tuple(values), self.lengths.chains, end - end // 2)
+                window.add(values)
+        return state, None if window is None else window.frozen()
 
     def draw(
         self,
@@ -122,6 +205,7 @@ class Loop:
     ) -> bool:
         """Make and keep draws; whether it was left to finish."""
         thinning, known, wanted = self.thinning, self.known, held.draws + draws
+        counted = self._counting(state, held)
         point: tuple[State, Mapping[str, Any], Mapping[str, np.ndarray]] | None = None
         try:
             with marking_invalid(), np.errstate(all="ignore"):
@@ -131,6 +215,8 @@ class Loop:
                         state = self._stepped(state, False)
                         bar.advance()
                     values = self._values(state)
+                    if counted is not None:
+                        self.diverged.append(counted(state))
                     if known:
                         values = {**known, **values}
                     held.add(values)
@@ -141,6 +227,21 @@ class Loop:
         if point is not None:
             self.last = Checkpoint(*point, self.observed)
         return held.draws == wanted
+
+    def divergences(self, draws: int) -> np.ndarray | None:
+        """Whether trajectories diverged, shape (chain, draw), of so many draws; None where there are none."""
+        if not self.diverged:
+            return None
+        return np.asarray(np.diff(np.stack(self.diverged[: draws + 1], axis=1), axis=1) > 0)
+
+    def _counting(self, state: State, held: Kept | RunningChains) -> Any:
+        """What counts trajectories that diverged, where draws are kept and there are any."""
+        count = getattr(self.sampler, "divergences", None)
+        if count is None or not isinstance(held, Kept) or count(state) is None:
+            return None
+        if not self.diverged:
+            self.diverged.append(count(state))
+        return count
 
     def _stepped(self, state: State, warmup: bool) -> State:
         self.sweep += 1
@@ -190,6 +291,12 @@ class Kept:
         self.room += draws
         self.draws = draws
 
+    def more(self, draws: int) -> None:
+        """Make room for some further draws after those in place."""
+        stored = self.frozen()
+        self.stored, self._moving, self._together, self.room = {}, [], [], draws
+        self.begin_with(stored, self.draws)
+
     def add(self, values: Mapping[str, np.ndarray]) -> None:
         """Take in one draw of every chain."""
         if not self.stored:
@@ -222,7 +329,7 @@ class Kept:
         alike: dict[np.dtype[Any], list[str]] = {}
         for name in self.names:
             node, value = self.model[name], values[name]
-            dtype = stored_dtype(node, value)
+            dtype = node.stored_dtype(value)
             if value.ndim == len(node.value_shape):
                 self.stored[name] = np.array(value, dtype=dtype)[None, None]
                 continue
@@ -240,6 +347,7 @@ class Kept:
             for name, array in self.stored.items():
                 if array.shape[1:2] == (self.room,):
                     array[:, : self.draws] = self._earlier[name]
+            self._earlier = {}
 
 
 class Patience(AbstractContextManager["Patience"]):

@@ -31,6 +31,8 @@ from bayesmc.structure.target import Target, Values, target_of
 
 #: first sweep of the warmup after which stragglers are brought back; later ones follow at twice that, ...
 _FIRST_RESCUE = 16
+#: chains where none are asked for
+_CHAINS = 4
 #: numbers beyond which continuous nodes no longer move as one block
 LARGEST_BLOCK = 200
 #: members of an ensemble, least and most
@@ -53,12 +55,13 @@ class MetropolisHastings(ChainEngine):
 
     Parameters
     ----------
-    draws : int
-        Draws kept of every chain.
-    warmup : int
-        Sweeps before that, in which scales and covariances adapt.
-    chains : int
-        Chains, all in one array.
+    draws : int, optional
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
+        warning that names the node.
+    warmup : int, optional
+        Sweeps before that, in which scales and covariances adapt; 1,000 by default.
+    chains : int, optional
+        Chains, all in one array; 4 by default, as each may be an ensemble.
     proposal : dict, optional
         Node name, or a tuple of names that move as one -> one of
 
@@ -73,6 +76,8 @@ class MetropolisHastings(ChainEngine):
         whole.
     thinning : int
         Sweeps per kept draw.
+    ess : float
+        Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
         Node -> where its chains start, shape ``(*plates, *event)`` for all of them or
         ``(chains, *plates, *event)`` for each; labels for states. Nodes that are left out are drawn given
@@ -113,14 +118,16 @@ class MetropolisHastings(ChainEngine):
     True
     """
 
-    draws: int = 1000
-    warmup: int = 1000
-    chains: int = 4
+    draws: int | None = None
+    warmup: int | None = None
+    chains: int | None = None
     proposal: Mapping[Any, Any] | None = field(default=None, hash=False)
     thinning: int = 1
+    ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Metropolis-Hastings"
+    ensembles: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -139,7 +146,7 @@ class MetropolisHastings(ChainEngine):
         return self._plan(problem).describe()
 
     def sampler(self, problem: Problem) -> MetropolisSampler:
-        return MetropolisSampler(self._plan(problem), self.warmup, self.thinning)
+        return MetropolisSampler(self._plan(problem), self.warmup or 0, self.thinning)
 
     def tied(self, problem: Problem) -> Sequence[str]:
         jointly = {n for key in self._given if isinstance(key, tuple) for n in key}
@@ -160,7 +167,7 @@ class MetropolisHastings(ChainEngine):
             raise UnsupportedError(
                 "MetropolisHastings: this engine was unpickled, and pickles carry no functions; make it anew"
             )
-        return plan_of(problem, self._given, self.chains)
+        return plan_of(problem, self._given, self.chains or _CHAINS)
 
     @property
     def _given(self) -> Mapping[Any, Any]:
@@ -179,16 +186,19 @@ class MetropolisHastings(ChainEngine):
         return self
 
     def __repr__(self) -> str:
-        options = f"draws={self.draws}, warmup={self.warmup}, chains={self.chains}"
+        said = {"draws": self.draws, "warmup": self.warmup, "chains": self.chains}
+        options = [f"{n}={v}" for n, v in said.items() if v is not None]
         if self._given:
             shown = (
                 f"{k!r}: {v!r}" if isinstance(v, (str, RandomWalk)) else f"{k!r}: ..."
                 for k, v in self._given.items()
             )
-            options += f", proposal={{{', '.join(shown)}}}"
+            options.append(f"proposal={{{', '.join(shown)}}}")
         if self.thinning != 1:
-            options += f", thinning={self.thinning}"
-        return f"MetropolisHastings({options})"
+            options.append(f"thinning={self.thinning}")
+        if self.draws is None:
+            options.append(f"ess={self.ess:g}")
+        return f"MetropolisHastings({', '.join(options)})"
 
 
 class MetropolisSampler(SweepSampler):
@@ -206,7 +216,7 @@ class MetropolisSampler(SweepSampler):
         self.ensemble = plan.ensemble
         self.warmup, self.thinning = warmup, thinning
         bands = {block_name(k): _band(k) for k in self.kernels}
-        self.acceptance_band: dict[str, tuple[float, float] | None] = bands
+        self.acceptance_band = bands
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
         return {**self._started(rng, chains, chains * self.ensemble), "sweep": 0}

@@ -24,11 +24,11 @@ from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
 from bayesmc.engines.slice_steps import SlicePlan, size_of
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.network import CompiledNode
-from bayesmc.network.align import Aligner
+from bayesmc.network.calling import Aligner
+from bayesmc.network.declaring import unknown
 from bayesmc.network.forward import Pass, Step
 from bayesmc.network.model import arguments_of
 from bayesmc.network.node import bind
-from bayesmc.network.store import unknown
 
 #: a first-stage factor is at least this share of the largest (in logs), so that nothing is ruled out
 _LEAST = -50.0

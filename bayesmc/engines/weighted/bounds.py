@@ -24,10 +24,10 @@ from bayesmc.distributions import (
 from bayesmc.errors import EnvelopeError, EvidenceError, ShapeError, UnknownNodeError
 from bayesmc.expression import Family, expressions_of
 from bayesmc.network import CompiledNode, Model, Problem
+from bayesmc.network.declaring import unknown
 from bayesmc.network.expressions import Opaque, density
 from bayesmc.network.forward import Pass, Step
 from bayesmc.network.model import potential_shape
-from bayesmc.network.store import unknown
 from bayesmc.shapes import Shape, broadcasts_to
 from bayesmc.structure.tables import Reads, configure, constants_of, reads_of
 

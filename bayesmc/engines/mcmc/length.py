@@ -1,0 +1,141 @@
+"""How many chains, how long a warmup, how many draws: where a run is asked for an effective size.
+
+Chains are an array axis: up to some thousand numbers a sweep costs Python's calls and hardly more for many
+chains than for few. Their number depends on the model's size alone, never on a clock, so that a seed gives
+the same answer everywhere. Many chains are short, and their starts must be forgotten: groups of them
+(superchains) start as one, and nested R-hat compares the groups.
+
+References
+----------
+Margossian et al. (2024), Nested R-hat: assessing the convergence of Markov chain Monte Carlo when running
+many short chains, Bayesian Analysis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bayesmc import diagnostics
+from bayesmc.engines.mcmc.convergence import MAX_RHAT, some_scalars, uncut
+from bayesmc.engines.mcmc.loop import Lengths
+from bayesmc.network import Model, Problem
+from bayesmc.structure.target import target_of
+
+#: numbers of all chains up to which a sweep costs little more than that of one chain
+_NUMBERS = 4096
+#: chains, least and most; effective draws that each must give at least, so that its own memory is judged
+LEAST, _MOST, _EACH = 4, 128, 8
+#: superchains where there are enough chains, and chains that each has at least
+_SUPERCHAINS, _MEMBERS = 8, 2
+#: sweeps of a warmup where none are said, at most where its end is judged
+WARMUP = 1000
+#: draws of each chain after which one that did not get to its effective size gives up, and numbers that
+#: are kept at most if these are enough for ``_FEWEST`` draws
+_BUDGET, _KEPT, _FEWEST = 4000, 1 << 24, 1000
+#: numbers by which the end of a warmup is judged, at most
+_WINDOW = 1 << 18
+
+
+def chosen(
+    problem: Problem,
+    warmup: int | None,
+    chains: int | None,
+    ess: float,
+    *,
+    judges: bool,
+    ensembles: bool,
+    kept: Sequence[str] | None,
+) -> Lengths:
+    """What a run makes that is asked for an effective size: what else is said is done, the rest chosen.
+
+    Parameters
+    ----------
+    problem : Problem
+    warmup, chains : int or None
+    ess : float
+    judges : bool
+        Whether the engine's kernels learn in few sweeps, so that a warmup may end early.
+    ensembles : bool
+        Whether each chain is an array of members itself.
+    kept : sequence of str or None
+        Nodes whose draws are held; None where draws are summed.
+    """
+    if chains is None:
+        chains = LEAST
+        if not ensembles and kept is not None:
+            most = min(_MOST, ess / _EACH, _NUMBERS / size_of(problem))
+            chains = max(LEAST, 1 << int(math.log2(max(most, 1.0))))
+    groups = 0 if ensembles else _superchains(chains)
+    judge = None
+    if judges and warmup is None:
+        judge = partial(forgotten, model=problem.model, superchains=groups)
+    budget = _BUDGET
+    if kept is not None:
+        numbers = sum(math.prod(problem.model[n].value_shape) for n in kept)
+        budget = min(budget, max(_KEPT // max(numbers * chains, 1), _FEWEST))
+    return Lengths(chains, WARMUP if warmup is None else warmup, budget, groups, ess, judge)
+
+
+def forgotten(stored: Mapping[str, np.ndarray], model: Model, superchains: int) -> bool:
+    """Whether some draws of a warmup tell neither where chains started nor whether they are early or late.
+
+    Parameters
+    ----------
+    stored : dict
+        Node -> stored values, shape ``(chain, draw, *plates, *event)``.
+    """
+    columns = []
+    nodes = [model[n] for n, v in stored.items() if v.size and v.shape[1] > 1]
+    for name, index in some_scalars(nodes, model):
+        at: tuple[Any, ...] = (slice(None), slice(None), *index)
+        values = stored[name][at]
+        if (values != values[0, 0]).any():
+            columns.append(uncut(model[name], index, values))
+    if not columns:
+        return True
+    step = -(-len(columns) * columns[0].size // _WINDOW)
+    draws = np.stack(columns[::step], axis=-1)
+    half = draws.shape[1] // 2
+    times = np.concatenate([draws[:, :half], draws[:, -half:]])  # the early ones as a superchain
+    starts = diagnostics.chain_statistic("rhat", draws, superchains=superchains)
+    drift = diagnostics.chain_statistic("rhat", times, superchains=2)
+    return bool((np.fmax(starts, drift) <= MAX_RHAT).all())
+
+
+def in_words(lengths: Lengths, problem: Problem) -> str:
+    """What a run will do, for those who ask before."""
+    many = f"{lengths.chains} chains"
+    if lengths.superchains:
+        many += f" from {lengths.superchains} starts"
+    warm = f"{'' if lengths.judge is None else 'at most '}{lengths.warmup} sweeps of warmup"
+    if lengths.ess is None:
+        return f"{many}, {warm}, {lengths.draws} draws of each"
+    return (
+        f"{many} of some {size_of(problem)} numbers each, {warm}, then draws until the smallest effective "
+        f"size is {lengths.ess:g}, at most {lengths.draws} of each chain"
+    )
+
+
+def size_of(problem: Problem) -> int:
+    """Numbers that the terms of one chain's density are made of: what a sweep's arithmetic grows with."""
+    size = 0
+    for term in target_of(problem).terms.values():
+        event = () if term.is_potential else problem.model[term.name].event_shape
+        size += math.prod(term.shape) * max(math.prod(event), 1)
+    return max(size, 1)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _superchains(chains: int) -> int:
+    """How many equal groups there may be; 0 where chains are few, and long enough to be judged alone."""
+    for count in range(_SUPERCHAINS, LEAST - 1, -1):
+        if chains % count == 0 and chains // count >= _MEMBERS and chains >= 2 * _SUPERCHAINS:
+            return count
+    return 0

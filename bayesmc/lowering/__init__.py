@@ -1,0 +1,24 @@
+"""Machine code from the expression graph: the room knows graphs and arrays, no nets.
+
+A graph becomes a text in LLVM's language (``kernel``), llvmlite makes machine code of it (``machine``), and
+``compiled`` calls it as ``expression.Program`` is called, ``checked`` holds it against that. Without llvmlite
+nothing here is used.
+"""
+
+from __future__ import annotations
+
+from bayesmc.lowering.checked import held_against_numpy, is_worth_it
+from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
+from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.weights import weight_loops
+
+__all__ = [
+    "Bound",
+    "Compiled",
+    "SliceKernel",
+    "compiled",
+    "held_against_numpy",
+    "is_available",
+    "is_worth_it",
+    "weight_loops",
+]

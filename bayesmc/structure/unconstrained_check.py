@@ -1,0 +1,218 @@
+"""A log density of free numbers held against the model at probe points, before its first use.
+
+Three things are compared: every log factor that counts, element by element, with what the model's function
+gives at the same values (which shows a mask, a coefficient or a constant that went wrong); the change of
+volume with that of the maps; and the sum that is used, which is written for free numbers far out, with the
+sum of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+
+from bayesmc.distributions.base import marking_invalid
+from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.expression import Expression, Program
+from bayesmc.structure.free_density import FREE, UnconstrainedDensity
+from bayesmc.structure.summing import Summed
+from bayesmc.structure.target import Target, Term, Values
+
+#: points, and how far the free numbers of each are from zero
+_SPREADS = (0.0, 3.0, 0.1, 5.0, 1.0, 2.0, 0.3, 1.0)
+#: terms from which on half as many points do: most of them are alike
+_MANY = 100
+#: reachable values farther out are tried at zero
+_FAR = 30.0
+#: how far log factors may be off, relative to themselves and to their largest part
+_RTOL = 1e-9
+#: how far those may be that are written for free numbers far out: where probabilities are near 0 or 1 the
+#: model's own lose digits
+_WRITTEN = 1e-7
+
+
+def hold_against_model(
+    density: UnconstrainedDensity,
+    terms: Sequence[Term],
+    plain: Sequence[Expression],
+    used: Sequence[Expression],
+    tables: Sequence[Summed] = (),
+) -> None:
+    """Refuse a log density that gives something else than the model's own functions.
+
+    Parameters
+    ----------
+    density : UnconstrainedDensity
+    terms : sequence of Term
+    plain : sequence of Expression
+        Of each term the log factors that count, then each node's log change of volume, of free numbers, as
+        they are written.
+    used : sequence of Expression
+        The same as they are added up.
+    tables : sequence of Summed
+        Terms for all states of nodes that are summed out.
+
+    Raises
+    ------
+    UnsupportedError
+        Says which term differs, or is zero at all points.
+    """
+    program = Program([*plain, *used])
+    totals = Program([table.total for table in tables])
+    inside = {t.name for table in tables for t in table.terms}
+    names = [t.name for t in terms]
+    seen, agreed = [False] * len(terms), [False] * len(plain)
+    for u, values in _points(density):
+        found = [np.asarray(v) for v in program({**values, FREE: u})]
+        given, written = found[: len(plain)], found[len(plain) :]
+        wanted = [_counted(term, values) for term in terms]
+        # parameters out of range: where its own density is zero, a node's value may be anything
+        nowhere = [
+            w is not None and t.name in density.names and not np.isfinite(w).all()
+            for t, w in zip(terms, wanted, strict=True)
+        ]
+        for k, own in enumerate(wanted):
+            if own is not None and nowhere[k] >= any(nowhere):
+                seen[k] |= _compare(terms[k], given[k], own)
+        if any(nowhere):
+            continue
+        sums = {t.name: float(log.sum()) for t, log in zip(terms, given, strict=False)}
+        _check_tables(tables, sums, u, values)
+        volume = sum(float(v) for v in given[len(terms) :])
+        if not np.isclose(volume, density.log_volume(u, values), rtol=1e-8, atol=1e-8):
+            raise UnsupportedError("the change of volume differs from that of the maps")
+        outside = [float(w.sum()) for w, n in zip(written, names, strict=False) if n not in inside]
+        outside += [float(w) for w in (*written[len(terms) :], *totals({**values, FREE: u}))]
+        _check_sum(density, outside, u, values)
+        for k, (a, b) in enumerate(zip(given, written, strict=True)):
+            agreed[k] |= _is_written(a, b)
+    for name, is_seen in zip(names, seen, strict=True):
+        if not is_seen:
+            raise UnsupportedError(
+                f"the density of {name!r} is zero, or no number, at all points where it was tried, so that "
+                "its expression cannot be held against its function"
+            )
+    if not all(agreed):
+        name = [*names, *density.names][agreed.index(False)]
+        raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]]:
+    """Free numbers, and the stored values of all nodes there, one point after the other."""
+    target, rng = density.target, np.random.default_rng(len(density.labels))
+    moving = set(density.names)
+    others = [n for n in target.chain if n not in moving]
+    states = target.states
+    if others and states is None:
+        raise UnsupportedError(f"no reachable value of node {others[0]!r} is known to try it on")
+    many = len(target.terms) > _MANY
+    for k, spread in enumerate(_SPREADS[-4:] if many else _SPREADS):
+        values: Values = dict(target.known)
+        for name in others:
+            assert states is not None
+            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
+        u = rng.normal(size=density.size) * spread
+        if states is not None and k % 2:  # reachable ones, moved a little
+            row = {n: states[n][k % len(states[n])] for n in density.names}
+            reached = density.unconstrain({**values, **row})
+            u = np.where(np.abs(reached) < _FAR, reached, 0.0) + 0.1 * u
+        values.update(density.constrain(u, values))
+        try:
+            with marking_invalid(), np.errstate(all="ignore"):
+                target.compute(values, target.links)
+        except BayesmcError:
+            continue
+        yield u, values
+
+
+def _with_seen(target: Target, name: str, value: np.ndarray) -> np.ndarray:
+    seen = target.seen(name)
+    if seen is None:
+        return value
+    assert seen.mask is not None  # of a node in the chain
+    mask = np.reshape(seen.mask, np.shape(seen.mask) + (1,) * len(target.model[name].event_shape))
+    return np.where(mask, seen.value, value)
+
+
+def _counted(term: Term, values: Values) -> np.ndarray | None:
+    """The model's own log factors that count; None where it cannot say."""
+    try:
+        with marking_invalid(), np.errstate(all="ignore"):
+            log = np.broadcast_to(term.log(values), term.shape).ravel()
+    except BayesmcError:
+        return None
+    return log if term.mask is None else log[np.flatnonzero(term.mask)]
+
+
+def _compare(term: Term, found: np.ndarray, wanted: np.ndarray) -> bool:
+    """Whether some element is finite; all must agree.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    if found.shape != wanted.shape:
+        raise UnsupportedError(
+            f"of {term.name!r} {found.size} elements are counted in place of {wanted.size}"
+        )
+    finite = np.isfinite(wanted)
+    with np.errstate(all="ignore"):
+        near = np.abs(found - wanted) <= _RTOL * (1.0 + np.abs(wanted))
+    agree = np.where(finite, near, ~np.isfinite(found))
+    if agree.all():
+        return bool(finite.any()) or not finite.size
+    at = int(np.argmin(agree))
+    raise UnsupportedError(
+        f"what was read of {term.name!r} gives {found[at]:.9g} at element {at} of those that count, and its "
+        f"function {wanted[at]:.9g}"
+    )
+
+
+def _is_written(plain: np.ndarray, used: np.ndarray) -> bool:
+    """Whether all log factors agree that are finite as they are written, and some are."""
+    finite = np.isfinite(plain)
+    with np.errstate(all="ignore"):
+        near = np.abs(used - plain) <= _WRITTEN * (1.0 + np.abs(plain))
+    return bool(near[finite].all() and (finite.any() or not finite.size))
+
+
+def _check_sum(
+    density: UnconstrainedDensity, parts: Sequence[float], u: np.ndarray, values: Values
+) -> None:
+    """Refuse a function that gives something else than the sum of its parts, where that is finite.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    wanted, found = sum(parts), float(density.value(u, values))
+    size = 1.0 + sum(map(abs, parts))
+    if np.isfinite(wanted) and not abs(found - wanted) <= _RTOL * size:
+        raise UnsupportedError(
+            f"the log density is {found:.9g}, and the sum of its terms {wanted:.9g}"
+        )
+
+
+def _check_tables(
+    tables: Sequence[Summed], sums: Mapping[str, float], u: np.ndarray, values: Values
+) -> None:
+    """Refuse tables that give other sums than the terms at the states that nodes have.
+
+    Raises
+    ------
+    UnsupportedError
+    """
+    for summed in tables:
+        wanted = sum(sums[t.name] for t in summed.terms)
+        roots = [summed.rest] if summed.table is None else [summed.rest, summed.table]
+        rest, *table = Program(roots)({**values, FREE: u})
+        shape = () if summed.table is None else summed.table.shape
+        wide = np.broadcast_to(table[0], shape) if table else None
+        found = summed.at(values, np.broadcast_to(rest, summed.rest.shape), wide)
+        if np.isfinite(wanted) and not abs(found - wanted) <= _WRITTEN * (1.0 + abs(wanted)):
+            names = ", ".join([*summed.labels, *summed.listed[0]])
+            raise UnsupportedError(f"the sum over the states of {names} differs from its terms")
