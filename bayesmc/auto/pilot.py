@@ -137,9 +137,7 @@ def _is_small(problem: Problem, plan: Plan) -> bool:
     """Whether Gibbs moves a few numbers by slices or walks, and no others, perhaps under finite nodes."""
     model = problem.model
     names = {n for kernel in plan.kernels for n in kernel.names}
-    slow = any(
-        isinstance(k, (Slice, FactorSlice, AdaptiveWalk, Hamiltonian)) for k in plan.kernels
-    )
+    slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk, Hamiltonian)) for k in plan.kernels)
     finite = {n for n in names if model[n].domain is not None}
     known = (Slice, FactorSlice, AdaptiveWalk, BlockWalk, Hamiltonian, Redrawn, Rescaled)
     if not slow or any(

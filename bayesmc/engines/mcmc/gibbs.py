@@ -57,9 +57,10 @@ class Gibbs(ChainEngine):
 
     What kernel a node gets is found, not declared (`explain` shows the table): nodes on which nothing
     observed depends are drawn forward; conjugate pairs in closed form; chains and trees of finite nodes as
-    one, by filtering and sampling along them; other finite nodes by trying all states; numbers by slice
-    sampling; simplices and matrices by an adaptive random walk. All chains and all elements of a plate move
-    in one array operation.
+    one, by filtering and sampling along them; other finite nodes by trying all states; up to 64 numbers that
+    share terms jointly along trajectories of the No-U-Turn sampler, with what has a closed form among them;
+    more by slices, and so what has no derivative; simplices and matrices without one by an adaptive random
+    walk. All chains and all elements of a plate move in one array operation.
 
     Parameters
     ----------

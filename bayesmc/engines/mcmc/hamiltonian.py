@@ -23,8 +23,11 @@ from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.target import target_of
 
+#: gradients of a transition, about
+_LEAVES = 8
 _METRICS = ("diagonal", "dense")
 
 
@@ -148,7 +151,8 @@ class HamiltonianMonteCarlo(ChainEngine):
         plan = plan_of(problem, only=finite)
         if not moving:
             return plan
-        density = density_of(problem, moving)
+        calls = _LEAVES * ((self.draws or 0) * self.thinning + (self.warmup or 0))
+        density = in_machine_code(density_of(problem, moving), calls, self.chains or 1)
         kernel = Hamiltonian(
             density,
             density.others,
