@@ -24,7 +24,8 @@ _RTOL = 1e-9
 def is_worth_it(roots: Sequence[Expression], calls: int, entries: int = 1) -> bool:
     """Whether so many calls, of so many entries each, take longer in NumPy than compiling.
 
-    And longer than a tenth of a second. By a count of nodes and elements, not by a clock: the same question is answered the same way again.
+    And longer than a tenth of a second. By a count of nodes and elements, not by a clock: the same question
+    is answered the same way again.
     """
     nodes = ordered(*roots)
     seconds = calls * (_NODE * len(nodes) + _ELEMENT * entries * sum(n.size for n in nodes))
