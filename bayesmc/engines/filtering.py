@@ -124,6 +124,10 @@ class FilterEngine:
         """What the engine does to each node of a slice."""
         raise NotImplementedError
 
+    def effort(self, problem: SeriesProblem) -> str:
+        """How it passes a series, where there is something to say."""
+        return ""
+
     def filter(
         self,
         problem: SeriesProblem,
