@@ -216,7 +216,11 @@ class _Slice:
         if not compile:
             Kernel(roots, noises | chosen, chosen)  # refuses what has no machine code
             return
-        self._kernel = SliceKernel(roots, noises, chosen)
+        kept = model.cache.setdefault("compiled slices", {})  # the next series finds it there
+        key = (*roots, noises, chosen)
+        if key not in kept:
+            kept[key] = SliceKernel(roots, noises, chosen)
+        self._kernel: SliceKernel = kept[key]
         self._drawn = drawn
         block = min(step.layout.block, step.layout.particles)
         self._noise = {_noise(z.name): np.empty((block, *z.shape)) for z in drawn}
