@@ -53,6 +53,7 @@ from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
 from bayesmc.engines.kalman.nonlinear import ExtendedKalmanFilter, UnscentedKalmanFilter
 from bayesmc.engines.mcmc.gibbs import Gibbs
+from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
 from bayesmc.engines.mcmc.proposals import Independence, RandomWalk
 from bayesmc.engines.particles.belief import ParticleBelief
@@ -96,6 +97,7 @@ __all__ = [
     "Geometric",
     "GridFilter",
     "Gibbs",
+    "HamiltonianMonteCarlo",
     "HalfCauchy",
     "HalfNormal",
     "Importance",

@@ -154,6 +154,10 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
     "Rejection": (by_rejection(2000, 200_000), dict.fromkeys(KINDS, 0.8)),
     # a sweep costs much the same for 32 chains as for 16, so many chains and few sweeps
     "Gibbs": (by(bmc.Gibbs(200, warmup=100, chains=32, debug=True)), dict.fromkeys(KINDS, 0.85)),
+    "HamiltonianMonteCarlo": (
+        by(bmc.HamiltonianMonteCarlo(200, warmup=200, chains=32)),
+        {"discrete": 0.5, "plates": 0.4, "hybrid": 0.4, "hybrid plates": 0.6, "gaussian": 0.4},
+    ),
     "MetropolisHastings": (
         by(bmc.MetropolisHastings(200, warmup=200, chains=32)),
         dict.fromkeys(KINDS, 0.5),

@@ -92,7 +92,7 @@ def check_all(
 @pytest.mark.parametrize("engine", ENGINES)
 def test_engine_matches_exact_answers(engine: str, kind: str) -> None:
     answer, share = ENGINES[engine]
-    chains = engine in ("Gibbs", "MetropolisHastings")
+    chains = engine in ("Gibbs", "MetropolisHastings", "HamiltonianMonteCarlo")
     chains |= engine == "no engine named" and kind.startswith("hybrid")  # mostly Gibbs
     nets, draw = (CHAIN_NETS, 2_000) if chains else (len(SEEDS), 1_000)
     if engine in ("LikelihoodWeighting, summaries", "no engine named"):

@@ -41,6 +41,8 @@ class _Chains(Posterior):
     #: finite node -> how often the hidden numbers below each element were drawn anew with it, at the least
     #: as often as chains started, shape (*plates,); only nodes that may wait for such numbers
     renewals: Mapping[str, np.ndarray] = MappingProxyType({})
+    #: draws whose Hamiltonian trajectory diverged, shape (chain, draw); None without such, or without draws
+    divergences: np.ndarray | None = None
     #: a sentence where chains name components differently that the model does not tell apart
     label_switching: str | None = None
 

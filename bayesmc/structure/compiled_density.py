@@ -114,7 +114,7 @@ class CompiledDensity(UnconstrainedDensity):
         """Values of all leaves, in a batch and alone."""
         rng, states = np.random.default_rng(self.size), self.target.states
         values = {FREE: rng.normal(size=(_SPREADS.size, self.size)) * _SPREADS[:, None]}
-        for name in self._others:
+        for name in self.others:
             if states is None:
                 raise TraceError(f"no reachable value of node {name!r} is known to try it on")
             rows = np.arange(_SPREADS.size) % len(states[name])

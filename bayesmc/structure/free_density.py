@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import Expression, Program
+from bayesmc.passes.arrays import for_arrays
 from bayesmc.structure.free_nodes import FreeNode
 from bayesmc.structure.target import Target, Values
 
@@ -42,14 +43,19 @@ class UnconstrainedDensity:
     slopes: Expression = field(repr=False)
     summed: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(node.name for node in self.nodes)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many free numbers there are."""
         return sum(node.size for node in self.nodes)
+
+    @cached_property
+    def others(self) -> tuple[str, ...]:
+        """Hidden nodes that do not move and that it depends on."""
+        return tuple(sorted(self.root.leaves - {FREE}))
 
     @cached_property
     def labels(self) -> list[str]:
@@ -119,19 +125,15 @@ class UnconstrainedDensity:
 
     @cached_property
     def _value(self) -> Program:
-        return Program([self.root])
+        return Program(for_arrays([self.root]))
 
     @cached_property
     def _both(self) -> Program:
-        return Program([self.root, self.slopes])
-
-    @cached_property
-    def _others(self) -> tuple[str, ...]:
-        return tuple(sorted(self.root.leaves - {FREE}))
+        return Program(for_arrays([self.root, self.slopes]))
 
     def _given(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None) -> Values:
         found: Values = {FREE: u}
-        for name in self._others:
+        for name in self.others:
             if values is None or name not in values:
                 raise UnsupportedError(f"the log density needs a value of node {name!r}")
             found[name] = values[name]

@@ -19,6 +19,7 @@ from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
 from bayesmc.engines.mcmc.missed import missed_ends, never_left
 from bayesmc.engines.mcmc.question import difference
+from bayesmc.engines.mcmc.trajectories import faulty_trajectories
 from bayesmc.engines.proposal import check_targets
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
@@ -186,6 +187,10 @@ class ChainEngine(Engine):
         except MemoryError as error:
             raise no_memory(self, lengths.draws * lengths.chains, names) from error
         posterior = self._posterior(problem, sampler, held, loop)
+        diverged = loop.divergences(posterior._chains_and_draws[1])
+        if diverged is not None:
+            before = None if resume is None else resume.divergences  # type: ignore[attr-defined]
+            posterior.divergences = diverged if before is None else np.hstack([before, diverged])
         self._warn(posterior, sampler, finished, lengths)
         return posterior
 
@@ -217,6 +222,8 @@ class ChainEngine(Engine):
             if share >= 1:
                 return True
             draws = lengths.further(done, share)
+            if not draws:
+                return True
             state = loop.last.state
 
     def _forward(self, sampler: Sampler) -> frozenset[str]:
@@ -325,6 +332,11 @@ class ChainEngine(Engine):
         found += never_left(posterior)
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, forward)
+        assert posterior.checkpoint is not None
+        state = posterior.checkpoint.state
+        count = getattr(sampler, "divergences", None)
+        if count is not None and count(state) is not None:
+            found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
 

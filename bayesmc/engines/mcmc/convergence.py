@@ -103,6 +103,18 @@ def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator
         )
 
 
+def scalar_name(model: Model, name: str, index: tuple[int, ...]) -> str:
+    """A scalar's name with its plate labels, as in a summary."""
+    if not index:
+        return name
+    node = model[name]
+    labels: list[Any] = [
+        model.labels.get(plate, range(size))[i]
+        for plate, size, i in zip(node.plates, node.plate_shape, index, strict=False)
+    ]
+    return f"{name}[{', '.join(map(str, [*labels, *index[len(labels) :]]))}]"
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -274,7 +286,7 @@ def _figures(
         at: tuple[Any, ...] = (slice(None), slice(None), *index)
         values = stored[name][at]
         if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
-            names.append(_scalar(posterior.model, name, index))
+            names.append(scalar_name(posterior.model, name, index))
             columns.append(uncut(posterior.model[name], index, _thinned(values, block, groups)))
     if not names:
         return _Judged(0, {}, {})
@@ -366,7 +378,7 @@ def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
         moves = posterior.moves(name)
         for index in _spread(moves.shape, _SCALARS):
             if moves[index]:
-                scalar = _scalar(posterior.model, name, index[: len(node.value_shape)])
+                scalar = scalar_name(posterior.model, name, index[: len(node.value_shape)])
                 if len(index) > len(node.value_shape) and node.domain is not None:
                     scalar += f" == {node.domain.states[index[-1]]!r}"
                 ratios[scalar] = float(rhat[index])
@@ -421,15 +433,3 @@ def uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.
     if node.angles is None or not node.angles[index[len(node.plates) :]]:
         return values
     return near(values, np.angle(np.exp(1j * values).mean()))
-
-
-def _scalar(model: Model, name: str, index: tuple[int, ...]) -> str:
-    """A scalar's name with its plate labels, as in a summary."""
-    if not index:
-        return name
-    node = model[name]
-    labels: list[Any] = [
-        model.labels.get(plate, range(size))[i]
-        for plate, size, i in zip(node.plates, node.plate_shape, index, strict=False)
-    ]
-    return f"{name}[{', '.join(map(str, [*labels, *index[len(labels) :]]))}]"

@@ -24,6 +24,8 @@ from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, 
 
 #: the first sweep at which a warmup may end where that is judged
 _END = 100
+#: draws of each chain from which on a run may be seen not to get to its effective size
+_HOPELESS = 500
 #: draws of each chain in the first round, at least, and how much longer a later round may make a run
 _ROUND, _GROWTH = 16, 3.0
 
@@ -41,8 +43,9 @@ class Sampler(Protocol):
     ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
-    Two methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
-    ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged.
+    Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,
+    ``moving(state)`` hands out the values that chains move, by which the end of a warmup is judged, and
+    ``divergences(state)`` says how many trajectories of each chain diverged since the warmup, or None.
     ``superchains`` (0) is set before the start, where so many groups of chains are to start as one.
 
     Ctrl-C waits for the end of a draw. A second one does not: then the loop goes back to the draw before,
@@ -115,7 +118,12 @@ class Lengths:
         return min(max(math.ceil(self.ess / self.chains), _ROUND), self.draws)
 
     def further(self, made: int, share: float) -> int:
-        """Draws of each chain in the next round, where those made are a share of what is wanted."""
+        """Draws of each chain in the next round, where those made are a share of what is wanted.
+
+        None where even all that are allowed would not do.
+        """
+        if made >= _HOPELESS and share * self.draws < 0.5 * made:
+            return 0
         needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
         return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
 
@@ -143,6 +151,8 @@ class Loop:
         self.known = {**problem.inputs, **seen}
         self.sweep = 0
         self.phase = ""
+        #: trajectories of each chain that diverged, before the first draw and after each
+        self.diverged: list[np.ndarray] = []
 
     def begun(self, bar: Progress, resume: Posterior | None, stop: Patience) -> State:
         """The state from which draws are made: after the warmup, or where an earlier run ended."""
@@ -195,6 +205,7 @@ class Loop:
     ) -> bool:
         """Make and keep draws; whether it was left to finish."""
         thinning, known, wanted = self.thinning, self.known, held.draws + draws
+        counted = self._counting(state, held)
         point: tuple[State, Mapping[str, Any], Mapping[str, np.ndarray]] | None = None
         try:
             with marking_invalid(), np.errstate(all="ignore"):
@@ -204,6 +215,8 @@ class Loop:
                         state = self._stepped(state, False)
                         bar.advance()
                     values = self._values(state)
+                    if counted is not None:
+                        self.diverged.append(counted(state))
                     if known:
                         values = {**known, **values}
                     held.add(values)
@@ -214,6 +227,21 @@ class Loop:
         if point is not None:
             self.last = Checkpoint(*point, self.observed)
         return held.draws == wanted
+
+    def divergences(self, draws: int) -> np.ndarray | None:
+        """Whether trajectories diverged, shape (chain, draw), of so many draws; None where there are none."""
+        if not self.diverged:
+            return None
+        return np.asarray(np.diff(np.stack(self.diverged[: draws + 1], axis=1), axis=1) > 0)
+
+    def _counting(self, state: State, held: Kept | RunningChains) -> Any:
+        """What counts trajectories that diverged, where draws are kept and there are any."""
+        count = getattr(self.sampler, "divergences", None)
+        if count is None or not isinstance(held, Kept) or count(state) is None:
+            return None
+        if not self.diverged:
+            self.diverged.append(count(state))
+        return count
 
     def _stepped(self, state: State, warmup: bool) -> State:
         self.sweep += 1

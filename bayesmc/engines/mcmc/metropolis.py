@@ -216,7 +216,7 @@ class MetropolisSampler(SweepSampler):
         self.ensemble = plan.ensemble
         self.warmup, self.thinning = warmup, thinning
         bands = {block_name(k): _band(k) for k in self.kernels}
-        self.acceptance_band: dict[str, tuple[float, float] | None] = bands
+        self.acceptance_band = bands
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
         return {**self._started(rng, chains, chains * self.ensemble), "sweep": 0}

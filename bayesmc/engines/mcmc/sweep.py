@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.mcmc.starts import start_states
+from bayesmc.engines.mcmc.uphill import uphill
 from bayesmc.errors import ModelError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.redrawn import renewals
@@ -40,10 +41,15 @@ class SweepSampler:
         by_name = dict(zip(bare.nodes, steps, strict=True))
         self._forward = [by_name[n] for n in target.forward]
         self.forward_nodes = target.forward
+        #: useful rates of acceptance, where some are
+        self.acceptance_band: dict[str, tuple[float, float] | None]
+        self.acceptance_band = {block_name(k): k.band for k in self.kernels}
         #: where the user wants chains to start: node -> stored values, shape (chains, *plates, *event)
         self.given: Values = {}
         #: groups of consecutive chains that start as one; 0 where each starts by itself
         self.superchains = 0
+        #: whether starts are moved uphill first: kernels that move one number at a time may never get there
+        self.climbs = False
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
         return self._started(rng, chains, chains)
@@ -87,6 +93,11 @@ class SweepSampler:
         rows = max((len(state["values"][n]) for n in found), default=0)
         return {name: np.asarray(np.maximum(count, rows)) for name, count in found.items()}
 
+    def divergences(self, state: Mapping[str, Any]) -> np.ndarray | None:
+        """Trajectories of each chain that diverged since the warmup; None where none are made."""
+        counts = [m["divergences"] for m in state["memory"] if "divergences" in m]
+        return np.asarray(sum(counts)) if counts else None
+
     # ---- for engines whose rows are no chains --------------------------------------------------
 
     def _started(self, rng: np.random.Generator, chains: int, rows: int) -> dict[str, Any]:
@@ -94,6 +105,8 @@ class SweepSampler:
         given = self.given_rows(rows)
         starts = rows if given or not self.superchains else self.superchains
         values = start_states(self.target, starts, rng, given)
+        if self.climbs and not given:
+            values = uphill(self.target, values, rng)
         inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
         if starts < rows:
             inside = {n: np.repeat(v, rows // starts, axis=0) for n, v in inside.items()}

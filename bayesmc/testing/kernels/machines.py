@@ -29,6 +29,7 @@ from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.enumerate import Enumerate, JointStates
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.gaussian_block import GaussianBlock
+from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels
 from bayesmc.kernels.lattice import SiteCounts, SiteSums
@@ -427,7 +428,7 @@ def _reverse_of(kernel: Any) -> Kernel | None:
         return in_classes(kernel, kernel.blanket.classes[::-1])
     if isinstance(kernel, Redrawn):
         return _with(kernel, from_last=not kernel.from_last) if kernel.turns == 1 else None
-    if isinstance(kernel, (BlockWalk, GaussianBlock, JointStates, ProposedBlock)):
+    if isinstance(kernel, (BlockWalk, GaussianBlock, Hamiltonian, JointStates, ProposedBlock)):
         return kernel
     if isinstance(kernel, (Conjugate, Labels, SiteCounts, SiteSums)):
         return kernel if len(kernel.blanket.classes) == 1 else None

@@ -1,0 +1,190 @@
+"""Hamiltonian Monte Carlo on any net whose densities have derivatives: options, and which kernel moves what.
+
+Continuous nodes move together by the No-U-Turn sampler; finite ones, and whole numbers, by the kernels that
+Gibbs has for them, in turn with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+from bayesmc.engines.base import Treatment
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.gibbs import Plan, plan_of
+from bayesmc.engines.mcmc.sweep import SweepSampler
+from bayesmc.engines.weighted.drawing import check_count
+from bayesmc.errors import UnsupportedError
+from bayesmc.kernels.hamiltonian import Hamiltonian
+from bayesmc.kernels.hamiltonian_warmup import Metric
+from bayesmc.kernels.redrawn import redrawn_kernels
+from bayesmc.network import Problem
+from bayesmc.network.forward import refuse_noiseless, refuse_parts
+from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.free_density import UnconstrainedDensity
+from bayesmc.structure.target import Target, target_of
+from bayesmc.structure.unconstrained import unconstrained_density
+
+_METRICS = ("diagonal", "dense")
+
+
+@dataclass(frozen=True)
+class HamiltonianMonteCarlo(ChainEngine):
+    """Markov chains that follow the gradient of the log posterior: multinomial No-U-Turn sampling.
+
+    All continuous nodes move together on an unconstrained scale, which mixes where one at a time they would
+    crawl: correlated coefficients, hierarchies, hundreds of effects. Every density must be one that can be
+    followed and has a derivative; finite nodes and whole numbers are drawn in between, as `Gibbs` does, and
+    nodes on which nothing observed depends are drawn forward.
+
+    Parameters
+    ----------
+    draws : int
+        Draws kept of every chain.
+    warmup : int
+        Draws before that, in which the step and the metric are learnt from all chains together.
+    chains : int
+        Chains, all in one array.
+    thinning : int
+        Transitions per kept draw.
+    target_accept : float
+        Mean acceptance that the step is learnt for; nearer to 1 steps are shorter, and follow sharper bends.
+    max_depth : int
+        Doublings of a trajectory, at most: up to ``2**max_depth - 1`` evaluations of the gradient for a draw.
+    metric : "diagonal" or "dense"
+        Whether scales of all numbers are learnt, or their correlations, too: dense where a few hundred
+        numbers at most are strongly correlated.
+    start : dict, optional
+        Node -> where its chains start, as for `Gibbs`.
+
+    Notes
+    -----
+    The posterior has ``divergences``, shape (chain, draw): draws whose trajectory left the level set that
+    it should follow, as it does where the density bends more sharply than elsewhere. A run warns where they
+    are more than chance, and names the numbers near which they are; so it does of trajectories that were
+    cut short, and of energies that momenta hardly change.
+
+    References
+    ----------
+    Hoffman and Gelman (2014), JMLR 15; Betancourt (2017), A conceptual introduction to Hamiltonian Monte
+    Carlo, arXiv 1701.02434, appendix A; Stan Reference Manual, version 2.36, chapter "MCMC Sampling".
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> import bayesmc as bmc
+    >>> dose = np.array([-0.86, -0.3, -0.05, 0.73])
+    >>> net = bmc.BayesNet(plates={"group": 4})
+    >>> net.add("a", bmc.Normal(0.0, 2.0))
+    >>> net.add("b", bmc.Normal(0.0, 10.0))
+    >>> net.add("dead", lambda a, b: bmc.Binomial(5, logits=a + b * dose), plates="group")
+    >>> posterior = bmc.infer(net, {"dead": [0, 1, 3, 5]}, engine=bmc.HamiltonianMonteCarlo(), rng=0)
+    >>> bool(abs(posterior.mean("b") - 8.4) < 0.6), int(posterior.divergences.sum())
+    (True, 0)
+    """
+
+    draws: int = 1000
+    warmup: int = 1000
+    chains: int = 4
+    thinning: int = 1
+    target_accept: float = 0.8
+    max_depth: int = 10
+    metric: Metric = "diagonal"
+    start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
+
+    label: ClassVar[str] = "Hamiltonian Monte Carlo"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count(self, "max_depth", self.max_depth, "10")
+        what = type(self).__name__
+        if not isinstance(self.target_accept, (int, float)) or not 0 < self.target_accept < 1:
+            raise ValueError(
+                f"{what}(target_accept={self.target_accept!r}): target_accept is a share between 0 and "
+                "1, such as 0.8"
+            )
+        if self.metric not in _METRICS:
+            raise ValueError(f'{what}(metric={self.metric!r}): metric is "diagonal" or "dense"')
+
+    def refusal(self, problem: Problem) -> str | None:
+        who = type(self).__name__
+        parts = refuse_parts(problem.observed, who)
+        if parts is not None:
+            return parts
+        try:
+            target = target_of(problem)
+            terms = [n for n in target.terms if n in problem.model.nodes]
+            reason = refuse_noiseless(problem.model, terms, who)
+            if reason is not None:
+                return reason
+            if target.chain and not continuous(target):
+                return (
+                    f"{who} moves continuous nodes, and what observations depend on is finite: "
+                    f"{', '.join(map(repr, target.chain[:4]))}"
+                )
+            self._plan(problem)
+        except UnsupportedError as error:
+            return f"{who} follows gradients, and this net has none: {error}"
+        return None
+
+    def describe(self, problem: Problem) -> dict[str, str]:
+        return {row.node: str(row) for row in self.table(problem)}
+
+    def table(self, problem: Problem) -> list[Treatment]:
+        return self._plan(problem).table()
+
+    def tied(self, problem: Problem) -> Sequence[str]:
+        return self._plan(problem).constraints
+
+    def sampler(self, problem: Problem) -> SweepSampler:
+        plan = self._plan(problem)
+        return SweepSampler(plan.target, plan.kernels)
+
+    def _plan(self, problem: Problem) -> Plan:
+        """Kernels of what is finite, and one for all that is continuous."""
+        target = target_of(problem)
+        moving = continuous(target)
+        finite = [n for n in target.chain if n not in moving]
+        plan = plan_of(problem, only=finite)
+        if not moving:
+            return plan
+        density = density_of(problem, moving)
+        kernel = Hamiltonian(
+            density,
+            density.others,
+            warmup=self.warmup,
+            target_accept=self.target_accept,
+            max_depth=self.max_depth,
+            metric=self.metric,
+            match=f"with all {density.size} free numbers, {self.metric} metric",
+        )
+        blankets = {n: plan.blankets.get(n) or Blanket(target, n) for n in target.chain}
+        kernels = [*plan.kernels, kernel]
+        kernels += redrawn_kernels(target, blankets, kernels) if finite else []
+        return replace(plan, kernels=kernels, blankets=blankets)
+
+
+def continuous(target: Target) -> tuple[str, ...]:
+    """Nodes of the chain that are numbers with a density."""
+    nodes = ((n, target.model[n]) for n in target.chain)
+    return tuple(n for n, node in nodes if not node.is_discrete and node.domain is None)
+
+
+def density_of(problem: Problem, names: tuple[str, ...]) -> UnconstrainedDensity:
+    """The density of some nodes given the rest, made once.
+
+    Raises
+    ------
+    UnsupportedError
+        It cannot be followed, or has no derivative.
+    """
+    found = problem.cache.setdefault("densities of free numbers", {})
+    if names not in found:
+        try:
+            found[names] = unconstrained_density(target_of(problem), names)
+        except UnsupportedError as error:
+            found[names] = str(error)
+    if isinstance(found[names], str):
+        raise UnsupportedError(found[names])
+    return found[names]

@@ -1,0 +1,113 @@
+"""What is worth a warning of Hamiltonian trajectories: that they diverged, and where; that they were cut;
+energies.
+
+A trajectory diverges where the density bends more sharply than the step that suits the rest can follow.
+Chains stay away from there, so draws beside such places, and not there, are what shows it.
+
+References
+----------
+Betancourt (2017), A conceptual introduction to Hamiltonian Monte Carlo, arXiv 1701.02434, sec. 6.2;
+Betancourt (2016), Diagnosing suboptimal cotangent disintegrations in Hamiltonian Monte Carlo, arXiv
+1604.00695.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.mcmc.convergence import scalar_name
+from bayesmc.kernels.hamiltonian import Hamiltonian
+from bayesmc.results import ChainsPosterior, ChainsSums
+
+#: share of trajectories that may diverge by chance, as at the edge of a support
+_CHANCE = 1e-3
+#: share of trajectories that may be cut short
+_CUT = 0.01
+#: E-BFMI below which energies are explored too slowly (Betancourt 2016, sec. 5)
+_LEAST_RATIO = 0.3
+#: standard errors by which ranks of a number must be off where trajectories diverged; numbers looked at
+_LIMIT, _NUMBERS = 4.0, 2_000_000
+
+
+def faulty_trajectories(
+    posterior: ChainsPosterior | ChainsSums, kernels: list[Any], state: Mapping[str, Any]
+) -> Iterator[str]:
+    """What is wrong with the trajectories of a run, in words, and the remedy.
+
+    Parameters
+    ----------
+    posterior : ChainsPosterior or ChainsSums
+    kernels : list of Kernel
+    state : dict
+        Of the sampler, after the last draw.
+    """
+    for kernel, memory in zip(kernels, state.get("memory", ()), strict=False):
+        if not isinstance(kernel, Hamiltonian) or not memory["moves"]:
+            continue
+        moves = memory["moves"] * len(memory["divergences"])
+        diverged = int(memory["divergences"].sum())
+        if diverged > _CHANCE * moves:
+            yield (
+                f"{diverged} of {moves} trajectories diverged{_where(posterior, kernel)}: the density bends "
+                "there more sharply than their steps can follow, and draws leave it out; declare effects "
+                "apart from their scale (z ~ Normal(0, 1), b = sigma * z), give tighter priors, or raise "
+                "target_accept= of HamiltonianMonteCarlo (0.95, 0.99)"
+            )
+        cut = int(memory["saturated"].sum())
+        if cut > _CUT * moves:
+            yield (
+                f"{cut} of {moves} trajectories were cut at {kernel.max_depth} doublings, so that draws stay "
+                'near each other; use metric="dense", a larger max_depth=, or numbers less correlated'
+            )
+        ratio = float(np.nanmin(kernel.energy_ratio(memory))) if memory["moves"] > 100 else np.inf
+        if ratio < _LEAST_RATIO:
+            yield (
+                f"energies change slowly (E-BFMI {ratio:.2f}, under {_LEAST_RATIO}): heavy tails or a funnel "
+                "are not explored; declare effects apart from their scale, or heavy tails as a scale mixture"
+            )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> str:
+    """The numbers that tell most where trajectories diverged, in words; empty where none does."""
+    diverged = posterior.divergences
+    if not isinstance(posterior, ChainsPosterior) or diverged is None:
+        return ""
+    if not diverged.any() or diverged.all():
+        return ""
+    found: list[tuple[float, str]] = []
+    left = _NUMBERS
+    for name in kernel.names:
+        stored = posterior._stored.get(name)
+        if stored is None or left < diverged.size:
+            continue
+        columns = stored.reshape(*diverged.shape, -1)[..., : left // diverged.size]
+        left -= columns.size
+        shape = posterior.model[name].value_shape
+        for k in range(columns.shape[-1]):
+            score, words = _apart(columns[..., k], diverged)
+            index = np.unravel_index(k, shape) if shape else ()
+            label = scalar_name(posterior.model, name, tuple(int(i) for i in index))
+            found.append((score, f"{label!r} is {words}"))
+    found = sorted((f for f in found if f[0] > _LIMIT), key=lambda f: -f[0])
+    if not found:
+        return ""
+    return ", most of them where " + " and ".join(words for _, words in found[:2])
+
+
+def _apart(values: np.ndarray, diverged: np.ndarray) -> tuple[float, str]:
+    """Standard errors by which ranks of diverged draws are off (Mann and Whitney), and which way."""
+    ranks = np.empty(values.size)
+    ranks[np.argsort(values, axis=None, kind="stable")] = np.arange(values.size)
+    there = diverged.ravel()
+    count, others = int(there.sum()), int((~there).sum())
+    off = ranks[there].mean() - (values.size - 1) / 2
+    error = np.sqrt((values.size + 1) * others / (12.0 * count))
+    here, elsewhere = np.median(values[diverged]), np.median(values[~diverged])
+    way = "low" if off < 0 else "high"
+    return float(abs(off) / error), f"{way} (median {here:.3g}, {elsewhere:.3g} elsewhere)"

@@ -1,0 +1,242 @@
+"""Hamiltonian moves: continuous nodes together, along trajectories that follow the gradient of their density.
+
+What a transition is stands in ``no_u_turn``, what the warmup learns in ``hamiltonian_warmup``; here they
+become a kernel of nodes, and what was seen of trajectories is counted.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import numpy as np
+
+from bayesmc.errors import DensityError
+from bayesmc.kernels.base import Kernel, Memory, counted
+from bayesmc.kernels.hamiltonian_warmup import (
+    Metric,
+    MetricLearning,
+    StepSize,
+    first_steps,
+    windows,
+)
+from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, transition
+from bayesmc.structure.target import Values
+
+
+class Density(Protocol):
+    """A log density of some nodes on free numbers, with its gradient: ``structure.unconstrained``."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def size(self) -> int: ...
+    def with_gradient(
+        self, u: np.ndarray, values: Values | None = None
+    ) -> tuple[np.ndarray, np.ndarray]: ...
+    def constrain(self, u: np.ndarray, values: Values | None = None) -> Values: ...
+    def unconstrain(self, values: Values) -> np.ndarray: ...
+
+
+class Hamiltonian(Kernel):
+    """The No-U-Turn sampler on all continuous nodes of a density.
+
+    Parameters
+    ----------
+    density : Density
+    given : tuple of str
+        Nodes that the density reads and others move, so that it differs from step to step.
+    warmup : int or None
+        Sweeps of the warmup, where they are known.
+    target_accept : float
+        Mean acceptance that the step's length is learnt for.
+    max_depth : int
+        Doublings of a trajectory, at most.
+    metric : "diagonal" or "dense"
+    match : str
+        Why these nodes move so, for the table of kernels.
+
+    Notes
+    -----
+    The free numbers of the last draw are kept beside the values that they stand for, so that nothing is
+    lost to rounding near a bound; other values than those that it returned are read anew. The density and
+    its gradient are kept, too, where nobody else moves what they depend on.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.kernels.hamiltonian import Hamiltonian
+    >>> class Normal:
+    ...     names, size = ("x",), 1
+    ...     def with_gradient(self, u, values=None):
+    ...         return -0.5 * (u[:, 0] - 3.0) ** 2, 3.0 - u
+    ...     def constrain(self, u, values=None):
+    ...         return {"x": u[:, 0]}
+    ...     def unconstrain(self, values):
+    ...         return values["x"][:, None]
+    >>> kernel, rng = Hamiltonian(Normal(), warmup=100), np.random.default_rng(0)
+    >>> values = {"x": np.zeros(500)}
+    >>> memory = kernel.start(values, 500)
+    >>> for _ in range(100):
+    ...     values, memory = kernel.step(values, memory, rng, warmup=True)
+    >>> memory = kernel.end_warmup(memory)
+    >>> values, memory = kernel.step(values, memory, rng, warmup=False)
+    >>> float(values["x"].mean().round(1)), bool(kernel.acceptance(memory).mean() > 0.7)
+    (3.0, True)
+    """
+
+    label = "Hamiltonian"
+    band = None
+
+    def __init__(
+        self,
+        density: Density,
+        given: tuple[str, ...] = (),
+        *,
+        warmup: int | None = None,
+        target_accept: float = 0.8,
+        max_depth: int = 10,
+        metric: Metric = "diagonal",
+        match: str = "",
+    ) -> None:
+        self.density = density
+        self.names = density.names
+        self.given = given
+        self.max_depth = max_depth
+        self.match = match
+        self.step_size = StepSize(target_accept)
+        self.metric = MetricLearning(metric)
+        self.ends = windows(warmup)
+
+    def start(self, values: Values, chains: int) -> Memory:
+        u = self.density.unconstrain(values)
+        log, slope = self._gradient(values)(u, np.arange(chains))
+        if not (log > -np.inf).all():
+            raise DensityError(
+                f"nodes {', '.join(map(repr, self.names[:6]))}: the density is zero where chains start"
+            )
+        nobody = np.zeros(chains, dtype=bool)
+        return {
+            "place": {"u": u, "log": log, "slope": slope},
+            "values": {n: values[n] for n in self.names},
+            "metric": self.metric.start(slope),
+            "step": self.step_size.start(np.zeros(chains)),
+            "sweep": 0,
+            "windows": 0,
+            "accepted": np.zeros(chains),
+            "moves": 0,
+            "divergent": nobody,
+            "divergences": np.zeros(chains, dtype=int),
+            "saturated": np.zeros(chains, dtype=int),
+            "energy": {"last": np.zeros(chains), "steps": np.zeros(chains), "mean": np.zeros(chains),
+                       "square": np.zeros(chains)},
+        }  # fmt: skip
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        gradient = self._gradient(values)
+        place = self._place(values, memory, gradient)
+        if warmup and memory["sweep"] == 0:
+            memory = self._first_steps(gradient, place, memory, rng, pooled=False)
+        scale = Scale(memory["metric"]["root"])
+        length = np.exp(memory["step"]["log"])
+        found = transition(gradient, place, length, scale, rng, self.max_depth)
+        place = found.place
+        new = self.density.constrain(place.u, values)
+        kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
+        if warmup:
+            return new, self._learnt(gradient, place, kept, found.acceptance, rng)
+        kept["divergences"] = kept["divergences"] + found.divergent
+        kept["saturated"] = kept["saturated"] + (found.depth == self.max_depth)
+        kept["energy"] = _with_energy(kept["energy"], found.energy, kept["moves"])
+        return new, counted(kept, found.acceptance)
+
+    def end_warmup(self, memory: Memory) -> Memory:
+        return {**memory, "step": self.step_size.frozen(memory["step"])}
+
+    def energy_ratio(self, memory: Memory) -> np.ndarray:
+        """E-BFMI of every chain: mean square step of the energy over its variance.
+
+        Far below 1, fresh momenta are too weak to take a chain through all the energies there are.
+
+        References
+        ----------
+        Betancourt (2016), Diagnosing suboptimal cotangent disintegrations in Hamiltonian Monte Carlo.
+        """
+        energy = memory["energy"]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return np.asarray(energy["steps"] / energy["square"])
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _gradient(self, values: Values) -> Gradient:
+        def gradient(u: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return self.density.with_gradient(u, {n: values[n][rows] for n in self.given} or None)
+
+        return gradient
+
+    def _place(self, values: Values, memory: Memory, gradient: Gradient) -> Place:
+        """Where the chains are: as the last step left them, or as somebody else has."""
+        known, last = memory["place"], memory["values"]
+        same = all(values[n] is last[n] or np.array_equal(values[n], last[n]) for n in self.names)
+        if same and not self.given:
+            return Place(**known)
+        u = known["u"] if same else self.density.unconstrain(values)
+        return Place(u, *gradient(u, np.arange(len(u))))
+
+    def _first_steps(
+        self,
+        gradient: Gradient,
+        place: Place,
+        memory: Memory,
+        rng: np.random.Generator,
+        pooled: bool,
+    ) -> Memory:
+        """The memory with dual averaging begun anew."""
+        scale = Scale(memory["metric"]["root"])
+        step, target = memory["step"], self.step_size.target
+        log = step["log"]
+        if pooled:
+            log = np.full_like(log, log.mean())
+        log = first_steps(gradient, place, log, scale, rng, target, pooled)
+        return {**memory, "step": self.step_size.start(log)}
+
+    def _learnt(
+        self,
+        gradient: Gradient,
+        place: Place,
+        memory: Memory,
+        acceptance: np.ndarray,
+        rng: np.random.Generator,
+    ) -> Memory:
+        """The memory after a sweep of the warmup: the step always, the metric within windows."""
+        sweep, pooled = memory["sweep"] + 1, memory["windows"] > 0
+        memory = {**memory, "sweep": sweep}
+        memory["step"] = self.step_size.learnt(memory["step"], acceptance, pooled)
+        if memory["windows"] == len(self.ends):
+            return memory
+        if pooled:
+            memory["metric"] = self.metric.learnt(memory["metric"], place.u)
+        if sweep < self.ends[memory["windows"]]:
+            return memory
+        if pooled:
+            memory["metric"] = self.metric.renewed(memory["metric"])
+        memory["windows"] += 1
+        return self._first_steps(gradient, place, memory, rng, pooled=True)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _with_energy(known: dict[str, np.ndarray], energy: np.ndarray, before: int) -> dict[str, Any]:
+    """Running sums of the energy: of its squared steps, and of its squares about the mean (Welford)."""
+    count = before + 1
+    away = energy - known["mean"]
+    mean = known["mean"] + away / count
+    step = np.square(energy - known["last"]) if before else np.zeros_like(energy)
+    return {
+        "last": energy,
+        "steps": known["steps"] + step,
+        "mean": mean,
+        "square": known["square"] + away * (energy - mean),
+    }
