@@ -131,6 +131,10 @@ class FilterEngine:
         """From a node that is neither input nor static to what the engine does to it."""
         raise NotImplementedError
 
+    def effort(self, problem: SeriesProblem) -> str:
+        """How it passes a series, where there is something to say."""
+        return ""
+
     def filter(
         self,
         problem: SeriesProblem,
