@@ -354,12 +354,12 @@ def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bo
     """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
     groups = families.shares.shape[1]
     fresh: Any = (*_even(len(now.weights), groups, now.weights.ndim - 1), 0.0, 0.0, now.t)
-    found = []
+    found: list[Any] = []
     for value, new in zip(families[:5], fresh, strict=True):
         begun = np.empty_like(value)
         begun[OLD], begun[YOUNG] = new if both else value[YOUNG], new
         found.append(begun if where.ndim == 0 else np.where(where, begun, value))
-    return families._replace(**dict(zip(families._fields, found, strict=False)))
+    return Families(*found, *families[5:])
 
 
 def _weights(families: Families, now: Particles) -> np.ndarray:
