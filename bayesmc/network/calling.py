@@ -59,11 +59,13 @@ class Aligner:
         self.own = len(child)
         self.domain = None if positions else domain
         order = [plates.index(p) for p in (*shared, *self.foreign)]
-        tail = [*order, *range(len(plates), self.trailing)]
-        self._axes = None if tail == list(range(self.trailing)) else tuple(tail)
-        inserted = tuple(slice(None) if p in plates else None for p in child)
-        rest = (slice(None),) * (len(self.foreign) + event_ndim)
-        self._insert = (Ellipsis, *inserted, *rest) if None in inserted else None
+        moved = order != list(range(len(order)))
+        self._axes = (*order, *range(len(plates), self.trailing)) if moved else None
+        self._insert: tuple[Any, ...] | None = None
+        if len(shared) < len(child):
+            inserted = (slice(None) if p in plates else None for p in child)
+            rest = (slice(None),) * (len(self.foreign) + event_ndim)
+            self._insert = (Ellipsis, *inserted, *rest)
         self._plain = self._axes is None and self._insert is None
 
     def batch_shape(self, value: np.ndarray) -> Shape:
