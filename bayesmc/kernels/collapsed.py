@@ -238,18 +238,10 @@ def _scope(
         terms.update({c.term.name: c.term for c in blanket.children})
         if blanket.own is not None:
             terms[blanket.own.name] = blanket.own
-    found: set[str] = set()
-    todo = [n for t in terms.values() for n in t.scope]
-    while todo:
-        name = todo.pop()
-        if name in found or name in target.known:
-            continue
-        found.add(name)
-        if name in target.links:
-            todo += target.model[name].parents
-    hidden = (*target.chain, *target.links)
-    found -= {*block.names, *block.path}  # these are put at zero
-    return tuple(n for n in hidden if n in found)
+    read = (n for t in terms.values() for n in t.scope)
+    found = set(target.model.above(read, lambda n: n in target.links and n not in target.known))
+    found -= {*block.names, *block.path, *target.known}  # the block's are put at zero
+    return tuple(n for n in (*target.chain, *target.links) if n in found)
 
 
 def _alike(target: Target, names: Sequence[str]) -> tuple[list[str], ...]:

@@ -22,6 +22,9 @@ from bayesmc.kernels.hamiltonian_warmup import (
 from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, transition
 from bayesmc.structure.target import Values
 
+#: doublings of a trajectory before a metric is learnt, at most: long ones tell no more
+_EARLY = 5
+
 
 class Density(Protocol):
     """A log density of some nodes on free numbers, with its gradient: ``structure.unconstrained``."""
@@ -122,6 +125,7 @@ class Hamiltonian(Kernel):
             "step": self.step_size.start(np.zeros(chains)),
             "sweep": 0,
             "windows": 0,
+            "work": np.zeros(2),
             "accepted": np.zeros(chains),
             "moves": 0,
             "divergent": nobody,
@@ -140,10 +144,13 @@ class Hamiltonian(Kernel):
             memory = self._first_steps(gradient, place, memory, rng, pooled=False)
         scale = Scale(memory["metric"]["root"])
         length = np.exp(memory["step"]["log"])
-        found = transition(gradient, place, length, scale, rng, self.max_depth)
+        early = warmup and memory["windows"] < min(2, len(self.ends))
+        depth = min(self.max_depth, _EARLY) if early else self.max_depth
+        found = transition(gradient, place, length, scale, rng, depth)
         place = found.place
         new = self.density.constrain(place.u, values)
         kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
+        kept["work"] = memory["work"] + np.array([found.calls, found.points])
         if warmup:
             return new, self._learnt(gradient, place, kept, found.acceptance, rng)
         kept["divergences"] = kept["divergences"] + found.divergent
