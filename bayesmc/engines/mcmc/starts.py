@@ -147,8 +147,9 @@ class _Search:
             return
         self.tried = self.tried or values
         log = np.where(np.isnan(log), -np.inf, log).reshape(attempts, self.chains)
-        # a power of the likelihood as weight: starts as wide as the posterior, or wider
-        key = _TEMPERED * log + self.rng.gumbel(size=log.shape)
+        # a power of the likelihood as weight: starts as wide as the posterior, or wider; but what is to go
+        # with a start that the user gave goes with it as well as it can
+        key = log if self.given else _TEMPERED * log + self.rng.gumbel(size=log.shape)
         pick = key.argmax(axis=0), np.arange(self.chains)
         # closer to the prior mean only where that helps a lot: starts ought to differ
         better = log[pick] > self.log + (10.0 if self.best else 0.0)
