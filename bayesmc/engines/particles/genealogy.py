@@ -359,7 +359,7 @@ def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bo
         begun = np.empty_like(value)
         begun[OLD], begun[YOUNG] = new if both else value[YOUNG], new
         found.append(begun if where.ndim == 0 else np.where(where, begun, value))
-    return Families(*found, *families[5:])
+    return Families(*found, *families[5:])  # type: ignore[call-arg]
 
 
 def _weights(families: Families, now: Particles) -> np.ndarray:
