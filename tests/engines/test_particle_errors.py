@@ -15,7 +15,10 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines.particles.genealogy import begun, followed
+from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.errors import LowEssWarning
+from bayesmc.resampling import systematic
 from bayesmc.testing import session
 
 RUNS = 100
@@ -364,3 +367,37 @@ def test_fixed_lags_forecasts_and_smoothed_series() -> None:
     assert 0.4 < np.sqrt(np.mean(z**2)) < 2.0
     assert (exact.mcse("x") == 0).all()
     assert bmc.filter(dbn, {"y": y}).log_marginal_likelihood_mcse == 0.0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_one_filter_in_python_numbers_says_what_arrays_of_filters_say(seed: int) -> None:
+    """Families of made-up slices, some with weights of long tails, by themselves and in a plate of one."""
+    rng, n = np.random.default_rng(seed), int(10 ** (2 + seed % 3))
+
+    def both(t: int, ancestors: np.ndarray | None, log: np.ndarray) -> list[Particles]:
+        weights = np.exp(log - log.max())
+        total, ess = float(weights.sum()), float(weights.sum() ** 2 / (weights**2).sum())
+        one = Particles(t, {}, log, weights, total, 0.0, 0.0, ess, ancestors, ancestors is not None)
+        wide = [None if a is None else a[:, None] for a in (log, weights, ancestors)]
+        figures = (np.array([f]) for f in (total, 0.0, 0.0, ess))
+        resampled = np.array([one.resampled])
+        return [one, Particles(t, {}, wide[0], wide[1], *figures, wide[2], resampled)]
+
+    layouts = Layout(n, (), ()), Layout(n, ("each",), (1,))
+    before = both(0, None, rng.standard_normal(n))
+    families = [begun(p, layout) for p, layout in zip(before, layouts, strict=True)]
+    seen = set()
+    for t in range(1, 200):
+        ancestors = systematic(before[0].weights, n, rng)
+        tailed = rng.choice([0.2, 1.0, 3.0]) * rng.standard_t(3, n)
+        now = both(t, ancestors, tailed if seed % 2 else rng.standard_normal(n))
+        found = [followed(f, b, p, True) for f, b, p in zip(families, before, now, strict=True)]
+        families, before = [f for f, _ in found], now
+        one, other = families
+        seen |= {"odd"} if np.max(one.doubted) == t else set()
+        seen |= {"due"} if (one.born == t).any() and np.isfinite(found[0][1]) else set()
+        assert np.allclose(found[0][1], found[1][1], rtol=1e-9)
+        for name in ("bounds", "shares", "explained", "born", "doubted"):
+            left, right = getattr(one, name), getattr(other, name)
+            assert np.allclose(left, np.reshape(right, np.shape(left)), rtol=1e-9), (t, name)
+    assert "due" in seen or "odd" in seen
