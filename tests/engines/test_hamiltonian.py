@@ -136,7 +136,7 @@ def test_resumed_as_if_never_stopped() -> None:
 
 
 def test_summaries_and_starts() -> None:
-    engine = bmc.HamiltonianMonteCarlo(200, warmup=200, start={"a": -1.0, "b": 0.3})
+    engine = bmc.HamiltonianMonteCarlo(400, warmup=300, start={"a": -1.0, "b": 0.3})
     kept = bmc.infer(line(), LINE, engine=engine, rng=2)
     summed = bmc.infer(line(), LINE, engine=engine, rng=2, keep="summaries")
     assert summed.divergences is None
