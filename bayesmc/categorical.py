@@ -99,10 +99,7 @@ def pick_log(log: np.ndarray, uniform: np.ndarray, what: str) -> np.ndarray:
     """
     count, top = len(log), _largest(log)
     if not np.isfinite(top).all():
-        raise ZeroProbabilityError(
-            f"{what}: no state has positive probability given the others; the chain is at an impossible "
-            "configuration"
-        )
+        raise impossible(what)
     sums = [np.exp(log[0] - top)]
     for row in log[1:]:
         sums.append(sums[-1] + np.exp(row - top))
@@ -169,6 +166,35 @@ def edges(probs: np.ndarray) -> np.ndarray:
     last = probs.shape[1] - 1 - np.argmax(probs[:, ::-1] > 0, axis=1)
     found[np.arange(probs.shape[1]) >= last[:, None]] = np.inf
     return found[:, :-1]
+
+
+def searched(edges: np.ndarray, start: Any, levels: np.ndarray, width: int) -> np.ndarray:
+    """How many edges of its row each level reaches, by binary search without branches.
+
+    Parameters
+    ----------
+    edges : ndarray, shape (rows * width,)
+        Ascending in each row, whose last ones no level reaches.
+    start : ndarray of int
+        Where the row of each level begins; broadcasts to ``levels``.
+    width : int
+        A power of two.
+    """
+    start = np.broadcast_to(start, levels.shape)
+    at = start.copy()
+    step = width // 2
+    while step:
+        at += step * (levels >= edges.take(at + (step - 1)))
+        step //= 2
+    return at - start
+
+
+def impossible(what: str) -> ZeroProbabilityError:
+    """That no state can follow, of which nodes."""
+    return ZeroProbabilityError(
+        f"{what}: no state has positive probability given the others; the chain is at an impossible "
+        "configuration"
+    )
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -234,7 +234,7 @@ def normal_scores(values: np.ndarray) -> np.ndarray:
     --------
     >>> import numpy as np
     >>> normal_scores(np.array([[3.0, 1.0, 2.0]])).round(2).tolist()
-    [[0.82, -0.82, 0.0]]
+    [[0.87, -0.87, 0.0]]
     """
     flat = values.reshape(len(values), -1)
     order = np.argsort(flat, axis=1)

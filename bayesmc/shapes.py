@@ -105,6 +105,11 @@ def first_index(mask: np.ndarray) -> Shape:
     return tuple(int(i) for i in np.unravel_index(int(np.argmax(mask)), mask.shape))
 
 
+def at_index(index: Shape) -> str:
+    """An index in words, for messages."""
+    return f" at index {index if len(index) > 1 else index[0]}" if index else ""
+
+
 def masks(size: int) -> list[np.ndarray]:
     """Sets of elements such that for any two, one set holds the first and not the second."""
     bits = [(np.arange(size) >> k) & 1 == 1 for k in range(max((size - 1).bit_length(), 1))]

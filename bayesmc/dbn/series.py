@@ -18,11 +18,10 @@ from bayesmc.dbn.given import check_even, check_frame, check_steps, count_of, is
 from bayesmc.dbn.slices import PREVIOUS, TIME, Slices, Template
 from bayesmc.errors import EvidenceError, PlateError, did_you_mean
 from bayesmc.network import Observed
-from bayesmc.network.evidence import observe, warn_of_doubts
+from bayesmc.network.evidence import checked_input, observe, warn_of_doubts
 from bayesmc.network.labels import by_label, refuse_backwards, refuse_crossed
 from bayesmc.network.model import CompiledNode
 from bayesmc.network.node import Declaration
-from bayesmc.shapes import first_index, owned
 
 
 class Compiled(Protocol):
@@ -266,23 +265,7 @@ def read_input_rows(
             raise EvidenceError(
                 f"input {name!r} has no values; pass inputs={{{name!r}: array}}, time first"
             )
-        value = np.array(given[name])
-        if value.dtype.kind not in "biuf":
-            raise EvidenceError(f"input {name!r} has dtype {value.dtype}; give numbers")
-        declaration = template.later[name]
-        shape = (steps, *(sizes[p] for p in declaration.plates), *declaration.event_shape)
-        if value.shape != shape:
-            raise EvidenceError(
-                f"input {name!r} has shape {value.shape}, but {steps} slices, its plates "
-                f"{declaration.plates} and event_shape {declaration.event_shape} make {shape}"
-            )
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            at = first_index(~np.isfinite(value))
-            raise EvidenceError(
-                f"input {name!r} is {value[at]} at index {at}; inputs must be finite, also where "
-                "observations are missing"
-            )
-        read[name] = owned(value)
+        read[name] = checked_input(template.later[name], given[name], sizes, steps)
     return read
 
 

@@ -25,7 +25,7 @@ from bayesmc.errors import (
 )
 from bayesmc.network import BayesNet, Node
 from bayesmc.network.declaring import DeclaredPlates, Parents
-from bayesmc.network.node import Declaration, without_noise
+from bayesmc.network.node import Declaration, decorating, without_noise
 from bayesmc.randomness import Purpose, seed_sequence, stream
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ class DynamicBayesNet:
         """
 
         options: dict[str, Any] = {"initial": initial, "vectorize": vectorize, "replace": replace}
-        return _declaring(function, name, self.add, (parents, plates, states), options)
+        return decorating(function, name, self.add, (parents, plates, states), options)
 
     def add(
         self,
@@ -205,7 +205,7 @@ class DynamicBayesNet:
         """
 
         rest, options = (parents, plates, states), {"vectorize": vectorize}
-        return _declaring(function, name, self.add_static, rest, options)
+        return decorating(function, name, self.add_static, rest, options)
 
     def add_static(
         self,
@@ -424,25 +424,3 @@ class DynamicBayesNet:
             raise DuplicateNodeError(
                 f"node {name!r} is declared already; choose another name or pass replace=True"
             )
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _declaring(
-    function: Callable[..., Any] | None,
-    name: str | None,
-    add: Callable[..., None],
-    rest: tuple[Any, ...],
-    options: Mapping[str, Any],
-) -> Any:
-    """A decorator that declares a function, or what that returns for one that is given."""
-
-    def declare(f: Callable[..., Any]) -> Callable[..., Any]:
-        own = name or getattr(f, "__name__", None)
-        if own is None or own == "<lambda>":
-            raise ModelError("a node needs a name: pass name=, or decorate a named function")
-        add(own, f, *rest, **options)
-        return f
-
-    return declare if function is None else declare(function)

@@ -21,7 +21,7 @@ from bayesmc.distributions.support import Support
 from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import ParameterError, ShapeError, UnsupportedError
 from bayesmc.expression.array import TracedCall, is_traced
-from bayesmc.shapes import Shape, as_shape, broadcast_shapes, broadcasts_to, first_index
+from bayesmc.shapes import Shape, as_shape, at_index, broadcast_shapes, broadcasts_to, first_index
 from bayesmc.states import NumberArray
 
 _mark_invalid: ContextVar[bool] = ContextVar("mark_invalid", default=False)
@@ -291,7 +291,7 @@ class Distribution:
         """Raise for the first ``bad`` element, whose parameter is ``value``; or mark them all."""
         index = first_index(bad)
         error = ParameterError(
-            f"{self._family}: {name} must be {requirement}; got {_short(value)}{_at(index)}",
+            f"{self._family}: {name} must be {requirement}; got {_short(value)}{at_index(index)}",
             index,
             value,
         )
@@ -318,9 +318,9 @@ class Distribution:
             return
         index = first_index(none)
         error = ParameterError(
-            f"{self._family}: {name} is 0{_at(index)}: a point without noise, which has no density; declare "
-            "a function that returns the value, or give it a little noise (Exact() and Kalman filters take "
-            "it as it is)", index, 0.0,
+            f"{self._family}: {name} is 0{at_index(index)}: a point without noise, which has no density; "
+            "declare a function that returns the value, or give it a little noise (Exact() and Kalman "
+            "filters take it as it is)", index, 0.0,
         )  # fmt: skip
         self.noiseless = none = np.broadcast_to(none, self.batch_shape)
         self.invalid = none if self.invalid is None else self.invalid | none
@@ -444,7 +444,3 @@ def draw_to(
 
 def _short(value: Any) -> str:
     return " ".join(np.array2string(np.asarray(value), precision=6, threshold=8).split())
-
-
-def _at(index: Shape) -> str:
-    return f" at index {index if len(index) > 1 else index[0]}" if index else ""

@@ -91,7 +91,19 @@ class LogNormal(LocationScale):
             return np.exp(self.loc + self.scale * special.ndtri(as_quantile(q)))
 
 
-class InverseGamma(Distribution):
+class ShapeScale(Distribution):
+    """A positive number with a shape, ``concentration``, that is stretched by ``scale``."""
+
+    parameter_ndim = {"concentration": 0, "scale": 0}
+
+    def __init__(self, concentration: Any, scale: Any = 1.0) -> None:
+        concentration, scale = as_float(concentration), as_float(scale)
+        self._set_batch(concentration.shape, scale.shape)
+        self.concentration = self._positive("concentration", concentration)
+        self.scale = self._positive("scale", scale)
+
+
+class InverseGamma(ShapeScale):
     """Inverse gamma distribution, ``x**(-concentration - 1) exp(-scale / x)`` normalised.
 
     Its reciprocal is Gamma with ``rate = scale``.
@@ -119,14 +131,6 @@ class InverseGamma(Distribution):
     >>> float(dist.log_prob(1.0).round(4)), float(dist.mean), float(dist.var)
     (-0.5343, 2.0, 4.0)
     """
-
-    parameter_ndim = {"concentration": 0, "scale": 0}
-
-    def __init__(self, concentration: Any, scale: Any = 1.0) -> None:
-        concentration, scale = as_float(concentration), as_float(scale)
-        self._set_batch(concentration.shape, scale.shape)
-        self.concentration = self._positive("concentration", concentration)
-        self.scale = self._positive("scale", scale)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         a = self.concentration
@@ -195,7 +199,7 @@ class InverseGamma(Distribution):
         return value
 
 
-class Weibull(Distribution):
+class Weibull(ShapeScale):
     """Weibull distribution, whose cdf is ``1 - exp(-(x / scale)**concentration)``.
 
     Parameters
@@ -225,14 +229,6 @@ class Weibull(Distribution):
     >>> float(dist.log_prob(3.0).round(4)), float(dist.cdf(3.0).round(4))
     (-1.4055, 0.6321)
     """
-
-    parameter_ndim = {"concentration": 0, "scale": 0}
-
-    def __init__(self, concentration: Any, scale: Any = 1.0) -> None:
-        concentration, scale = as_float(concentration), as_float(scale)
-        self._set_batch(concentration.shape, scale.shape)
-        self.concentration = self._positive("concentration", concentration)
-        self.scale = self._positive("scale", scale)
 
     def _sample(self, rng: np.random.Generator, shape: Shape) -> np.ndarray:
         logs = np.asarray(rng.standard_exponential(shape))

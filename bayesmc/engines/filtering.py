@@ -74,7 +74,7 @@ def read_queries(call: str, queries: Any) -> Queries:
 class FilterEngine:
     """Base of the engines over time; ``filter``, ``smooth``, ``forecast`` and ``most_likely`` are the way in.
 
-    A family supplies ``refusal``, ``describe`` and ``filter``, and of the other questions those that it can
+    A family supplies ``refusal``, ``treatment`` and ``filter``, and of the other questions those that it can
     answer.
     """
 
@@ -122,6 +122,13 @@ class FilterEngine:
 
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         """What the engine does to each node of a slice."""
+        template, treated = problem.slices.template, self.treatment(problem)
+        found = dict.fromkeys(template.inputs, "input")
+        found |= dict.fromkeys(template.static, "static, known")
+        return {n: found.get(n) or treated(n) for n in template.later}
+
+    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
+        """From a node that is neither input nor static to what the engine does to it."""
         raise NotImplementedError
 
     def filter(

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.categorical import edges
+from bayesmc.categorical import edges, searched
 from bayesmc.errors import BayesmcError, ParameterError
 from bayesmc.network import CompiledNode, Model, Observed
 from bayesmc.network.calling import Aligner
@@ -169,15 +169,8 @@ class TableDraw:
         return codes
 
     def _search(self, index: Any, bits: np.ndarray) -> np.ndarray:
-        """Branchless binary search in each draw's row; the row's last edge is never exceeded."""
-        edges = self.edges[0]
-        start = np.broadcast_to(np.asarray(index, dtype=np.intp) * self.width, bits.shape)
-        at = start.copy()
-        step = self.width // 2
-        while step:
-            at += step * (bits >= edges.take(at + (step - 1)))
-            step //= 2
-        return (at - start).astype(self.dtype)
+        start = np.asarray(index, dtype=np.intp) * self.width
+        return searched(self.edges[0], start, bits, self.width).astype(self.dtype)
 
 
 class TableWeigh:

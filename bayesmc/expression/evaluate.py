@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import as_strided
 
+from bayesmc.expression.buffers import Buffers
+from bayesmc.expression.composed import log_sum_exp
 from bayesmc.expression.graph import (
     Call,
     Constant,
@@ -157,7 +159,7 @@ def shaped(
     """
     scope: dict[str, Any] = {"concatenate": np.concatenate, "otherwise": otherwise}
     names: dict[Expression, str] = {}
-    lines = []
+    lines, buffers = [], Buffers(roots, values)
     for k, node in enumerate(ordered(*roots)):
         names[node] = f"t{k}"
         if isinstance(node, Leaf):
@@ -167,10 +169,14 @@ def shaped(
             scope[f"t{k}"] = node.value
         else:
             right = _written(node, k, names, steps, values, scope)
+            place = buffers.place_for(node)
+            if place is not None and right.endswith(")"):
+                right = f"{right[:-1]}, out={names[place]})"
             lines.append(f"t{k} = {right}")
             if isinstance(node, Call):
                 scope[f"s{k}"] = np.shape(values[node])
                 lines.append(f"if t{k}.shape != s{k}: return otherwise(values)")
+            lines += [f"{names[over]} = None" for over in buffers.over_with(node)]
     lines.append(f"return [{', '.join(names[r] for r in roots)}]")
     exec("def function(values):\n    " + "\n    ".join(lines), scope)  # noqa: S102 - names are our own
     return scope["function"]
@@ -195,15 +201,7 @@ def _step(node: Expression) -> Step:
 
 
 def _reducing(ufunc: np.ufunc) -> Callable[..., np.ndarray]:
-    return _log_sum_exp if ufunc is np.logaddexp else ufunc.reduce
-
-
-def _log_sum_exp(value: np.ndarray, axis: Any = None) -> np.ndarray:
-    """What ``np.logaddexp.reduce`` gives, with one logarithm and no more exponentials than numbers."""
-    top = np.max(value, axis=axis, keepdims=True, initial=-np.inf)
-    top = np.where(np.isfinite(top), top, 0.0)
-    total = np.sum(np.exp(value - top), axis=axis)
-    return np.log(total) + top.reshape(total.shape)
+    return log_sum_exp if ufunc is np.logaddexp else ufunc.reduce
 
 
 def _elementwise(node: Elementwise) -> Step:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from functools import lru_cache
+from operator import is_
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -61,8 +62,11 @@ class Expression:
         return getattr(self.content[0], "__name__", "") or str(self.content[0])
 
     def with_operands(self, operands: Sequence[Expression]) -> Expression:
-        """The same operation on others of the same shapes."""
-        return self
+        """The same operation on others of the same shapes; itself where they are its own."""
+        return self if all(map(is_, operands, self.operands)) else self._on(operands)
+
+    def _on(self, operands: Sequence[Expression]) -> Expression:
+        raise NotImplementedError
 
     def __repr__(self) -> str:
         detail = self.detail
@@ -97,7 +101,7 @@ class Elementwise(Expression):
     __slots__ = ("function",)
     function: Callable[..., np.ndarray]
 
-    def with_operands(self, operands: Sequence[Expression]) -> Expression:
+    def _on(self, operands: Sequence[Expression]) -> Expression:
         return elementwise(self.function, *operands)
 
 
@@ -107,7 +111,7 @@ class Pick(Expression):
     __slots__ = ("positions",)
     positions: np.ndarray
 
-    def with_operands(self, operands: Sequence[Expression]) -> Expression:
+    def _on(self, operands: Sequence[Expression]) -> Expression:
         return pick(operands, self.positions)
 
 
@@ -124,7 +128,7 @@ class Gather(Expression):
     def rows(self) -> Expression:
         return self.operands[1]
 
-    def with_operands(self, operands: Sequence[Expression]) -> Expression:
+    def _on(self, operands: Sequence[Expression]) -> Expression:
         return gather(*operands)
 
 
@@ -135,7 +139,7 @@ class Reduction(Expression):
     ufunc: np.ufunc
     axes: tuple[int, ...]
 
-    def with_operands(self, operands: Sequence[Expression]) -> Expression:
+    def _on(self, operands: Sequence[Expression]) -> Expression:
         return reduction(self.ufunc, operands[0], self.axes)
 
 
@@ -145,7 +149,7 @@ class Call(Expression):
     __slots__ = ("call",)
     call: Any
 
-    def with_operands(self, operands: Sequence[Expression]) -> Expression:
+    def _on(self, operands: Sequence[Expression]) -> Expression:
         return call(self.call, operands)
 
 
@@ -358,12 +362,7 @@ def replaced(root: Expression, values: dict[Expression, Expression]) -> Expressi
     """The expression with others in place of some that it is made of."""
     found: dict[Expression, Expression] = {}
     for node in ordered(root):
-        if node in values:
-            found[node] = values[node]
-            continue
-        operands = [found[a] for a in node.operands]
-        same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-        found[node] = node if same else node.with_operands(operands)
+        found[node] = values.get(node) or node.with_operands([found[a] for a in node.operands])
     return found[root]
 
 

@@ -11,7 +11,7 @@ import itertools
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -62,7 +62,8 @@ class SmallProgram:
     def __init__(self, roots: Sequence[Expression]) -> None:
         self._roots = tuple(roots)
         nodes = ordered(*roots)
-        self._leaves = [(n.name, len(n.shape), n.size) for n in nodes if isinstance(n, Leaf)]
+        leaves = (n for n in nodes if isinstance(n, Leaf))
+        self._leaves = tuple((n.name, len(n.shape), n.size) for n in leaves)
         self._calls = sum(_MATRIX if _is_matrix(n) else bool(n.operands) for n in nodes)
         self._size = sum(n.size for n in nodes)
         ends = np.cumsum([0, *(r.size for r in roots)]).tolist()
@@ -177,9 +178,11 @@ def _operation(function: Any, row: Sequence[str], lines: _Lines) -> str:
     return lines(_TEXTS[function].format(*row))
 
 
+@lru_cache(maxsize=256)  # equal expressions are one object: a model asked again has its code
 def _compiled(
-    roots: Sequence[Expression], leaves: Sequence[tuple[str, int, int]]
+    roots: tuple[Expression, ...], leaves: tuple[tuple[str, int, int], ...]
 ) -> tuple[Callable[..., Any], int]:
+    """A function of the leaves' elements, one list each, and how many operations it takes."""
     lines = _Lines()
     names = {name: f"v{k}" for k, (name, _, _) in enumerate(leaves)}
     made: dict[Expression, np.ndarray] = {}

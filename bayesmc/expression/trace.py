@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import dis
 import functools
+import inspect
 import types
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -126,7 +127,8 @@ def rebuilt(traced: Any, values: Iterator[Any]) -> Any:
     if isinstance(traced, Expression):
         return next(values)
     if isinstance(traced, Family):
-        return traced.make(**{k: rebuilt(v, values) for k, v in traced.parameters.items()})
+        kept = {k: rebuilt(v, values) for k, v in traced.parameters.items()}
+        return traced.make(*kept.pop(_starred(traced.make), ()), **kept)
     if isinstance(traced, (list, tuple)):
         return type(traced)(rebuilt(v, values) for v in traced)
     return traced
@@ -215,6 +217,13 @@ def is_left(value: Any) -> bool:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+@lru_cache(maxsize=256)
+def _starred(make: Callable[..., Any]) -> str:
+    """The name of ``*parts`` in a signature, where there is one."""
+    parameters = inspect.signature(make).parameters.values()
+    return next((p.name for p in parameters if p.kind is p.VAR_POSITIONAL), "")
 
 
 def _called(function: Callable[..., Any], arguments: Sequence[Any]) -> Any:

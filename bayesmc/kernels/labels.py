@@ -18,7 +18,8 @@ from functools import cached_property
 
 import numpy as np
 
-from bayesmc.errors import BayesmcError, ZeroProbabilityError
+from bayesmc.categorical import impossible
+from bayesmc.errors import BayesmcError
 from bayesmc.expression import (
     Expression,
     as_expression,
@@ -208,10 +209,7 @@ class Labels(Kernel):
             own = None if by_element is None else by_element[..., part]
             if table.steep or self._prior.steep or not buffers.odds(table.odds, features, own):
                 if buffers.tilted(table.flat, features, own) < NEVER:
-                    raise ZeroProbabilityError(
-                        f"node {self.blanket.name!r}: no state has positive probability given the "
-                        "others; the chain is at an impossible configuration"
-                    )
+                    raise impossible(f"node {self.blanket.name!r}")
             drawn = label[:, part]
             buffers.draw(rng, drawn)
             if self._is_asked:

@@ -11,8 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
-from bayesmc.categorical import edges
-from bayesmc.errors import ZeroProbabilityError
+from bayesmc.categorical import edges, impossible, searched
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.kernels.enumerate import (
     MOST_STATES,
@@ -226,14 +225,7 @@ class _Group:
         return new
 
     def _search(self, index: np.ndarray, levels: np.ndarray) -> np.ndarray:
-        """Binary search in the row of each draw; the row's last edge is never exceeded."""
-        _, edges = self.edges[0]
-        at = index.copy()
-        step = self.width // 2
-        while step:
-            at += step * (levels >= edges.take(at + (step - 1)))
-            step //= 2
-        return at - index
+        return searched(self.edges[0][1], index, levels, self.width)
 
     def _check(self, index: np.ndarray) -> None:
         assert self.impossible is not None
@@ -241,10 +233,7 @@ class _Group:
         if bad.any():
             names = self.part[int(np.argwhere(bad)[0, 0])].names
             what = f"node {names[0]!r}" if len(names) == 1 else f"nodes {list(names)}"
-            raise ZeroProbabilityError(
-                f"{what}: no state has positive probability given the others; the chain is at an "
-                "impossible configuration"
-            )
+            raise impossible(what)
 
 
 def _colours(conditionals: Sequence[Conditional]) -> list[list[Conditional]]:

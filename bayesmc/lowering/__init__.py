@@ -8,14 +8,17 @@ nothing here is used.
 from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
-from bayesmc.lowering.compiled import Bound, Compiled, compiled
+from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
 from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
     "Bound",
     "Compiled",
+    "SliceKernel",
     "compiled",
     "held_against_numpy",
     "is_available",
     "is_worth_it",
+    "weight_loops",
 ]

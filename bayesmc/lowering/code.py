@@ -274,9 +274,9 @@ class Module:
         return name in self._defined
 
     @property
-    def foreign(self) -> list[str]:
+    def foreign(self) -> tuple[str, ...]:
         """Functions that are called and not defined."""
-        return [n for n in self._declared if n not in self._defined]
+        return tuple(n for n in self._declared if n not in self._defined)
 
     def __str__(self) -> str:
         return "\n".join([*(self._declared[n] for n in self.foreign), *self._defined.values(), ""])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import math
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -170,10 +171,17 @@ class Way:
     roots : sequence of Expression
     varying : frozenset of str
         Leaves that have values of their own for each entry.
+    chosen : frozenset of str, optional
+        Of those the ones that are read at other entries.
     """
 
-    def __init__(self, roots: Sequence[Expression], varying: frozenset[str]) -> None:
-        self.kernel = Kernel(roots, varying)
+    def __init__(
+        self,
+        roots: Sequence[Expression],
+        varying: frozenset[str],
+        chosen: frozenset[str] = frozenset(),
+    ) -> None:
+        self.kernel = Kernel(roots, varying, chosen)
         self.loaded: Loaded = loaded(self.kernel.text, self.kernel.foreign)
         self._constants = list(self.kernel.constants.values())
         self._own = threading.local()
@@ -204,8 +212,79 @@ class Way:
         """Addresses of all arguments, those of leaves and results still open, and the memory behind some."""
         kept = [np.empty(n.size) for n in self.kernel.kept]
         fixed = [_address(a) for a in (*self._constants, *kept)]
-        leaves = len(self.kernel.leaves)
-        return np.array([*[0] * leaves, *fixed, *[0] * results], np.uintp), kept
+        leaves, last = len(self.kernel.leaves), results + bool(self.kernel.chosen)
+        return np.array([*[0] * leaves, *fixed, *[0] * last], np.uintp), kept
+
+
+class SliceKernel:
+    """Expressions of many particles, whose values in the slice before are those of their ancestors.
+
+    Parameters
+    ----------
+    roots : sequence of Expression
+    own : frozenset of str
+        Leaves that have values of their own for each particle.
+    chosen : frozenset of str
+        Leaves with a value for each particle before. Of all others there is one value.
+
+    Attributes
+    ----------
+    shapes : list of tuple
+        Of the results of one particle; they are real numbers.
+
+    Raises
+    ------
+    TraceError
+    """
+
+    def __init__(
+        self, roots: Sequence[Expression], own: frozenset[str], chosen: frozenset[str]
+    ) -> None:
+        if not is_available():
+            raise TraceError("machine code needs llvmlite: pip install bayesmc[fast]")
+        if any(r.dtype.kind != "f" for r in roots):
+            raise TraceError("particles that are not real numbers")
+        self.shapes = [r.shape for r in roots]
+        self._own, self._chosen = own, chosen
+        self._way = Way(roots, own | chosen, chosen)
+        self._wide = [bool(r.leaves & (own | chosen)) for r in roots]
+        if not all(self._wide):
+            raise TraceError("what is the same for all particles is made by plain steps")
+
+    def begun(
+        self, values: Mapping[str, np.ndarray], rows: np.ndarray, results: Sequence[np.ndarray]
+    ) -> Callable[[int, int], int]:
+        """``run(low, count)``: results of so many particles from ``low`` on; 0 where all went well.
+
+        Parameters
+        ----------
+        values : mapping
+            Leaf -> its values; those of own ones begin anew with every call.
+        rows : ndarray of int64
+            Of each particle the ancestor.
+        results : sequence of ndarray
+            To be filled, in C order.
+        """
+        way = self._way
+        table, kept = way.table(len(results))
+        held: list[Any] = [kept]
+        for k, node in enumerate(way.kernel.leaves):
+            array = np.ascontiguousarray(values[node.name], DTYPES[kind_of(node)])
+            held.append(array)
+            table[k] = _address(array)
+        moving = [(len(table) - len(results) + k, _address(r), 8 * math.prod(s))
+                  for k, (r, s) in enumerate(zip(results, self.shapes, strict=True))]  # fmt: skip
+        if self._chosen:
+            held.append(np.ascontiguousarray(rows, np.int64))
+            moving.append((len(table) - len(results) - 1, _address(held[-1]), 8))
+        address, call = _address(table), way.loaded.call
+
+        def run(low: int, count: int, held: Any = held) -> int:
+            for place, first, step in moving:
+                table[place] = first + low * step
+            return call(count, address)
+
+        return run
 
 
 class Bound:
@@ -258,4 +337,6 @@ class _Shapes(NamedTuple):
 
 
 def _address(array: np.ndarray) -> int:
+    if array.flags.writeable:  # several times faster
+        return ctypes.addressof(ctypes.c_char.from_buffer(array))  # type: ignore[arg-type]
     return array.__array_interface__["data"][0]

@@ -11,7 +11,7 @@ from bayesmc.lowering.code import WHOLE, Code, Module, Number
 from bayesmc.lowering.kept import keep
 from bayesmc.lowering.layout import is_few, is_given, laid_out
 from bayesmc.lowering.places import flat, plus, times
-from bayesmc.lowering.writer import DTYPES, Place, Writer
+from bayesmc.lowering.writer import DTYPES, ROWS, Place, Writer
 
 #: the name of the function in the machine code
 ENTRY = "bayesmc_kernel"
@@ -33,6 +33,8 @@ class Kernel:
     roots : sequence of Expression
     varying : frozenset of str
         Leaves that have values of their own for each entry; of the others there is one.
+    chosen : frozenset of str, optional
+        Of those the ones whose value is that of another entry: which, is an argument behind what is kept.
 
     Attributes
     ----------
@@ -49,13 +51,18 @@ class Kernel:
         Something has no machine code.
     """
 
-    def __init__(self, roots: Sequence[Expression], varying: frozenset[str]) -> None:
+    def __init__(
+        self,
+        roots: Sequence[Expression],
+        varying: frozenset[str],
+        chosen: frozenset[str] = frozenset(),
+    ) -> None:
         layout = laid_out(roots)
-        self.varying = varying
+        self.varying, self.chosen = varying, chosen
         self.leaves = [n for n in layout.nodes if isinstance(n, Leaf)]
         self.kept = [n for n in layout.nodes if n in layout.kept]
-        self._writer = w = Writer(layout, varying)
-        names = [*self.leaves, *DTYPES, *self.kept, *range(len(roots))]
+        self._writer = w = Writer(layout, varying, chosen)
+        names = [*self.leaves, *DTYPES, *self.kept, *([ROWS] if chosen else []), *range(len(roots))]
         for k, what in enumerate(names):
             w.pointers[what] = f"%p{k}"
         self._write(roots)
@@ -73,7 +80,9 @@ class Kernel:
                 self._prepare(node)
 
         def entry(i: Number) -> None:
-            w.entry = i
+            w.entry = w.row = i
+            if self.chosen:
+                w.row = w.code.load(w.pointers[ROWS], i, WHOLE)
             for node in varies:
                 self._prepare(node)
             for k, root in enumerate(roots):

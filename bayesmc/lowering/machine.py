@@ -33,7 +33,7 @@ def is_available() -> bool:
 
 
 class Loaded:
-    """A function of machine code.
+    """Functions of machine code.
 
     Attributes
     ----------
@@ -54,18 +54,22 @@ class Loaded:
         self._engine.finalize_object()
         self.address: int = self._engine.get_function_address(ENTRY)
         self.direct: int = self._engine.get_function_address(DIRECT)
-        kind = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p)
-        self.call = kind(self.address)
+        self.call = self.function(ENTRY, ctypes.c_int32, ctypes.c_int64, ctypes.c_void_p)
         self.was_cached = was_cached
 
+    def function(self, name: str, *types: Any) -> Any:
+        """A function of the code, of these types: that of the result first."""
+        return ctypes.CFUNCTYPE(*types)(self._engine.get_function_address(name))
 
-def loaded(text: str, foreign: list[str]) -> Loaded:
+
+@lru_cache(maxsize=128)
+def loaded(text: str, foreign: tuple[str, ...]) -> Loaded:
     """Machine code of a text, from the cache if it is there.
 
     Parameters
     ----------
     text : str
-    foreign : list of str
+    foreign : tuple of str
         Functions that it calls and does not define.
 
     Raises

@@ -118,6 +118,11 @@ def _machine(name: str) -> Rule:
     return lambda c, *x: c.call(f"llvm.{name}.f64", *x)
 
 
+def _rounded(name: str) -> Rule:
+    """Whole numbers stay as they are."""
+    return lambda c, x: c.call(f"llvm.{name}.f64", x) if x.kind == REAL else x
+
+
 def _library(name: str) -> Rule:
     """A function of the C library."""
     return lambda c, *x: c.call(name, *x)
@@ -227,6 +232,7 @@ _ANY: Mapping[Any, Rule] = {
     np.multiply: lambda c, a, b: a & b if a.kind == TRUTH else a * b,
     np.subtract: lambda c, a, b: a - b,
     np.negative: lambda c, x: -x, np.square: lambda c, x: x * x, np.where: lambda c, *x: x[0],
+    np.floor: _rounded("floor"), np.ceil: _rounded("ceil"), np.trunc: _rounded("trunc"),
     np.maximum: _maximum, np.minimum: _minimum, np.absolute: _absolute, np.sign: _sign,
     np.remainder: _remainder, np.floor_divide: _quotient,
     np.bitwise_and: lambda c, a, b: a & b, np.bitwise_or: lambda c, a, b: a | b,
@@ -236,8 +242,7 @@ _ANY: Mapping[Any, Rule] = {
 _REAL: Mapping[Any, Rule] = {
     np.true_divide: lambda c, a, b: a / b, np.reciprocal: lambda c, x: 1.0 / x,
     np.fabs: _absolute, np.fmax: _machine("maxnum"), np.fmin: _machine("minnum"),
-    np.sqrt: _machine("sqrt"), np.floor: _machine("floor"), np.ceil: _machine("ceil"),
-    np.trunc: _machine("trunc"), np.rint: _machine("rint"), np.copysign: _machine("copysign"),
+    np.sqrt: _machine("sqrt"), np.rint: _machine("rint"), np.copysign: _machine("copysign"),
     np.exp: _own("exp"), np.expm1: _own("expm1"), np.log: _own("log"), np.log1p: _own("log1p"),
     np.tanh: _own("tanh"), np.cosh: _own("cosh"), np.logaddexp: _own("logaddexp"),
     special.expit: _own("expit"), special.log_expit: _own("log_expit"),

@@ -29,6 +29,8 @@ from bayesmc.lowering.places import flat, plus, times, unraveled
 from bayesmc.lowering.ufuncs import OUTSIDE, kind_of, lowered
 
 Place = tuple[Index, ...]
+#: stands for the numbers of the entries that are read
+ROWS = "rows"
 #: types of numbers as they lie in memory
 DTYPES = {REAL: np.dtype(float), WHOLE: np.dtype(np.int64), TRUTH: np.dtype(bool)}
 
@@ -41,6 +43,8 @@ class Writer:
     layout : Layout
     varying : frozenset of str
         Leaves that have values of their own for each entry.
+    chosen : frozenset of str
+        Of those the ones that are read at other entries.
 
     Attributes
     ----------
@@ -49,16 +53,19 @@ class Writer:
         Leaf, type of constants or kept node -> where it begins.
     ready : set of Expression
         Kept nodes that are in memory already.
-    entry : int or Number
-        The number of the entry.
+    entry, row : int or Number
+        The number of the entry, and that of the one whose chosen leaves it reads.
     """
 
-    def __init__(self, layout: Layout, varying: frozenset[str]) -> None:
-        self.layout, self.varying = layout, varying
+    def __init__(
+        self, layout: Layout, varying: frozenset[str], chosen: frozenset[str] = frozenset()
+    ) -> None:
+        self.layout, self.varying, self.chosen = layout, varying, chosen
         self.code = Code(Module())
         self.pointers: dict[Any, str] = {}
         self.ready: set[Expression] = set()
         self.entry: Index = 0
+        self.row: Index = 0
         self._known: list[dict[tuple[Expression, Place], Number]] = [{}]
         self._tables: dict[str, list[np.ndarray]] = {kind: [] for kind in DTYPES}
         self._offsets: dict[Any, int] = {}
@@ -114,7 +121,8 @@ class Writer:
             first = self._table(node, node.value, kind)
             return self.code.load(self.pointers[kind], plus(at, first), kind)
         if isinstance(node, Leaf) and node.name in self.varying:
-            at = plus(times(self.entry, node.size), at)
+            entry = self.row if node.name in self.chosen else self.entry
+            at = plus(times(entry, node.size), at)
         return self.code.load(self.pointers[node], at, kind)
 
     def computed(self, node: Expression, at: Place) -> Number:

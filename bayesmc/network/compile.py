@@ -192,13 +192,15 @@ def _stochastic(bare: CompiledNode, dist: Distribution, batch: Shape) -> Compile
             f"{_DOMAIN_SIZE}) that do not depend on the parents; {type(dist).__name__} is on "
             f"{support.describe()}"
         )
-    return replace(
-        bare,
-        event_shape=dist.event_shape,
-        is_discrete=bool(dist.is_discrete),
-        is_stochastic=True,
-        domain=domain,
-        support=support if constant else None,
+    return CompiledNode(
+        declaration,
+        bare.links,
+        bare.plate_shape,
+        dist.event_shape,
+        bool(dist.is_discrete),
+        True,
+        domain,
+        support if constant else None,
         unsampled=isinstance(dist, Density) and not dist.can_sample,
         noiseless=_is_noiseless(dist, batch + bare.plate_shape, len(batch)),
         splits=dist.splits,

@@ -19,7 +19,7 @@ from bayesmc.errors import BayesmcError, EvidenceError, EvidenceWarning, PlateEr
 from bayesmc.network.labels import by_label, refuse_crossed
 from bayesmc.network.model import CompiledNode, Model
 from bayesmc.network.node import Declaration, observed_links
-from bayesmc.shapes import Shape, first_index
+from bayesmc.shapes import Shape, at_index, first_index
 
 _ARTICLE = {"deterministic": "a deterministic", "input": "an input", "fixed": "a fixed (do)"}
 _FULL_TURN = 2 * math.pi * (1 + 1e-6)
@@ -91,9 +91,9 @@ def observe(node: CompiledNode, value: Any) -> Observed | None:
     if partly.any() and not node.splits:
         at = first_index(missing & np.expand_dims(partly, event))
         raise EvidenceError(
-            f"evidence on {node.name!r}: of one vector the entry at {_index(at)} is missing and others are "
-            "not, which is not supported; split the vector into nodes of its parts, leave all of it out, or "
-            "put in what stands for no reading (of ranges: robotics.clean_ranges)"
+            f"evidence on {node.name!r}: of one vector the entry at {at if len(at) > 1 else at[0]} is "
+            "missing and others are not, which is not supported; split the vector into nodes of its parts, "
+            "leave all of it out, or put in what stands for no reading (of ranges: robotics.clean_ranges)"
         )
     if every.all() and array.size:
         return None
@@ -144,24 +144,35 @@ def read_inputs(
     for name, declaration in wanted.items():
         if name not in given:
             raise EvidenceError(f"input {name!r} has no value; pass inputs={{{name!r}: value}}")
-        what = f"input {name!r}"
-        value = np.array(by_label(what, given[name], declaration.plates, labels))
-        if value.dtype.kind not in "biuf":
-            raise EvidenceError(f"{what} has dtype {value.dtype}; give numbers")
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            at = first_index(~np.isfinite(value))
-            raise EvidenceError(
-                f"input {name!r} is {value[at]} at index {at}; inputs must be finite"
-            )
-        shape = tuple(sizes[p] for p in declaration.plates) + declaration.event_shape
-        if value.shape != shape:
-            raise EvidenceError(
-                f"input {name!r} has shape {value.shape}, but its plates {declaration.plates} and "
-                f"event_shape {declaration.event_shape} make {shape}"
-            )
-        value.flags.writeable = False
-        read[name] = value
+        value = by_label(f"input {name!r}", given[name], declaration.plates, labels)
+        read[name] = checked_input(declaration, value, sizes)
     return read
+
+
+def checked_input(
+    declaration: Declaration, given: Any, sizes: Mapping[str, int], steps: int | None = None
+) -> np.ndarray:
+    """The value of an input as finite numbers of its shape; with ``steps``, of so many slices, time first."""
+    name, value = declaration.name, np.array(given)
+    if value.dtype.kind not in "biuf":
+        raise EvidenceError(f"input {name!r} has dtype {value.dtype}; give numbers")
+    shape = tuple(sizes[p] for p in declaration.plates) + declaration.event_shape
+    slices, also = "", ""
+    if steps is not None:
+        shape, slices = (steps, *shape), f"{steps} slices, "
+        also = ", also where observations are missing"
+    if value.shape != shape:
+        raise EvidenceError(
+            f"input {name!r} has shape {value.shape}, but {slices}its plates {declaration.plates} and "
+            f"event_shape {declaration.event_shape} make {shape}"
+        )
+    if value.dtype.kind == "f" and not np.isfinite(value).all():
+        at = first_index(~np.isfinite(value))
+        raise EvidenceError(
+            f"input {name!r} is {value[at]} at index {at}; inputs must be finite{also}"
+        )
+    value.flags.writeable = False
+    return value
 
 
 def plate_sizes(
@@ -264,7 +275,7 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
         if bad.any():
             at = first_index(bad)
             raise EvidenceError(
-                f"evidence on {node.name!r} is {stored[at]:g}{_at(at)}; it must be finite"
+                f"evidence on {node.name!r} is {stored[at]:g}{at_index(at)}; it must be finite"
             )
     support = node.support or node.reach
     if node.domain is not None or support is None:
@@ -277,7 +288,7 @@ def _check_support(node: CompiledNode, stored: np.ndarray, observed: np.ndarray)
     if outside.any():
         at = first_index(outside)
         raise EvidenceError(
-            f"evidence on {node.name!r} is {_short(stored[at])}{_at(at)}, outside its support "
+            f"evidence on {node.name!r} is {_short(stored[at])}{at_index(at)}, outside its support "
             f"({support.describe()})"
         )
 
@@ -287,10 +298,6 @@ def _short(value: np.ndarray) -> str:
     if value.size <= 6:
         return str(value)
     return f"a vector of {value.size} numbers from {value.min():g} to {value.max():g}"
-
-
-def _index(at: Shape) -> str:
-    return str(at if len(at) > 1 else at[0])
 
 
 def _allowed(node: CompiledNode) -> str:
@@ -333,10 +340,6 @@ def _peek(value: Any) -> str:
     return (
         repr(array.item()) if array.size == 1 else repr(array.ravel()[:3].tolist())[:-1] + ", ...]"
     )
-
-
-def _at(index: Shape) -> str:
-    return f" at index {index if len(index) > 1 else index[0]}" if index else ""
 
 
 def _close(name: str, model: Model) -> str:

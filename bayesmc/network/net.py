@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bayesmc.errors import DuplicateNodeError, EvidenceError, ModelError, UnknownNodeError
+from bayesmc.errors import DuplicateNodeError, EvidenceError, UnknownNodeError
 from bayesmc.network.declaring import (
     Declared,
     DeclaredPlates,
     Parents,
     check_parents,
     declared,
-    declared_function,
     declared_potential,
     declared_table,
     settled_sizes,
@@ -28,7 +27,7 @@ from bayesmc.network.factor_graph import FactorGraph
 from bayesmc.network.intervene import intervened
 from bayesmc.network.joint import joint_log_prob, joint_sample
 from bayesmc.network.model import Model
-from bayesmc.network.node import Declaration, Node, Potential, without_noise
+from bayesmc.network.node import Declaration, Node, Potential, decorating, without_noise
 from bayesmc.randomness import Purpose, seed_sequence, stream
 from bayesmc.shapes import as_shape
 
@@ -108,23 +107,8 @@ class BayesNet(Declared):
         ------
         DuplicateNodeError, PlateError, ModelError
         """
-
-        if function is not None and not callable(function):
-            raise ModelError(
-                f"net.node({function!r}): it decorates a function; give the node's name with name="
-            )
-
-        def declare(f: Callable[..., Any]) -> Callable[..., Any]:
-            own = name if name is not None else getattr(f, "__name__", "<lambda>")
-            if own == "<lambda>":
-                raise ModelError(
-                    "this function has no name to give the node (a lambda or partial); use name= or net.add"
-                )
-            within = self._plates.of(f"node {own!r}", plates)
-            self._declare(declared_function(own, f, parents, within, states, vectorize), replace)
-            return f
-
-        return declare if function is None else declare(function)
+        options = {"vectorize": vectorize, "replace": replace}
+        return decorating(function, name, self.add, (parents, plates, states), options)
 
     def add(
         self,

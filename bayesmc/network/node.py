@@ -178,6 +178,31 @@ def bind(
     return tuple(positional + keyword), _with_keywords(function, len(positional), keyword)
 
 
+def decorating(
+    function: Callable[..., Any] | None,
+    name: str | None,
+    add: Callable[..., None],
+    rest: tuple[Any, ...],
+    options: Mapping[str, Any],
+) -> Any:
+    """A decorator that declares a function by ``add``, or what that returns for one that is given."""
+    if function is not None and not callable(function):
+        raise ModelError(
+            f"net.node({function!r}): it decorates a function; give the node's name with name="
+        )
+
+    def declare(f: Callable[..., Any]) -> Callable[..., Any]:
+        own = name if name is not None else getattr(f, "__name__", "<lambda>")
+        if own == "<lambda>":
+            raise ModelError(
+                "this function has no name to give the node (a lambda or partial); use name= or net.add"
+            )
+        add(own, f, *rest, **options)
+        return f
+
+    return declare if function is None else declare(function)
+
+
 def checked_rows(name: str, table: np.ndarray) -> np.ndarray:
     """Rows renormalised where they are off by rounding; worse ones raise with their index."""
     from_one = np.abs(table.sum(axis=-1) - 1)
@@ -256,21 +281,31 @@ def nodes_read(function: Callable[..., Any]) -> tuple[str, ...]:
 
 def topological_order(parents: Mapping[str, Sequence[str]]) -> list[str]:
     """Names with every parent before its children, otherwise as declared (Kahn 1962)."""
-    graph = dict.fromkeys(parents, ())
-    sorter: graphlib.TopologicalSorter[str] = graphlib.TopologicalSorter(graph)
+    waiting = {name: len(set(above)) for name, above in parents.items()}
+    children: dict[str, list[str]] = {name: [] for name in parents}
     for name, above in parents.items():
-        sorter.add(name, *dict.fromkeys(above))
+        for parent in set(above):
+            children[parent].append(name)
+    order = [name for name, count in waiting.items() if count == 0]
+    for name in order:  # which grows
+        for child in children[name]:
+            waiting[child] -= 1
+            if waiting[child] == 0:
+                order.append(child)
+    if len(order) == len(parents):
+        return order
     try:
-        return list(sorter.static_order())
+        graphlib.TopologicalSorter(parents).prepare()
+        raise AssertionError
     except graphlib.CycleError as error:
         cycle = error.args[1][1:]  # parent before child
-        start = cycle.index(min(cycle))
-        path = [*cycle[start:], *cycle[: start + 1]]
-        raise CycleError(
-            f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
-            "(for time, use a dynamic net with _prev arguments)",
-            path,
-        ) from None
+    start = cycle.index(min(cycle))
+    path = [*cycle[start:], *cycle[: start + 1]]
+    raise CycleError(
+        f"the parents form a cycle: {' -> '.join(path)}; a net must be acyclic "
+        "(for time, use a dynamic net with _prev arguments)",
+        path,
+    )
 
 
 def ancestors(parents: Mapping[str, Sequence[str]], names: Iterable[str]) -> set[str]:

@@ -6,7 +6,7 @@ reads sums of terms with coefficients has the linear part from here.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -60,17 +60,34 @@ def tidy(function: Any, *operands: Any) -> Expression:
     return elementwise(function, *args)
 
 
+def rewritten(
+    roots: Sequence[Expression],
+    change: Callable[[Expression, list[Expression]], Expression | None],
+) -> list[Expression]:
+    """Expressions made anew, operands first.
+
+    Parameters
+    ----------
+    change : callable
+        From a node and its new operands to what stands in its place; None for the same operation on these.
+    """
+    found: dict[Expression, Expression] = {}
+    for node in ordered(*roots):
+        operands = [found[a] for a in node.operands]
+        made = change(node, operands)
+        found[node] = node.with_operands(operands) if made is None else made
+    return [found[r] for r in roots]
+
+
 def tidied(root: Expression) -> Expression:
     """An expression without what changes nothing for finite values."""
-    found: dict[Expression, Expression] = {}
-    for node in ordered(root):
-        operands = [found[a] for a in node.operands]
+
+    def change(node: Expression, operands: list[Expression]) -> Expression | None:
         if isinstance(node, Elementwise) and node.dtype == float:
-            found[node] = broadcast(tidy(node.function, *operands), node.shape)
-        else:
-            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-            found[node] = node if same else node.with_operands(operands)
-    return found[root]
+            return broadcast(tidy(node.function, *operands), node.shape)
+        return None
+
+    return rewritten([root], change)[0]
 
 
 def add(a: Any, b: Any) -> Expression:

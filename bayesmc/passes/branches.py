@@ -19,12 +19,11 @@ from bayesmc.expression import (
     broadcast,
     elementwise,
     gather,
-    ordered,
     pick,
 )
 from bayesmc.expression.graph import CASTS
 from bayesmc.expression.indexing import bounds
-from bayesmc.passes.arithmetic import tidy
+from bayesmc.passes.arithmetic import rewritten, tidy
 from bayesmc.passes.reads import same_along
 
 #: branches in one operation, at most
@@ -44,13 +43,7 @@ def branches_up(root: Expression, name: str) -> Expression:
     >>> found, branches_up(found, "p")
     (<Elementwise log ()>, <Elementwise where ()>)
     """
-    found: dict[Expression, Expression] = {}
-    for node in ordered(root):
-        operands = [found[a] for a in node.operands]
-        same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-        made = node if same else node.with_operands(operands)
-        found[node] = _up(made, name)
-    return found[root]
+    return rewritten([root], lambda node, new: _up(node.with_operands(new), name))[0]
 
 
 # ---- private ------------------------------------------------------------------------------------

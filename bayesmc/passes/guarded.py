@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from bayesmc.expression import Call, Expression, call, ordered
+from bayesmc.expression import Call, Expression, call
 from bayesmc.expression.functions import Repeated
+from bayesmc.passes.arithmetic import rewritten
 
 
 def guarded(roots: Iterable[Expression]) -> list[Expression]:
@@ -27,16 +28,13 @@ def guarded(roots: Iterable[Expression]) -> list[Expression]:
     >>> evaluate(guarded([root]), {"a": np.array([[[4.0]], [[-1.0]]])})[0].ravel()
     array([ 2., nan])
     """
-    asked = list(roots)
-    found: dict[Expression, Expression] = {}
-    for node in ordered(*asked):
-        operands = [found[a] for a in node.operands]
+
+    def change(node: Expression, operands: list[Expression]) -> Expression | None:
         if isinstance(node, Call) and isinstance(node.call, Repeated):
-            found[node] = call(_guarded(node.call), operands, node.shape, node.dtype)
-            continue
-        same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-        found[node] = node if same else node.with_operands(operands)
-    return [found[r] for r in asked]
+            return call(_guarded(node.call), operands, node.shape, node.dtype)
+        return None
+
+    return rewritten(list(roots), change)
 
 
 # ---- private ------------------------------------------------------------------------------------

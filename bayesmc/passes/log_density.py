@@ -22,8 +22,9 @@ from scipy import special
 
 from bayesmc import distributions as d
 from bayesmc.errors import TraceError
-from bayesmc.expression import Expression, Family, TracedArray, as_expression, trace
+from bayesmc.expression import Constant, Expression, Family, TracedArray, as_expression, trace
 from bayesmc.expression.composed import log_sum_exp
+from bayesmc.passes.interval_mass import log_mass
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -78,6 +79,13 @@ def family_of(dist: d.Distribution) -> Family:
         names = [k for k in inspect.signature(type(dist)).parameters if k != "base"]
         kept = {k: _constant(getattr(dist, k)) for k in names}
         return Family(type(dist), {"base": family_of(dist.base), **kept})
+    if isinstance(dist, d.Joint):
+        return Family(d.Joint, {"parts": tuple(map(family_of, dist.parts))})
+    if isinstance(dist, d.Mixture):
+        parts = dist.components
+        several = isinstance(parts, (list, tuple))
+        made = [family_of(c) for c in parts] if several else family_of(parts)
+        return Family(d.Mixture, {"weights": as_expression(dist.weights), "components": made})
     names = list(inspect.signature(type(dist)).parameters)
     known = type(dist) in _FORMS or type(dist).log_density is not None
     if not known or not all(hasattr(dist, n) for n in names):
@@ -304,39 +312,109 @@ def _multinomial(x: Any, total_count: Any, probs: Any, logits: Any) -> Any:
     return _inside(fits, density)
 
 
+def _log_det(root: Any) -> Any:
+    """Of a matrix, by its Cholesky factor."""
+    return 2.0 * np.sum(np.log(np.linalg.diagonal(root)), axis=-1)
+
+
+def _matrices(x: Any, df: Any, scale: Any, is_inverse: bool) -> Any:
+    size = x.shape[-1]
+    root, of_scale = np.linalg.cholesky(x), np.linalg.cholesky(scale)
+    first, second = (root, of_scale) if is_inverse else (of_scale, root)
+    z = np.matmul(np.linalg.inv(first), second)
+    trace_of = np.sum(z * z, axis=(-2, -1))
+    halves = 0.5 * (np.reshape(df, (*np.shape(df), 1)) - np.arange(size))
+    norm = 0.5 * df * size * math.log(2.0) + 0.25 * size * (size - 1) * math.log(math.pi)
+    norm = norm + np.sum(special.gammaln(halves), axis=-1)
+    if is_inverse:
+        logs = 0.5 * df * _log_det(of_scale) - 0.5 * (df + size + 1) * _log_det(root)
+    else:
+        logs = 0.5 * (df - size - 1) * _log_det(root) - 0.5 * df * _log_det(of_scale)
+    # fewer degrees of freedom have no density, though the gamma function has values there
+    return logs - 0.5 * trace_of - norm + np.where(df > size - 1, 0.0, -np.inf)
+
+
+def _wishart(x: Any, df: Any, scale: Any) -> Any:
+    return _matrices(x, df, scale, False)
+
+
+def _inverse_wishart(x: Any, df: Any, scale: Any) -> Any:
+    return _matrices(x, df, scale, True)
+
+
+def _wrapped_normal(x: Any, loc: Any, scale: Any) -> Any:
+    turn = 2 * math.pi
+    off = x - loc
+    off = off - turn * np.rint(off / turn)
+    narrow, wide = np.minimum(scale, _FOURIER), np.maximum(scale, _FOURIER)
+    turns = [_normal(off + turn * k, 0.0, narrow) for k in range(-3, 4)]
+    sums = [np.exp(-0.5 * np.square(n * wide)) * np.cos(n * off) for n in range(1, 8)]
+    series = np.log1p(2.0 * sum(sums)) - _LOG_2PI
+    near = log_sum_exp(np.stack(np.broadcast_arrays(*turns), axis=-1), axis=-1)
+    return _inside(np.isfinite(x), np.where(scale < _FOURIER, near, series) + 0.0 * np.log(scale))
+
+
+def _part(part: Any) -> Family:
+    """A component or base as a family."""
+    if isinstance(part, d.Distribution):
+        return family_of(part)
+    if not isinstance(part, Family):
+        raise TraceError(f"no closed log density of {type(part).__name__} is known to derivatives")
+    return part
+
+
 def _mixture(x: Any, weights: Any, components: Any) -> Any:
-    if not isinstance(components, Family):
-        raise TraceError(
-            "no closed log density of a mixture of unlike parts is known to derivatives"
-        )
-    if components.make in _VECTORS:
-        raise TraceError("no closed log density of a mixture of vectors is known to derivatives")
-    parts = _log_density(components, x[..., None])
-    return log_sum_exp(_log_probs(weights, None) + parts, axis=-1)
+    logs = _log_probs(np.asarray(weights) if isinstance(weights, list) else weights, None)
+    if isinstance(components, (list, tuple)):
+        each = [_log_density(_part(c), x) for c in components]
+        parts = np.stack(np.broadcast_arrays(*each), axis=-1)
+    elif _part(components).make in _MATRICES:
+        raise TraceError("no closed log density of a mixture of matrices is known to derivatives")
+    else:
+        is_vector = _part(components).make in _VECTORS
+        parts = _log_density(_part(components), x[..., None, :] if is_vector else x[..., None])
+    return log_sum_exp(logs + parts, axis=-1)
+
+
+def _joint(x: Any, parts: Any) -> Any:
+    if len(parts) == 1 and isinstance(parts[0], (list, tuple)):
+        parts = parts[0]
+    total: Any = 0.0
+    start = 0
+    for part in map(_part, parts):
+        if part.make not in _VECTORS:
+            total, start = total + _log_density(part, x[..., start]), start + 1
+            continue
+        sized = next(v for v in part.parameters.values() if isinstance(v, Expression) and v.shape)
+        stop = start + sized.shape[-1]
+        total, start = total + _log_density(part, x[..., start:stop]), stop
+    return total
 
 
 def _affine(x: Any, base: Any, loc: Any, scale: Any) -> Any:
-    if not isinstance(base, Family):
-        raise TraceError(
-            "no closed log density of this affine distribution is known to derivatives"
-        )
-    return _log_density(base, (x - loc) / scale) - np.log(np.abs(scale))
+    return _log_density(_part(base), (x - loc) / scale) - np.log(np.abs(scale))
 
 
 def _truncated(x: Any, base: Any, low: Any, high: Any) -> Any:
-    if not isinstance(base, Family) or base.make is not d.Normal:
-        raise TraceError("no closed log density of this truncation is known to derivatives")
-    loc, scale = (_stand_in(base.parameters[k]) for k in ("loc", "scale"))
-    # a bound that is infinite moves with nothing
-    first, last = (np.where(np.isinf(b), b, (b - loc) / scale) for b in (low, high))
-    # the tail that is the smaller one keeps its digits
-    turned = first > 0
-    near, far = np.where(turned, -last, first), np.where(turned, -first, last)
-    mass = special.log_ndtr(far) + np.log1p(-np.exp(special.log_ndtr(near) - special.log_ndtr(far)))
-    return _inside((x >= low) & (x <= high), _normal(x, loc, scale) - mass)
+    family = _part(base)
+    known = [v for v in family.parameters.values() if v is not None]
+    bounds = [as_expression(getattr(b, "expression", b)) for b in (low, high)]
+    if all(isinstance(v, Constant) for v in (*known, *bounds)):  # by the family itself
+        made = family.make(**{k: getattr(v, "value", v) for k, v in family.parameters.items()})
+        mass: Any = d.Truncated(made, *(b.value for b in bounds)).log_mass  # type: ignore[attr-defined]
+    else:
+        stand_ins = {k: _stand_in(v) for k, v in family.parameters.items()}
+        mass = log_mass(family.make, stand_ins, low, high)
+    if mass is None:
+        name = getattr(family.make, "__name__", str(family.make))
+        raise TraceError(f"no closed mass of {name} between bounds is known to derivatives")
+    return _inside((x >= low) & (x <= high), _log_density(family, x) - mass)
 
 
-_VECTORS = frozenset((d.MvNormal, d.Dirichlet, d.Multinomial, d.Wishart, d.InverseWishart))
+#: scale from which on a Fourier series has few terms
+_FOURIER = 1.25
+_MATRICES = frozenset((d.Wishart, d.InverseWishart))
+_VECTORS = frozenset((d.MvNormal, d.Dirichlet, d.Multinomial))
 
 _FORMS: Mapping[Any, Callable[..., Any]] = {
     d.Normal: _normal, d.MvNormal: _mv_normal, d.StudentT: _student_t, d.Laplace: _laplace,
@@ -347,5 +425,6 @@ _FORMS: Mapping[Any, Callable[..., Any]] = {
     d.Binomial: _binomial, d.Poisson: _poisson, d.Geometric: _geometric,
     d.NegativeBinomial: _negative_binomial, d.DiscreteUniform: _discrete_uniform,
     d.Categorical: _categorical, d.Multinomial: _multinomial, d.Mixture: _mixture,
-    d.Affine: _affine, d.Truncated: _truncated,
+    d.Affine: _affine, d.Truncated: _truncated, d.Joint: _joint, d.Wishart: _wishart,
+    d.InverseWishart: _inverse_wishart, d.WrappedNormal: _wrapped_normal,
 }  # fmt: skip

@@ -26,10 +26,10 @@ from bayesmc.expression import (
     broadcast,
     elementwise,
     gather,
-    ordered,
     pick,
 )
-from bayesmc.passes.arithmetic import add, is_all, multiply, subtract, tidy
+from bayesmc.passes.arithmetic import add, is_all, multiply, rewritten, subtract, tidy
+from bayesmc.passes.choices import chosen
 
 
 def stable(roots: Iterable[Expression]) -> list[Expression]:
@@ -47,16 +47,13 @@ def stable(roots: Iterable[Expression]) -> list[Expression]:
     >>> [float(evaluate([r], {"u": np.array(800.0)})[0]) for r in (root, *stable([root]))]
     [-inf, -800.0]
     """
-    asked = list(roots)
-    found: dict[Expression, Expression] = {}
-    for node in ordered(*asked):
-        operands = [found[a] for a in node.operands]
+
+    def change(node: Expression, operands: list[Expression]) -> Expression | None:
         if isinstance(node, Elementwise) and node.dtype == float:
-            found[node] = broadcast(_made(node.function, operands), node.shape)
-        else:
-            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-            found[node] = node if same else node.with_operands(operands)
-    return [found[r] for r in asked]
+            return broadcast(_made(node.function, operands), node.shape)
+        return None
+
+    return rewritten(list(roots), change)
 
 
 def log_of(node: Expression) -> Expression | None:
@@ -242,4 +239,5 @@ _RULES: Mapping[Any, Callable[..., Expression | None]] = {
     np.sqrt: _of_exp(lambda x: multiply(0.5, x)),
     np.reciprocal: _of_exp(_negative),
     np.negative: lambda x: x.operands[0] if _is(x, np.negative) else None,
+    np.where: chosen,
 }

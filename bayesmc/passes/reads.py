@@ -30,6 +30,7 @@ from bayesmc.expression import (
     replaced,
     reshape,
 )
+from bayesmc.passes.arithmetic import rewritten
 
 #: functions of whole matrices: their batch axes are all but the last two
 _OF_MATRICES = frozenset(("cholesky", "inv", "solve", "det", "upper_inverse"))
@@ -154,13 +155,7 @@ def sunk(root: Expression, name: str) -> Expression:
     >>> found, sunk(found, "x")
     (<Pick ()>, <Elementwise exp ()>)
     """
-    found: dict[Expression, Expression] = {}
-    for node in ordered(root):
-        operands = [found[a] for a in node.operands]
-        same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-        made = node if same else node.with_operands(operands)
-        found[node] = _sunk(made, name)
-    return found[root]
+    return rewritten([root], lambda node, new: _sunk(node.with_operands(new), name))[0]
 
 
 # ---- private ------------------------------------------------------------------------------------

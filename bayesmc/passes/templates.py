@@ -187,6 +187,5 @@ def _with_leaves(
         if not _is_number(node):
             at_call = isinstance(node, Call)
             operands = [a if at_call and _is_number(a) else place(a) for a in node.operands]
-            same = all(a is b for a, b in zip(operands, node.operands, strict=True))
-            found[node] = node if same else node.with_operands(operands)
+            found[node] = node.with_operands(operands)
     return tuple(map(place, roots))

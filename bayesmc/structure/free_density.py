@@ -10,6 +10,7 @@ import numpy as np
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.expression import Expression, Program
+from bayesmc.passes.arrays import for_arrays
 from bayesmc.structure.free_nodes import FreeNode
 from bayesmc.structure.target import Target, Values
 
@@ -42,11 +43,11 @@ class UnconstrainedDensity:
     slopes: Expression = field(repr=False)
     summed: tuple[str, ...] = ()
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         return tuple(node.name for node in self.nodes)
 
-    @property
+    @cached_property
     def size(self) -> int:
         """How many free numbers there are."""
         return sum(node.size for node in self.nodes)
@@ -124,11 +125,11 @@ class UnconstrainedDensity:
 
     @cached_property
     def _value(self) -> Program:
-        return Program([self.root])
+        return Program(for_arrays([self.root]))
 
     @cached_property
     def _both(self) -> Program:
-        return Program([self.root, self.slopes])
+        return Program(for_arrays([self.root, self.slopes]))
 
     def _given(self, u: np.ndarray, values: Mapping[str, np.ndarray] | None) -> Values:
         found: Values = {FREE: u}

@@ -6,14 +6,17 @@ speaks user values.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from bayesmc.errors import EvidenceError, ShapeError, UnsupportedError
+from bayesmc.errors import EvidenceError, ShapeError, TraceError, UnsupportedError
+from bayesmc.lowering import Bound
 from bayesmc.network import BayesNet, FactorGraph, Problem, pose
 from bayesmc.network.evidence import store
+from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.target import target_of
 from bayesmc.structure.unconstrained import unconstrained_density
@@ -42,11 +45,19 @@ class LogDensity:
         net: BayesNet | FactorGraph,
         evidence: Mapping[str, Any] | None,
         inputs: Mapping[str, Any] | None,
+        compiled: bool = False,
     ) -> None:
         problem = pose(net, evidence, inputs)
-        self._question = problem.net, evidence, inputs
+        self._question = problem.net, evidence, inputs, compiled
         self._problem: Problem = problem
         self._density: UnconstrainedDensity = _density_of(problem)
+        self._bound: Bound | None = None
+        if compiled:
+            fast = in_machine_code(self._density, calls=sys.maxsize)
+            try:
+                self._density, self._bound = fast, fast.bound()
+            except TraceError as error:
+                raise UnsupportedError(f"log_density(compiled=True): {error}") from error
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -63,6 +74,22 @@ class LogDensity:
     @property
     def summed(self) -> tuple[str, ...]:
         return self._density.summed
+
+    @property
+    def address(self) -> int | None:
+        """Of the function in C; None where it is not compiled.
+
+        ``int32_t f(int64_t points, const double *u, double *value, double *gradient, void **arguments)`` with
+        ``arguments`` as its last argument, as long as this object lives, and for one thread at a time: others
+        make their own. Where it returns something else than 0 its results must not be used; values and
+        derivatives that are no numbers are left as they are.
+        """
+        return None if self._bound is None else self._bound.address
+
+    @property
+    def arguments(self) -> int | None:
+        """The address of what the function at ``address`` reads besides."""
+        return None if self._bound is None else self._bound.arguments
 
     def __call__(self, u: Any) -> tuple[np.ndarray, np.ndarray]:
         """The log density at ``u``, minus infinity where it is zero, and its gradient, 0 there."""
@@ -120,6 +147,7 @@ def log_density(
     evidence: Mapping[str, Any] | None = None,
     *,
     inputs: Mapping[str, Any] | None = None,
+    compiled: bool = False,
 ) -> LogDensity:
     """The log posterior density on unconstrained numbers, up to a constant, with its gradient.
 
@@ -135,6 +163,8 @@ def log_density(
     evidence : mapping, optional
         As of ``bmc.infer``.
     inputs : mapping, optional
+    compiled : bool
+        Machine code, with an ``address`` for callers in C; needs the extra ``fast``.
 
     Returns
     -------
@@ -146,7 +176,8 @@ def log_density(
     ------
     UnsupportedError
         A function cannot be followed or has no derivative, a hidden node is discrete without finite states,
-        or finite nodes have too many joint states; the message names it and the remedy.
+        or finite nodes have too many joint states; the message names it and the remedy. With ``compiled``,
+        there is no compiler, or something has no machine code.
 
     References
     ----------
@@ -167,12 +198,12 @@ def log_density(
     >>> f.labels, round(float(f.constrain(found.x)["rate"]), 3)
     (['rate'], 2.5)
     """
-    return LogDensity(net, evidence, inputs)
+    return LogDensity(net, evidence, inputs, compiled)
 
 
-def log_density_again(net: Any, evidence: Any, inputs: Any) -> LogDensity:
+def log_density_again(net: Any, evidence: Any, inputs: Any, compiled: bool) -> LogDensity:
     """A log density that was sent, made anew where it arrives."""
-    return LogDensity(net, evidence, inputs)
+    return LogDensity(net, evidence, inputs, compiled)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -26,6 +26,7 @@ from bayesmc.expression import (
     reduction,
 )
 from bayesmc.expression.graph import substituted
+from bayesmc.passes.alike import sums_of
 from bayesmc.passes.arithmetic import ZERO, add
 from bayesmc.passes.derivatives import gradient
 from bayesmc.passes.guarded import guarded
@@ -39,8 +40,8 @@ from bayesmc.structure.unconstrained_check import hold_against_model
 
 __all__ = ["FREE", "UnconstrainedDensity", "unconstrained_density"]
 
-#: terms that are added up one by one; more are laid side by side
-_FEW = 8
+#: numbers that are added up one by one, and nodes by which one by one derivatives are taken
+_FEW = 12
 
 
 def unconstrained_density(
@@ -94,15 +95,14 @@ def unconstrained_density(
         for t, e in zip(terms, plain, strict=True)
     ]
     used = stable([*used, *volumes.values()])
-    sums = [reduction(np.add, e, range(len(e.shape))) for e in used]
     tables = sum_out(target, terms, finite, above)
     inside = {term.name for table in tables for term in table.terms}
-    kept = [s for s, t in zip(sums, terms, strict=False) if t.name not in inside]
-    root = _total([*kept, *sums[len(terms) :], *(table.total for table in tables)])
-    slopes = _slopes(root, sums, terms, list(parts.values()))
+    kept = [e for e, t in zip(used, terms, strict=False) if t.name not in inside]
+    kept += used[len(terms) :]
+    root = _total([*sums_of(kept), *(table.total for table in tables)])
     once = _on_one_leaf(nodes, parts)
-    both = [once(e) for e in guarded([root, slopes])]
-    density = UnconstrainedDensity(target, nodes, both[0], both[1], tuple(finite))
+    slopes = _slopes(root, list(zip(terms, used, strict=False)), list(parts.values()), once)
+    density = UnconstrainedDensity(target, nodes, once(root), slopes, tuple(finite))
     plain = [once(e) for e in guarded([*plain, *volumes.values()])]
     hold_against_model(
         density,
@@ -141,9 +141,9 @@ def _total(numbers: Sequence[Expression]) -> Expression:
 
 def _slopes(
     root: Expression,
-    sums: Sequence[Expression],
-    terms: Sequence[Term],
+    used: Sequence[tuple[Term, Expression]],
     parts: Sequence[Leaf],
+    once: Callable[[Expression], Expression],
 ) -> Expression:
     """The derivatives by all free numbers, one after the other.
 
@@ -153,17 +153,19 @@ def _slopes(
     """
     names = [part.name for part in parts]
     try:
+        if len(parts) > _FEW:  # what reads many nodes reads one array
+            return stable([gradient(once(root), [FREE])[FREE]])[0]
         found = gradient(root, names)
     except TraceError as error:
-        for total, term in zip(sums, terms, strict=False):  # volumes follow
+        for term, log in used:
             try:
-                gradient(total, names)
+                gradient(reduction(np.add, log, [0]), names)
             except TraceError as own:
                 kind = "potential" if term.is_potential else "node"
                 raise UnsupportedError(f"{kind} {term.name!r}: {own}") from own
         raise UnsupportedError(str(error)) from error
     each = [found.get(p.name, broadcast(ZERO, p.shape)) for p in parts]
-    return pick(stable(each), np.arange(sum(p.size for p in parts)))
+    return once(pick(stable(each), np.arange(sum(p.size for p in parts))))
 
 
 def _on_one_leaf(

@@ -195,7 +195,7 @@ def test_weighting_is_taken_where_it_sees_all_states(rare: float, chosen: type) 
         p * np.trapezoid(stats.gamma.pdf(at, a) * stats.weibull_min.pdf(6.0, 2.0, scale=at), at)
         for p, a in ((1 - rare, 2), (rare, 10))
     ]
-    assert abs(found.mean("s") - joint[1] / sum(joint)) < 4.5 * found.mcse("s") < 0.1
+    assert abs(found.mean("s") - joint[1] / sum(joint)) < 4.5 * found.mcse("s") < 0.2
 
 
 def sensor(steep: bool) -> tuple[bmc.BayesNet, dict[str, Any]]:

@@ -120,10 +120,11 @@ def test_a_run_meets_its_effective_size() -> None:
 
 def test_what_was_not_met_is_said() -> None:
     posterior, (message, *_) = run(1, phi=0.9999, chains=4)
-    assert posterior["x"].shape == (4, 4000)
+    assert 500 <= posterior["x"].shape[1] < 1000  # all that is allowed would not have done either
     assert "have not mixed" in message or "that ess=1000 asks for" in message
-    _, said = run(2, phi=0.997, chains=16, warmup=2000, ess=20_000)
-    assert any("of 20000 that ess=20000 asks for" in m and "'x'" in m for m in said)
+    posterior, said = run(2, phi=0.95, chains=4, warmup=500, ess=500)
+    assert posterior["x"].shape == (4, 4000)
+    assert any("of 500 that ess=500 asks for" in m and "'x'" in m for m in said)
 
 
 def test_options_that_are_given_mean_what_they_meant() -> None:

@@ -145,6 +145,12 @@ def test_functions_of_whole_numbers(function: Any) -> None:
     np.testing.assert_array_equal(found, expected)
 
 
+def test_rounding_whole_numbers_leaves_them() -> None:
+    a = np.arange(-5, 6)
+    for function in (np.floor, np.ceil, np.trunc):
+        np.testing.assert_array_equal(machine(function, a), function(a))
+
+
 @pytest.mark.parametrize("exponent", [2.0, 0.5, -1.0, 3.0, -2.0, 0.0, 1.0, 2.5, 17.0])
 def test_known_exponents(exponent: float) -> None:
     x = np.abs(numbers(-40.0, 40.0))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import TraceError
+from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import Program
 from bayesmc.lowering import compiled, machine, writer
 from bayesmc.lowering.checked import Compared
@@ -17,6 +17,12 @@ from bayesmc.network import pose
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.target import target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
+from bayesmc.testing import session
+from bayesmc.testing.makers.gaussians import gaussian_evidence, random_gaussian_net
+from bayesmc.testing.makers.nets import random_net
+from bayesmc.testing.makers.observing import random_evidence
+from tests.passes.test_log_density import FAMILIES
+from tests.structure.test_unconstrained import over_family
 
 pytest.importorskip("llvmlite", reason="llvmlite is not installed")
 
@@ -140,7 +146,8 @@ def test_the_same_point_gives_the_same_bits_in_any_batch() -> None:
 
 
 def test_a_short_question_compiles_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(machine, "loaded", lambda *a: pytest.fail("compiled"))
+    machine.loaded.cache_clear()
+    monkeypatch.setattr(machine, "Loaded", lambda *a: pytest.fail("compiled"))
     fast = in_machine_code(schools(), 100)
     assert fast.code.startswith("NumPy: 100 gradients")
     fast.with_gradient(np.zeros(fast.size))
@@ -188,6 +195,72 @@ def test_an_address_with_other_nodes_given() -> None:
     arrays = [a.ctypes.data_as(pointer) for a in (u, value, slopes)]
     assert kind(bound.address)(2, *arrays, bound.arguments) == 0
     np.testing.assert_allclose(value, density.with_gradient(u, others)[0], rtol=1e-13)
+
+
+def test_log_density_hands_out_its_address() -> None:
+    net = bmc.BayesNet(plates={"day": 3})
+    net.add("rate", bmc.Gamma(2.0, 1.0))
+    net.add("count", lambda rate: bmc.Poisson(rate), plates="day")
+    plain = bmc.log_density(net, {"count": [3, 1, 4]})
+    fast = bmc.log_density(net, {"count": [3, 1, 4]}, compiled=True)
+    assert plain.address is None and plain.arguments is None
+    assert fast.address and fast.arguments
+    u = np.linspace(-2, 2, 5)[:, None]
+    for a, b in zip(fast(u), plain(u), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13)
+    pointer = ctypes.POINTER(ctypes.c_double)
+    kind = ctypes.CFUNCTYPE(
+        ctypes.c_int32, ctypes.c_int64, pointer, pointer, pointer, ctypes.c_void_p
+    )
+    value, slopes = np.empty(5), np.empty((5, 1))
+    arrays = [a.ctypes.data_as(pointer) for a in (u, value, slopes)]
+    assert kind(fast.address)(5, *arrays, fast.arguments) == 0
+    np.testing.assert_array_equal(value, fast(u)[0])
+    with pytest.raises(UnsupportedError, match="no machine code"):
+        net, factor = bmc.BayesNet(), np.array([[1.0, 0.0], [0.5, 1.0]])
+        net.add("s", bmc.Exponential(1.0))
+        net.add("y", lambda s: bmc.MvNormal(np.zeros(2), scale_tril=s[..., None, None] * factor))
+        bmc.log_density(net, {"y": np.ones(2)}, compiled=True)
+
+
+def same_far_out(density: UnconstrainedDensity) -> bool:
+    """Whether machine code agrees wherever it is asked; false where there is none."""
+    fast = in_machine_code(density, MANY, debug=True)
+    if fast.code != "machine code":
+        assert "no machine code" in fast.code
+        return False
+    if not density._others:
+        u = (
+            np.random.default_rng(0).normal(size=(20, density.size))
+            * np.linspace(0, 6, 20)[:, None]
+        )
+        found, wanted = fast.with_gradient(u)[0], density.with_gradient(u)[0]
+        np.testing.assert_array_equal(np.isfinite(found), np.isfinite(wanted))
+    return True
+
+
+def test_every_family() -> None:
+    densities = [over_family(name, True) for name in FAMILIES]
+    assert sum(map(same_far_out, densities)) >= len(densities) - 1
+
+
+@pytest.mark.parametrize("seed", range(session.seed(), session.seed() + session.scaled(3, 2)))
+@pytest.mark.parametrize("kind", ["continuous", "hybrid", "gaussian"])
+def test_random_nets(kind: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    if kind == "gaussian":
+        net, _ = random_gaussian_net(seed, plates=True, vectors=True)
+        evidence = gaussian_evidence(net, rng)
+    else:
+        net = random_net(
+            seed, hybrid=kind == "hybrid", plates=True, continuous=kind == "continuous"
+        )
+        evidence = random_evidence(net, rng)
+    try:
+        density = unconstrained_density(target_of(pose(net, evidence)))
+    except UnsupportedError:
+        return
+    same_far_out(density)
 
 
 # planted faults

@@ -14,8 +14,9 @@ from scipy import special, stats
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, UnsupportedError
-from bayesmc.expression import elementwise
+from bayesmc.expression import elementwise, ordered
 from bayesmc.network import pose
+from bayesmc.passes import alike
 from bayesmc.structure import free_nodes, free_terms, unconstrained
 from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
@@ -355,3 +356,43 @@ def test_wrong_gradients_fail_the_check() -> None:
     shifted = replace(density, root=elementwise(np.add, 1e-4, density.root))
     with pytest.raises(AssertionError):
         check(shifted, np.random.default_rng(0))
+
+
+def of_slices(steps: int) -> Target:
+    dbn = bmc.DynamicBayesNet("counts")
+
+    @dbn.static
+    def s() -> Any:
+        return bmc.HalfNormal(1.0)
+
+    @dbn.node(initial=bmc.Gamma(2.0, 2.0))
+    def x(x_prev: Any, s: Any, t: Any) -> Any:
+        return bmc.Gamma(2.0 + s, (2.0 + 0.1 * t) / x_prev)
+
+    @dbn.node
+    def y(x: Any) -> Any:
+        return bmc.Poisson(x)
+
+    counts = np.array([np.nan if t == 3 else t % 4 for t in range(steps)])
+    return target(dbn.unroll(steps), dbn.unrolled_evidence({"y": counts}))
+
+
+def test_slices_are_one_expression() -> None:
+    """Constants that differ, and a slice that nobody saw."""
+    few, many = (unconstrained_density(of_slices(steps)) for steps in (15, 30))
+    assert len(ordered(many.root, many.slopes)) < 1.2 * len(ordered(few.root, few.slopes))
+    assert many.labels[:2] == ["s", "x[0]"]
+    assert check(few, np.random.default_rng(0)) == POINTS
+
+
+def test_constants_of_the_first_slice_for_all_are_seen_before_first_use() -> None:
+    def stale(*args: Any) -> Any:
+        found = STACKED(*args)
+        return replace(found, constants={n: v[:1] + 0 * v for n, v in found.constants.items()})
+
+    with mock.patch.object(alike, "stacked_rows", stale):
+        with pytest.raises(UnsupportedError, match="the sum of its terms"):
+            unconstrained_density(of_slices(15))
+
+
+STACKED = alike.stacked_rows

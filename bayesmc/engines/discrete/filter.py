@@ -6,6 +6,7 @@ Options, refusals and the calls; tables of slices are made in ``slices``, passed
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -123,28 +124,25 @@ class DiscreteFilter(FilterEngine):
             if n not in plan.reader.variables and is_untold(plan, series, n)
         )
 
-    def describe(self, problem: SeriesProblem) -> dict[str, str]:
-        plan = self._plan(problem)
+    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
+        plan, observed = self._plan(problem), problem.series.observed
         sizes = {v[1]: c.size for c in plan.chains for v in c.state}
-        found = {}
-        for name in problem.slices.template.later:
-            if name in problem.slices.template.inputs:
-                found[name] = "input"
-            elif name in problem.slices.template.static:
-                found[name] = "static, known"
-            elif name in sizes:
-                found[name] = f"part of a state with {sizes[name]} values"
-            elif name in plan.reader.variables:
-                found[name] = "summed out in its slice"
-            elif not problem.model[name].is_stochastic:
-                found[name] = "computed"
-            elif name in problem.series.observed:
-                found[name] = "observed, a likelihood of the state"
-                if problem.series.observed[name].mask is not None:
-                    found[name] += "; averaged over where it is missing"
-            else:
-                found[name] = "averaged over"
-        return found
+
+        def treated(name: str) -> str:
+            if name in sizes:
+                return f"part of a state with {sizes[name]} values"
+            if name in plan.reader.variables:
+                return "summed out in its slice"
+            if not problem.model[name].is_stochastic:
+                return "computed"
+            if name not in observed:
+                return "averaged over"
+            missing = "; averaged over where it is missing"
+            return "observed, a likelihood of the state" + missing * (
+                observed[name].mask is not None
+            )
+
+        return treated
 
     def filter(
         self,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar
@@ -174,32 +175,25 @@ class GridFilter(GridOptions, FilterEngine):
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
         return self._search.said(problem)
 
-    def describe(self, problem: SeriesProblem) -> dict[str, str]:
-        model = self.model_on_grid(problem.slices, known_static(problem))
+    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
         grid = self._search.found(problem)
-        if grid is not None:
-            model = grid.mover.model
-        found = {}
-        for name in problem.slices.template.later:
-            seen = problem.series.observed.get(name)
-            if name in problem.slices.template.inputs:
-                found[name] = "input"
-            elif name in problem.slices.template.static:
-                found[name] = "static, known"
-            elif name not in model.own:
-                found[name] = "computed"
-            elif seen is not None and seen.mask is None:
-                found[name] = "observed, weights the cells"
-            elif name in model.leaves:
-                found[name] = "integrated out in closed form where it is hidden"
-            else:
-                sizes = " x ".join(str(a.size) for a in model.axes.of[name])
-                each = f" for each of {n} elements" if (n := model.elements(name)) > 1 else ""
-                cells = "states" if problem.model[name].domain is not None else "cells"
-                found[name] = f"on a grid of {sizes} {cells}" + (
-                    each if not problem.model[name].event_shape else ""
-                )
-        return found
+        model = self.model_on_grid(problem.slices, known_static(problem))
+        model = model if grid is None else grid.mover.model
+
+        def treated(name: str) -> str:
+            node = problem.model[name]
+            if name not in model.own:
+                return "computed"
+            if name in problem.seen:
+                return "observed, weights the cells"
+            if name in model.leaves:
+                return "integrated out in closed form where it is hidden"
+            sizes = " x ".join(str(a.size) for a in model.axes.of[name])
+            count = 1 if node.event_shape else model.elements(name)
+            each = f" for each of {count} elements" if count > 1 else ""
+            return f"on a grid of {sizes} {'cells' if node.domain is None else 'states'}{each}"
+
+        return treated
 
     # ---- runs over a series -----------------------------------------------------------------
 

@@ -6,7 +6,7 @@ coefficients of independent normals (``expected``), and why it refuses (``_own_r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -79,29 +79,18 @@ class GaussianFilter(FilterEngine):
         silent = {n for layout in self._data(problem).layouts for n in layout.silent}
         return tuple(n for n in problem.slices.dynamic if n in silent)
 
-    def describe(self, problem: SeriesProblem) -> dict[str, str]:
-        data, found = self._data(problem), {}
-        layout = data.layouts[1]
-        for name in problem.slices.template.later:
-            if name in problem.slices.template.inputs:
-                found[name] = "input"
-            elif name in problem.slices.template.static:
-                found[name] = "static, known"
-            elif name in layout.computed:
-                found[name] = "computed"
-            elif name in layout.certain:
-                found[name] = "observed, depends on nothing hidden"
-            elif name in layout.seen:
-                found[name] = "observed, updates the Gaussian belief"
-            elif name in problem.series.observed:
-                found[name] = "Gaussian, observed in part"
-            elif name in layout.drawn:
-                found[name] = "Gaussian"
-            elif name in layout.silent:
-                found[name] = "not answered for: takes no continuous values"
-            else:
-                found[name] = "computed from Gaussian nodes"
-        return found
+    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
+        layout = self._data(problem).layouts[1]
+        kinds: list[tuple[Collection[str], str]] = [
+            (layout.computed, "computed"),
+            (layout.certain, "observed, depends on nothing hidden"),
+            (layout.seen, "observed, updates the Gaussian belief"),
+            (problem.series.observed, "Gaussian, observed in part"),
+            (layout.drawn, "Gaussian"),
+            (layout.silent, "not answered for: takes no continuous values"),
+        ]
+        other = "computed from Gaussian nodes"
+        return lambda name: next((words for names, words in kinds if name in names), other)
 
     def filter(
         self,

@@ -222,6 +222,8 @@ class ChainEngine(Engine):
             if share >= 1:
                 return True
             draws = lengths.further(done, share)
+            if not draws:
+                return True
             state = loop.last.state
 
     def _forward(self, sampler: Sampler) -> frozenset[str]:

@@ -137,7 +137,9 @@ class Gibbs(ChainEngine):
 
     def sampler(self, problem: Problem) -> SweepSampler:
         plan = plan_of(problem, self.debug)
-        return SweepSampler(plan.target, plan.kernels)
+        sampler = SweepSampler(plan.target, plan.kernels)
+        sampler.climbs = any(_is_slice(k) for k in plan.kernels)
+        return sampler
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,6 +24,8 @@ from bayesmc.results import ChainsPosterior, ChainsSums, Checkpoint, Posterior, 
 
 #: the first sweep at which a warmup may end where that is judged
 _END = 100
+#: draws of each chain from which on a run may be seen not to get to its effective size
+_HOPELESS = 500
 #: draws of each chain in the first round, at least, and how much longer a later round may make a run
 _ROUND, _GROWTH = 16, 3.0
 
@@ -116,7 +118,12 @@ class Lengths:
         return min(max(math.ceil(self.ess / self.chains), _ROUND), self.draws)
 
     def further(self, made: int, share: float) -> int:
-        """Draws of each chain in the next round, where those made are a share of what is wanted."""
+        """Draws of each chain in the next round, where those made are a share of what is wanted.
+
+        None where even all that are allowed would not do.
+        """
+        if made >= _HOPELESS and share * self.draws < 0.5 * made:
+            return 0
         needed = made * min(1.05 / max(share, 1e-9), _GROWTH)
         return min(max(math.ceil(needed) - made, made // 8, 1), self.draws - made)
 

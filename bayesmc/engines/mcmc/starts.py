@@ -32,6 +32,8 @@ from bayesmc.structure.target import Target, Term, Values
 #: how far draws go from the prior mean, for successive attempts
 _SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4, 0.0)
 _ATTEMPTS = 8
+#: power of the likelihood by which one of several attempts is drawn
+_TEMPERED = 0.25
 #: numbers of one node drawn in all attempts, at most, where possible states are rare
 _MOST = 1 << 19
 #: chains that search for themselves; others start where one of them does
@@ -145,7 +147,9 @@ class _Search:
             return
         self.tried = self.tried or values
         log = np.where(np.isnan(log), -np.inf, log).reshape(attempts, self.chains)
-        pick = log.argmax(axis=0), np.arange(self.chains)
+        # a power of the likelihood as weight: starts as wide as the posterior, or wider
+        key = _TEMPERED * log + self.rng.gumbel(size=log.shape)
+        pick = key.argmax(axis=0), np.arange(self.chains)
         # closer to the prior mean only where that helps a lot: starts ought to differ
         better = log[pick] > self.log + (10.0 if self.best else 0.0)
         for name, value in values.items():

@@ -13,6 +13,7 @@ import numpy as np
 
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.mcmc.starts import start_states
+from bayesmc.engines.mcmc.uphill import uphill
 from bayesmc.errors import ModelError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.redrawn import renewals
@@ -47,6 +48,8 @@ class SweepSampler:
         self.given: Values = {}
         #: groups of consecutive chains that start as one; 0 where each starts by itself
         self.superchains = 0
+        #: whether starts are moved uphill first: kernels that move one number at a time may never get there
+        self.climbs = False
 
     def start(self, rng: np.random.Generator, chains: int) -> dict[str, Any]:
         return self._started(rng, chains, chains)
@@ -102,6 +105,8 @@ class SweepSampler:
         given = self.given_rows(rows)
         starts = rows if given or not self.superchains else self.superchains
         values = start_states(self.target, starts, rng, given)
+        if self.climbs and not given:
+            values = uphill(self.target, values, rng)
         inside = {n: values[n] for n in (*self.target.chain, *self.target.links)}
         if starts < rows:
             inside = {n: np.repeat(v, rows // starts, axis=0) for n, v in inside.items()}

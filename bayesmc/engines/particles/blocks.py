@@ -18,7 +18,7 @@ from bayesmc.network import CompiledNode
 from bayesmc.results.posterior import circular_variance
 
 #: numbers of all particles of slices that are looked at side by side: what costs is calling NumPy
-NUMBERS = 1 << 16
+NUMBERS = 1 << 17
 
 
 class Moments(NamedTuple):
@@ -192,7 +192,7 @@ class Block:
         """The values of a node that all particles agree on, slices first."""
         values = [p.values[node.name] for p in self.slices]
         rank = len(node.value_shape)
-        return np.stack([v if v.ndim == rank else v[0] for v in values])
+        return np.array([v if v.ndim == rank else v[0] for v in values])
 
     def _moments(self, node: CompiledNode, rows: np.ndarray) -> Moments:
         mean = self.weighted(rows)

@@ -14,6 +14,7 @@ from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief
+from bayesmc.engines.particles.compiled_step import compiled_step
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
@@ -384,6 +385,7 @@ class ParticleFilter(FilterEngine):
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
         step = self.step_of(problem.slices, problem.known_static, kept)
+        step = compiled_step(step, problem.steps, self.resampling == "systematic")
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _sized(self, particles: int) -> ParticleFilter:

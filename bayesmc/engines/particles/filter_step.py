@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -74,10 +75,13 @@ class FilterStep(SMCStep):
         self.steps, self.known = plan.steps, plan.known  # type: ignore[method-assign]
         self.first_stage, self.rejuvenate = first_stage, rejuvenate
         self.counts, self.injection = counts, injection
+        #: makes the particles of a slice, or None where the plain steps must
+        self.machine: Any = None
 
     def __call__(self, earlier: Particles | None, row: Row, rng: np.random.Generator) -> Particles:
         before, selection = self.chosen(earlier, row, rng)
-        values, log = self.propagated(self.steps(row), row, before, selection, rng)
+        made = None if self.machine is None else self.machine(row, before, selection, rng)
+        values, log = made or self.propagated(self.steps(row), row, before, selection, rng)
         averages, injected = None, 0
         if self.injection is not None and earlier is not None:
             passed = values, log
@@ -119,6 +123,12 @@ class FilterStep(SMCStep):
         if needed < most:
             chosen = self.resample(earlier.weights, needed, rng)
         return Selection(needed, chosen, True, 0.0, math.log(needed))
+
+    def exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
+        if self.machine is None or log.ndim > 1 or not log.flags.c_contiguous:
+            return super().exponentials(log, level)
+        weights = self.room(log.shape)
+        return weights, *self.machine.exponentials(log, level, weights)
 
     def recycle(self, particles: Particles) -> None:
         if self.counts is None:

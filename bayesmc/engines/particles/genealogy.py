@@ -53,6 +53,8 @@ SOME = 2.0
 #: share of the particles below which the worth of a slice's has its weights looked at for a tail, and the
 #: mean log of the largest of them over the next from which on they have one (Hill's estimate)
 FEW, TAIL = 0.05, 0.7
+#: share of the largest weight below which none is among the few largest, most often
+_SMALL = 1e-3
 #: variance above which slices with a tail explain nothing
 LONG = 0.2
 #: variance between two origins beyond which the families that are left are too few to tell
@@ -409,11 +411,18 @@ def _explained(now: Particles) -> Any:
     bounded = np.array(variance, ndmin=1).reshape(-1)
     for at in np.flatnonzero(few):
         count = max(int(ess.reshape(-1)[at]), 5)
-        top = np.partition(weights[:, at], max(n - count - 1, 0))[-count - 1 :]
+        top = _largest(weights[:, at], count + 1)
         least = np.maximum(top.min(), 1e-300)  # fewer have any weight
         if np.log(np.maximum(top, least) / least).sum() > TAIL * count:
             bounded[at] = 0.0
     return np.stack([variance, bounded.reshape(variance.shape)])
+
+
+def _largest(weights: np.ndarray, count: int) -> np.ndarray:
+    """The largest of some weights; of many, only those that may be among them are put in order."""
+    some = weights[weights > weights.max() * _SMALL]
+    among = some if len(some) > count else weights
+    return np.partition(among, max(len(among) - count, 0))[-count:]
 
 
 def _at_edge(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -84,9 +83,6 @@ class Record:
     ) -> None:
         self.problem, self.layout, self.asked, self.tracker = problem, layout, queries, tracker
         self._nodes = [problem.model[n] for n in problem.hidden]
-        numbers = sum(max(1, math.prod(n.value_shape)) for n in self._nodes) or 1
-        many = NUMBERS // (layout.particles * numbers)
-        self.together = min(TOGETHER, max(1, many // 2, min(FEW, many)))
         self._waiting: list[Waiting] = []
         self._written: list[Written] = []
         self._room: dict[Any, np.ndarray] = {}
@@ -103,7 +99,7 @@ class Record:
         if self._waiting and not alike(self._waiting[-1].particles, particles):
             self.write()
         self._waiting.append(Waiting(k, particles, row, families, values))
-        if len(self._waiting) >= self.together:
+        if len(self._waiting) >= self._together(particles):
             self.write()
 
     @property
@@ -216,6 +212,12 @@ class Record:
         return self.posterior(engine, "smooth", filtered=filtered, sharing=sharing)
 
     # ---- private -------------------------------------------------------------------------------
+
+    def _together(self, particles: Particles) -> int:
+        """Slices that are written together."""
+        numbers = sum(particles.values[n.name].size for n in self._nodes)
+        many = NUMBERS // max(numbers, len(particles.weights))
+        return min(TOGETHER, max(1, many // 2, min(FEW, many)))
 
     def _followed(self, waiting: Sequence[Waiting], block: Block) -> list[Families]:
         """The families of slices that wait."""

@@ -327,7 +327,7 @@ class SMCStep:
         if log.shape != (n, *lead):
             log = np.broadcast_to(log, (n, *lead))
         level = _top(log)
-        weights, total, squares = self._exponentials(log, level)
+        weights, total, squares = self.exponentials(log, level)
         if lead:
             log_total, ess = level + np.log(total), total * total / squares
         else:
@@ -338,9 +338,13 @@ class SMCStep:
             selection.ancestors, selection.resampled,
         )  # fmt: skip
 
-    # ---- private -------------------------------------------------------------------------------
+    def room(self, shape: tuple[int, ...]) -> np.ndarray:
+        """An array of real numbers to be filled."""
+        if shape[0] <= self.layout.block:
+            return np.empty(shape)
+        return self._spare.get(shape, np.dtype(float))
 
-    def _exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
+    def exponentials(self, log: np.ndarray, level: Any) -> tuple[np.ndarray, Any, Any]:
         """Weights relative to a level, block by block, their sums and the sums of their squares."""
         if len(log) <= self.layout.block:
             weights = log - level
@@ -356,6 +360,8 @@ class SMCStep:
             total = total + self._sum(part)
             squares = squares + _squares(part)
         return weights, total, squares
+
+    # ---- private -------------------------------------------------------------------------------
 
     def _sum(self, weights: np.ndarray) -> Any:
         if weights.ndim == 1:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -265,15 +266,25 @@ class Compass:
         counts = zip(self.nodes, self.counts, strict=True)
         parts = [_moves(block, node, count, earlier) for node, count in counts]
         steps = parts[0] if len(parts) == 1 else np.concatenate(parts, axis=-1)
-        state: Any = 0.0 if drift is None else drift.moves
-        for k in range(steps.shape[1]):
-            steps[:, k] = state = _FADED * state + steps[:, k]
-        worst = (np.abs(steps[0]) / np.sqrt(steps[1] + _LEAST)).max(axis=-1)
         if drift is not None:
-            worst[0] = np.maximum(worst[0], KEPT * np.reshape(drift.worst, -1))
+            steps[:, 0] += _FADED * drift.moves
+        if len(steps[0]) > 1:
+            faded, kept = _fading(len(steps[0]))
+            steps /= faded
+            np.add.accumulate(steps, axis=1, out=steps)
+            steps *= faded
+        worst = np.abs(steps[0])
+        worst /= np.sqrt(steps[1] + _LEAST)
+        worst = worst[..., 0] if worst.shape[-1] == 1 else np.maximum.reduce(worst, axis=-1)
+        if drift is not None:
+            np.maximum(worst[0], KEPT * np.reshape(drift.worst, -1), out=worst[0])
         if len(worst) > 1:
-            kept = KEPT ** np.arange(len(worst))[:, None]
-            worst = np.maximum.accumulate(worst / kept) * kept
+            worst /= kept
+            np.maximum.accumulate(worst, out=worst)
+            worst *= kept
+        if not self.layout.lead:
+            each = worst[:, 0].tolist()
+            return [Drift(steps[:, k], own, own, self.limit) for k, own in enumerate(each)]
         largest, worst = worst.max(axis=-1).tolist(), worst.reshape(-1, *self.layout.lead)
         return [Drift(steps[:, k], worst[k], most, self.limit) for k, most in enumerate(largest)]
 
@@ -319,24 +330,41 @@ def _moves(
     moments = block.moments(node)
     if moments is None:  # the same for all particles
         return np.zeros((2, len(block.slices), block.elements, count))
-    off, n = moments.off, block.particles
-    shift, wide = np.add.reduce(off, -1) / n, np.vecdot(off, off) / n
+    off, n, lead = moments.off, block.particles, block.layout.lead
+    shift, wide = np.add.reduce(off, -1), np.vecdot(off, off)
+    shift /= n
+    wide /= n
     for k, now in enumerate(block.slices):  # where particles bring weights along
         if now.resampled is not True and earlier is not None and len(earlier.weights) == n:
-            weights, total = earlier.weights.reshape(n, -1).T, np.reshape(earlier.total, (-1, 1))
-            own = ~np.reshape(now.resampled, (-1, 1))
-            part = weights[:, None] * off[k]
-            np.copyto(shift[k], np.add.reduce(part, -1) / total, where=own)
-            np.copyto(wide[k], np.vecdot(part, off[k]) / total, where=own)
+            weights, total = earlier.weights.reshape(n, -1).T[:, None], earlier.total
+            part = weights * off[k]
+            if lead:
+                own, total = ~np.reshape(now.resampled, (-1, 1)), np.reshape(total, (-1, 1))
+                np.copyto(shift[k], np.add.reduce(part, -1) / total, where=own)
+                np.copyto(wide[k], np.vecdot(part, off[k]) / total, where=own)
+            else:
+                np.divide(np.add.reduce(part, -1), total, out=shift[k])
+                np.divide(np.vecdot(part, off[k]), total, out=wide[k])
         earlier = now
-    wide = wide - shift**2
+    wide -= shift**2
     found = np.empty((2, *wide.shape))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(-shift, np.sqrt(wide), out=found[0])
-        np.maximum(1.0 - moments.variance / wide, 0.0, out=found[1])
-    none = ~(wide > 0.0)
-    if none.any():
-        found[:, none] = 0.0
+    np.divide(shift, -np.sqrt(wide), out=found[0])  # whoever filters has silenced warnings
+    np.divide(moments.variance, wide, out=found[1])
+    np.subtract(1.0, found[1], out=found[1])
+    np.maximum(found[1], 0.0, out=found[1])
+    some = wide > 0.0
+    if not some.all():
+        found[:, ~some] = 0.0
+    return found
+
+
+@lru_cache(maxsize=64)
+def _fading(slices: int) -> tuple[np.ndarray, np.ndarray]:
+    """What is left of each slice's moves, and of their variances, in the last; and of the largest sum."""
+    at = np.arange(slices)[:, None]
+    found = np.stack([FADING**at, FADING ** (2 * at)])[..., None], KEPT**at
+    for array in found:
+        array.flags.writeable = False
     return found
 
 

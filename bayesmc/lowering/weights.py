@@ -1,0 +1,159 @@
+"""Loops of particle filters over all particles, which no element-wise expression says.
+
+Weights from their logs with their sums in one pass, and systematic resampling: the same numbers, to
+rounding, as ``resampling.systematic`` gives.
+
+References
+----------
+Carpenter, Clifford and Fearnhead (1999), IEE Proceedings F 146; Murray, Lee and Jacob (2016), JCGS 25(3)
+(ancestors by a running maximum).
+"""
+
+from __future__ import annotations
+
+import ctypes
+import threading
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+
+from bayesmc.lowering.code import REAL, WHOLE, Code, Module, Number
+from bayesmc.lowering.elementary import elementary
+from bayesmc.lowering.machine import Loaded, loaded
+
+#: sums of weights between which their scale does not matter
+_SMALL, _LARGE = 1e-200, 1e200
+
+
+class WeightLoops:
+    """The loops, compiled once."""
+
+    def __init__(self) -> None:
+        whole, real, pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+        self._code = code = _loaded()  # the functions live as long as this
+        self._exponentials = code.function("exponentials", None, whole, real, *[pointer] * 3)
+        self._running = code.function("running", real, whole, *[pointer] * 2)
+        self._ancestors = code.function(
+            "ancestors", None, whole, whole, real, real, real, *[pointer] * 2
+        )
+        self._own = threading.local()
+
+    def exponentials(
+        self, log: np.ndarray, level: float, weights: np.ndarray
+    ) -> tuple[float, float]:
+        """Fill ``exp(log - level)``: its sum, and the sum of its squares. Arrays are in C order."""
+        sums = np.empty(2)
+        self._exponentials(len(log), level, log.ctypes.data, weights.ctypes.data, sums.ctypes.data)
+        return float(sums[0]), float(sums[1])
+
+    def systematic(
+        self, weights: np.ndarray, draws: int, uniform: Callable[[], float]
+    ) -> np.ndarray | None:
+        """What ``resampling.systematic`` gives; None where the weights want another scale, or are none.
+
+        Parameters
+        ----------
+        weights : ndarray, shape (n,)
+            Not negative.
+        draws : int
+        uniform : callable
+            Draws the shift; not called where the answer is None.
+        """
+        running = self._room(len(weights))
+        total = self._running(len(weights), weights.ctypes.data, running.ctypes.data)
+        if not _SMALL < total < _LARGE:
+            return None
+        scale, shift = draws / total, (1.0 - uniform()) % 1.0
+        found = np.zeros(draws + 1, np.int64)
+        last = float(running[-1] * scale + shift)
+        self._ancestors(
+            len(weights), draws, scale, shift, last, running.ctypes.data, found.ctypes.data
+        )
+        return found[:draws]
+
+    def _room(self, size: int) -> np.ndarray:
+        """Each thread's own: fresh memory costs the machine a page at a time."""
+        held = getattr(self._own, "running", None)
+        if held is None or len(held) != size:
+            held = self._own.running = np.empty(size)
+        return held
+
+
+@lru_cache(maxsize=1)
+def weight_loops() -> WeightLoops:
+    """The loops, where there is a compiler."""
+    return WeightLoops()
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _loaded() -> Loaded:
+    module = Module()
+    texts = [_exponentials(module), _running(module), _ancestors(module)]
+    return loaded("\n".join([str(module), *texts]), module.foreign)
+
+
+def _exponentials(module: Module) -> str:
+    c = Code(module)
+    zero = c.number(0.0)
+    total, squares = c.variable(zero), c.variable(zero)
+
+    def body(i: Number) -> None:
+        weight = elementary(c, "exp", c.load("%log", i, REAL) - Number(c, "%level", REAL))
+        c.store("%weights", i, weight)
+        for place, part in ((total, weight), (squares, weight * weight)):
+            old = c.get(place, REAL)
+            c.set(place, c.op(REAL, f"fadd reassoc double {old.text}, {part.text}"))
+
+    c.loop(Number(c, "%n", WHOLE), body)
+    c.store("%sums", 0, c.get(total, REAL))
+    c.store("%sums", 1, c.get(squares, REAL))
+    c.do("ret void")
+    head = "i64 %n, double %level, ptr noalias %log, ptr noalias %weights, ptr noalias %sums"
+    return f"define void @exponentials({head}) {{\n{c}\n}}"
+
+
+def _running(module: Module) -> str:
+    c = Code(module)
+    total = c.variable(c.number(0.0))
+
+    def body(i: Number) -> None:
+        found = c.get(total, REAL) + c.load("%weights", i, REAL)
+        c.set(total, found)
+        c.store("%running", i, found)
+
+    c.loop(Number(c, "%n", WHOLE), body)
+    c.do(f"ret double {c.get(total, REAL).text}")
+    head = "i64 %n, ptr noalias %weights, ptr noalias %running"
+    return f"define double @running({head}) {{\n{c}\n}}"
+
+
+def _ancestors(module: Module) -> str:
+    """Every particle writes its number where its offspring begin; a running maximum fills the rest."""
+    c = Code(module)
+    draws = Number(c, "%draws", WHOLE)
+    scale, shift, last = (Number(c, f"%{n}", REAL) for n in ("scale", "shift", "last"))
+    start = c.variable(c.number(0, WHOLE))
+
+    def begin(i: Number) -> None:
+        c.store("%found", c.get(start, WHOLE), i)
+        position = c.load("%running", i, REAL) * scale + shift
+        edge = position.to(WHOLE)
+        is_end = (position >= last) | (edge > draws)
+        c.set(start, c.where(is_end, draws, edge))
+
+    c.loop(Number(c, "%n", WHOLE), begin)
+    top = c.variable(c.number(0, WHOLE))
+
+    def fill(j: Number) -> None:
+        old, own = c.get(top, WHOLE), c.load("%found", j, WHOLE)
+        found = c.where(own > old, own, old)
+        c.set(top, found)
+        c.store("%found", j, found)
+
+    c.loop(draws, fill)
+    c.do("ret void")
+    head = "i64 %n, i64 %draws, double %scale, double %shift, double %last"
+    return f"define void @ancestors({head}, ptr noalias %running, ptr noalias %found) {{\n{c}\n}}"
