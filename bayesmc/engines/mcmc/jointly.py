@@ -65,6 +65,18 @@ def trajectories_of(
         hardly move.
     alone : collection of str
         Nodes that others move in their own way.
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.mcmc.jointly import trajectories_of
+    >>> from bayesmc.network import pose
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Laplace(0.0, 1.0))
+    >>> net.add("b", bmc.Laplace(0.0, 1.0))
+    >>> net.add("y", lambda a, b: bmc.Normal(a * b, 1.0))
+    >>> [kernel.names for kernel in trajectories_of(pose(net, {"y": 1.0}), ["a", "b"])]
+    [('a', 'b')]
     """
     target = target_of(problem)
     kernels = []
