@@ -229,16 +229,22 @@ def explained_series(
     asked = Asked(question, keep, read_queries("explain", queries))
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
-        return Explanation(chosen, reasons, refused, chosen.describe(problem))
+        nodes = chosen.describe(problem)
+        return Explanation(chosen, reasons, refused, nodes, effort=_effort(chosen, problem, asked))
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
     if why is None:
-        return Explanation(checked, ("it was asked for",), {}, checked.describe(problem))
+        nodes, effort = checked.describe(problem), _effort(checked, problem, asked)
+        return Explanation(checked, ("it was asked for",), {}, nodes, effort=effort)
     reasons = ("it was asked for, but it cannot answer",)
     return Explanation(checked, reasons, {type(checked).__name__: why})
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _effort(engine: FilterEngine, problem: SeriesProblem, asked: Asked) -> str:
+    return engine.effort(problem) if asked.what == "filter" else ""
 
 
 def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -> FilterEngine:

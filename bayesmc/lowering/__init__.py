@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
+from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available
 from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
     "Bound",
     "Compiled",
+    "Kernel",
     "SliceKernel",
     "compiled",
     "held_against_numpy",

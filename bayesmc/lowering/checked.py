@@ -9,23 +9,28 @@ import numpy as np
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression, ordered
 from bayesmc.lowering.compiled import Compiled, compiled
+from bayesmc.lowering.layout import written_out
 
 #: seconds in NumPy of one node of a graph, and of one element
 _NODE, _ELEMENT = 1e-6, 1.5e-9
 #: seconds that a question takes in NumPy for which nothing is compiled
 _WORTH = 0.1
+#: seconds that compiling takes for one element that is written out, and for two of the same code
+_ONE, _PAIR = 2e-4, 5e-8
 #: how far results may be off, relative to the largest element of each
 _RTOL = 1e-9
 
 
 def is_worth_it(roots: Sequence[Expression], calls: int, entries: int = 1) -> bool:
-    """Whether so many calls, of so many entries each, take longer in NumPy than a tenth of a second.
+    """Whether so many calls, of so many entries each, take longer in NumPy than compiling.
 
-    By a count of nodes and elements, not by a clock: the same question is answered the same way again.
+    And longer than a tenth of a second. By a count of nodes and elements, not by a clock: the same question
+    is answered the same way again.
     """
     nodes = ordered(*roots)
     seconds = calls * (_NODE * len(nodes) + _ELEMENT * entries * sum(n.size for n in nodes))
-    return seconds > _WORTH
+    written = written_out(nodes)
+    return seconds > max(_WORTH, _ONE * written + _PAIR * written**2)
 
 
 def held_against_numpy(

@@ -19,7 +19,7 @@ from bayesmc.lowering.writer import DTYPES
 from bayesmc.shapes import Shape
 
 #: sets of shapes that are remembered
-_SHAPES = 64
+_SHAPES = 512
 #: ways in which leaves may have a batch or not that are compiled
 _WAYS = 4
 

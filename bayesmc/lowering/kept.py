@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from bayesmc.expression.scatter import Gathered, Scattered
 from bayesmc.lowering.code import REAL
 from bayesmc.lowering.layout import FEW, adds_in_place, cumulated_axis, is_given
 from bayesmc.lowering.places import flat, plus, times, unraveled
+from bayesmc.lowering.schedule import is_sum, loop_shape
 from bayesmc.lowering.ufuncs import kind_of
 from bayesmc.lowering.writer import Place, Writer
 
@@ -24,7 +26,7 @@ def keep(w: Writer, node: Expression) -> None:
         else:
             _cumulate(w, node, pointer)
     elif isinstance(node, Pick) and len(node.operands) > 1:
-        _together(w, node, pointer)
+        _joined(w, node, pointer)
     elif isinstance(node, Reduction) and adds_in_place(node):
         _side_by_side(w, node, pointer)
     else:
@@ -32,6 +34,34 @@ def keep(w: Writer, node: Expression) -> None:
             node.shape,
             lambda at: w.code.store(pointer, flat(node.shape, at), w.computed(node, at)),
         )
+
+
+def together(w: Writer, group: Sequence[Expression]) -> None:
+    """Nodes whose loops are one (``schedule``), kept or summed."""
+    shape = loop_shape(group[0], w.layout)
+    assert shape is not None
+    totals = {
+        n: w.code.variable(w.start(n)) for n in group if isinstance(n, Reduction) and is_sum(n)
+    }
+
+    def each(at: Place) -> None:
+        for node in group:
+            if node in totals:
+                value = w.element(node.operands[0], at).to(kind_of(node))
+                old = w.code.get(totals[node], kind_of(node))
+                w.code.set(totals[node], w.combined(node, old, value, free=True))
+            else:
+                value = w.computed(node, at)
+                w.code.store(w.pointers[node], flat(node.shape, at), value)
+
+    w.nest(shape, each)
+    for node in group:
+        if node in totals:
+            value = w.know(node, w.code.get(totals[node], kind_of(node)))
+            if node in w.layout.kept:
+                w.code.store(w.pointers[node], 0, value)
+        if node in w.layout.kept:
+            w.ready.add(node)
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -52,7 +82,7 @@ def _side_by_side(w: Writer, node: Reduction, pointer: str) -> None:
     w.nest(operand.shape, more)
 
 
-def _together(w: Writer, node: Pick, pointer: str) -> None:
+def _joined(w: Writer, node: Pick, pointer: str) -> None:
     """Operands side by side, each to its places."""
     positions, first = node.positions.reshape(-1), 0
     for number, operand in enumerate(node.operands):

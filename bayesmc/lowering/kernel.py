@@ -8,9 +8,10 @@ import numpy as np
 
 from bayesmc.expression import Call, Expression, Leaf
 from bayesmc.lowering.code import WHOLE, Code, Module, Number
-from bayesmc.lowering.kept import keep
-from bayesmc.lowering.layout import is_few, is_given, laid_out
+from bayesmc.lowering.kept import keep, together
+from bayesmc.lowering.layout import is_few, laid_out
 from bayesmc.lowering.places import flat, plus, times
+from bayesmc.lowering.schedule import scheduled
 from bayesmc.lowering.writer import DTYPES, ROWS, Place, Writer
 
 #: the name of the function in the machine code
@@ -75,16 +76,13 @@ class Kernel:
     def _write(self, roots: Sequence[Expression]) -> None:
         w = self._writer
         varies = [n for n in w.layout.nodes if n.leaves & self.varying]
-        for node in w.layout.nodes:
-            if not node.leaves & self.varying:
-                self._prepare(node)
+        self._prepare_all([n for n in w.layout.nodes if not n.leaves & self.varying])
 
         def entry(i: Number) -> None:
             w.entry = w.row = i
             if self.chosen:
                 w.row = w.code.load(w.pointers[ROWS], i, WHOLE)
-            for node in varies:
-                self._prepare(node)
+            self._prepare_all(varies)
             for k, root in enumerate(roots):
                 self._result(k, root)
 
@@ -102,12 +100,17 @@ class Kernel:
         other = _entry(module, DIRECT, count, [*direct, *ends]) if len(direct) == 1 else ""
         return f"{module}\n{body}\n{outer}\n{other}\n"
 
+    def _prepare_all(self, nodes: Sequence[Expression]) -> None:
+        """What later loops read, computed now."""
+        for group in scheduled(nodes, self._writer.layout):
+            if len(group) > 1:
+                together(self._writer, group)
+            else:
+                self._prepare(group[0])
+
     def _prepare(self, node: Expression) -> None:
-        """What later loops read of a node, computed now."""
         w = self._writer
         is_kept = node in w.layout.kept
-        if is_given(node):
-            return
         if is_few(node) and not isinstance(node, Call):
             for k, at in enumerate(np.ndindex(node.shape)):
                 value = w.element(node, at)

@@ -7,7 +7,7 @@ it, unless several loops do, or one reads it at places of its own.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,7 +33,7 @@ from bayesmc.shapes import Shape
 #: elements up to which an array is written out element by element
 FEW = 8
 #: elements written out, and bytes kept for one entry, beyond which nothing is compiled
-_WRITTEN, _KEPT = 6000, 1 << 26
+_WRITTEN, _KEPT = 8000, 1 << 26
 
 #: ufuncs that reduce -> what they begin with
 STARTS: dict[Any, float] = {
@@ -87,10 +87,9 @@ def laid_out(roots: Sequence[Expression]) -> Layout:
         Something has no machine code, or there is too much of it.
     """
     found = Layout(ordered(*roots))
-    written = 0
     for node in found.nodes:
         _check(node)
-        written += node.size if is_few(node) else 1
+    written = written_out(found.nodes)
     if written > _WRITTEN:
         raise TraceError(f"{written} elements to be written out, more than {_WRITTEN}")
     readers: dict[Expression, int] = dict.fromkeys(found.nodes, 0)
@@ -118,6 +117,11 @@ def laid_out(roots: Sequence[Expression]) -> Layout:
     if kept > _KEPT:
         raise TraceError(f"{kept >> 20} MiB to be kept of each entry, more than {_KEPT >> 20}")
     return found
+
+
+def written_out(nodes: Iterable[Expression]) -> int:
+    """How many elements are written out: what compiling takes."""
+    return sum(node.size if is_few(node) else 1 for node in nodes)
 
 
 def is_few(node: Expression) -> bool:

@@ -203,3 +203,23 @@ def test_what_has_no_machine_code_says_why(monkeypatch: pytest.MonkeyPatch) -> N
     fast, code = passed("finite", monkeypatch, True)
     assert "family without machine code" in str(code.refused)
     np.testing.assert_allclose(fast.mean("x"), plain.mean("x"), rtol=1e-12)
+
+
+def test_explain_says_what_makes_the_slices(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = bmc.ParticleFilter(500)
+    dbn, seen = growth()
+    assert bmc.explain(dbn, seen, engine=engine, question="filter").effort == ""  # it takes no time
+    monkeypatch.setattr(compiled_step, "_WORTH", 0.0)
+    assert (
+        bmc.explain(dbn, seen, engine=engine, question="filter").effort == "slices as machine code"
+    )
+    assert bmc.explain(dbn, seen, engine=engine, question="smooth").effort == ""
+    dbn, seen = finite()
+    told = bmc.explain(dbn, seen, engine=engine, question="filter").effort
+    assert told == "slices in NumPy: node 'k' is drawn from a family without machine code"
+    stratified = bmc.ParticleFilter(500, resampling="stratified")
+    told = bmc.explain(*growth(), engine=stratified, question="filter").effort
+    assert told == "slices as machine code, but for resampling"
+    guided = bmc.ParticleFilter(500, proposal={"x": lambda y: bmc.Normal(y, 9.0)})
+    told = bmc.explain(*growth(), engine=guided, question="filter").effort
+    assert "proposals are made by plain steps" in told

@@ -186,7 +186,7 @@ def test_what_has_no_machine_code_says_so() -> None:
         compiled([np.linalg.solve(x, np.ones((3, 1))).expression])
     with pytest.raises(TraceError, match="zeta"):
         compiled([special.zeta(2.0, x).expression])
-    many = np.stack([np.sin(x[0, 0] + k) for k in range(7000)]).expression
+    many = np.stack([np.sin(x[0, 0] + k) for k in range(9000)]).expression
     with pytest.raises(TraceError, match="written out"):
         compiled([many])
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc import distributions as d
-from bayesmc.dbn import Row
+from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.smc import Selection
 from bayesmc.engines.slice_steps import SlicePlan
@@ -31,7 +31,7 @@ from bayesmc.expression import (
 )
 from bayesmc.expression.functions import product
 from bayesmc.expression.graph import substituted
-from bayesmc.lowering import SliceKernel, is_available, weight_loops
+from bayesmc.lowering import Kernel, SliceKernel, is_available, weight_loops
 from bayesmc.network import Model
 from bayesmc.network.expressions import Opaque, density, log_density_of, value_of
 from bayesmc.passes.arithmetic import ZERO, add
@@ -67,6 +67,24 @@ def compiled_step(step: FilterStep, steps: int, is_systematic: bool) -> FilterSt
         if is_systematic:
             step.resample = _resampling(step.resample)
     return step
+
+
+def told(step: FilterStep, problem: SeriesProblem, is_systematic: bool) -> str:
+    """What makes the slices of a series, and why nothing faster does; nothing where that is no question."""
+    if not is_available() or _is_short(step, problem.steps):
+        return ""
+    reason = _why_not(step, problem.steps)
+    row = problem.series.row(problem.steps - 1)
+    try:
+        if reason is None and any(seen.mask is not None for seen in row.seen.values()):
+            reason = "nodes that are seen in part are made by plain steps"
+        if reason is None:
+            _Slice(step, row, frozenset(previous for _, previous in step.before), compile=False)
+    except TraceError as error:
+        reason = str(error)
+    if reason is not None:
+        return f"slices in NumPy: {reason}"
+    return "slices as machine code" + ("" if is_systematic else ", but for resampling")
 
 
 class SliceCode:
@@ -153,11 +171,15 @@ class SliceCode:
 def _why_not(step: FilterStep, steps: int) -> str | None:
     if not is_available():
         return "there is no llvmlite"
-    if steps * (_SLICE + _PARTICLE * step.layout.particles) < _WORTH:
+    if _is_short(step, steps):
         return "it takes no time"
     if step.layout.apart or step.injection is not None or type(step.plan) is not SlicePlan:
         return "plates apart, injection and proposals are made by plain steps"
     return "proposals are made by plain steps" if step.plan.guided else None
+
+
+def _is_short(step: FilterStep, steps: int) -> bool:
+    return steps * (_SLICE + _PARTICLE * step.layout.particles) < _WORTH
 
 
 def _resampling(plain: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
@@ -181,7 +203,9 @@ class _Drawn:
 class _Slice:
     """One kind of slice."""
 
-    def __init__(self, step: FilterStep, row: Row, chosen: frozenset[str]) -> None:
+    def __init__(
+        self, step: FilterStep, row: Row, chosen: frozenset[str], compile: bool = True
+    ) -> None:
         self._step = step
         model = step.slices.model(row.t)
         values, log, good, drawn = _expressions(step, model, row)
@@ -189,7 +213,14 @@ class _Slice:
         flagged = elementwise(np.where, good, log, math.nan)
         roots = [*(values[n] for n in self._names), flagged]
         noises = frozenset(_noise(z.name) for z in drawn)
-        self._kernel = SliceKernel(roots, noises, chosen)
+        if not compile:
+            Kernel(roots, noises | chosen, chosen)  # refuses what has no machine code
+            return
+        kept = model.cache.setdefault("compiled slices", {})  # the next series finds it there
+        key = (*roots, noises, chosen)
+        if key not in kept:
+            kept[key] = SliceKernel(roots, noises, chosen)
+        self._kernel: SliceKernel = kept[key]
         self._drawn = drawn
         block = min(step.layout.block, step.layout.particles)
         self._noise = {_noise(z.name): np.empty((block, *z.shape)) for z in drawn}

@@ -14,7 +14,7 @@ from bayesmc.dbn import DynamicBayesNet, Row, SeriesProblem, Slices, read_static
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, answer_so_far
 from bayesmc.engines.particles.auxiliary import GivenStage, PluggedIn
 from bayesmc.engines.particles.belief import ParticleBelief
-from bayesmc.engines.particles.compiled_step import compiled_step
+from bayesmc.engines.particles.compiled_step import compiled_step, told
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.kld import KLD
 from bayesmc.engines.particles.layers import endless
@@ -244,6 +244,10 @@ class ParticleFilter(FilterEngine):
     def describe(self, problem: SeriesProblem) -> dict[str, str]:
         found = described(problem)
         return found | looks_told(self, problem, found)
+
+    def effort(self, problem: SeriesProblem) -> str:
+        step = self._sized(START).step_of(problem.slices, problem.known_static)
+        return told(step, problem, self.resampling == "systematic")
 
     def filter(
         self,
