@@ -92,7 +92,7 @@ CASES: dict[str, tuple[Any, dict[str, Any]]] = {
 @pytest.mark.parametrize("name", CASES)
 def test_answers_are_exact(name: str, metric: Any) -> None:
     net, evidence = CASES[name][0](), CASES[name][1]
-    engine = bmc.HamiltonianMonteCarlo(400, warmup=300, chains=8, metric=metric)
+    engine = bmc.HamiltonianMonteCarlo(1000, warmup=400, chains=8, metric=metric)
     posterior = bmc.infer(net, evidence, engine=engine, rng=3)
     assert assert_matches(posterior, exact(net, evidence), alpha=1e-5)
 
@@ -136,7 +136,7 @@ def test_resumed_as_if_never_stopped() -> None:
 
 
 def test_summaries_and_starts() -> None:
-    engine = bmc.HamiltonianMonteCarlo(400, warmup=200, start={"a": -1.0, "b": 0.3})
+    engine = bmc.HamiltonianMonteCarlo(400, warmup=300, start={"a": -1.0, "b": 0.3})
     kept = bmc.infer(line(), LINE, engine=engine, rng=2)
     summed = bmc.infer(line(), LINE, engine=engine, rng=2, keep="summaries")
     assert summed.divergences is None

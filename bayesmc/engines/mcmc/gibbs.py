@@ -279,7 +279,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     scales_of = [governing(target, block, blankets) for block in blocks]
     governed = {n for scales in scales_of for n in scales}
     closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]
-    joint = trajectories_of(problem, refusals, closed, governed)
+    keys = {n: forms.key(blankets[n]) for n in refusals} if len(refusals) >= FEWEST else {}
+    joint = trajectories_of(problem, refusals, closed, governed, keys) if refusals else []
     moved = {n for k in joint for n in k.names}
     kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
     kernels += [*joint, *_numbers(target, blankets, forms, [n for n in refusals if n not in moved])]

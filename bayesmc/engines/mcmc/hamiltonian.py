@@ -151,7 +151,8 @@ class HamiltonianMonteCarlo(ChainEngine):
         plan = plan_of(problem, only=finite)
         if not moving:
             return plan
-        calls = _LEAVES * ((self.draws or 0) * self.thinning + (self.warmup or 0))
+        # the same code however many draws are asked for, so that a run goes on to the last digit
+        calls = _LEAVES * (self.warmup or 0)
         density = in_machine_code(density_of(problem, moving), calls, self.chains or 1)
         kernel = Hamiltonian(
             density,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections import Counter
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 
 from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.hamiltonian import Hamiltonian
@@ -15,6 +16,8 @@ from bayesmc.structure.unconstrained import unconstrained_density
 
 #: numbers up to which their covariance is learnt, and not their scales alone
 _DENSE = 64
+#: numbers of like nodes from which on slices move them as one (60 slices of a volatility: 5 times better)
+_CROWD = 32
 #: numbers of one vector, at most
 _MOST = 4096
 
@@ -49,12 +52,15 @@ def trajectories_of(
     names: Iterable[str],
     closed: Collection[str] = (),
     alone: Collection[str] = (),
+    keys: Mapping[str, Hashable] | None = None,
 ) -> list[Hamiltonian]:
     """Kernels of nodes without a closed form that move better together than one at a time.
 
     That is so up to so many numbers that their covariance is learnt. Of more that share terms, the larger
     nodes are left to slices, which move all elements of a plate at once; vectors, which slices move number
-    by number, are not.
+    by number, are not. Many like nodes (slices of a template) count as one plate, and keep what shares terms
+    with them. A node whose own density is another for each state of a hidden finite one is left out: no one
+    length of a step suits them all.
 
     Parameters
     ----------
@@ -65,10 +71,25 @@ def trajectories_of(
         hardly move.
     alone : collection of str
         Nodes that others move in their own way.
+    keys : mapping, optional
+        What is equal for like nodes, which slices move as one (``structure.stacked.Forms.key``).
+
+    Examples
+    --------
+    >>> import bayesmc as bmc
+    >>> from bayesmc.engines.mcmc.jointly import trajectories_of
+    >>> from bayesmc.network import pose
+    >>> net = bmc.BayesNet()
+    >>> net.add("a", bmc.Laplace(0.0, 1.0))
+    >>> net.add("b", bmc.Laplace(0.0, 1.0))
+    >>> net.add("y", lambda a, b: bmc.Normal(a * b, 1.0))
+    >>> [kernel.names for kernel in trajectories_of(pose(net, {"y": 1.0}), ["a", "b"])]
+    [('a', 'b')]
     """
     target = target_of(problem)
     kernels = []
-    for group in _groups(target, [n for n in names if n not in alone]):
+    fit = [n for n in _few(target, names, keys or {}) if n not in alone]
+    for group in _groups(target, [n for n in fit if not _is_switched(target, n)]):
         joined = _joined(target, group, [n for n in closed if n not in alone])
         density = _density_or_none(problem, joined) or _density_or_none(problem, group)
         if density is not None:
@@ -86,6 +107,28 @@ def _density_or_none(problem: Problem, names: tuple[str, ...]) -> UnconstrainedD
         return density_of(problem, names)
     except UnsupportedError:
         return None
+
+
+def _few(target: Target, names: Iterable[str], keys: Mapping[str, Hashable]) -> list[str]:
+    """Nodes without those of which there are many alike, and what shares terms with these."""
+    names = list(names)
+    numbers: Counter[Hashable] = Counter()
+    for name, key in keys.items():
+        numbers[key] += _size(target, [name])
+    many = {
+        n
+        for n, key in keys.items()
+        if key is not None and max(_CROWD, _size(target, [n])) < numbers[key]
+    }
+    near = {id(t) for t in target.terms_of(many)} if many else set()
+    return [n for n in names if not any(id(t) in near for t in target.terms_of((n,)))]
+
+
+def _is_switched(target: Target, name: str) -> bool:
+    """Whether hidden finite nodes enter its own density."""
+    own = target.terms.get(name)
+    above = () if own is None else target.hidden_above(own)
+    return any(target.model[n].domain is not None for n in above)
 
 
 def _groups(target: Target, names: Sequence[str]) -> list[tuple[str, ...]]:
