@@ -153,6 +153,7 @@ class ChainEngine(Engine):
         free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
         names = tuple(keep) if listed else tuple(free)
         lengths = self.lengths(problem, keep)
+        expected = lengths.warmup, lengths.chains  # the same where it is resumed
         if resume is not None:
             lengths = self._refuse_another(resume, problem, names, summed, lengths)
         ready = self
@@ -166,6 +167,8 @@ class ChainEngine(Engine):
             sampler.given = given  # type: ignore[attr-defined]
         if lengths.superchains:
             sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
+        for kernel in getattr(sampler, "kernels", ()):
+            kernel.expect(*expected)
         tied = self.tied(problem)
         if tied:
             _warn_of_ties(type(self).__name__, tied)

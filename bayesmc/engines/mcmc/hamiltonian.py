@@ -16,12 +16,13 @@ from bayesmc.engines.mcmc.gibbs import Plan, plan_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import UnsupportedError
-from bayesmc.kernels.hamiltonian import Hamiltonian
+from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.target import Target, target_of
 from bayesmc.structure.unconstrained import unconstrained_density
@@ -133,6 +134,12 @@ class HamiltonianMonteCarlo(ChainEngine):
 
     def table(self, problem: Problem) -> list[Treatment]:
         return self._plan(problem).table()
+
+    def effort(self, problem: Problem) -> str:
+        lengths = self.lengths(problem)
+        density = density_of(problem, continuous(target_of(problem)))
+        told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
+        return "; ".join(filter(None, [super().effort(problem), told]))
 
     def tied(self, problem: Problem) -> Sequence[str]:
         return self._plan(problem).constraints
