@@ -27,6 +27,7 @@ from bayesmc.engines.weighted.likelihood_weighting import LikelihoodWeighting
 from bayesmc.errors import BayesmcError
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.factor_slice import FactorSlice
+from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.random_walk import AdaptiveWalk
 from bayesmc.kernels.redrawn import Redrawn
 from bayesmc.kernels.rescaled import Rescaled
@@ -34,6 +35,7 @@ from bayesmc.kernels.slice import Slice
 from bayesmc.network import Model, Problem
 from bayesmc.results import DrawsPosterior
 from bayesmc.shapes import Shape
+from bayesmc.structure.target import target_of
 
 #: numbers in the chain up to which engines are weighed
 _NUMBERS = 12
@@ -49,6 +51,8 @@ _WEIGHTED, _ENOUGH = 2000, 0.1
 _WITHIN = 10
 _ENOUGH_WEIGHTED = "weighted draws are good enough{}, so that no chains were tried"
 _EACH_STATE = " within each joint state of the finite nodes"
+#: evaluations of a density that its gradient takes about as long as
+_GRADIENT = 3.0
 #: how much better than Gibbs, which needs no tuning, another engine must be
 _BETTER = 1.5
 #: the pilots' own seed
@@ -133,9 +137,9 @@ def _is_small(problem: Problem, plan: Plan) -> bool:
     """Whether Gibbs moves a few numbers by slices or walks, and no others, perhaps under finite nodes."""
     model = problem.model
     names = {n for kernel in plan.kernels for n in kernel.names}
-    slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk)) for k in plan.kernels)
+    slow = any(isinstance(k, (Slice, FactorSlice, AdaptiveWalk, Hamiltonian)) for k in plan.kernels)
     finite = {n for n in names if model[n].domain is not None}
-    known = (Slice, FactorSlice, AdaptiveWalk, BlockWalk, Redrawn, Rescaled)
+    known = (Slice, FactorSlice, AdaptiveWalk, BlockWalk, Hamiltonian, Redrawn, Rescaled)
     if not slow or any(
         not isinstance(k, known) and not finite >= set(k.names) for k in plan.kernels
     ):
@@ -253,7 +257,20 @@ def _run(engine: Any, counted: Problem) -> tuple[DrawsPosterior, float]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         posterior = engine.run(counted, np.random.SeedSequence(_SEED), "draws", False, None)
-    return posterior, max(counted.model.work.units - before, 1.0)
+    units = counted.model.work.units - before + _along_trajectories(posterior)
+    return posterior, max(units, 1.0)
+
+
+def _along_trajectories(posterior: DrawsPosterior) -> float:
+    """The work of gradients, which no model sees: each as much as some evaluations of all densities."""
+    point = getattr(posterior, "checkpoint", None)
+    if point is None or posterior.problem is None:
+        return 0.0
+    work = sum(m["work"] for m in point.state.get("memory", ()) if "work" in m)
+    calls, points = np.broadcast_to(work, 2)
+    target = target_of(posterior.problem)
+    numbers = sum(math.prod(term.shape) for term in target.terms.values())
+    return _GRADIENT * float(calls * len(target.terms) + points * numbers / _ELEMENTS)
 
 
 def _counted(problem: Problem) -> Problem:

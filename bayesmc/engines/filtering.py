@@ -1,8 +1,7 @@
 """What engines over time share: refusals, the calls, and the one loop of those that go slice by slice.
 
-A *sequential* engine turns the state of one slice and the row of the next into the state of that slice;
-``pass_slices`` is the loop, and ``start`` and ``step`` are the same moves taken one by one. Engines that know
-all slices to be alike (finite, linear) work through them at their own speed instead.
+A *sequential* engine turns the state of one slice and the row of the next into the state of that slice, in
+the loop ``pass_slices`` or by ``start`` and ``step``. Where all slices are alike, engines go their own way.
 """
 
 from __future__ import annotations

@@ -71,7 +71,14 @@ def _isin(element: Any, test_elements: Any, *, invert: bool = False) -> Any:
     return np.logical_not(found) if invert else found
 
 
-def _diff(a: Any, n: int = 1, axis: int = -1) -> Any:
+def _diff(a: Any, n: int = 1, axis: int = -1, prepend: Any = None, append: Any = None) -> Any:
+    if prepend is not None or append is not None:
+        one = tuple(1 if k == axis % a.ndim else size for k, size in enumerate(a.shape))
+        before, after = (
+            [np.broadcast_to(end, one) if np.ndim(end) == 0 else end] if end is not None else []
+            for end in (prepend, append)
+        )
+        a = np.concatenate([*before, a, *after], axis=axis)
     for _ in range(n):
         at = np.arange(a.shape[axis] - 1)
         a = np.take(a, at + 1, axis=axis) - np.take(a, at, axis=axis)

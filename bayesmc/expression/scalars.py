@@ -104,7 +104,7 @@ class SmallProgram:
                 batch = value.shape[: value.ndim - rank]
             given.append(value.ravel().tolist())
         try:
-            flat = np.array(function(*given))
+            flat = np.array(function(*[[rows] for rows in given]))
         except (ArithmeticError, ValueError):
             return self._arrays(values)
         return [flat[part].reshape(batch + shape) for part, shape in self._parts]
@@ -114,21 +114,20 @@ class SmallProgram:
     ) -> list[np.ndarray]:
         """The same for several entries, one after the other."""
         batch: Shape = ()
-        given = []
+        count, given = 1, []
         for name, rank, size in self._leaves:
             value = values[name]
             lead = value.shape[: value.ndim - rank]
-            if math.prod(lead) > most or (lead and batch and lead != batch):
-                return self._arrays(values)
-            batch = lead or batch
-            given.append(value.reshape(math.prod(lead), size).tolist())
-        count = math.prod(batch)
+            if lead and lead != batch:
+                if batch or (count := math.prod(lead)) > most:
+                    return self._arrays(values)
+                batch = lead
+            given.append(value.reshape(-1, size).tolist() if size else [[]] * math.prod(lead))
         given = [rows if len(rows) == count else rows * count for rows in given]
         try:
-            flat = np.array([function(*row) for row in zip(*given, strict=True)])
+            flat = np.array(function(*given)).reshape(count, -1)
         except (ArithmeticError, ValueError):
             return self._arrays(values)
-        flat = flat.reshape(count, -1)
         return [flat[:, part].reshape(batch + shape) for part, shape in self._parts]
 
 
@@ -182,7 +181,7 @@ def _operation(function: Any, row: Sequence[str], lines: _Lines) -> str:
 def _compiled(
     roots: tuple[Expression, ...], leaves: tuple[tuple[str, int, int], ...]
 ) -> tuple[Callable[..., Any], int]:
-    """A function of the leaves' elements, one list each, and how many operations it takes."""
+    """A function of the leaves' elements (a list of each leaf's for every entry), and its operations."""
     lines = _Lines()
     names = {name: f"v{k}" for k, (name, _, _) in enumerate(leaves)}
     made: dict[Expression, np.ndarray] = {}
@@ -191,12 +190,14 @@ def _compiled(
     results = [x for r in roots for x in made[r].ravel()]
     needed = lines.needed(results)
     heads = [
-        f"{', '.join(f'{v}_{i}' for i in range(size))}, = {v}"
+        f"({''.join(f'{v}_{i}, ' for i in range(size))})" if size else v
         for (_, _, size), v in zip(leaves, names.values(), strict=True)
-        if size
     ]
-    text = f"def function({', '.join(names.values())}):\n    "
-    text += "\n    ".join([*heads, *needed, f"return ({', '.join(results)},)"])
+    rows = ", ".join(names.values())
+    text = f"def function({rows}):\n    found = []\n"
+    text += f"    for {', '.join(heads)}, in zip({rows}, strict=True):\n        "
+    text += "\n        ".join([*needed, f"found += ({''.join(f'{x}, ' for x in results)})"])
+    text += "\n    return found"
     scope: dict[str, Any] = {
         "log": math.log, "log1p": math.log1p, "exp": math.exp, "sqrt": math.sqrt, "pow": math.pow,
         "lgamma": math.lgamma, "inf": math.inf, "nan": math.nan,

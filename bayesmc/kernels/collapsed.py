@@ -25,9 +25,11 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.target import Target, Values
 
-#: sweeps of the warmup that are watched
-_WATCH_FROM, _WATCH_TO = 40, 240
-#: sweeps of the watch without which nothing is called slow
+#: first sweep of the warmup that is watched, and how many are, most and least: chains pool what they show
+_WATCH_FROM, _WATCHED, _FEWEST = 40, 200, 30
+#: draws of all chains that tell enough
+_DRAWS = 800
+#: sweeps of the watch without which nothing is called slow, where chains are few
 _ENOUGH = 50
 #: lags, and the autocorrelations there that count as slow
 _SLOW = ((1, 0.6), (10, 0.1))
@@ -93,6 +95,7 @@ class CollapsedBlock(Kernel):
     def start(self, values: Values, chains: int) -> Memory:
         return {
             "sweep": 0,
+            "until": _WATCH_FROM + min(_WATCHED, max(_DRAWS // chains, _FEWEST)),
             "slow": dict.fromkeys(self.blankets, False),
             "width": dict.fromkeys(self.blankets, 1.0),
             "step": dict.fromkeys(self.blankets, 0.0),
@@ -104,7 +107,7 @@ class CollapsedBlock(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
         state = values
-        watching = warmup and memory["sweep"] < _WATCH_TO
+        watching = warmup and memory["sweep"] < memory["until"]
         slow = [n for n in self.blankets if memory["slow"][n] and not watching]
         # those that are drawn given the block come first: after a collapsed move it must be drawn anew
         for name in self.alone:
@@ -180,18 +183,19 @@ class CollapsedBlock(Kernel):
         """Notes where the nodes are; at the end of the watch, which of them are slow."""
         sweep = memory["sweep"] + 1
         memory = {**memory, "sweep": sweep}
-        if not _WATCH_FROM <= sweep <= _WATCH_TO:
+        if not _WATCH_FROM <= sweep <= memory["until"]:
             return memory
         series = {}
         for name, seen in memory["series"].items():
             series[name] = np.vstack([seen, self.transforms[name].unconstrain(state[name])])
         memory = {**memory, "series": series}
-        return memory if sweep < _WATCH_TO else self._decided(memory)
+        return memory if sweep < memory["until"] else self._decided(memory)
 
     def _decided(self, memory: Memory) -> Memory:
         """Which nodes are slow, if enough was seen of them to tell."""
         series = memory["series"]
-        if min(len(seen) for seen in series.values()) < _ENOUGH:
+        enough = min(_ENOUGH, memory["until"] - _WATCH_FROM)
+        if min(len(seen) for seen in series.values()) < enough:
             return memory
         slow = {
             name: any(_autocorrelation(seen, lag) > limit for lag, limit in _SLOW)
@@ -234,18 +238,10 @@ def _scope(
         terms.update({c.term.name: c.term for c in blanket.children})
         if blanket.own is not None:
             terms[blanket.own.name] = blanket.own
-    found: set[str] = set()
-    todo = [n for t in terms.values() for n in t.scope]
-    while todo:
-        name = todo.pop()
-        if name in found or name in target.known:
-            continue
-        found.add(name)
-        if name in target.links:
-            todo += target.model[name].parents
-    hidden = (*target.chain, *target.links)
-    found -= {*block.names, *block.path}  # these are put at zero
-    return tuple(n for n in hidden if n in found)
+    read = (n for t in terms.values() for n in t.scope)
+    found = set(target.model.above(read, lambda n: n in target.links and n not in target.known))
+    found -= {*block.names, *block.path, *target.known}  # the block's are put at zero
+    return tuple(n for n in (*target.chain, *target.links) if n in found)
 
 
 def _alike(target: Target, names: Sequence[str]) -> tuple[list[str], ...]:

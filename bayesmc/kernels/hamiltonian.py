@@ -26,6 +26,8 @@ from bayesmc.structure.target import Values
 
 #: gradients that a trajectory takes at least, on the whole
 GRADIENTS = 8
+#: doublings of a trajectory before a metric is learnt, at most: long ones tell no more
+_EARLY = 5
 
 
 class Density(Protocol):
@@ -132,6 +134,7 @@ class Hamiltonian(Kernel):
             "step": self.step_size.start(np.zeros(chains)),
             "sweep": 0,
             "windows": 0,
+            "work": np.zeros(2),
             "accepted": np.zeros(chains),
             "moves": 0,
             "divergent": nobody,
@@ -150,10 +153,13 @@ class Hamiltonian(Kernel):
             memory = self._first_steps(gradient, place, memory, rng, pooled=False)
         scale = Scale(memory["metric"]["root"])
         length = np.exp(memory["step"]["log"])
-        found = transition(gradient, place, length, scale, rng, self.max_depth)
+        early = warmup and memory["windows"] < min(2, len(self.ends))
+        depth = min(self.max_depth, _EARLY) if early else self.max_depth
+        found = transition(gradient, place, length, scale, rng, depth)
         place = found.place
         new = self.density.constrain(place.u, values)
         kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
+        kept["work"] = memory["work"] + np.array([found.calls, found.points])
         if warmup:
             return new, self._learnt(gradient, place, kept, found.acceptance, rng)
         kept["divergences"] = kept["divergences"] + found.divergent

@@ -74,6 +74,8 @@ class Transition:
         Doublings of the tree.
     energy : ndarray
         Of the first point of the trajectory.
+    calls, points : int
+        Evaluations of the gradient, and points that it was evaluated at.
     """
 
     place: Place
@@ -81,6 +83,8 @@ class Transition:
     divergent: np.ndarray
     depth: np.ndarray
     energy: np.ndarray
+    calls: int
+    points: int
 
 
 def transition(
@@ -199,6 +203,7 @@ class _Forest:
         self.acceptance, self.leaves = np.zeros(chains), np.zeros(chains)
         self.depth = np.zeros(chains, dtype=int)
         self.divergent = np.zeros(chains, dtype=bool)
+        self.calls = 0
         momenta = rng.standard_normal(place.u.shape)
         self.energy = energy_of(momenta, place.log)
         ends = np.stack([place.u, momenta, scale.pulled(place.slope)], axis=1)
@@ -214,7 +219,10 @@ class _Forest:
     def found(self) -> Transition:
         place = Place(self.u, self.log, self.slope)
         acceptance = self.acceptance / np.maximum(self.leaves, 1.0)
-        return Transition(place, acceptance, self.divergent, self.depth, self.energy)
+        points = int(self.leaves.sum())
+        return Transition(
+            place, acceptance, self.divergent, self.depth, self.energy, self.calls, points
+        )
 
     def double(self, depth: int) -> bool:
         """Double all trees, each forwards or backwards in time; whether any goes on."""
@@ -282,6 +290,7 @@ class _Forest:
         u, momenta, pull, log, slope = leapfrog(
             self.gradient, going["end"], going["momenta"], going["pull"], going["half"], self.scale, rows
         )  # fmt: skip
+        self.calls += 1
         going["end"], going["momenta"], going["pull"] = u, momenta, pull
         weight = going["energy"] - energy_of(momenta, log)
         self.acceptance[rows] += np.exp(np.minimum(weight, 0.0))

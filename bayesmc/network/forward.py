@@ -260,7 +260,7 @@ def _advised(
             f"{f' ({known})' if known else ''}, so that none of them is to blame: mend the function, or the "
             "values that it reads",
         )
-    elif depends_on_numbers(node.links, model.nodes):
+    elif depends_on_numbers(model, node):
         error.args = (
             f"{error}; draws of its parents may be out of range: give those a prior that cannot be "
             "(HalfNormal, LogNormal, Truncated), or use Gibbs or MetropolisHastings, which reject such "

@@ -13,7 +13,7 @@ from bayesmc.network.declaring import ModelStore, unknown
 from bayesmc.network.evidence import plate_sizes, store
 from bayesmc.network.labels import by_label
 from bayesmc.network.model import CompiledNode, Model
-from bayesmc.network.node import Declaration, ancestors
+from bayesmc.network.node import Declaration
 from bayesmc.shapes import owned
 
 
@@ -40,7 +40,7 @@ def _fixed(name: str, node: CompiledNode, value: Any, model: Model) -> Declarati
     """The declaration of ``node`` fixed at ``value``; what it cannot be is refused."""
     if node.kind == "input":
         raise EvidenceError(f"do({name}=...): {name!r} is an input; pass it with inputs=")
-    above = ancestors({n: c.parents for n, c in model.nodes.items()}, [name])
+    above = model.above([name], lambda _: True)
     has_inputs = any(model.nodes[n].kind == "input" for n in above)
     value = by_label(f"do({name}=...)", value, node.plates, model.labels)
     node = _widened(node, value, has_inputs)

@@ -9,7 +9,7 @@ the values themselves for all others, shape ``(*batch, *plates, *event)``.
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -142,6 +142,16 @@ class Model:
     def parents(self, name: str) -> tuple[str, ...]:
         """The nodes that a node's function, or a potential's, receives."""
         return self.nodes[name].parents if name in self.nodes else self.potentials[name][0].parents
+
+    def above(self, names: Iterable[str], passes: Callable[[str], bool]) -> list[str]:
+        """Some nodes, the parents of those that pass, the parents of these that do, and so on."""
+        found = list(dict.fromkeys(names))
+        met = set(found)
+        for name in found:  # which grows
+            new = [p for p in self.parents(name) if p not in met] if passes(name) else ()
+            met.update(new)
+            found += dict.fromkeys(new)
+        return found
 
     def without_functions(self) -> Model:
         """The same model for results that are stored: it describes nodes but evaluates none."""

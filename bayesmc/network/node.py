@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import graphlib
 import inspect
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Hashable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 from types import FunctionType
 from typing import Any
@@ -306,18 +306,6 @@ def topological_order(parents: Mapping[str, Sequence[str]]) -> list[str]:
         "(for time, use a dynamic net with _prev arguments)",
         path,
     )
-
-
-def ancestors(parents: Mapping[str, Sequence[str]], names: Iterable[str]) -> set[str]:
-    """``names`` and everything above them."""
-    found: set[str] = set()
-    todo = list(names)
-    while todo:
-        name = todo.pop()
-        if name not in found:
-            found.add(name)
-            todo.extend(parents[name])
-    return found
 
 
 def observed_links(nodes: Any, evidence: Mapping[str, Any]) -> dict[str, int]:

@@ -7,7 +7,7 @@ all of them is the model's fault, and the caller raises it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,6 @@ from bayesmc.distributions import Distribution
 from bayesmc.distributions.support import Support, is_half_line
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import BayesmcError, UnsupportedError
-from bayesmc.network.calling import Aligner
 from bayesmc.network.model import CompiledNode, Model, invalid_error
 from bayesmc.shapes import Shape, broadcasts_to, read_only
 
@@ -26,9 +25,6 @@ _SPREADS = (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3)
 _DRAWS = 64
 #: how often the nodes of one net are drawn anew, at most
 _MOST = 16
-
-Links = tuple[tuple[str, Aligner], ...]
-
 
 #: the most that draws of a half line go from the middle
 _FROM_ZERO = 0.9
@@ -42,7 +38,7 @@ def made_possible(model: Model, node: CompiledNode, result: Any, batch: Shape) -
     Configurations of finite parents that are out of range stay the model's fault.
     """
     plates = node.plate_shape
-    if not batch or not depends_on_numbers(node.links, model.nodes):
+    if not batch or not depends_on_numbers(model, node):
         return False
     if isinstance(result, Distribution) and not broadcasts_to(result.batch_shape, batch + plates):
         return False
@@ -58,20 +54,12 @@ def made_possible(model: Model, node: CompiledNode, result: Any, batch: Shape) -
     return _drawn_anew(model, node, result, batch, np.random.default_rng([20, anew]))
 
 
-def depends_on_numbers(links: Links, nodes: Mapping[str, CompiledNode]) -> bool:
-    """Whether a function depends, through deterministic nodes as well, on a node that is not finite."""
-    todo, reached = [name for name, _ in links], set()
-    while todo:
-        name = todo.pop()
-        if name in reached:
-            continue
-        reached.add(name)
-        node = nodes[name]
-        if node.is_stochastic and node.domain is None:
-            return True
-        if node.kind == "deterministic":
-            todo += node.parents
-    return False
+def depends_on_numbers(model: Model, node: CompiledNode) -> bool:
+    """Whether a node depends, through deterministic ones as well, on one that is not finite."""
+    parents: Iterable[str] = node.parents
+    if any(model[name].kind == "deterministic" for name in parents):
+        parents = model.above(parents, lambda name: model[name].kind == "deterministic")
+    return any(model[name].is_stochastic and model[name].domain is None for name in parents)
 
 
 def wrong_elements(result: Any, batch: Shape, plates: Shape) -> np.ndarray:

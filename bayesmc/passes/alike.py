@@ -28,7 +28,7 @@ def sums_of(expressions: Sequence[Expression]) -> list[Expression]:
     >>> made = [elementwise(np.multiply, leaf(f"x{t}", ()), float(t)) for t in range(5)]
     >>> sums = sums_of(made)
     >>> len(sums), evaluate(sums, {f"x{t}": np.array(10.0**t) for t in range(5)})
-    (1, [array(43210.)])
+    (1, [np.float64(43210.0)])
     """
     groups: dict[Hashable, list[tuple[Expression, Template]]] = {}
     for expression in expressions:

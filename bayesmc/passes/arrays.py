@@ -14,6 +14,7 @@ from scipy import special
 from bayesmc.expression import Elementwise, Expression, elementwise, ordered
 from bayesmc.passes.contractions import contracted
 from bayesmc.passes.guarded import guarded
+from bayesmc.passes.scaling import rescaled
 
 #: elements of an entry from which on several functions of NumPy are quicker than one of SciPy
 _MANY = 32
@@ -33,7 +34,7 @@ def for_arrays(roots: Iterable[Expression]) -> list[Expression]:
     >>> made, float(evaluate(made, {"x": np.full(100, -800.0)})[0][0])
     ([<Elementwise log_expit_by_exp (100,)>], -800.0)
     """
-    return contracted(guarded(_quick(list(roots))))
+    return contracted(rescaled(guarded(_quick(list(roots)))))
 
 
 def expit_by_exp(x: Any) -> np.ndarray:

@@ -87,7 +87,11 @@ def _is(node: Expression, function: Any) -> bool:
 
 
 def _made(function: Any, operands: list[Expression]) -> Expression:
-    """A function of operands that are stable themselves."""
+    """A function of operands that are stable themselves; of what is repeated, it is taken once."""
+    first = operands[0]
+    if len(operands) == 1 and isinstance(first, Pick) and len(first.operands) == 1:
+        if first.size >= first.operands[0].size:
+            return pick([_made(function, list(first.operands))], first.positions)
     rule = _RULES.get(function)
     found = None if rule is None else rule(*operands)
     return tidy(function, *operands) if found is None else found
@@ -158,6 +162,9 @@ def _subtract(a: Expression, b: Expression) -> Expression | None:
 def _divide(a: Expression, b: Expression) -> Expression | None:
     if _is(b, np.exp):
         return multiply(a, elementwise(np.exp, _negative(b.operands[0])))
+    if isinstance(b, Pick) and len(b.operands) == 1 and _is(b.operands[0], np.exp):
+        inner = elementwise(np.exp, _negative(b.operands[0].operands[0]))
+        return multiply(a, pick([inner], b.positions))
     return None
 
 

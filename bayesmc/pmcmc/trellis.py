@@ -190,9 +190,7 @@ class Tolerant:
             dist, batch = self.model.evaluate(self.node.name, state.values)
             if dist.invalid is None or dist.problem is None:
                 raise
-            if not dist.problem.is_overflow and not depends_on_numbers(
-                self.node.links, self.model.nodes
-            ):
+            if not dist.problem.is_overflow and not depends_on_numbers(self.model, self.node):
                 raise
             full = np.broadcast_to(dist.invalid, batch + self.node.plate_shape)
             state.weigh(summed(np.where(full, -np.inf, 0.0), self.node, self.apart))

@@ -62,14 +62,9 @@ class _Chains(Posterior):
 
     def _renewed(self, nodes: Iterable[str]) -> dict[str, np.ndarray]:
         """Renewals of some nodes, or of those that they are computed from."""
-        found, todo = {}, list(nodes)
-        while todo:
-            name = todo.pop()
-            if name in self.renewals:
-                found[name] = self.renewals[name]
-            elif self.model[name].kind == "deterministic":
-                todo += self.model[name].parents
-        return found
+        model, own = self.model, self.renewals
+        above = model.above(nodes, lambda n: n not in own and model[n].kind == "deterministic")
+        return {n: own[n] for n in above if n in own}
 
     def _title(self) -> str:
         chains, draws = self._chains_and_draws

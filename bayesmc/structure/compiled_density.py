@@ -12,6 +12,8 @@ import numpy as np
 from bayesmc.errors import TraceError
 from bayesmc.expression import Program
 from bayesmc.lowering import Compiled, Kernel, held_against_numpy, is_available, is_worth_it
+from bayesmc.passes.arrays import for_arrays
+from bayesmc.passes.guarded import guarded
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
 
 #: how far the free numbers of the points where it is compared are from zero
@@ -76,11 +78,11 @@ class CompiledDensity(UnconstrainedDensity):
     @property
     def told(self) -> str:
         """What will compute the gradient, where there is something to say; nothing is compiled to know."""
-        roots = [self.root, self.slopes]
+        roots = guarded([self.root, self.slopes])
         if not is_available() or not is_worth_it(roots, self.calls, self.chains):
             return ""
         try:
-            Kernel(roots, self.root.leaves | self.slopes.leaves)
+            Kernel(roots, frozenset(self.root.leaves | self.slopes.leaves))
         except TraceError as error:
             return f"gradients in NumPy: {error}"
         return "gradients in machine code"
@@ -118,13 +120,13 @@ class CompiledDensity(UnconstrainedDensity):
 
     @cached_property
     def _made(self) -> tuple[Any, str]:
-        roots = [self.root, self.slopes]
+        roots = guarded([self.root, self.slopes])
         if not is_worth_it(roots, self.calls, self.chains):
-            return Program(roots), f"NumPy: {self.calls} gradients take no time"
+            return Program(for_arrays(roots)), f"NumPy: {self.calls} gradients take no time"
         try:
             return held_against_numpy(roots, self._points(), self.debug), "machine code"
         except TraceError as error:
-            return Program(roots), f"NumPy: {error}"
+            return Program(for_arrays(roots)), f"NumPy: {error}"
 
     def _points(self) -> Iterator[dict[str, np.ndarray]]:
         """Values of all leaves, in a batch and alone."""

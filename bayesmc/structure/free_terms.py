@@ -8,16 +8,18 @@ import numpy as np
 
 from bayesmc.errors import TraceError, UnsupportedError
 from bayesmc.expression import (
+    Call,
     Elementwise,
     Expression,
     Family,
     broadcast,
     expressions_of,
     mapped,
+    ordered,
     pick,
 )
 from bayesmc.expression.graph import cast, substituted
-from bayesmc.network.expressions import Opaque, log_density_of, stored_leaf
+from bayesmc.network.expressions import NodeCall, Opaque, density, log_density_of, stored_leaf
 from bayesmc.passes.arithmetic import is_all, tidy
 from bayesmc.passes.log_density import has_own_form
 from bayesmc.passes.logarithms import stable
@@ -52,6 +54,7 @@ def elements(
     whole = term.expression
     if whole is None:
         raise UnsupportedError(_why_not(term))
+    _refuse_opaque(term, whole, above)
     given = {**known_values(target, [whole, *expressions_of(term.read.result)]), **above}  # type: ignore[union-attr]
     log = broadcast(substituted(whole, given), term.shape)
     if not term.is_potential:
@@ -75,6 +78,21 @@ def _why_not(term: Term) -> str:
     except TraceError as error:
         return f"{kind} {term.name!r}: {error}"
     return f"{kind} {term.name!r} has no closed form"
+
+
+def _refuse_opaque(term: Term, whole: Expression, above: Mapping[str, Expression]) -> None:
+    """Refuse computed nodes that are called as they are, where they read what moves."""
+    for node in ordered(whole):
+        if (
+            isinstance(node, Call)
+            and isinstance(node.call, NodeCall)
+            and node.leaves & above.keys()
+        ):
+            read = density(term.model, node.call.name)
+            why = read.reason if isinstance(read, Opaque) else "it is called as it is"
+            raise UnsupportedError(
+                f"node {term.name!r} reads node {node.call.name!r}, which is not followed: {why}"
+            )
 
 
 def _of_support(log: Expression) -> Expression:

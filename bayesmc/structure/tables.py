@@ -246,11 +246,4 @@ def _along(axis: int, card: int, ndim: int, plates: Shape) -> np.ndarray:
 
 def _between(model: Model, names: Sequence[str], known: Mapping[str, Any]) -> set[str]:
     """Deterministic nodes to compute on the way from known values to ``names``."""
-    needed: set[str] = set()
-    todo = [n for n in names if n not in known]
-    while todo:
-        name = todo.pop()
-        if name not in needed:
-            needed.add(name)
-            todo += [p for p in model[name].parents if p not in known]
-    return needed
+    return {n for n in model.above(names, lambda n: n not in known) if n not in known}

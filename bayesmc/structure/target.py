@@ -85,7 +85,7 @@ class Term:
     @cached_property
     def rejects(self) -> bool:
         """Whether its parameters depend on numbers: points where they are out of range are rejected."""
-        return depends_on_numbers(self.model[self.name].links, self.model.nodes)
+        return depends_on_numbers(self.model, self.model[self.name])
 
     def distribution(self, values: Mapping[str, np.ndarray]) -> tuple[Distribution, Shape]:
         """A node's distribution given its parents, and the batch shape of those."""
@@ -192,15 +192,12 @@ class Target:
 
     def hidden_above(self, term: Term) -> tuple[str, ...]:
         """Nodes of the chain that a term's function varies with, through deterministic ones, too."""
-        todo, reached = list(term.parents), set()
-        while todo:
-            name = todo.pop()
-            if name in reached or self.is_known(name):
-                continue
-            reached.add(name)
-            if not self.model[name].is_stochastic:
-                todo += self.model[name].parents
-        return self._in_order(n for n in reached if self.model[n].is_stochastic)
+        model = self.model
+        reached = model.above(
+            term.parents, lambda n: not (model[n].is_stochastic or self.is_known(n))
+        )
+        hidden = (n for n in reached if model[n].is_stochastic and not self.is_known(n))
+        return self._in_order(hidden)
 
     def free_elements(self, name: str) -> np.ndarray | None:
         """Flat plate elements of a chain node that are hidden; None where all are."""

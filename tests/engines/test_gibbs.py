@@ -96,8 +96,42 @@ def test_the_table_of_a_mixture(capsys: pytest.CaptureFixture) -> None:
 def test_every_kind_of_kernel_is_found() -> None:
     found = kernels(*everything())
     assert found["p"] == "conjugate" and found["coin"] == "enumerate + redrawn"
-    assert found["shape"] == found["slope"] == "factor slice"
-    assert found["hidden"] == "slice" and "walk" in found["simplex"]
+    assert found["shape"] == found["slope"] == found["simplex"] == "Hamiltonian"
+    assert found["hidden"] == "slice"
+
+
+def test_kernels_of_what_has_no_derivative() -> None:
+    """A function that is not followed leaves numbers to slices, and simplices to walks."""
+    net = bmc.BayesNet()
+    net.add("a", bmc.Laplace(0.0, 1.0))
+    net.add("b", bmc.Laplace(0.0, 1.0))
+    net.add("w", bmc.Dirichlet([1.0, 2.0, 3.0]))
+
+    def seen(a: float, b: float, w: np.ndarray) -> bmc.Normal:
+        return bmc.Normal(a + b if a > 0 else w[0], 1.0)
+
+    net.add("y", seen, vectorize=True)
+    found = kernels(net, {"y": 0.3})
+    assert found["a"].startswith("factor slice") and found["b"].startswith("factor slice")
+    assert "walk" in found["w"]
+
+
+def test_few_numbers_move_jointly_and_many_by_slices() -> None:
+    """Whatever shares terms joins while the covariance of all is learnt; a plate of more does not."""
+    net = bmc.BayesNet(plates={"group": 100})
+    for name in ("low", "high", "rate"):
+        net.add(name, bmc.Laplace(0.0, 1.0))
+    net.add("effect", bmc.StudentT(4.0, 0.0, 1.0), plates="group")
+    net.add(
+        "y",
+        lambda low, high, rate, effect: bmc.Normal(low + high / (1 + np.exp(-rate)) + effect, 1.0),
+        plates="group",
+    )
+    evidence = {"y": np.linspace(-1.0, 3.0, 100)}
+    table = {row.node: row for row in bmc.explain(net, evidence, engine=bmc.Gibbs()).table}
+    assert "Hamiltonian" in table["rate"].kernel
+    assert "3 free numbers jointly, dense metric" in table["rate"].why
+    assert table["effect"].kernel == "slice"
 
 
 def test_the_reason_of_a_refusal_is_told(capsys: pytest.CaptureFixture) -> None:

@@ -16,14 +16,13 @@ from scipy import stats
 
 import bayesmc as bmc
 from bayesmc.dbn import pose_series
-from bayesmc.engines.particles import defensive as guarding
 from bayesmc.engines.particles import linearisation
+from bayesmc.engines.particles import optimal as guarding
 from bayesmc.engines.particles.auxiliary import PluggedIn
-from bayesmc.engines.particles.defensive import Guarded
 from bayesmc.engines.particles.linearisation import Belief, LookAhead
 from bayesmc.engines.particles.looking import has_moments
 from bayesmc.engines.particles.mixtures import ByCase, Cases
-from bayesmc.engines.particles.optimal import groups_of, is_affine, order_of
+from bayesmc.engines.particles.optimal import Guarded, groups_of, is_affine, order_of
 from bayesmc.errors import ModelError, ProposalWarning
 from bayesmc.network.forward import Pass
 from bayesmc.testing import session

@@ -9,7 +9,7 @@ import pytest
 
 import bayesmc as bmc
 import bayesmc.distributions as families
-from bayesmc.expression import TracedArray, TracedCall, is_traced, leaf
+from bayesmc.expression import Program, TracedArray, TracedCall, is_traced, leaf, trace
 
 X = TracedArray(leaf("x", (2, 3)))
 ONE = TracedArray(leaf("one", ()))
@@ -86,3 +86,11 @@ def test_methods_of_arrays_are_those_of_numpy() -> None:
     for look in (complex, hash, lambda x: 1.0 in x, float, bool):
         with pytest.raises(bmc.errors.TraceError):
             look(ONE)
+
+
+def test_differences_with_ends_are_followed():
+    x = TracedArray(leaf("x", (3,)))
+    root = trace(lambda x: np.diff(x, prepend=0.0, append=x[..., -1:] + 2.0), [x])
+    values = np.array([[1.0, 4.0, 9.0], [2.0, 2.0, 2.0]])
+    (found,) = Program([root])({"x": values})
+    assert np.array_equal(found, [[1.0, 3.0, 5.0, 2.0], [2.0, 0.0, 0.0, 2.0]])

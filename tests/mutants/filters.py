@@ -247,7 +247,7 @@ MUTANTS = [
     ),
     Mutant(
         "a guided draw is weighed as if none came from its own density",
-        (Edit("bayesmc.engines.particles.defensive:Guarded.__call__",
+        (Edit("bayesmc.engines.particles.optimal:Guarded.__call__",
               "mixture = np.logaddexp(math.log1p(-SHARE) + log_q, math.log(SHARE) + log_p)",
               "mixture = log_q"),),
         evidence_of(counted, {"y": [9, 2]}, bmc.ParticleFilter(30, proposal="optimal"), 150),

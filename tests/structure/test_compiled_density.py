@@ -229,7 +229,7 @@ def same_far_out(density: UnconstrainedDensity) -> bool:
     if fast.code != "machine code":
         assert "no machine code" in fast.code
         return False
-    if not density._others:
+    if not density.others:
         u = (
             np.random.default_rng(0).normal(size=(20, density.size))
             * np.linspace(0, 6, 20)[:, None]

@@ -56,8 +56,9 @@ def by_states(target: Target, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     for values in joint_states(target, names):
         value, slopes = density.with_gradient(u, values)
         found = {**target.known, **values}
+        found.update(density.constrain(u[0], found))  # on which the terms outside do not depend
         with np.errstate(all="ignore"):
-            target.compute(found, target.links) if not density.names else None
+            target.compute(found, target.links)
             own = sum(
                 np.sum(np.where(True if t.mask is None else t.mask, t.log(found), 0.0))
                 for t in outside

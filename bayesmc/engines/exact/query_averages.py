@@ -286,13 +286,8 @@ def _is_computed(model: Any, name: str, values: Mapping[str, Any]) -> bool:
 def _passed(tables: TableAnswers, nodes: Sequence[str]) -> tuple[str, ...]:
     """Deterministic nodes without a domain on the way to the finite ones."""
     model = tables.model
-    found: list[str] = []
-    todo = tables.missing(nodes)
-    while todo:
-        name = todo.pop()
-        found.append(name)
-        todo += [p for p in model[name].parents if model[p].domain is None]
-    return tuple(n for n in found if not model[n].is_stochastic)
+    found = model.above(tables.missing(nodes), lambda n: model[n].domain is None)
+    return tuple(n for n in found if model[n].domain is None and not model[n].is_stochastic)
 
 
 def _flat(values: np.ndarray, cards: tuple[int, ...], shape: Shape) -> np.ndarray:

@@ -89,16 +89,16 @@ class TableAnswers:
 
     def above(self, nodes: Sequence[str]) -> tuple[str, ...]:
         """Finite nodes that the named ones are, or are computed from."""
-        found: dict[str, None] = {}
-        todo = list(nodes)
-        while todo:
-            name = todo.pop(0)
-            node = self.model[name]
-            if node.domain is not None and node.kind != "fixed":
-                found[name] = None
-            elif self.known(name) is None and not node.is_stochastic:
-                todo += node.parents
-        return tuple(found)
+        model = self.model
+
+        def is_finite(name: str) -> bool:
+            return model[name].domain is not None and model[name].kind != "fixed"
+
+        def passes(name: str) -> bool:
+            known = is_finite(name) or self.known(name) is not None
+            return not known and not model[name].is_stochastic
+
+        return tuple(filter(is_finite, model.above(nodes, passes)))
 
     def missing(self, nodes: Sequence[str]) -> list[str]:
         """The named nodes that have neither a finite domain nor a known value."""

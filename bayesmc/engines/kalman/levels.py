@@ -275,15 +275,12 @@ class Plan:
 
     def _between(self, nodes: list[str]) -> set[str]:
         """Deterministic unknown nodes above some nodes."""
-        found: set[str] = set()
-        todo = list(nodes)
-        while todo:
-            for parent in self.layout.model[todo.pop()].parents:
-                if parent in self.sources and not self.layout.model[parent].is_stochastic:
-                    if parent not in found:
-                        found.add(parent)
-                        todo.append(parent)
-        return found
+        model = self.layout.model
+
+        def is_between(name: str) -> bool:
+            return name in self.sources and not model[name].is_stochastic
+
+        return set(filter(is_between, model.above(nodes, lambda n: n in nodes or is_between(n))))
 
 
 class Level:

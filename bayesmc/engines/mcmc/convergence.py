@@ -103,6 +103,12 @@ def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator
         )
 
 
+def by_chance(ess: Any, groups: int) -> Any:
+    """R-hat of so many groups that agree, or ``MAX_RHAT``, seldom exceeded where draws are worth ``ess``."""
+    limit = scipy.special.chdtri(groups - 1, _ALARM)
+    return np.maximum(MAX_RHAT, np.sqrt(1.0 + groups / (groups - 1) * limit / np.maximum(ess, 1.0)))
+
+
 def scalar_name(model: Model, name: str, index: tuple[int, ...]) -> str:
     """A scalar's name with its plate labels, as in a summary."""
     if not index:
@@ -304,19 +310,21 @@ def _figures(
     ratios = {names[at]: figure("rhat", at) for at in apart}
     if not groups:
         return _Judged(len(names), ratios, sizes)
-    chance = {names[at]: _by_chance(figure("ess", at), groups) for at in apart}
+    chance = {names[at]: _chance(columns[at], block, groups) for at in apart}
     lasting = {names[at]: _memory(columns[at]) for at in {*apart, *slow}}
     lasting = {name: memory for name, memory in lasting.items() if memory > 0}
     return _Judged(len(names), ratios, sizes, chance, lasting)
 
 
-def _by_chance(ess: float, groups: int) -> float:
+def _chance(values: np.ndarray, block: int, groups: int) -> float:
     """Nested R-hat of so many superchains that have mixed, or ``MAX_RHAT``, seldom exceeded.
 
-    The means of superchains then have the variance of ``ess / groups`` independent draws.
+    The means of superchains, of values or of their distances from the median, then have the variance of
+    ``ess / groups`` independent draws.
     """
-    limit = float(scipy.special.chdtri(groups - 1, _ALARM))
-    return max(MAX_RHAT, math.sqrt(1.0 + groups / (groups - 1) * limit / max(ess, 1.0)))
+    far = np.abs(values - np.median(values))
+    ess = min(float(diagnostics.chain_statistic("ess", x, block)) for x in (values, far))
+    return float(by_chance(ess, groups))
 
 
 def _memory(values: np.ndarray) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.jointly import trajectories_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.engines.weighted.drawing import treatment
 from bayesmc.errors import UnsupportedError
@@ -27,6 +28,7 @@ from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_block import ForestBlock
 from bayesmc.kernels.forest_search import forest_blocks
 from bayesmc.kernels.gaussian_block import gaussian_blocks, vector_blocks
+from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
 from bayesmc.kernels.lattice import lattice_kernel, site_forest
@@ -55,9 +57,10 @@ class Gibbs(ChainEngine):
 
     What kernel a node gets is found, not declared (`explain` shows the table): nodes on which nothing
     observed depends are drawn forward; conjugate pairs in closed form; chains and trees of finite nodes as
-    one, by filtering and sampling along them; other finite nodes by trying all states; numbers by slice
-    sampling; simplices and matrices by an adaptive random walk. All chains and all elements of a plate move
-    in one array operation.
+    one, by filtering and sampling along them; other finite nodes by trying all states; up to 64 numbers that
+    share terms jointly along trajectories of the No-U-Turn sampler, with what has a closed form among them;
+    more by slices, and so what has no derivative; simplices and matrices without one by an adaptive random
+    walk. All chains and all elements of a plate move in one array operation.
 
     Parameters
     ----------
@@ -273,9 +276,14 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     conjugate, refusals = _conjugate(blankets, forms, left, debug)
     joints = [k.joint for k in kernels if isinstance(k, ForestBlock) and k.joint is not None]
     kernels += [k.reading(joints) if isinstance(k, Conjugate) else k for k in conjugate]
-    kernels += _numbers(target, blankets, forms, list(refusals))
-    for block in blocks:
-        scales = governing(target, block, blankets)
+    scales_of = [governing(target, block, blankets) for block in blocks]
+    governed = {n for scales in scales_of for n in scales}
+    closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]
+    joint = trajectories_of(problem, refusals, closed, governed)
+    moved = {n for k in joint for n in k.names}
+    kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
+    kernels += [*joint, *_numbers(target, blankets, forms, [n for n in refusals if n not in moved])]
+    for block, scales in zip(blocks, scales_of, strict=True):
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
         kernels.append(CollapsedBlock(target, block, scales, alone) if scales else block)
@@ -319,7 +327,7 @@ def _conjugate(
 
 def _is_slice(kernel: Kernel) -> bool:
     return isinstance(
-        kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice)
+        kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice, Hamiltonian)
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any, ClassVar
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Plan, plan_of
+from bayesmc.engines.mcmc.jointly import continuous, density_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import UnsupportedError
@@ -23,9 +24,7 @@ from bayesmc.network import Problem
 from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.compiled_density import in_machine_code
-from bayesmc.structure.free_density import UnconstrainedDensity
-from bayesmc.structure.target import Target, target_of
-from bayesmc.structure.unconstrained import unconstrained_density
+from bayesmc.structure.target import target_of
 
 _METRICS = ("diagonal", "dense")
 
@@ -136,10 +135,13 @@ class HamiltonianMonteCarlo(ChainEngine):
         return self._plan(problem).table()
 
     def effort(self, problem: Problem) -> str:
-        lengths = self.lengths(problem)
-        density = density_of(problem, continuous(target_of(problem)))
+        lengths, moving = self.lengths(problem), continuous(target_of(problem))
+        text = super().effort(problem)
+        if not moving:
+            return text
+        density = density_of(problem, moving)
         told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
-        return "; ".join(filter(None, [super().effort(problem), told]))
+        return f"{text}; {told}" if told else text
 
     def tied(self, problem: Problem) -> Sequence[str]:
         return self._plan(problem).constraints
@@ -170,28 +172,3 @@ class HamiltonianMonteCarlo(ChainEngine):
         kernels = [*plan.kernels, kernel]
         kernels += redrawn_kernels(target, blankets, kernels) if finite else []
         return replace(plan, kernels=kernels, blankets=blankets)
-
-
-def continuous(target: Target) -> tuple[str, ...]:
-    """Nodes of the chain that are numbers with a density."""
-    nodes = ((n, target.model[n]) for n in target.chain)
-    return tuple(n for n, node in nodes if not node.is_discrete and node.domain is None)
-
-
-def density_of(problem: Problem, names: tuple[str, ...]) -> UnconstrainedDensity:
-    """The density of some nodes given the rest, made once.
-
-    Raises
-    ------
-    UnsupportedError
-        It cannot be followed, or has no derivative.
-    """
-    found = problem.cache.setdefault("densities of free numbers", {})
-    if names not in found:
-        try:
-            found[names] = unconstrained_density(target_of(problem), names)
-        except UnsupportedError as error:
-            found[names] = str(error)
-    if isinstance(found[names], str):
-        raise UnsupportedError(found[names])
-    return found[names]

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from bayesmc import diagnostics
-from bayesmc.engines.mcmc.convergence import MAX_RHAT, some_scalars, uncut
+from bayesmc.engines.mcmc.convergence import MAX_RHAT, by_chance, some_scalars, uncut
 from bayesmc.engines.mcmc.loop import Lengths
 from bayesmc.network import Model, Problem
 from bayesmc.structure.target import target_of
@@ -37,8 +37,11 @@ WARMUP = 1000
 #: draws of each chain after which one that did not get to its effective size gives up, and numbers that
 #: are kept at most if these are enough for ``_FEWEST`` draws
 _BUDGET, _KEPT, _FEWEST = 4000, 1 << 24, 1000
-#: numbers by which the end of a warmup is judged, at most
-_WINDOW = 1 << 18
+#: numbers by which the end of a warmup is judged, at most, and draws of each chain that are not thinned away
+_FEW = 16
+#: effective draws from which on chance is an excuse
+_ENOUGH = 400
+_WINDOW = 1 << 16
 
 
 def chosen(
@@ -98,13 +101,18 @@ def forgotten(stored: Mapping[str, np.ndarray], model: Model, superchains: int) 
             columns.append(uncut(model[name], index, values))
     if not columns:
         return True
-    step = -(-len(columns) * columns[0].size // _WINDOW)
-    draws = np.stack(columns[::step], axis=-1)
+    chains, count = columns[0].shape
+    every = min(-(-len(columns) * chains * count // _WINDOW), max(count // _FEW, 1))
+    some = -(-len(columns) * chains * (count // every) // _WINDOW)
+    draws = np.stack([column[:, ::every] for column in columns[::some]], axis=-1)
     half = draws.shape[1] // 2
     times = np.concatenate([draws[:, :half], draws[:, -half:]])  # the early ones as a superchain
     starts = diagnostics.chain_statistic("rhat", draws, superchains=superchains)
     drift = diagnostics.chain_statistic("rhat", times, superchains=2)
-    return bool((np.fmax(starts, drift) <= MAX_RHAT).all())
+    ess = diagnostics.chain_statistic("ess", draws)
+    enough = (ess >= _ENOUGH) | (np.fmax(starts, drift) <= MAX_RHAT)
+    agree = (starts <= by_chance(ess, superchains or 2 * chains)) & (drift <= by_chance(ess, 2))
+    return bool((enough & agree).all())
 
 
 def in_words(lengths: Lengths, problem: Problem) -> str:

@@ -303,7 +303,7 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
         off = _off(families, counts * np.exp(families.kept))
     else:
         off = counts - families.shares
-        if not _matters(families, now, off):
+        if off.ndim == 2 and not _matters(families, now, counts, off):
             return families, 0.0
     resampled = np.asarray(now.resampled)
     variance = _variance(families, off)
@@ -326,13 +326,21 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
     return _begun_again(families, now, due, False), gained
 
 
-def _matters(families: Families, now: Particles, off: np.ndarray) -> bool:
-    """Whether anything can be due: an origin has drifted far, or the younger one is old."""
-    spread, age = _square(off, 1), now.t - int(families.born[YOUNG].min())
-    far, n = float(spread.max()), len(now.weights)
-    if age > LONGEST or far > 0.9 * _level(n):
+def _matters(families: Families, now: Particles, counts: np.ndarray, off: np.ndarray) -> bool:
+    """Whether anything is due, or seems odd, in a filter without plates: the same in Python's numbers."""
+    level, age = _level(len(now.weights)), now.t - int(families.born[YOUNG])
+    shares, far = _square(families.shares, 1).tolist(), _square(off, 1).tolist()
+    few = shares[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
+    if age > LONGEST or (age > SHORTEST and few):
         return True
-    return age > SHORTEST and far > 0.9 * (1.0 / LEFT - 1.0) / off.shape[1]
+    for even, spread, (every, bounded) in zip(
+        shares, far, families.explained.tolist(), strict=True
+    ):
+        left = 1.0 - spread / (1.0 - even) if even < 1.0 else 0.0
+        variance = -math.log(left) if left > 1e-9 else math.inf
+        if variance > min(max(level, EDGE * every), max(LONG, EDGE * bounded), MOST):
+            return True
+    return False
 
 
 def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Families, Any]:
@@ -345,17 +353,13 @@ def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Fa
 def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bool) -> Families:
     """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
     groups = families.shares.shape[1]
-    even = _even(len(now.weights), groups, now.weights.ndim - 1)
-    fresh: tuple[Any, ...] = (*even, 0.0, 0.0, now.t)
-    found = []
+    fresh: Any = (*_even(len(now.weights), groups, now.weights.ndim - 1), 0.0, 0.0, now.t)
+    found: list[Any] = []
     for value, new in zip(families[:5], fresh, strict=True):
         begun = np.empty_like(value)
         begun[OLD], begun[YOUNG] = new if both else value[YOUNG], new
         found.append(begun if where.ndim == 0 else np.where(where, begun, value))
-    bounds, shares, kept, explained, born = found
-    return families._replace(
-        bounds=bounds, shares=shares, kept=kept, explained=explained, born=born
-    )
+    return Families(*found, *families[5:])  # type: ignore[call-arg]
 
 
 def _weights(families: Families, now: Particles) -> np.ndarray:
@@ -404,25 +408,20 @@ def _explained(now: Particles) -> Any:
         return 1.0 / now.ess - 1.0 / n  # an array of two would cost more than it says
     ess = np.asarray(now.ess)
     variance = 1.0 / ess - 1.0 / n
-    few = ess < FEW * n
-    if not few.any():
-        return np.stack([variance, variance])
-    weights = now.weights.reshape(n, -1)
-    bounded = np.array(variance, ndmin=1).reshape(-1)
-    for at in np.flatnonzero(few):
-        count = max(int(ess.reshape(-1)[at]), 5)
-        top = _largest(weights[:, at], count + 1)
-        least = np.maximum(top.min(), 1e-300)  # fewer have any weight
-        if np.log(np.maximum(top, least) / least).sum() > TAIL * count:
+    weights, bounded = now.weights.reshape(n, -1), np.array(variance, ndmin=1).reshape(-1)
+    for at in np.flatnonzero(ess < FEW * n):
+        if _has_tail(weights[:, at], max(int(ess.reshape(-1)[at]), 5)):
             bounded[at] = 0.0
-    return np.stack([variance, bounded.reshape(variance.shape)])
+    return np.array([variance, bounded.reshape(variance.shape)])
 
 
-def _largest(weights: np.ndarray, count: int) -> np.ndarray:
-    """The largest of some weights; of many, only those that may be among them are put in order."""
-    some = weights[weights > weights.max() * _SMALL]
-    among = some if len(some) > count else weights
-    return np.partition(among, max(len(among) - count, 0))[-count:]
+def _has_tail(weights: np.ndarray, count: int) -> bool:
+    """Whether the few weights that a slice is worth fall off slowly."""
+    some = weights[weights > weights.max() * _SMALL]  # fewer are put in order faster
+    some = some if len(some) > count else weights
+    top = np.partition(some, max(len(some) - count - 1, 0))[-count - 1 :]
+    least = np.maximum(top.min(), 1e-300)  # fewer have any weight
+    return bool(np.log(np.maximum(top, least) / least).sum() > TAIL * count)
 
 
 def _at_edge(

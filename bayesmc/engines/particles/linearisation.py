@@ -261,7 +261,8 @@ class LookAhead:
         off = self._flat(node, np.asarray(state.values[name], dtype=float)) - centre
         off = wrap_angle(off) if node.angles is not None else off
         off = off - _applied(slopes, mean - point)
-        inner = _times(_times(slopes, cov), np.swapaxes(slopes, -1, -2)) + noise
+        gain = _times(cov, np.swapaxes(slopes, -1, -2))
+        inner = _times(slopes, gain) + noise
         var = np.diagonal(inner, axis1=-2, axis2=-1)
         alone: Any = 0.0
         blind = ~(np.isfinite(off) & np.isfinite(var) & (var > 0))
@@ -278,8 +279,8 @@ class LookAhead:
             apart = blind[..., :, None] | blind[..., None, :]
             noise = np.where(apart, np.eye(size), noise)
             alone = alone + _HALF_LOG_2PI * blind.sum(axis=-1)
-        gain = _times(cov, np.swapaxes(slopes, -1, -2))
-        inner = _times(slopes, gain) + noise
+            gain = _times(cov, np.swapaxes(slopes, -1, -2))
+            inner = _times(slopes, gain) + noise
         if size == 1:
             weights = gain / inner
             log = -0.5 * (off[..., 0] ** 2 / inner[..., 0, 0] + np.log(inner[..., 0, 0]))
@@ -326,6 +327,8 @@ class LookAhead:
             node, np.asarray(noise, dtype=float), lead, 2 * bool(node.event_shape)
         )
         cov = cov.reshape(*lead, size // inner, inner, inner)[0]
+        if size == inner:  # of one element
+            return cov[..., 0, :, :]
         full = np.zeros((*lead[1:], size // inner, inner, size // inner, inner))
         each = np.arange(size // inner)
         full[..., each, :, each, :] = np.moveaxis(cov, -3, 0)
@@ -337,9 +340,9 @@ class LookAhead:
         """With all axes, plates apart right after the batch, shape ``(*lead, *other plates, *event)``."""
         event = array.shape[array.ndim - event_ndim :]
         batch = lead[: len(lead) - len(self.lead)]
-        full = np.broadcast_to(array, (*batch, *node.plate_shape, *event))
-        front, own = self._places(node, len(batch))
-        return np.moveaxis(full, own, front)
+        shape = (*batch, *node.plate_shape, *event)
+        full = array if array.shape == shape else np.broadcast_to(array, shape)
+        return np.moveaxis(full, *self._places(node, len(batch))[::-1]) if self.apart else full
 
     def _places(self, node: CompiledNode, first: int) -> tuple[list[int], list[int]]:
         """Where plates apart lie: after so many axes of the batch, and among the node's plates there."""
@@ -365,7 +368,9 @@ class LookAhead:
             part = joined[..., at : at + size]
             part = part.reshape(*batch, *self.lead, *others, *node.event_shape)
             at += size
-            part = np.ascontiguousarray(np.moveaxis(part, *self._places(node, len(batch))))
+            if self.apart:
+                part = np.moveaxis(part, *self._places(node, len(batch)))
+            part = np.ascontiguousarray(part)
             part.flags.writeable = False
             found[name] = part
         return found

@@ -1,10 +1,10 @@
 """The proposal that looks at the row, derived from the declared densities: ``proposal="optimal"``.
 
 For every particle the hidden numbers of a slice are taken as jointly Gaussian given the slice before, and
-what was seen as Gaussian given them (``lookahead``), or by the curvature of its log density (``curved``);
-mixtures of Gaussians by their components (``cases``). Where transitions are Normal and means of what is seen
-are affine this is exactly p(x_t | x_{t-1}, y_t), the proposal of least variance; elsewhere weights p/q make
-up for the difference.
+what was seen as Gaussian given them (``linearisation``), or by the curvature of its log density
+(``laplace``); mixtures of Gaussians by their components (``mixtures``). Where transitions are Normal and
+means of what is seen are affine this is exactly p(x_t | x_{t-1}, y_t), the proposal of least variance;
+elsewhere weights p/q make up for the difference.
 
 A slice is cut into *groups*: a hidden node that is no number (a finite one, say) and depends on numbers of
 a group is drawn once these are, and what depends on it makes the next group. Numbers that nothing seen
@@ -19,19 +19,22 @@ Statistics and Computing 10, sec. II-D; van der Merwe et al. (2000), The unscent
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from bayesmc.dbn import Row, Slices
-from bayesmc.engines.particles.defensive import Guarded
 from bayesmc.engines.particles.looking import NUMBERS, once, why_not_drawn, why_not_looked_at
 from bayesmc.engines.particles.mixtures import look_ahead
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.network import Model, Observed
-from bayesmc.network.forward import Step
+from bayesmc.network.forward import Pass, Step, run
 from bayesmc.structure.affine import NotLinearError, linear_node
+
+#: share of the particles that a guarded block draws from its own densities
+SHARE = 0.1
 
 
 class OptimalPlan(SlicePlan):
@@ -217,6 +220,55 @@ def guidance(
         why = why_not_looked_at(model, name) if numbers else _NO_NUMBER
         unheard[name] = why or (_MANY if looked else _BEHIND)
     return Guidance(guided, unguided, unheard, finite)
+
+
+class Guarded:
+    """Draws a block by looking ahead, a share of the particles from its own densities instead; weighs by p/q.
+
+    A Gaussian can be far too narrow where means are not affine. In the mixture no weight is more than
+    1 / ``SHARE`` of what it is when all are drawn from their own densities (Hesterberg 1995, Weighted average
+    importance sampling and defensive mixture distributions, Technometrics 37).
+
+    Parameters
+    ----------
+    look : LookAhead or ByCase
+    own : sequence of steps
+        Draw the block from its own densities, and compute what lies between.
+    factors : sequence of steps
+        Compute what lies between, and weigh by the block's own densities.
+    """
+
+    def __init__(self, look: Any, own: Sequence[Step], factors: Sequence[Step]) -> None:
+        self.look, self.own, self.factors = look, own, factors
+
+    def __call__(self, state: Pass) -> None:
+        look = self.look
+        belief = look.believed(state)
+        shape = belief.log_density.shape
+        alive = state.alive.reshape(state.batch + (1,) * len(look.apart))
+        dead = np.where(alive, 0.0, -np.inf)  # bad parameters are excused there
+        plain = run(self.own, Pass(state.rng, state.batch, dict(state.values), dead))
+        look.draw(state, belief)
+        valid: dict[str, np.ndarray] = {}
+        plainly = state.rng.random(shape) < SHARE
+        for name in look.block:
+            at = look.along(plainly, look.model[name])
+            mixed = np.where(at, plain.values[name], state.values[name])
+            mixed.flags.writeable = False
+            state.values[name] = mixed
+        drawn = run(self.factors, Pass(state.rng, state.batch, dict(state.values), dead))
+        log_p = np.broadcast_to(drawn.log_weight, shape)
+        lost = log_p == -np.inf
+        if lost.any():  # such as below zero: without weight, but what comes later has to stand them
+            for name in look.block:
+                at = look.along(lost, look.model[name])
+                kept = np.where(at, plain.values[name], state.values[name])
+                kept.flags.writeable = False
+                valid[name] = kept
+        log_q = look.log_density(state.values, belief)
+        mixture = np.logaddexp(math.log1p(-SHARE) + log_q, math.log(SHARE) + log_p)
+        state.weigh(np.where(lost, -np.inf, log_p - mixture))
+        state.values.update(valid)
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -84,6 +84,7 @@ class Record:
         self.problem, self.layout, self.asked, self.tracker = problem, layout, queries, tracker
         self._nodes = [problem.model[n] for n in problem.hidden]
         self._waiting: list[Waiting] = []
+        self._most = 1
         self._written: list[Written] = []
         self._room: dict[Any, np.ndarray] = {}
         self.keep = keep
@@ -99,7 +100,9 @@ class Record:
         if self._waiting and not alike(self._waiting[-1].particles, particles):
             self.write()
         self._waiting.append(Waiting(k, particles, row, families, values))
-        if len(self._waiting) >= self._together(particles):
+        if len(self._waiting) == 1:
+            self._most = self._together(particles)
+        if len(self._waiting) >= self._most:
             self.write()
 
     @property
