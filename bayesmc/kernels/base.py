@@ -38,6 +38,9 @@ class Kernel:
         """What it does to one of its nodes: the kind of move, and what that rests on."""
         return self.label, self.match
 
+    def expect(self, steps: int, chains: int) -> None:  # noqa: B027 - most need not know
+        """Told before a run how many steps its warmup takes, and of how many chains."""
+
     def start(self, values: Values, chains: int) -> Memory:
         """Its memory before the first step."""
         return {}

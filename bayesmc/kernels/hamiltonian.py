@@ -20,8 +20,12 @@ from bayesmc.kernels.hamiltonian_warmup import (
     windows,
 )
 from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, transition
+from bayesmc.structure.compiled_density import in_machine_code
+from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.target import Values
 
+#: gradients that a trajectory takes at least, on the whole
+GRADIENTS = 8
 #: doublings of a trajectory before a metric is learnt, at most: long ones tell no more
 _EARLY = 5
 
@@ -109,6 +113,11 @@ class Hamiltonian(Kernel):
         self.step_size = StepSize(target_accept)
         self.metric = MetricLearning(metric)
         self.ends = windows(warmup)
+
+    def expect(self, steps: int, chains: int) -> None:
+        """Gradients are machine code where so many steps pay for it."""
+        if isinstance(self.density, UnconstrainedDensity):
+            self.density = in_machine_code(self.density, GRADIENTS * steps, chains)
 
     def start(self, values: Values, chains: int) -> Memory:
         u = self.density.unconstrain(values)

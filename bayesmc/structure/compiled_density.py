@@ -11,7 +11,7 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import Program
-from bayesmc.lowering import Compiled, held_against_numpy, is_worth_it
+from bayesmc.lowering import Compiled, Kernel, held_against_numpy, is_available, is_worth_it
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.guarded import guarded
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
@@ -75,6 +75,18 @@ class CompiledDensity(UnconstrainedDensity):
         """What computes the gradient, and why nothing faster does."""
         return self._made[1]
 
+    @property
+    def told(self) -> str:
+        """What will compute the gradient, where there is something to say; nothing is compiled to know."""
+        roots = guarded([self.root, self.slopes])
+        if not is_available() or not is_worth_it(roots, self.calls, self.chains):
+            return ""
+        try:
+            Kernel(roots, frozenset(self.root.leaves | self.slopes.leaves))
+        except TraceError as error:
+            return f"gradients in NumPy: {error}"
+        return "gradients in machine code"
+
     def bound(self, values: Mapping[str, np.ndarray] | None = None) -> Any:
         """The log density and its gradient as a function in C (``lowering.compiled.Bound``).
 
@@ -95,6 +107,10 @@ class CompiledDensity(UnconstrainedDensity):
             raise TraceError(f"the log density has no address: {self.code}")
         given = self._given(np.zeros(self.size), values)
         return run.bound({n: v for n, v in given.items() if n != FREE})
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Machine code stays where it was made."""
+        return {k: v for k, v in self.__dict__.items() if k not in ("_made", "_both")}
 
     # ---- private -------------------------------------------------------------------------------
 

@@ -110,6 +110,7 @@ def answered(build: Callable[[], Question], **options: Any) -> tuple[np.ndarray,
     return np.abs(found.mean(name) - truth) / error, error
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")  # of draws, which are few
 @pytest.mark.parametrize("build", ALL[1:])
 def test_chains_cross(build: Callable[[], Question]) -> None:
     off, error = answered(build, engine=QUICK)

@@ -152,7 +152,7 @@ class ChainEngine(Engine):
         summed = not listed and keep == "summaries"
         free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
         names = tuple(keep) if listed else tuple(free)
-        lengths = self.lengths(problem, keep)
+        asked = lengths = self.lengths(problem, keep)
         if resume is not None:
             lengths = self._refuse_another(resume, problem, names, summed, lengths)
         ready = self
@@ -166,6 +166,8 @@ class ChainEngine(Engine):
             sampler.given = given  # type: ignore[attr-defined]
         if lengths.superchains:
             sampler.superchains = lengths.superchains  # type: ignore[attr-defined]
+        for kernel in getattr(sampler, "kernels", ()):
+            kernel.expect(asked.warmup, asked.chains)  # the same where it is resumed
         tied = self.tied(problem)
         if tied:
             _warn_of_ties(type(self).__name__, tied)

@@ -17,7 +17,7 @@ from bayesmc.engines.mcmc.jointly import continuous, density_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.errors import UnsupportedError
-from bayesmc.kernels.hamiltonian import Hamiltonian
+from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.kernels.redrawn import redrawn_kernels
 from bayesmc.network import Problem
@@ -26,8 +26,6 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.target import target_of
 
-#: gradients of a transition, about
-_LEAVES = 8
 _METRICS = ("diagonal", "dense")
 
 
@@ -136,6 +134,15 @@ class HamiltonianMonteCarlo(ChainEngine):
     def table(self, problem: Problem) -> list[Treatment]:
         return self._plan(problem).table()
 
+    def effort(self, problem: Problem) -> str:
+        lengths, moving = self.lengths(problem), continuous(target_of(problem))
+        text = super().effort(problem)
+        if not moving:
+            return text
+        density = density_of(problem, moving)
+        told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
+        return f"{text}; {told}" if told else text
+
     def tied(self, problem: Problem) -> Sequence[str]:
         return self._plan(problem).constraints
 
@@ -151,9 +158,7 @@ class HamiltonianMonteCarlo(ChainEngine):
         plan = plan_of(problem, only=finite)
         if not moving:
             return plan
-        # the same code however many draws are asked for, so that a run goes on to the last digit
-        calls = _LEAVES * (self.warmup or 0)
-        density = in_machine_code(density_of(problem, moving), calls, self.chains or 1)
+        density = density_of(problem, moving)
         kernel = Hamiltonian(
             density,
             density.others,

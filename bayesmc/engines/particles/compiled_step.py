@@ -250,7 +250,7 @@ class _Slice:
             return None
         values = dict(zip(self._names, arrays, strict=True))
         for array in arrays:
-            array.flags.writeable = n <= step.layout.block
+            array.flags.writeable = n > step.layout.block  # large ones are used again
         values |= {k: known[k] for k in step.kept if k not in values}
         return {k: values[k] for k in step.kept}, log if row.seen else 0.0
 

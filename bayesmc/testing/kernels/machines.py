@@ -120,7 +120,9 @@ class Machine:
         )
         self.is_given = not joint.observed or self._is_given(rng)
         most = _WARMUP if self.is_given else _OWN_WARMUP
-        self.warmup = min(getattr(kernel, "warmup", most), most) if warmup is None else warmup
+        asked = getattr(kernel, "warmup", None)  # None where the engine chooses
+        own = most if asked is None else min(asked, most)
+        self.warmup = own if warmup is None else warmup
         if not self.is_given and self.members > 1:
             raise UnsupportedError(
                 f"{call}: {kernel!r} moves ensembles, and reads what is observed when it compiles; test it "
