@@ -159,7 +159,7 @@ ENGINES: dict[str, tuple[Answer, dict[str, float]]] = {
         {"discrete": 0.5, "plates": 0.4, "hybrid": 0.4, "hybrid plates": 0.6, "gaussian": 0.4},
     ),
     "MetropolisHastings": (
-        by(bmc.MetropolisHastings(200, warmup=200, chains=32)),
+        by(bmc.MetropolisHastings(250, warmup=200, chains=32)),
         dict.fromkeys(KINDS, 0.5),
     ),
     "no engine named": (by(None), dict.fromkeys(KINDS, 0.9)),
