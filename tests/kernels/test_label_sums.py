@@ -132,6 +132,23 @@ def test_what_a_label_does_not_tell_is_refused(child: Any) -> None:
     assert label_sums(target, target.terms["x"], "label") is None
 
 
+def test_trials_of_each_element_by_label() -> None:
+    """An array of the function's own where the family's other parameter is read by label (BUGS, hearts)."""
+    trials = np.arange(3, 3 + N)
+    net = bmc.BayesNet(plates={"i": N})
+    net.add("p", bmc.Beta(1.0, 1.0))
+    net.add("label", bmc.Bernoulli(0.4), plates="i")
+    net.add(
+        "x",
+        lambda label, p: bmc.Binomial(trials, np.where(label == 1, 0.05, p)),
+        plates="i",
+    )
+    target = target_of(pose(net, {"x": np.ones(N, int)}))
+    assert label_sums(target, target.terms["x"], "label") is None
+    posterior = bmc.infer(net, {"x": np.ones(N, int)}, engine=bmc.Gibbs(300, 50, 4), rng=0)
+    assert 0.0 < posterior.mean("p") < 0.5
+
+
 @pytest.mark.parametrize("states", [2, 3, 40])
 def test_scattered_and_chunked_sums(states: int) -> None:
     label = RNG.integers(states, size=(3, 5000)).astype(np.uint8)
