@@ -440,8 +440,8 @@ def _found(target: Target, term: Term, label: str) -> LabelSums | None:
     try:
         with np.errstate(all="ignore"):
             return LabelSums(target, term, label)
-    except (TraceError, ValueError, np.linalg.LinAlgError):
-        return None  # a value error: arrays of the function's own, one entry for each element, fit no labels
+    except (TraceError, np.linalg.LinAlgError):
+        return None
 
 
 def _summed(part: Expression) -> Expression:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import count
@@ -217,9 +217,12 @@ def density_at(model: Model, name: str, given: Mapping[str, np.ndarray]) -> Any:
             function = declaration.function
             reading = read_function(function, arguments, links, is_steady=is_steady)
         found = Followed(model, reading, parents, arguments).result
+        found = family_of(found) if isinstance(found, Distribution) else found
+        if isinstance(found, Family):
+            np.broadcast_shapes(*_batches(found))  # an array of the function's own may fit no more
     except (BayesmcError, ValueError, IndexError) as error:
         raise TraceError(str(error)) from error
-    return family_of(found) if isinstance(found, Distribution) else found
+    return found
 
 
 def log_factor_of(model: Model, name: str) -> Expression:
@@ -257,6 +260,14 @@ def stored_leaf(model: Model, node: CompiledNode) -> Expression:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _batches(family: Family) -> Iterator[tuple[int, ...]]:
+    """Shapes of a family's parameters, without those of an event."""
+    for name, ndim in getattr(family.make, "parameter_ndim", {}).items():
+        value = family.parameters.get(name)
+        if isinstance(value, Expression):
+            yield value.shape[: len(value.shape) - ndim]
 
 
 @dataclass(frozen=True, eq=False)
