@@ -10,8 +10,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bayesmc.errors import DensityError
+from bayesmc.errors import DensityError, TraceError
 from bayesmc.kernels.base import Kernel, Memory, counted
+from bayesmc.kernels.compiled_transition import CompiledTransition
 from bayesmc.kernels.hamiltonian_warmup import (
     Metric,
     MetricLearning,
@@ -19,7 +20,7 @@ from bayesmc.kernels.hamiltonian_warmup import (
     first_steps,
     windows,
 )
-from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, transition
+from bayesmc.kernels.no_u_turn import Gradient, Place, Scale, Transition, transition
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.free_density import UnconstrainedDensity
 from bayesmc.structure.target import Values
@@ -61,6 +62,10 @@ class Hamiltonian(Kernel):
     metric : "diagonal" or "dense"
     match : str
         Why these nodes move so, for the table of kernels.
+    threads : int
+        Threads that share the chains where trajectories are machine code; the result is the same.
+    debug : bool
+        Compare machine code with NumPy at every step.
 
     Notes
     -----
@@ -105,12 +110,16 @@ class Hamiltonian(Kernel):
         max_depth: int = 10,
         metric: Metric = "diagonal",
         match: str = "",
+        threads: int = 1,
+        debug: bool = False,
     ) -> None:
         self.density = density
         self.names = density.names
         self.given = given
         self.max_depth = max_depth
         self.match = match
+        self.threads, self.debug = threads, debug
+        self._compiled: CompiledTransition | None = None
         self.step_size = StepSize(target_accept)
         self.metric = MetricLearning(metric)
         self.ends = windows(warmup)
@@ -118,7 +127,10 @@ class Hamiltonian(Kernel):
     def expect(self, steps: int, chains: int) -> None:
         """Gradients are machine code where so many steps pay for it."""
         if isinstance(self.density, UnconstrainedDensity):
-            self.density = in_machine_code(self.density, GRADIENTS * steps, chains)
+            made = in_machine_code(self.density, GRADIENTS * steps, chains, self.debug)
+            self.density, self._compiled = made, None
+            if made.trajectories is not None:
+                self._compiled = CompiledTransition(made.trajectories, made, self.threads)
 
     def start(self, values: Values, chains: int) -> Memory:
         u = self.density.unconstrain(values)
@@ -156,7 +168,7 @@ class Hamiltonian(Kernel):
         length = np.exp(memory["step"]["log"])
         early = warmup and memory["windows"] < min(2, len(self.ends))
         depth = min(self.max_depth, _EARLY) if early else self.max_depth
-        found = transition(gradient, place, length, scale, rng, depth)
+        found = self._moved(gradient, place, length, scale, rng, depth, values)
         place = found.place
         new = self.density.constrain(place.u, values)
         kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
@@ -191,6 +203,26 @@ class Hamiltonian(Kernel):
             return self.density.with_gradient(u, {n: values[n][rows] for n in self.given} or None)
 
         return gradient
+
+    def _moved(
+        self,
+        gradient: Gradient,
+        place: Place,
+        step: np.ndarray,
+        scale: Scale,
+        rng: np.random.Generator,
+        depth: int,
+        values: Values,
+    ) -> Transition:
+        """A transition in machine code where there is some, and it grows the trees that NumPy grows."""
+        if self._compiled is not None:
+            try:
+                return self._compiled(gradient, place, step, scale, rng, depth, values)
+            except TraceError:
+                if self.debug:
+                    raise
+                self._compiled = None
+        return transition(gradient, place, step, scale, rng, depth)
 
     def _place(self, values: Values, memory: Memory, gradient: Gradient) -> Place:
         """Where the chains are: as the last step left them, or as somebody else has."""

@@ -11,6 +11,7 @@ from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.trajectory import Told, Trajectories
 from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
@@ -18,6 +19,8 @@ __all__ = [
     "Compiled",
     "Kernel",
     "SliceKernel",
+    "Told",
+    "Trajectories",
     "compiled",
     "held_against_numpy",
     "is_available",

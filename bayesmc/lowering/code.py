@@ -251,6 +251,30 @@ class Code:
         self._lines.append(f"{end}:")
         self._block = end
 
+    def when(self, condition: Number, body: Callable[[], None]) -> None:
+        """``body()`` where a condition holds."""
+        self._count += 1
+        yes, after = f"when{self._count}", f"after{self._count}"
+        self.do(f"br i1 {condition.text}, label %{yes}, label %{after}")
+        self._begin(yes)
+        body()
+        self.do(f"br label %{after}")
+        self._begin(after)
+
+    def repeat(self, body: Callable[[], Number]) -> None:
+        """``body()`` once, and again while what it gives is true."""
+        self._count += 1
+        head, end = f"repeat{self._count}", f"done{self._count}"
+        self.do(f"br label %{head}")
+        self._begin(head)
+        again = body()
+        self.do(f"br i1 {again.text}, label %{head}, label %{end}")
+        self._begin(end)
+
+    def _begin(self, block: str) -> None:
+        self._lines.append(f"{block}:")
+        self._block = block
+
     def __str__(self) -> str:
         return "\n".join(["start:", *self._entry, *self._lines])
 

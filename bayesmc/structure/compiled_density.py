@@ -11,7 +11,14 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import Program
-from bayesmc.lowering import Compiled, Kernel, held_against_numpy, is_available, is_worth_it
+from bayesmc.lowering import (
+    Compiled,
+    Kernel,
+    Trajectories,
+    held_against_numpy,
+    is_available,
+    is_worth_it,
+)
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.guarded import guarded
 from bayesmc.structure.free_density import FREE, UnconstrainedDensity
@@ -85,7 +92,7 @@ class CompiledDensity(UnconstrainedDensity):
             Kernel(roots, frozenset(self.root.leaves | self.slopes.leaves))
         except TraceError as error:
             return f"gradients in NumPy: {error}"
-        return "gradients in machine code"
+        return "trajectories in machine code"
 
     def bound(self, values: Mapping[str, np.ndarray] | None = None) -> Any:
         """The log density and its gradient as a function in C (``lowering.compiled.Bound``).
@@ -108,9 +115,22 @@ class CompiledDensity(UnconstrainedDensity):
         given = self._given(np.zeros(self.size), values)
         return run.bound({n: v for n, v in given.items() if n != FREE})
 
+    @cached_property
+    def trajectories(self) -> Trajectories | None:
+        """What runs along it in machine code; None where its gradient is none."""
+        run = self._made[0]
+        run = getattr(run, "run", run)  # of one that is compared
+        if not isinstance(run, Compiled):
+            return None
+        try:
+            return Trajectories(run, FREE)
+        except TraceError:
+            return None
+
     def __getstate__(self) -> dict[str, Any]:
         """Machine code stays where it was made."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("_made", "_both")}
+        made = ("_made", "_both", "trajectories")
+        return {k: v for k, v in self.__dict__.items() if k not in made}
 
     # ---- private -------------------------------------------------------------------------------
 
