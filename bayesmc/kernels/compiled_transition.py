@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from bayesmc.errors import TraceError
@@ -11,7 +13,7 @@ from bayesmc.structure.compiled_density import CompiledDensity
 from bayesmc.structure.target import Values
 
 #: chains whose first transition is compared, and doublings of it
-_CHAINS, _DEPTH = 4, 2
+_CHAINS, _DEPTH = 8, 3
 #: how far draws may be off: a step multiplies errors of rounding
 _RTOL = 1e-6
 #: how far densities and gradients of draws may be off where every draw is compared
@@ -79,15 +81,15 @@ class CompiledTransition:
             log, slope = gradient(u[None], np.array([chain]))
             return float(log[0]), slope[0]
 
-        moved = Place(*(np.array(part, float, order="C") for part in place))
+        u, log, slope = (np.array(part, float, order="C") for part in place)
         root, step = (np.ascontiguousarray(a, float) for a in (scale.root, step))
         others = {n: values[n] for n in self.density.others}
         told = self.run.move(
-            tuple(moved), momenta, step, root, seeds, max_depth, ask, others, self.threads
+            (u, log, slope), momenta, step, root, seeds, max_depth, ask, others, self.threads
         )
         leaves, divergent = told.leaves.astype(int), told.divergent > 0
         return Transition(
-            moved, told.acceptance, divergent, told.depth.astype(int), told.energy,
+            Place(u, log, slope), told.acceptance, divergent, told.depth.astype(int), told.energy,
             int(leaves.max(initial=0)), int(leaves.sum()),
         )  # fmt: skip
 
@@ -108,9 +110,9 @@ class CompiledTransition:
         found = self._moved(
             gradient, some, step[rows], scale, momenta[rows], seeds[rows].copy(), _DEPTH, own
         )
-        for row in rows:
+        for row in range(len(rows)):
             one = slice(row, row + 1)
-            numbers = SameNumbers(momenta[one], seeds[row])
+            numbers: Any = SameNumbers(momenta[one], seeds[row])
             wanted = transition(
                 lambda u, _, row=row: gradient(u, np.full(len(u), row)),  # type: ignore[misc]
                 Place(*(part[one] for part in some)), step[one], scale, numbers, _DEPTH,

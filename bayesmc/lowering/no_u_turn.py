@@ -29,8 +29,14 @@ DIVERGENT = 1000.0
 #: what is told of each transition, in this order
 TOLD = ("acceptance", "leaves", "depth", "divergent", "energy")
 #: vectors of one chain's memory: the end that grows, what a new subtree has drawn, both ends, the sum of
-#: momenta, a velocity; then three for each tree that waits: momenta of its first leaf, its last, and their sum
-_U, _P, _PULL, _SLOPE, _NEW_U, _NEW_SLOPE, _ENDS, _SUM, _VELOCITY, _PENDING = *range(6), 6, 12, 13, 14
+#: momenta, a velocity; then three for each tree that waits: momenta of its first and last leaf, and the sum
+_U, _P, _PULL, _SLOPE, _NEW_U, _NEW_SLOPE, _ENDS, _SUM, _VELOCITY, _PENDING = (
+    *range(6),
+    6,
+    12,
+    13,
+    14,
+)
 #: what a trajectory is made of: whole numbers, then addresses
 _WHOLES = ("first", "last", "size", "max_depth", "dense", "others")
 _POINTERS = (
@@ -249,10 +255,10 @@ class _Text:
         tree = self._tree(c.number(0, WHOLE))
         turned = self._turned([outer, inner, total], tree)
         c.set(self.ended, turned.to(WHOLE))
-        c.set(self.weight, elementary(c, "logaddexp", self._real(self.weight), self._real(self.new)))
-        self._each(
-            lambda i: c.store(total, i, c.load(total, i, REAL) + c.load(tree[2], i, REAL))
+        c.set(
+            self.weight, elementary(c, "logaddexp", self._real(self.weight), self._real(self.new))
         )
+        self._each(lambda i: c.store(total, i, c.load(total, i, REAL) + c.load(tree[2], i, REAL)))
         for k, part in enumerate((_U, _P, _PULL)):
             self._copy(self._vector(part), self._vector(self._end(k)))
 
@@ -399,9 +405,7 @@ class _Text:
         def row(i: Number) -> None:
             own, times = c.address("%root", i * self.n, REAL), c.load(slope, i, REAL)
             self._each(
-                lambda j: c.store(
-                    pull, j, c.load(pull, j, REAL) + times * c.load(own, j, REAL)
-                )
+                lambda j: c.store(pull, j, c.load(pull, j, REAL) + times * c.load(own, j, REAL))
             )
 
         def columns() -> None:
@@ -413,6 +417,4 @@ class _Text:
 
     def _scaled(self, source: str, target: str) -> None:
         c = self.c
-        self._each(
-            lambda i: c.store(target, i, c.load(source, i, REAL) * c.load("%root", i, REAL))
-        )
+        self._each(lambda i: c.store(target, i, c.load(source, i, REAL) * c.load("%root", i, REAL)))

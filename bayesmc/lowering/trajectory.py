@@ -117,7 +117,8 @@ class Trajectories:
         def part(first: int, last: int) -> None:
             if first == last:
                 return
-            direct, table, kept = 0, np.zeros(1, np.uintp), []
+            direct, table = 0, np.zeros(1, np.uintp)
+            kept: list[np.ndarray] = []  # lives as long as the call
             if self._way is not None:
                 direct, (table, kept) = self._way.loaded.direct, self._way.table(2)
             memory = np.empty(numbers_of(size, max_depth))
@@ -163,7 +164,7 @@ def _callback(ask: Ask, size: int, failed: list[Any]) -> Any:
             failed[0] = failed[0] or error
             log, slope = -np.inf, np.zeros(size)
         ctypes.c_double.from_address(value).value = float(log)
-        np.frombuffer(numbers.from_address(gradient))[:] = slope
+        numbers.from_address(gradient)[:] = np.asarray(slope, float).tolist()
         return 0
 
     return FALLBACK(tell)

@@ -77,7 +77,7 @@ def test_explain_names_it() -> None:
     def effort(net: bmc.BayesNet, evidence: Any, **options: Any) -> str:
         return bmc.explain(net, evidence, engine=bmc.HamiltonianMonteCarlo(**options)).effort
 
-    assert effort(schools(), EVIDENCE, warmup=2000).endswith("; gradients in machine code")
+    assert effort(schools(), EVIDENCE, warmup=2000).endswith("; trajectories in machine code")
     assert "gradients" not in effort(schools(), EVIDENCE, warmup=10)
     net, factor = bmc.BayesNet(), np.array([[1.0, 0.0], [0.5, 1.0]])
     net.add("s", bmc.Exponential(1.0))

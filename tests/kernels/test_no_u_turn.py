@@ -2,19 +2,32 @@
 
 Densities here are written by hand. Geweke's test and the rank test have a chance of false alarm of 1e-4
 each, at fixed seeds that ``--bayesmc-seed`` shifts; each fault is seen by both. The tree itself is held
-against its definition: all balanced subtrees of a path, leaf by leaf.
+against its definition: all balanced subtrees of a path, leaf by leaf. Machine code passes the same tests,
+with the same faults planted, and grows the same trees.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import numpy as np
 import pytest
 
+import bayesmc as bmc
+from bayesmc.errors import TraceError
 from bayesmc.kernels import no_u_turn
+from bayesmc.kernels.compiled_transition import CompiledTransition, SameNumbers
 from bayesmc.kernels.no_u_turn import Place, Scale, transition, turning_back
+from bayesmc.lowering import Trajectories, is_available
+from bayesmc.lowering.no_u_turn import transitions
+from bayesmc.network import pose
+from bayesmc.structure.compiled_density import in_machine_code
+from bayesmc.structure.target import target_of
+from bayesmc.structure.unconstrained import unconstrained_density
 from bayesmc.testing import JointModel, geweke_test, rank_test, session
+from tests.mutants.faults import Edit
 
 ALPHA = 1e-4
 SHIFT = session.seed()
@@ -69,6 +82,36 @@ def moves(kind: str = "diagonal", step: float = 1.0, max_depth: int = 10) -> Any
                 rng, max_depth,
             )  # fmt: skip
         return found.place.u
+
+    return move
+
+
+def compiled(threads: int = 1) -> CompiledTransition:
+    """The same density, read off a net whose ``y`` somebody else moves, in machine code."""
+    net = bmc.BayesNet()
+    net.add("x", bmc.MvNormal(np.zeros(3), COV))
+    net.add("y", lambda x: bmc.Normal(x[..., 0] + 0.5 * x[..., 1] ** 2, np.exp(x[..., 2])))
+    density = unconstrained_density(target_of(pose(net, {}), also=["x", "y"]), ("x",))
+    fast = in_machine_code(density, 10**6, 2000)
+    assert fast.code == "machine code"
+    assert fast.trajectories is not None
+    return CompiledTransition(fast.trajectories, fast, threads)
+
+
+def compiled_moves(kind: str, step: float, stale: bool, check: bool = False) -> Any:
+    run = compiled()
+    run.is_checked = not check
+
+    def move(x: np.ndarray, y: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        def gradient(u: np.ndarray, rows: np.ndarray) -> Any:
+            return run.density.with_gradient(u, {"y": y[rows]})
+
+        with np.errstate(all="ignore"):
+            place = Place(x, *gradient(x, np.arange(len(x))))
+            if stale:
+                place = place._replace(slope=np.roll(place.slope, 1, axis=0))
+            steps = np.full(len(x), step)
+            return run(gradient, place, steps, SCALES[kind], rng, 10, {"y": y}).place.u
 
     return move
 
@@ -134,6 +177,34 @@ FAULTS = {
 }
 
 
+_CODE = "bayesmc.lowering.no_u_turn:_Text."
+#: the same in machine code
+EDITS = {
+    "weights": Edit(f"{_CODE}_counted", "weight - total)",
+                    '-elementary(c, "log", self._whole(self.leaf).to(REAL) + 1.0))'),
+    "direction": Edit(f"{_CODE}_double", "< 0.5", "< 2.0"),
+    "subtrees": Edit(f"{_CODE}_merged", " | turned.to(WHOLE)", ""),
+}  # fmt: skip
+with_compiler = pytest.mark.skipif(not is_available(), reason="llvmlite is not installed")
+
+
+@contextmanager
+def planted(fault: str) -> Iterator[None]:
+    """Machine code with a fault."""
+    with ExitStack() as stack:
+        if fault in EDITS:
+            stack.enter_context(EDITS[fault].planted())
+        stack.callback(transitions.cache_clear)
+        transitions.cache_clear()
+        yield
+
+
+def verdict(move: Any, test: str) -> Any:
+    if test == "geweke":
+        return geweke_test(move, MODEL, draws=20 * LONGER, chains=2000, alpha=ALPHA, rng=SHIFT)
+    return rank_test(move, MODEL, replications=20_000 * LONGER, alpha=ALPHA, rng=SHIFT)
+
+
 @pytest.mark.parametrize("kind", SCALES)
 @pytest.mark.parametrize("test", ["geweke", "ranks"])
 @pytest.mark.parametrize("fault", ["", *FAULTS])
@@ -142,15 +213,35 @@ def test_law(kind: str, test: str, fault: str, monkeypatch: pytest.MonkeyPatch) 
     if fault:
         faulty, step = FAULTS[fault]
         monkeypatch.setattr(no_u_turn, "_Forest", faulty)
-    if test == "geweke":
-        found: Any = geweke_test(
-            moves(kind, step), MODEL, draws=20 * LONGER, chains=2000, alpha=ALPHA, rng=SHIFT
-        )
-    else:
-        found = rank_test(
-            moves(kind, step), MODEL, replications=20_000 * LONGER, alpha=ALPHA, rng=SHIFT
-        )
+    found = verdict(moves(kind, step), test)
     assert bool(found) != bool(fault), found
+
+
+@with_compiler
+@pytest.mark.parametrize("kind", SCALES)
+@pytest.mark.parametrize("test", ["geweke", "ranks"])
+@pytest.mark.parametrize("fault", ["", *FAULTS])
+def test_law_of_machine_code(kind: str, test: str, fault: str) -> None:
+    step = FAULTS[fault][1] if fault else 1.0
+    with planted(fault):
+        found = verdict(compiled_moves(kind, step, fault == "stale"), test)
+    assert bool(found) != bool(fault), found
+
+
+@with_compiler
+@pytest.mark.parametrize("fault", ["", *EDITS])
+def test_machine_code_is_compared_before_its_first_use(fault: str) -> None:
+    rng, seen = np.random.default_rng(SHIFT), 0
+    step = FAULTS[fault][1] if fault else 0.35
+    with planted(fault):
+        for _ in range(10):
+            x = prior(rng, 50)
+            try:
+                compiled_moves("dense", step, stale=False, check=True)(x, simulate(x, rng), rng)
+            except TraceError as error:
+                assert "in machine code ends at" in str(error)
+                seen += 1
+    assert (seen > 0) == bool(fault)
 
 
 def test_law_of_short_trees() -> None:
@@ -254,6 +345,104 @@ def test_trees_are_those_of_the_definition() -> None:
         assert (int(found.depth[0]), count) == expected
         depths.append(expected[0])
     assert len(set(depths)) == 7  # all of them were seen
+
+
+@with_compiler
+def test_trees_of_machine_code_are_the_same() -> None:
+    """The same momenta and uniform numbers: the same leaves, draws and counts, chain by chain."""
+    rng, run = np.random.default_rng(SHIFT), compiled()
+    run.is_checked = True
+    for kind, scale in SCALES.items():
+        x, steps = prior(rng, 300), np.exp(rng.uniform(-4, 1, 300))
+        y = simulate(x, rng)
+        momenta, seeds = rng.standard_normal(x.shape), rng.integers(0, 1 << 64, (300, 4), np.uint64)
+
+        def gradient(u: np.ndarray, rows: Any, y: np.ndarray = y) -> Any:
+            return run.density.with_gradient(u, {"y": y[rows]})
+
+        with np.errstate(all="ignore"):
+            place = Place(x, *gradient(x, np.arange(300)))
+            found = run._moved(
+                gradient, place, steps, scale, momenta, seeds.copy(), 6,
+                {"y": y},
+            )  # fmt: skip
+            for k in range(300):
+                row = slice(k, k + 1)
+                wanted = transition(
+                    lambda u, _, k=k: gradient(u, np.full(len(u), k)),
+                    Place(*(part[row] for part in place)), steps[row], scale,
+                    SameNumbers(momenta[row], seeds[k]), 6,
+                )  # fmt: skip
+                assert found.depth[k] == wanted.depth[0], kind
+                assert found.divergent[k] == wanted.divergent[0]
+                for a, b in zip(found.place, wanted.place, strict=True):
+                    np.testing.assert_allclose(a[k], b[0], rtol=1e-6, atol=1e-6)
+                np.testing.assert_allclose(found.acceptance[k], wanted.acceptance[0], atol=1e-7)
+                np.testing.assert_allclose(found.energy[k], wanted.energy[0])
+        assert len(np.unique(found.depth)) >= 6
+        assert found.divergent.any()
+
+
+@with_compiler
+def test_trajectories_run_backwards() -> None:
+    """From where a tree of the last leaf ended, with its momenta turned, the same leaves lead back."""
+    half, count, run = 0.05, 8, Trajectories(None, "u")
+    rng = np.random.default_rng(SHIFT)
+    x, seen = prior(rng, 1), []
+
+    def ask(chain: int, u: np.ndarray) -> Any:
+        log, slope = with_gradient(u[None], np.full(1, 0.7))
+        seen.append(u)
+        return log[0], slope[0]
+
+    momenta, root = rng.standard_normal((1, 3)), SCALES["diagonal"].root
+    log, slope = with_gradient(x, np.full(1, 0.7))
+    place = Place(x.copy(), log.copy(), slope.copy())
+    seeds = rng.integers(0, 1 << 64, (1, 4), np.uint64)
+    run.move(tuple(place), momenta, np.full(1, 2 * half), root, seeds, 3, ask)
+    # the leapfrog integrator written out, from the first place to and fro
+    path = {}
+    for sign in (1.0, -1.0):
+        u, p = x, momenta
+        for k in range(1, count):
+            p = p + sign * half * root * with_gradient(u, np.full(1, 0.7))[1]
+            u = u + sign * 2 * half * root * p
+            p = p + sign * half * root * with_gradient(u, np.full(1, 0.7))[1]
+            path[sign * k] = u
+    for u in seen:
+        assert min(np.abs(u - v).max() for v in path.values()) < 1e-9
+    assert len(seen) >= 3
+
+
+@with_compiler
+def test_threads_make_no_difference() -> None:
+    rng = np.random.default_rng(SHIFT)
+    x = prior(rng, 37)
+    y, found = simulate(x, rng), []
+    for threads in (1, 2, 5, 40):
+        run, own = compiled(threads), np.random.default_rng(1)
+
+        def gradient(u: np.ndarray, rows: np.ndarray) -> Any:
+            return run.density.with_gradient(u, {"y": y[rows]})  # noqa: B023
+
+        place = Place(x, *gradient(x, np.arange(37)))
+        for _ in range(3):
+            place = run(gradient, place, np.full(37, 0.3), SCALES["dense"], own, 10, {"y": y}).place
+        found.append(place)
+    for other in found[1:]:
+        for a, b in zip(found[0], other, strict=True):
+            assert np.array_equal(a, b)
+
+
+@with_compiler
+def test_errors_of_a_density_are_raised() -> None:
+    def ask(chain: int, u: np.ndarray) -> Any:
+        raise ArithmeticError(f"no density of chain {chain}")
+
+    place = np.zeros((2, 1)), np.zeros(2), np.zeros((2, 1))
+    seeds = np.arange(8, dtype=np.uint64).reshape(2, 4)
+    with pytest.raises(ArithmeticError, match="chain 0"):
+        Trajectories(None, "u").move(place, np.ones((2, 1)), np.ones(2), np.ones(1), seeds, 3, ask)
 
 
 def test_criterion_looks_at_neighbours() -> None:

@@ -10,6 +10,8 @@ import numpy as np
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.kernels.hamiltonian import Hamiltonian
+from bayesmc.lowering import is_available
+from bayesmc.lowering.no_u_turn import transitions
 from bayesmc.network import pose
 from bayesmc.structure.target import target_of
 from bayesmc.structure.unconstrained import unconstrained_density
@@ -21,6 +23,7 @@ from tests.mutants.faults import Edit
 from tests.mutants.mutant import ALPHA, Mutant
 
 TREE = "bayesmc.kernels.no_u_turn"
+CODE = "bayesmc.lowering.no_u_turn:_Text"
 
 
 def readings() -> bmc.BayesNet:
@@ -34,7 +37,7 @@ def readings() -> bmc.BayesNet:
 
 
 def trajectories(
-    length: float, draws: int = 20, together: bool = False
+    length: float, draws: int = 20, compiled: bool = False
 ) -> Callable[[int], Verdict]:
     """Geweke's test of a sweep: mean and scale along a trajectory, the hidden number exactly, twice."""
 
@@ -43,6 +46,12 @@ def trajectories(
         target = target_of(pose(net, {}), also=["m", "s", "x", "y"])
         density = unconstrained_density(target, ("m", "s"))
         kernel = Hamiltonian(density, density.others, warmup=0)
+        transitions.cache_clear()  # the text is written anew, with the fault
+        if compiled:
+            kernel.expect(10**6, 2000)
+            assert kernel._compiled is not None
+            kernel._compiled.is_checked = True  # who compares would see most faults first
+        transitions.cache_clear()
 
         def prior(rng: np.random.Generator, rows: int) -> dict[str, np.ndarray]:
             drawn = net.sample(rows, rng=rng)
@@ -123,3 +132,21 @@ MUTANTS = [
         "rank_test, 20 replications (for certain)",
     ),
 ]  # fmt: skip
+
+JACOBIAN, STALE = MUTANTS[0].faults, MUTANTS[1].faults
+if is_available():
+    MUTANTS += [
+        Mutant(f"{name}: machine code", faults, trajectories(length, draws, True), OF.format(draws))
+        for name, faults, length, draws in (
+            ("a Jacobian is missing", JACOBIAN, 0.8, 20),
+            ("a gradient is stale", STALE, 0.8, 400),
+            ("values that others moved are those of the first chain",
+             (Edit(f"{CODE}._point_at_others", "first + step * self.row", "first"),), 0.8, 20),
+            ("time goes forwards only", (Edit(f"{CODE}._double", "< 0.5", "< 2.0"),), 0.8, 20),
+            ("subtrees that turn are taken",
+             (Edit(f"{CODE}._merged", " | turned.to(WHOLE)", ""),), 0.3, 40),
+            ("leaves are drawn whatever they weigh",
+             (Edit(f"{CODE}._counted", "weight - total)",
+                   '-elementary(c, "log", self._whole(self.leaf).to(REAL) + 1.0))'),), 1.0, 200),
+        )
+    ]  # fmt: skip
