@@ -245,7 +245,10 @@ def test_a_biased_estimate_of_the_evidence_is_caught(net: str) -> None:
 CHAIN_ENGINES = {
     "Gibbs": bmc.Gibbs(25, warmup=25, chains=8),
     "MetropolisHastings": bmc.MetropolisHastings(25, warmup=100, chains=8),
+    "HamiltonianMonteCarlo": bmc.HamiltonianMonteCarlo(25, warmup=100, chains=8),
 }
+#: engines that move finite nodes by themselves
+OF_STATES = [name for name in CHAIN_ENGINES if name != "HamiltonianMonteCarlo"]
 
 
 #: kinds of nets all of whose nodes are single numbers
@@ -278,7 +281,7 @@ def of_leaves(net: bmc.BayesNet, seed: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("kind", ["discrete", "plates"])
-@pytest.mark.parametrize("engine", CHAIN_ENGINES)
+@pytest.mark.parametrize("engine", OF_STATES)
 def test_sweeps_keep_finite_posteriors(engine: str, kind: str) -> None:
     """Exactly: the matrices are read from the code that draws."""
     asked = 0
@@ -331,8 +334,15 @@ def sees_the_prior(kind: str, seed: int, test: str) -> bool:
         return not simulation_based_calibration(draws, net, replications=REPLICATIONS, **options)
 
 
-@pytest.mark.parametrize("kind", [*SCALARS, pytest.param("gaussian", marks=pytest.mark.thorough)])
-@pytest.mark.parametrize("engine", CHAIN_ENGINES)
+#: engines, and kinds of nets that have something for them to move
+SWEPT = [
+    *itertools.product(OF_STATES, SCALARS),
+    *(("HamiltonianMonteCarlo", kind) for kind in SCALARS if "hybrid" in kind),
+    *(pytest.param(e, "gaussian", marks=pytest.mark.thorough) for e in CHAIN_ENGINES),
+]
+
+
+@pytest.mark.parametrize(("engine", "kind"), SWEPT)
 def test_sweeps_keep_all_posteriors(engine: str, kind: str) -> None:
     """By ranks and by Geweke's test, at 1e-5 each: what little they see of a net in an ordinary run, they
     see of many in a thorough one."""
@@ -378,11 +388,13 @@ def calibrated(engine: str, net: bmc.BayesNet) -> Any:
 #: chains take long for an answer: one kind of nets will do in an ordinary run
 CALIBRATED = [
     *itertools.product(["Exact", "LikelihoodWeighting", "Importance", "Rejection"], JOINT_KINDS),
-    *((engine, "plates") for engine in CHAIN_ENGINES),
+    *((engine, "plates") for engine in OF_STATES),
+    ("HamiltonianMonteCarlo", "hybrid"),
     *(
         pytest.param(engine, kind, marks=pytest.mark.thorough)
         for engine in CHAIN_ENGINES
         for kind in ("hybrid", "gaussian")
+        if (engine, kind) != ("HamiltonianMonteCarlo", "hybrid")
     ),
 ]
 

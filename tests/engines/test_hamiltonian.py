@@ -20,6 +20,8 @@ from bayesmc.testing import assert_matches, exact
 
 EFFECTS = np.array([28.0, 8.0, -3.0, 7.0, -1.0, 1.0, 18.0, 12.0])
 ERRORS = np.array([15.0, 10.0, 16.0, 11.0, 9.0, 11.0, 10.0, 18.0])
+#: posterior mean of ``tau``, by quadrature of the marginal density of two million points
+TAU = 3.59771
 
 
 def schools(centred: bool) -> bmc.BayesNet:
@@ -158,10 +160,35 @@ def test_divergences_are_told_with_where_they_are() -> None:
     (words,) = [t for t in told if "diverged" in t]
     assert f"{count} of 2000 trajectories diverged" in words
     assert "'tau' is low" in words
-    assert any("E-BFMI" in t for t in told)
     apart, told = quietly(line(), LINE, engine=engine, rng=0)
     assert not apart.divergences.any()
     assert not told
+
+
+def test_energies_that_hardly_change_are_told() -> None:
+    """A funnel whose scale is an exponential, so that nothing moves it with what it scales."""
+    net = bmc.BayesNet(plates={"i": 9})
+    net.add("v", bmc.Normal(0.0, 3.0))
+    net.add("x", lambda v: bmc.Normal(0.0, np.exp(0.5 * v)), plates="i")
+    net.add("y", lambda x: bmc.Normal(x, 100.0), plates="i")
+    _, told = quietly(
+        net, {"y": np.zeros(9)}, engine=bmc.HamiltonianMonteCarlo(500, warmup=500), rng=0
+    )
+    assert any("E-BFMI" in t for t in told)
+
+
+def test_scales_move_with_what_they_scale() -> None:
+    """Effects declared about their mean; the mean of their scale is off by 4.9 errors once in a million."""
+    posterior, _ = quietly(
+        schools(centred=True), {"y": EFFECTS}, engine=bmc.HamiltonianMonteCarlo(ess=2000), rng=0
+    )
+    assert posterior.ess("tau") > 1500
+    table = {
+        row.node: row.kernel
+        for row in bmc.explain(schools(centred=True), {"y": EFFECTS}, engine=posterior.engine).table
+    }
+    assert table["tau"] == "Hamiltonian + rescaled"
+    assert abs(posterior.mean("tau") - TAU) < 4.9 * posterior.mcse("tau")
 
 
 def test_trajectories_that_are_cut_are_told() -> None:

@@ -148,18 +148,18 @@ class ChainEngine(Engine):
         progress: bool | None = None,
         resume: Posterior | None = None,
     ) -> Posterior:
-        listed = not isinstance(keep, str)
-        summed = not listed and keep == "summaries"
+        listed, summed = not isinstance(keep, str), isinstance(keep, str) and keep == "summaries"
         free = (n for n, c in problem.model.nodes.items() if c.kind != "input")
         names = tuple(keep) if listed else tuple(free)
         asked = lengths = self.lengths(problem, keep)
         if resume is not None:
             lengths = self._refuse_another(resume, problem, names, summed, lengths)
-        ready = self
-        if None in (self.draws, self.warmup, self.chains):
-            ready = replace(  # type: ignore[type-var]
-                self, draws=lengths.draws, warmup=lengths.warmup, chains=lengths.chains
-            )
+        ready = replace(  # type: ignore[type-var]
+            self,
+            draws=lengths.draws,
+            warmup=None if lengths.judge else lengths.warmup,
+            chains=lengths.chains,
+        )
         sampler = ready.sampler(problem)
         if self.start and resume is None:
             given = read_start(type(self).__name__, problem, self.start, lengths.chains)

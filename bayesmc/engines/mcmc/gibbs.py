@@ -16,9 +16,8 @@ from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.cost import shares
 from bayesmc.engines.mcmc.jointly import trajectories_of
-from bayesmc.engines.mcmc.sweep import SweepSampler
+from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import treatment
-from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
@@ -40,7 +39,6 @@ from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import joint_states, table_kernel, table_kernels
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.structure.blanket import Blanket, colours
 from bayesmc.structure.like_terms import with_like_children
 from bayesmc.structure.stacked import FEWEST, Forms, stacks
@@ -114,18 +112,10 @@ class Gibbs(ChainEngine):
     judges: ClassVar[bool] = True
 
     def refusal(self, problem: Problem) -> str | None:
-        parts = refuse_parts(problem.observed, "Gibbs")
-        if parts is not None:
-            return parts
-        try:
-            terms = [n for n in target_of(problem).terms if n in problem.model.nodes]
-            reason = refuse_noiseless(problem.model, terms, "Gibbs")
-            if reason is not None:
-                return reason
+        def planned(problem: Problem) -> None:
             plan_of(problem, self.debug)
-        except UnsupportedError as error:
-            return f"Gibbs has no kernel for this net: {error}"
-        return None
+
+        return refused(problem, "Gibbs", "has no kernel for this net", planned)
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return {row.node: str(row) for row in self.table(problem)}
@@ -282,7 +272,7 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     governed = {n for scales in scales_of for n in scales}
     closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]
     keys = {n: forms.key(blankets[n]) for n in refusals} if len(refusals) >= FEWEST else {}
-    joint = trajectories_of(problem, refusals, closed, governed, keys) if refusals else []
+    joint = trajectories_of(problem, refusals, closed, governed, keys, debug) if refusals else []
     moved = {n for k in joint for n in k.names}
     kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
     kernels += [*joint, *_numbers(target, blankets, forms, [n for n in refusals if n not in moved])]

@@ -14,14 +14,13 @@ from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Plan, plan_of
 from bayesmc.engines.mcmc.jointly import continuous, density_of
-from bayesmc.engines.mcmc.sweep import SweepSampler
+from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import check_count
-from bayesmc.errors import UnsupportedError
 from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.kernels.redrawn import redrawn_kernels
+from bayesmc.kernels.rescaled import rescaled_kernels
 from bayesmc.network import Problem
-from bayesmc.network.forward import refuse_noiseless, refuse_parts
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.target import target_of
@@ -29,23 +28,27 @@ from bayesmc.structure.target import target_of
 _METRICS = ("diagonal", "dense")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class HamiltonianMonteCarlo(ChainEngine):
     """Markov chains that follow the gradient of the log posterior: multinomial No-U-Turn sampling.
 
     All continuous nodes move together on an unconstrained scale, which mixes where one at a time they would
     crawl: correlated coefficients, hierarchies, hundreds of effects. Every density must be one that can be
     followed and has a derivative; finite nodes and whole numbers are drawn in between, as `Gibbs` does, and
-    nodes on which nothing observed depends are drawn forward.
+    nodes on which nothing observed depends are drawn forward. A scale of effects also moves in proportion
+    with them, since no one length of a step suits both the neck and the mouth of such a funnel.
 
     Parameters
     ----------
-    draws : int
-        Draws kept of every chain.
-    warmup : int
-        Draws before that, in which the step and the metric are learnt from all chains together.
-    chains : int
-        Chains, all in one array.
+    draws : int, optional
+        Draws kept of every chain; by default as many as it takes to ``ess``, or 4,000 of each chain and a
+        warning that names the node.
+    warmup : int, optional
+        Draws before that, in which the step and the metric are learnt from all chains together; by default
+        until chains have forgotten where they started, 1,000 at most (with ``draws``: 1,000).
+    chains : int, optional
+        Chains, all in one array. By default as many as the model's size lets run at little cost, 4 to 128,
+        in groups that start as one (with ``draws``: 4).
     thinning : int
         Transitions per kept draw.
     target_accept : float
@@ -55,6 +58,12 @@ class HamiltonianMonteCarlo(ChainEngine):
     metric : "diagonal" or "dense"
         Whether scales of all numbers are learnt, or their correlations, too: dense where a few hundred
         numbers at most are strongly correlated.
+    threads : int
+        Threads that share the chains where trajectories are machine code; the answer is the same.
+    debug : bool
+        Compare machine code with NumPy after every trajectory: an error says what differs.
+    ess : float
+        Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
         Node -> where its chains start, as for `Gibbs`.
 
@@ -84,20 +93,25 @@ class HamiltonianMonteCarlo(ChainEngine):
     (True, 0)
     """
 
-    draws: int = 1000
-    warmup: int = 1000
-    chains: int = 4
+    draws: int | None = None
+    warmup: int | None = None
+    chains: int | None = None
     thinning: int = 1
     target_accept: float = 0.8
     max_depth: int = 10
     metric: Metric = "diagonal"
+    threads: int = field(default=1, compare=False)
+    debug: bool = False
+    ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Hamiltonian Monte Carlo"
+    judges: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_count(self, "max_depth", self.max_depth, "10")
+        check_count(self, "threads", self.threads, "2")
         what = type(self).__name__
         if not isinstance(self.target_accept, (int, float)) or not 0 < self.target_accept < 1:
             raise ValueError(
@@ -108,25 +122,9 @@ class HamiltonianMonteCarlo(ChainEngine):
             raise ValueError(f'{what}(metric={self.metric!r}): metric is "diagonal" or "dense"')
 
     def refusal(self, problem: Problem) -> str | None:
-        who = type(self).__name__
-        parts = refuse_parts(problem.observed, who)
-        if parts is not None:
-            return parts
-        try:
-            target = target_of(problem)
-            terms = [n for n in target.terms if n in problem.model.nodes]
-            reason = refuse_noiseless(problem.model, terms, who)
-            if reason is not None:
-                return reason
-            if target.chain and not continuous(target):
-                return (
-                    f"{who} moves continuous nodes, and what observations depend on is finite: "
-                    f"{', '.join(map(repr, target.chain[:4]))}"
-                )
-            self._plan(problem)
-        except UnsupportedError as error:
-            return f"{who} follows gradients, and this net has none: {error}"
-        return None
+        return refused(
+            problem, type(self).__name__, "follows gradients, and this net has none", self._fits
+        )
 
     def describe(self, problem: Problem) -> dict[str, str]:
         return {row.node: str(row) for row in self.table(problem)}
@@ -148,7 +146,20 @@ class HamiltonianMonteCarlo(ChainEngine):
 
     def sampler(self, problem: Problem) -> SweepSampler:
         plan = self._plan(problem)
-        return SweepSampler(plan.target, plan.kernels)
+        sampler = SweepSampler(plan.target, plan.kernels)
+        sampler.climbs = True
+        return sampler
+
+    def _fits(self, problem: Problem) -> str | None:
+        """Why it has nothing to move."""
+        target = target_of(problem)
+        if target.chain and not continuous(target):
+            return (
+                f"{type(self).__name__} moves continuous nodes, and what observations depend on is finite: "
+                f"{', '.join(map(repr, target.chain[:4]))}"
+            )
+        self._plan(problem)
+        return None
 
     def _plan(self, problem: Problem) -> Plan:
         """Kernels of what is finite, and one for all that is continuous."""
@@ -167,8 +178,10 @@ class HamiltonianMonteCarlo(ChainEngine):
             max_depth=self.max_depth,
             metric=self.metric,
             match=f"with all {density.size} free numbers, {self.metric} metric",
+            threads=self.threads,
+            debug=self.debug,
         )
         blankets = {n: plan.blankets.get(n) or Blanket(target, n) for n in target.chain}
-        kernels = [*plan.kernels, kernel]
+        kernels = [*plan.kernels, kernel, *rescaled_kernels(target, moving)]
         kernels += redrawn_kernels(target, blankets, kernels) if finite else []
         return replace(plan, kernels=kernels, blankets=blankets)

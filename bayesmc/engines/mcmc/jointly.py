@@ -53,6 +53,7 @@ def trajectories_of(
     closed: Collection[str] = (),
     alone: Collection[str] = (),
     keys: Mapping[str, Hashable] | None = None,
+    debug: bool = False,
 ) -> list[Hamiltonian]:
     """Kernels of nodes without a closed form that move better together than one at a time.
 
@@ -73,6 +74,8 @@ def trajectories_of(
         Nodes that others move in their own way.
     keys : mapping, optional
         What is equal for like nodes, which slices move as one (``structure.stacked.Forms.key``).
+    debug : bool
+        Compare machine code with NumPy at every step.
 
     Examples
     --------
@@ -95,7 +98,9 @@ def trajectories_of(
         if density is not None:
             metric: Metric = "dense" if density.size <= _DENSE else "diagonal"
             match = f"{density.size} free numbers jointly, {metric} metric"
-            kernels.append(Hamiltonian(density, density.others, metric=metric, match=match))
+            kernels.append(
+                Hamiltonian(density, density.others, metric=metric, match=match, debug=debug)
+            )
     return kernels
 
 

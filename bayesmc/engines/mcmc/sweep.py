@@ -5,7 +5,7 @@ What the kernels are, and how rows of the state make chains, is each engine's af
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,11 +14,12 @@ import numpy as np
 from bayesmc.engines.forward import fast_steps
 from bayesmc.engines.mcmc.starts import start_states
 from bayesmc.engines.mcmc.uphill import uphill
-from bayesmc.errors import ModelError
+from bayesmc.errors import ModelError, UnsupportedError
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.redrawn import renewals
-from bayesmc.network.forward import Pass, run
-from bayesmc.structure.target import Target, Values
+from bayesmc.network import Problem
+from bayesmc.network.forward import Pass, refuse_noiseless, refuse_parts, run
+from bayesmc.structure.target import Target, Values, target_of
 
 
 class SweepSampler:
@@ -130,6 +131,31 @@ class SweepSampler:
 def block_name(kernel: Kernel) -> str:
     """What a kernel's acceptance rate stands under."""
     return ", ".join(kernel.names)
+
+
+def refused(
+    problem: Problem, who: str, words: str, planned: Callable[[Problem], str | None]
+) -> str | None:
+    """Why an engine whose kernels sweep over a net cannot answer; None where it can.
+
+    Parameters
+    ----------
+    problem : Problem
+    who : str
+        The engine.
+    words : str
+        What is said before the reason where something is unsupported: "has no kernel for this net".
+    planned : callable
+        Makes the plan, or says why there is none.
+    """
+    parts = refuse_parts(problem.observed, who)
+    if parts is not None:
+        return parts
+    try:
+        terms = [n for n in target_of(problem).terms if n in problem.model.nodes]
+        return refuse_noiseless(problem.model, terms, who) or planned(problem)
+    except UnsupportedError as error:
+        return f"{who} {words}: {error}"
 
 
 # ---- private ------------------------------------------------------------------------------------
