@@ -132,8 +132,8 @@ class SameNumbers:
     --------
     >>> import numpy as np
     >>> from bayesmc.kernels.compiled_transition import SameNumbers
-    >>> SameNumbers(np.zeros((1, 1)), np.arange(4, dtype=np.uint64)).random(2).round(12)
-    array([0.        , 0.        ])
+    >>> SameNumbers(np.zeros((1, 1)), np.arange(1, 5, dtype=np.uint64) << 60).random(2)
+    array([0.0625, 0.4375])
     """
 
     def __init__(self, momenta: np.ndarray, seed: np.ndarray) -> None:
