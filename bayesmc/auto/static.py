@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from bayesmc.auto.along import along_trajectories
 from bayesmc.auto.explanation import Explanation
 from bayesmc.auto.pilot import weighed
 from bayesmc.dbn import DynamicBayesNet
@@ -151,6 +152,10 @@ def _choose(problem: Problem) -> tuple[Any, tuple[str, ...], dict[str, str]]:
         if forward is not None:
             refused["LikelihoodWeighting"] = forward
         found = weighed(problem, plan)
+        along = along_trajectories(problem, plan) if found is None else None
+        if along is not None:
+            refused["Gibbs"] = f"its sweeps are of {plan.in_short()}"
+            return along[0], (along[1],), refused
         if found is None:
             return (
                 Gibbs(),

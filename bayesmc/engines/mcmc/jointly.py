@@ -15,9 +15,9 @@ from bayesmc.structure.target import Target, target_of
 from bayesmc.structure.unconstrained import unconstrained_density
 
 #: numbers up to which their covariance is learnt, and not their scales alone
-_DENSE = 64
+DENSE = 64
 #: numbers of like nodes from which on slices move them as one (60 slices of a volatility: 5 times better)
-_CROWD = 32
+CROWD = 32
 #: numbers of one vector, at most
 _MOST = 4096
 
@@ -96,7 +96,7 @@ def trajectories_of(
         joined = _joined(target, group, [n for n in closed if n not in alone])
         density = _density_or_none(problem, joined) or _density_or_none(problem, group)
         if density is not None:
-            metric: Metric = "dense" if density.size <= _DENSE else "diagonal"
+            metric: Metric = "dense" if density.size <= DENSE else "diagonal"
             match = f"{density.size} free numbers jointly, {metric} metric"
             kernels.append(
                 Hamiltonian(density, density.others, metric=metric, match=match, debug=debug)
@@ -123,7 +123,7 @@ def _few(target: Target, names: Iterable[str], keys: Mapping[str, Hashable]) -> 
     many = {
         n
         for n, key in keys.items()
-        if key is not None and max(_CROWD, _size(target, [n])) < numbers[key]
+        if key is not None and max(CROWD, _size(target, [n])) < numbers[key]
     }
     near = {id(t) for t in target.terms_of(many)} if many else set()
     return [n for n in names if not any(id(t) in near for t in target.terms_of((n,)))]
@@ -146,7 +146,7 @@ def _groups(target: Target, names: Sequence[str]) -> list[tuple[str, ...]]:
     ]
     groups: list[list[str]] = []
     for name in sorted(fit, key=lambda n: _size(target, [n])):
-        if _size(target, [name]) > _DENSE:
+        if _size(target, [name]) > DENSE:
             if not model[name].plates and _size(target, [name]) <= _MOST:
                 groups.append([name])
             continue
@@ -154,7 +154,7 @@ def _groups(target: Target, names: Sequence[str]) -> list[tuple[str, ...]]:
         merged = [name]
         for group in list(groups):
             meets = any(id(t) in mine for other in group for t in target.terms_of((other,)))
-            if meets and _size(target, [*group, *merged]) <= _DENSE:
+            if meets and _size(target, [*group, *merged]) <= DENSE:
                 merged = [*group, *merged]
                 groups.remove(group)
         if len(merged) > 1 or not model[name].plates:
@@ -169,7 +169,7 @@ def _joined(target: Target, group: tuple[str, ...], closed: Sequence[str]) -> tu
     found = set(group)
     terms = {id(t) for t in target.terms_of(group)}
     for name in sorted(closed, key=lambda n: _size(target, [n])):
-        if _size(target, [*found, name]) <= _DENSE:
+        if _size(target, [*found, name]) <= DENSE:
             if any(id(t) in terms for t in target.terms_of((name,))):
                 found.add(name)
     return tuple(n for n in target.chain if n in found)

@@ -15,8 +15,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from bayesmc.engines.mcmc.jointly import continuous, density_of
 from bayesmc.errors import BayesmcError
-from bayesmc.structure.target import Target, Values
+from bayesmc.structure.target import Target, Values, target_of
 from bayesmc.structure.unconstrained import UnconstrainedDensity, unconstrained_density
 
 #: iterations of the optimiser, those after which it must have gained, those that it remembers, and how
@@ -52,7 +53,7 @@ def uphill(target: Target, values: Values, rng: np.random.Generator) -> Values:
     if all(model[n].is_discrete or model[n].domain is not None for n in target.chain):
         return values
     try:
-        density = unconstrained_density(target)
+        density = _density(target)
     except BayesmcError:
         return values
     if not 0 < density.size <= _LARGEST:
@@ -81,6 +82,13 @@ def uphill(target: Target, values: Values, rng: np.random.Generator) -> Values:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _density(target: Target) -> UnconstrainedDensity:
+    """That of all continuous nodes; of a problem's own target the one that kernels have."""
+    if target is target_of(target.problem):
+        return density_of(target.problem, continuous(target))
+    return unconstrained_density(target)
 
 
 def _paths(

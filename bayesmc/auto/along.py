@@ -1,0 +1,71 @@
+"""Where trajectories of all numbers together are better than a sweep over them, told without trying.
+
+A sweep moves a plate's elements by slices at once, each by itself: what they share crawls. Where many numbers
+are moved so, and they are most of all, trajectories in machine code take less for an effective draw (1.5 to
+13 times less on the models that it was tried on); in NumPy they need not. Their steps are shorter than the
+engine's own: hardly slower there, and fewer trajectories diverge.
+"""
+
+from __future__ import annotations
+
+import math
+
+from bayesmc.engines.mcmc.gibbs import Plan
+from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
+from bayesmc.engines.mcmc.jointly import CROWD, continuous, density_of
+from bayesmc.kernels.base import Kernel
+from bayesmc.kernels.ensemble import BlockWalk
+from bayesmc.kernels.factor_slice import FactorSlice
+from bayesmc.kernels.hamiltonian import GRADIENTS
+from bayesmc.kernels.slice import Slice
+from bayesmc.kernels.stacked import Stacked
+from bayesmc.network import Problem
+from bayesmc.structure.compiled_density import in_machine_code
+
+#: share of all numbers that have no closed form, at least; numbers of which a density is made to ask, at most
+_MOST_OF = 0.5
+_LARGEST = 4096
+_ACCEPTED = 0.9
+
+
+def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCarlo, str] | None:
+    """The engine that moves all numbers together, and why; None where a sweep is the better one.
+
+    Parameters
+    ----------
+    problem : Problem
+    plan : Plan
+        Of Gibbs.
+    """
+    model = problem.model
+    moved = {n for kernel in plan.kernels for n in kernel.names}
+    if any(model[n].is_discrete or model[n].domain is not None for n in moved):
+        return None
+    if any(isinstance(kernel, BlockWalk) for kernel in plan.kernels):  # it may find another mode
+        return None
+    sizes = {n: math.prod(model[n].value_shape) for n in moved}
+    slow = sum(sizes[n] for n in {n for k in plan.kernels if _is_slice(k) for n in k.names})
+    total = sum(sizes.values())
+    if not CROWD < slow or slow < _MOST_OF * total or total > _LARGEST:
+        return None
+    engine = HamiltonianMonteCarlo(target_accept=_ACCEPTED)
+    if engine.refusal(problem) is not None:
+        return None
+    lengths = engine.lengths(problem)
+    density = density_of(problem, continuous(plan.target))
+    told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
+    if "trajectories" not in told:
+        return None
+    return (
+        engine,
+        f"{slow} of {total} numbers have no closed form, and a sweep would move them one by one",
+    )
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _is_slice(kernel: Kernel) -> bool:
+    return isinstance(
+        kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice)
+    )

@@ -1,0 +1,83 @@
+"""Which models ``engine=None`` answers along trajectories, and that it says so."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import bayesmc as bmc
+from bayesmc.auto import along
+from bayesmc.auto.along import along_trajectories
+from bayesmc.engines.mcmc.gibbs import plan_of
+from bayesmc.lowering import machine
+from bayesmc.network import pose
+from bayesmc.structure import compiled_density
+
+pytest.importorskip("llvmlite", reason="llvmlite is not installed")
+
+TRIALS = np.tile([6, 9, 12, 7], 20)
+DIED = np.tile([0, 3, 2, 5, 1], 16)
+
+
+def litters(rows: int = 80, label: bool = False, closed: bool = False) -> Any:
+    """Counts of litters, whose logits (or shares) are alike."""
+    net, trials = bmc.BayesNet(plates={"litter": rows}), TRIALS[:rows]
+    net.add("mean", bmc.Normal(0.0, 3.0))
+    net.add("sd", bmc.HalfNormal(2.0))
+    if label:
+        net.add("kind", bmc.Bernoulli(0.4))
+        net.add("own", lambda mean, sd, kind: bmc.Normal(mean + kind, sd), plates="litter")
+    else:
+        net.add("own", lambda mean, sd: bmc.Normal(mean, sd), plates="litter")
+    if closed:
+        net.add("died", lambda own: bmc.Normal(own, 1.0), plates="litter")
+    else:
+        net.add("died", lambda own: bmc.Binomial(trials, logits=own), plates="litter")
+    return net, {"died": DIED[:rows]}
+
+
+def chosen(net: bmc.BayesNet, evidence: Any) -> Any:
+    problem = pose(net, evidence)
+    return along_trajectories(problem, plan_of(problem))
+
+
+def test_many_numbers_without_a_closed_form() -> None:
+    engine, why = chosen(*litters())
+    assert isinstance(engine, bmc.HamiltonianMonteCarlo)
+    assert why.startswith("81 of 82 numbers have no closed form")
+    told = bmc.explain(*litters())
+    assert isinstance(told.engine, bmc.HamiltonianMonteCarlo)
+    assert "slice (2)" in told.refused["Gibbs"]
+    assert "trajectories in machine code" in told.effort
+
+
+@pytest.mark.parametrize("options", [{"rows": 20}, {"label": True}, {"closed": True}])
+def test_others_are_swept_over(options: dict[str, Any]) -> None:
+    """Few numbers, finite nodes beside them, closed forms."""
+    assert chosen(*litters(**options)) is None
+
+
+def test_numpy_sweeps(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (machine, compiled_density):
+        monkeypatch.setattr(module, "is_available", lambda: False)
+    assert chosen(*litters()) is None
+
+
+def test_what_is_too_large_is_not_even_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(along, "_LARGEST", 70)
+    net, evidence = litters()
+    monkeypatch.setattr(bmc.HamiltonianMonteCarlo, "refusal", lambda *_: pytest.fail("asked"))
+    assert chosen(net, evidence) is None
+
+
+def test_means_are_those_of_gibbs() -> None:
+    """Two engines at 4.9 joint errors for 82 numbers: 1e-4 of false alarms."""
+    net, evidence = litters()
+    swept = bmc.infer(net, evidence, engine=bmc.Gibbs(ess=400), rng=0)
+    followed = bmc.infer(net, evidence, rng=0)
+    assert isinstance(followed.engine, bmc.HamiltonianMonteCarlo)
+    for name in ("mean", "sd", "own"):
+        error = np.hypot(swept.mcse(name), followed.mcse(name))
+        assert np.abs((swept.mean(name) - followed.mean(name)) / error).max() < 4.9
