@@ -9,23 +9,29 @@ engine's own: hardly slower there, and fewer trajectories diverge.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
-from bayesmc.engines.mcmc.gibbs import Plan
+from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.gibbs import Gibbs, Plan
 from bayesmc.engines.mcmc.hamiltonian import HamiltonianMonteCarlo
 from bayesmc.engines.mcmc.jointly import CROWD, continuous, density_of
+from bayesmc.expression import ordered
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.factor_slice import FactorSlice
-from bayesmc.kernels.hamiltonian import GRADIENTS
+from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
 from bayesmc.kernels.slice import Slice
 from bayesmc.kernels.stacked import Stacked
 from bayesmc.network import Problem
 from bayesmc.structure.compiled_density import in_machine_code
+from bayesmc.structure.free_density import UnconstrainedDensity
 
 #: share of all numbers that have no closed form, at least; numbers of which a density is made to ask, at most
 _MOST_OF = 0.5
 _LARGEST = 4096
 _ACCEPTED = 0.9
+#: nodes of an expression beyond which its arithmetic is slow in NumPy
+_LONG = 300
 
 
 def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCarlo, str] | None:
@@ -51,10 +57,7 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
     engine = HamiltonianMonteCarlo(target_accept=_ACCEPTED)
     if engine.refusal(problem) is not None:
         return None
-    lengths = engine.lengths(problem)
-    density = density_of(problem, continuous(plan.target))
-    told = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains).told
-    if "trajectories" not in told:
+    if not _is_compiled(problem, density_of(problem, continuous(plan.target)), engine):
         return None
     return (
         engine,
@@ -62,7 +65,27 @@ def along_trajectories(problem: Problem, plan: Plan) -> tuple[HamiltonianMonteCa
     )
 
 
+def follows(problem: Problem, kernels: Sequence[Kernel]) -> bool:
+    """Whether one kernel moves all numbers along trajectories, in machine code.
+
+    Not so of recursions written out: other kernels beside it evaluate them in NumPy, node by node.
+    """
+    if len(kernels) != 1 or not isinstance(kernels[0], Hamiltonian):
+        return False
+    density = kernels[0].density
+    if not isinstance(density, UnconstrainedDensity) or len(ordered(density.root)) > _LONG:
+        return False
+    return _is_compiled(problem, density, Gibbs())
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _is_compiled(problem: Problem, density: UnconstrainedDensity, engine: ChainEngine) -> bool:
+    """Whether a run will have trajectories in machine code."""
+    lengths = engine.lengths(problem)
+    made = in_machine_code(density, GRADIENTS * lengths.warmup, lengths.chains)
+    return "trajectories" in made.told
 
 
 def _is_slice(kernel: Kernel) -> bool:

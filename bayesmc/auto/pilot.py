@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from bayesmc.auto.along import follows
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Gibbs, Plan
 from bayesmc.engines.mcmc.metropolis import MetropolisHastings
@@ -126,7 +127,11 @@ def weighed(problem: Problem, plan: Plan) -> tuple[Trial, list[Trial]] | None:
     if "pilot" not in problem.cache:
         moved = dict.fromkeys(n for k in plan.kernels for n in k.names)
         finite = [n for n in moved if problem.model[n].domain is not None]
-        problem.cache["pilot"] = _weighed_once(problem, finite) if finite else _weighed(problem)
+        if finite:
+            problem.cache["pilot"] = _weighed_once(problem, finite)
+        else:
+            followed = follows(problem, [k for k in plan.kernels if not isinstance(k, BlockWalk)])
+            problem.cache["pilot"] = _weighed(problem, followed)
     return problem.cache["pilot"]
 
 
@@ -160,11 +165,17 @@ def _weighed_once(problem: Problem, finite: list[str]) -> tuple[Trial, list[Tria
     return None if drawn is None else (drawn, [Trial(Gibbs(), 0.0, words)])
 
 
-def _weighed(problem: Problem) -> tuple[Trial, list[Trial]]:
-    """Cheap pilots first: Gibbs has a full one only where it could still be better than what they showed."""
+def _weighed(problem: Problem, followed: bool) -> tuple[Trial, list[Trial]] | None:
+    """Cheap pilots first: Gibbs has a full one only where it could still be better than what they showed.
+
+    Where it moves all numbers along trajectories in machine code, a gradient costs less than the call of
+    one density, and no pilot of chains is worth its time.
+    """
     drawn = _weights(problem)
     if drawn is not None:
         return drawn, [Trial(Gibbs(), 0.0, _ENOUGH_WEIGHTED.format(""))]
+    if followed:
+        return None
     walk = _chains(problem, MetropolisHastings())
     gibbs = _at_best(problem)
     if walk.rate < _BETTER * gibbs.rate:
