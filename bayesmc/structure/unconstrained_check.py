@@ -8,7 +8,9 @@ sum of these.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import chain
 
 import numpy as np
 
@@ -25,6 +27,8 @@ _SPREADS = (0.0, 3.0, 0.1, 5.0, 1.0, 2.0, 0.3, 1.0)
 _MANY = 100
 #: reachable values farther out are tried at zero
 _FAR = 30.0
+#: points among which some of positive density are looked for, numbers that these may take, and how many do
+_SEARCHED, _NUMBERS, _FOUND = 8192, 4_000_000, 4
 #: how far log factors may be off, relative to themselves and to their largest part
 _RTOL = 1e-9
 #: how far those may be that are written for free numbers far out: where probabilities are near 0 or 1 the
@@ -63,7 +67,8 @@ def hold_against_model(
     inside = {t.name for table in tables for t in table.terms}
     names = [t.name for t in terms]
     seen, agreed = [False] * len(terms), [False] * len(plain)
-    for u, values in _points(density):
+    points = chain(_points(density), _positive(density, lambda: all(seen) and all(agreed)))
+    for u, values in points:
         found = [np.asarray(v) for v in program({**values, FREE: u})]
         given, written = found[: len(plain)], found[len(plain) :]
         wanted = [_counted(term, values) for term in terms]
@@ -104,29 +109,64 @@ def hold_against_model(
 def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]]:
     """Free numbers, and the stored values of all nodes there, one point after the other."""
     target, rng = density.target, np.random.default_rng(len(density.labels))
-    moving = set(density.names)
-    others = [n for n in target.chain if n not in moving]
     states = target.states
-    if others and states is None:
-        raise UnsupportedError(f"no reachable value of node {others[0]!r} is known to try it on")
     many = len(target.terms) > _MANY
     for k, spread in enumerate(_SPREADS[-4:] if many else _SPREADS):
-        values: Values = dict(target.known)
-        for name in others:
-            assert states is not None
-            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
+        values = _others(density, k)
         u = rng.normal(size=density.size) * spread
         if states is not None and k % 2:  # reachable ones, moved a little
             row = {n: states[n][k % len(states[n])] for n in density.names}
             reached = density.unconstrain({**values, **row})
             u = np.where(np.abs(reached) < _FAR, reached, 0.0) + 0.1 * u
-        values.update(density.constrain(u, values))
-        try:
-            with marking_invalid(), np.errstate(all="ignore"):
-                target.compute(values, target.links)
-        except BayesmcError:
-            continue
-        yield u, values
+        if _completed(density, u, values):
+            yield u, values
+
+
+def _positive(
+    density: UnconstrainedDensity, is_enough: Callable[[], bool]
+) -> Iterator[tuple[np.ndarray, Values]]:
+    """Where the density is positive, found among many: where it is nowhere so at the points before.
+
+    Cutpoints that must be in order, say, hardly ever are by chance.
+    """
+    if is_enough():
+        return
+    elements = sum(math.prod(t.shape) for t in density.target.terms.values())
+    count = min(_SEARCHED, max(_NUMBERS // max(elements, 1), 1))
+    rng, found = np.random.default_rng(density.size), 0
+    for k in range(_FOUND):
+        values = _others(density, k)
+        u = rng.normal(size=(count, density.size)) * rng.choice(_SPREADS[1:], size=(count, 1))
+        with np.errstate(all="ignore"):
+            log = np.broadcast_to(density.value(u, values), (count,))
+        for row in u[log > -np.inf][: _FOUND - found]:
+            at = dict(values)
+            if _completed(density, row, at):
+                found += 1
+                yield row, at
+
+
+def _others(density: UnconstrainedDensity, k: int) -> Values:
+    """Stored values of all nodes that do not move, in one of the reachable states."""
+    target, states = density.target, density.target.states
+    values: Values = dict(target.known)
+    for name in target.chain:
+        if name not in density.names:
+            if states is None:
+                raise UnsupportedError(f"no reachable value of node {name!r} is known to try it on")
+            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
+    return values
+
+
+def _completed(density: UnconstrainedDensity, u: np.ndarray, values: Values) -> bool:
+    """Put values of the nodes that move beside the others; whether they can be."""
+    values.update(density.constrain(u, values))
+    try:
+        with marking_invalid(), np.errstate(all="ignore"):
+            density.target.compute(values, density.target.links)
+    except BayesmcError:
+        return False
+    return True
 
 
 def _with_seen(target: Target, name: str, value: np.ndarray) -> np.ndarray:

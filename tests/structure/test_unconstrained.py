@@ -403,3 +403,23 @@ def test_constants_of_the_first_slice_for_all_are_seen_before_first_use() -> Non
 
 
 STACKED = alike.stacked_rows
+
+
+def test_points_of_positive_density_are_looked_for() -> None:
+    """Numbers that must be in order, as they are once in 720 draws: no point that is tried at first is."""
+    net, names = bmc.BayesNet(), [f"c{k}" for k in range(6)]
+    for name in names:
+        net.add(name, bmc.Normal(0.0, 1.0))
+
+    def in_order(*c: Any) -> Any:
+        inside = c[0] < c[1]
+        for low, high in zip(c[1:], c[2:], strict=False):
+            inside = inside & (low < high)
+        return np.where(inside, -np.abs(c[5] - c[0]), -np.inf)
+
+    net.potential("order", in_order, parents=names)
+    density = unconstrained_density(target_of(pose(net, {})))
+    u = np.arange(6.0)
+    value, slope = density.with_gradient(u)
+    np.testing.assert_allclose(value, -0.5 * u @ u - 3 * np.log(2 * np.pi) - 5.0)
+    np.testing.assert_allclose(slope, -u + np.array([1.0, 0, 0, 0, 0, -1.0]))
