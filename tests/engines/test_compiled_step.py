@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines import slice_densities
 from bayesmc.engines.particles import compiled_step
 from bayesmc.errors import BayesmcError
 from bayesmc.expression import elementwise
@@ -171,9 +172,9 @@ def test_planted_faults_leave_it_to_the_plain_steps(
 
         monkeypatch.setattr(writer.Writer, "_table", wrong)
     elif fault == "noise":
-        draw = compiled_step._draw
+        draw = slice_densities._draw
         monkeypatch.setattr(
-            compiled_step, "_draw", lambda n, f, z: draw(n, f, elementwise(np.multiply, z, 1.001))
+            slice_densities, "_draw", lambda n, f, z: draw(n, f, elementwise(np.multiply, z, 1.001))
         )
     else:
         call = compiled_step._Slice.__call__
