@@ -73,10 +73,11 @@ MODELS: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
 
 def passed(name: str, monkeypatch: pytest.MonkeyPatch, code: bool, **options: Any) -> Any:
     made: list[compiled_step.SliceCode] = []
-    kind = compiled_step.SliceCode
+    kind, read = compiled_step.SliceCode, options.pop("read", False)
     with monkeypatch.context() as patch:
         patch.setattr(compiled_step, "SliceCode", lambda step: made.append(kind(step)) or made[-1])
         patch.setattr(compiled_step, "_WORTH", 0.0 if code else np.inf)
+        patch.setattr(compiled_step, "_READ", 0 if read else np.inf)
         dbn, seen = MODELS[name]()
         inputs = {"u": np.linspace(0, 1, 25)} if name == "several" else None
         seed = options.pop("rng", 0)

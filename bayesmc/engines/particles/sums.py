@@ -191,7 +191,9 @@ def _of_run(run: Sequence[Tally]) -> dict[str, Sequence[np.ndarray]]:
             errors[k] = np.inf
     errors, places = np.sqrt(errors), run[0].moments.places
     whole = means, variances, errors
-    found = {n: tuple(a[:, low:high] for a in whole) for n, (low, high) in places.items()}
+    found: dict[str, Sequence[np.ndarray]] = {
+        n: tuple(a[:, low:high] for a in whole) for n, (low, high) in places.items()
+    }
     for name in run[0].agreed:
         values = np.array([s.agreed[name].reshape(-1) for s in run], dtype=float)
         found[name] = values, np.zeros(values.shape), np.zeros(values.shape)
