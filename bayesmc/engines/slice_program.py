@@ -7,7 +7,7 @@ parameter out of range, a weight that is no number) is done again by these, whic
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,12 @@ import numpy as np
 from bayesmc.distributions.base import all_finite
 from bayesmc.engines.slice_densities import SliceDensities, read_slice
 from bayesmc.errors import TraceError
-from bayesmc.expression import Program
+from bayesmc.expression import Expression, Leaf, Program, ordered
 from bayesmc.network import Model
 from bayesmc.network.forward import Pass, Step
 from bayesmc.network.forward import run as passed
 from bayesmc.passes.arrays import for_arrays
+from bayesmc.passes.elements import by_element, columns, together
 from bayesmc.passes.ranges import TRUE
 
 #: how far values and log weights may be off those of the plain steps
@@ -40,8 +41,8 @@ class SliceProgram:
     def __init__(self, read: SliceDensities) -> None:
         self.drawn, self.names, self.every = read.drawn, tuple(read.values), read.every
         self.is_strict, self.weighs = read.good is not TRUE, bool(read.log.leaves)
-        roots = [*read.values.values(), read.log]
-        self.program = Program(for_arrays([*roots, read.good] if self.is_strict else roots))
+        roots = [*read.values.values(), read.log, *([read.good] if self.is_strict else [])]
+        self.program = evaluator(roots)
         own = {z.name for z in read.drawn}
         self._own = [k for k, n in enumerate(self.names) if n in own]
         #: None until it was held against the plain steps; then what came of it
@@ -70,6 +71,24 @@ class SliceProgram:
     def _is_sound(self, values: Mapping[str, np.ndarray], log: np.ndarray) -> bool:
         (every,) = Program([self.every])(values)
         return bool(every.all()) and bool((log < np.inf).all())
+
+
+def evaluator(roots: Sequence[Expression]) -> Callable[[Mapping[str, Any]], list[np.ndarray]]:
+    """A program for many particles: short vectors element by element, where that can be."""
+    parts = by_element(roots) if any(n.shape for n in ordered(*roots) if n.leaves) else None
+    if parts is None:
+        return Program(for_arrays(roots))
+    program = Program(for_arrays([e for part in parts for e in part.reshape(-1)]))
+    leaves = [n for n in ordered(*roots) if isinstance(n, Leaf)]
+
+    def evaluated(values: Mapping[str, Any]) -> list[np.ndarray]:
+        found, whole = iter(program(columns(leaves, values))), []
+        for root in roots:
+            own = [next(found) for _ in range(root.size)]
+            whole.append(together(own, root.shape, root.dtype))
+        return whole
+
+    return evaluated
 
 
 class WholeSlice:

@@ -67,9 +67,9 @@ def test_what_is_out_of_range_is_the_error_of_the_plain_steps(
 def bounded() -> tuple[Any, dict[str, Any]]:
     """Weights of zero, which are no fault."""
     dbn = bmc.DynamicBayesNet()
-    dbn.add("x", lambda x_prev: bmc.Normal(x_prev, 1.0), initial=bmc.Normal(2.0, 1.0))
-    dbn.add("y", lambda x: bmc.Poisson(np.maximum(x, 0.0)))
-    return dbn, {"y": np.array([2.0, 1.0, 3.0, 0.0, 1.0, 2.0])}
+    dbn.add("x", lambda x_prev: bmc.Normal(0.5 * x_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Bernoulli(np.where(x > 0.0, 0.8, 0.0)))
+    return dbn, {"y": np.array([1, 1, 0, 1, 0, 1])}
 
 
 def test_weights_of_zero_are_no_fault(monkeypatch: pytest.MonkeyPatch, tried: list[Any]) -> None:

@@ -24,8 +24,8 @@ from bayesmc.lowering import Kernel, SliceKernel, is_available, weight_loops
 
 #: seconds in NumPy of a slice, and of a particle in it, below a tenth of which nothing is compiled
 _SLICE, _PARTICLE, _WORTH = 1e-4, 4e-8, 0.1
-#: slices from which on reading their densities is worth it
-_READ = 50
+#: seconds that a program saves of a slice, and of a particle in it; and that reading its densities takes
+_CALLS, _PASSES, _READ = 6e-5, 4e-9, 5e-3
 #: machine code, where it is kept with a model
 _KEPT = "compiled slices"
 
@@ -41,7 +41,8 @@ def compiled_step(step: FilterStep, steps: int, is_systematic: bool) -> FilterSt
     is_systematic : bool
         Whether it resamples by ``resampling.systematic``.
     """
-    step.plan.is_read = steps >= _READ
+    saved = steps * (_CALLS + _PASSES * step.layout.particles)
+    step.plan.is_read = saved > _READ
     if _why_not(step, steps) is None:
         step.machine = SliceCode(step)
         if is_systematic:

@@ -151,7 +151,7 @@ def answers(found: Sequence[Tally]) -> dict[str, Sequence[np.ndarray]]:
     if len(parts) == 1:
         return parts[0]
     joined = {n: zip(*(part[n] for part in parts), strict=True) for n in parts[0]}
-    return {n: tuple(map(np.concatenate, each)) for n, each in joined.items()}  # type: ignore[misc]
+    return {n: tuple(map(np.concatenate, each)) for n, each in joined.items()}
 
 
 # ---- private ------------------------------------------------------------------------------------
