@@ -119,21 +119,23 @@ def read_slice(
     if any(model[n].plates for n in dynamic):
         raise TraceError("plates are drawn by plain steps")
     given: dict[str, Expression] = {}
+    # what the slice before computed is known: as of slice 0, the model would have it follow otherwise
+    cut = frozenset(n for n in model.nodes if n not in dynamic)
     log, good, shows, drawn = ZERO, TRUE, TRUE, []
     for name in (n for n in model.nodes if n in dynamic):
         node = model[name]
         if not node.is_stochastic:
             if name in kept:
-                given[name] = substituted(value_of(model, name), given)
+                given[name] = substituted(value_of(model, name, cut), given)
                 if node.domain is not None:
                     raise TraceError(f"node {name!r} is computed and finite")
             continue
-        family = _family(model, name, given)
+        family = _family(model, name, given, cut)
         must, told = _in_range(name, family, name in seen)
         if name in seen:
             if family.make not in _SEEN:
                 raise TraceError(f"node {name!r} is seen through a family without machine code")
-            each = substituted(log_density_of(model, name), given)
+            each = substituted(log_density_of(model, name, cut), given)
             log = add(log, reduction(np.add, each, range(len(each.shape))))
         else:
             noise, shape = f"\0noise of {name}", (*node.plate_shape, *node.event_shape)
@@ -148,9 +150,11 @@ def read_slice(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _family(model: Model, name: str, given: Mapping[str, Expression]) -> Family:
+def _family(
+    model: Model, name: str, given: Mapping[str, Expression], cut: frozenset[str]
+) -> Family:
     """A node's family, its parameters by what is drawn before."""
-    read = density(model, name)
+    read = density(model, name, cut)
     if isinstance(read, Opaque):
         raise TraceError(f"node {name!r}: {read.reason}")
     family = read.result

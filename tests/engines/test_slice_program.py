@@ -17,7 +17,12 @@ from tests.engines import test_compiled_step as compiled
 
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.LowEssWarning")
 
-NODES = {"growth": ("x", "y"), "several": ("level", "scale", "both", "count"), "vector": ("x",)}
+NODES = {
+    "growth": ("x", "y"),
+    "several": ("level", "scale", "both", "count"),
+    "vector": ("x",),
+    "lagged": ("x", "b", "l"),
+}
 
 
 @pytest.fixture
