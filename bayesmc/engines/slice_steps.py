@@ -19,6 +19,7 @@ from bayesmc.distributions import Distribution
 from bayesmc.engines.forward import TableDraw, TableWeigh, table_of
 from bayesmc.engines.proposal import FUNCTION, as_function, bound
 from bayesmc.engines.proposing import proposal_steps
+from bayesmc.engines.slice_program import whole_slice
 from bayesmc.errors import ModelError, UnknownNodeError
 from bayesmc.kernels.proposal import Key, Proposal, names_of
 from bayesmc.network import CompiledNode, Model
@@ -59,6 +60,8 @@ class SlicePlan:
         self.slices, self.apart = slices, apart
         self.static = static_values(slices, static)
         self.proposals = proposals
+        #: whether densities that can be followed are read, which takes milliseconds, to be evaluated together
+        self.is_read = False
         self._kept: dict[Any, list[Step]] = {}
         self._tables: dict[tuple[bool, str], Table | None] = {}
 
@@ -120,9 +123,12 @@ class SlicePlan:
         plain = {name: self.step(row, name) for name in order}
         asked = [] if self.proposals is None else self.proposals.of(row)
         if not asked:
-            return list(plain.values())
-        steps = {name: plain.get(name, nothing) for name in model.nodes}
-        return proposal_steps(model, row.seen, steps, asked, self.apart)
+            steps = list(plain.values())
+            if self.is_read and all(seen.mask is None for seen in row.seen.values()):
+                return whole_slice(model, order, row.seen, steps)
+            return steps
+        every = {name: plain.get(name, nothing) for name in model.nodes}
+        return proposal_steps(model, row.seen, every, asked, self.apart)
 
     def _table(self, first: bool, name: str) -> Table | None:
         """A finite node's table over what varies, if it is the same in every slice."""

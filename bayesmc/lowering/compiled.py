@@ -251,40 +251,103 @@ class SliceKernel:
         if not all(self._wide):
             raise TraceError("what is the same for all particles is made by plain steps")
 
-    def begun(
-        self, values: Mapping[str, np.ndarray], rows: np.ndarray, results: Sequence[np.ndarray]
-    ) -> Callable[[int, int], int]:
-        """``run(low, count)``: results of so many particles from ``low`` on; 0 where all went well.
+    def call(self, own: Mapping[str, np.ndarray]) -> SliceCall:
+        """The function with memory of its own, and arrays that are filled before each call.
 
         Parameters
         ----------
-        values : mapping
-            Leaf -> its values; those of own ones begin anew with every call.
+        own : mapping
+            Leaf -> values of the particles of one call, in C order.
+        """
+        return SliceCall(self._way, self.shapes, own, self._chosen)
+
+
+class SliceCall:
+    """Calls of a ``SliceKernel``, not from two threads at once.
+
+    Parameters
+    ----------
+    way : Way
+    shapes : sequence of tuple
+        Of the results of one particle.
+    own : mapping
+    chosen : frozenset of str
+    """
+
+    def __init__(
+        self,
+        way: Way,
+        shapes: Sequence[Shape],
+        own: Mapping[str, np.ndarray],
+        chosen: frozenset[str],
+    ) -> None:
+        self._own, self._held = dict(own), list[np.ndarray]()
+        self._table, self._memory = way.table(len(shapes))
+        self._address, self._call = address_of(self._table), way.loaded.call
+        self._known: list[tuple[str, np.ndarray]] = []
+        self._chosen: list[tuple[int, str]] = []
+        for k, node in enumerate(way.kernel.leaves):
+            if node.name in chosen:
+                self._chosen.append((k, node.name))
+                continue
+            array = own.get(node.name)
+            if array is None:
+                array = np.empty(node.shape, DTYPES[kind_of(node)])
+                self._known.append((node.name, array))
+            self._table[k] = address_of(array)
+        self._first = len(self._table) - len(shapes)
+        self._rows = self._first - 1 if chosen else None
+        self._shapes = [(s, 8 * math.prod(s)) for s in shapes]
+        self._moving: list[tuple[int, int, int]] = []
+
+    def begin(
+        self,
+        known: Mapping[str, np.ndarray],
+        before: Mapping[str, np.ndarray],
+        rows: np.ndarray,
+        room: Callable[[tuple[int, ...]], np.ndarray],
+        particles: int,
+    ) -> list[np.ndarray]:
+        """Arrays for the results of so many particles, which calls then fill.
+
+        Parameters
+        ----------
+        known : mapping
+            Leaves with one value for all.
+        before : mapping
+            Leaves with one value for each particle before.
         rows : ndarray of int64
             Of each particle the ancestor.
-        results : sequence of ndarray
-            To be filled, in C order.
+        room : callable
+            An array of a shape.
         """
-        way = self._way
-        table, kept = way.table(len(results))
-        held: list[Any] = [kept]
-        for k, node in enumerate(way.kernel.leaves):
-            array = np.ascontiguousarray(values[node.name], DTYPES[kind_of(node)])
+        table = self._table
+        for name, array in self._known:
+            array[...] = known[name] if name in known else before[name]
+        held: list[np.ndarray] = []
+        for k, name in self._chosen:
+            array = np.ascontiguousarray(before[name], float)
             held.append(array)
             table[k] = address_of(array)
-        moving = [(len(table) - len(results) + k, address_of(r), 8 * math.prod(s))
-                  for k, (r, s) in enumerate(zip(results, self.shapes, strict=True))]  # fmt: skip
-        if self._chosen:
-            held.append(np.ascontiguousarray(rows, np.int64))
-            moving.append((len(table) - len(results) - 1, address_of(held[-1]), 8))
-        address, call = address_of(table), way.loaded.call
+        found = [room((particles, *shape)) for shape, _ in self._shapes]
+        moving = self._moving = [
+            (k, address_of(array), size)
+            for k, (array, (_, size)) in enumerate(
+                zip(found, self._shapes, strict=True), self._first
+            )
+        ]
+        if self._rows is not None:
+            rows = np.ascontiguousarray(rows, np.int64)
+            held.append(rows)
+            moving.append((self._rows, address_of(rows), 8))
+        self._held = held  # as long as calls read them
+        return found
 
-        def run(low: int, count: int, held: Any = held) -> int:
-            for place, first, step in moving:
-                table[place] = first + low * step
-            return call(count, address)
-
-        return run
+    def __call__(self, low: int, count: int) -> int:
+        """Results of so many particles from ``low`` on; 0 where all went well."""
+        for place, first, size in self._moving:
+            self._table[place] = first + low * size
+        return int(self._call(count, self._address))
 
 
 class Bound:

@@ -161,15 +161,17 @@ def density(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Follo
     return known[name, cut]
 
 
-def log_density_of(model: Model, name: str) -> Expression:
+def log_density_of(model: Model, name: str, cut: frozenset[str] = frozenset()) -> Expression:
     """The log density of a stochastic node at its stored value, shape its plates.
+
+    Deterministic nodes in ``cut`` are leaves.
 
     Raises
     ------
     TraceError
         Its function cannot be followed, or its family has no closed form.
     """
-    node, found = model[name], density(model, name)
+    node, found = model[name], density(model, name, cut)
     if isinstance(found, Opaque):
         raise TraceError(f"node {name!r}: {found.reason}")
     family = found.result

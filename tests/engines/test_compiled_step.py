@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines import slice_densities
 from bayesmc.engines.particles import compiled_step
 from bayesmc.errors import BayesmcError
 from bayesmc.expression import elementwise
@@ -65,17 +66,32 @@ def vector() -> tuple[Any, dict[str, Any]]:
     return dbn, {"y": np.random.default_rng(2).gamma(2.0, size=20)}
 
 
+def lagged() -> tuple[Any, dict[str, Any]]:
+    """What the slice before computed is not what it would have computed as slice 0."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("b", lambda b_prev: bmc.Normal(b_prev, 0.5), initial=bmc.Normal(3.0, 1.0))
+    dbn.add(
+        "x",
+        lambda x_prev, l_prev: bmc.Normal(1.2 * x_prev - 0.6 * l_prev, 0.8),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("l", lambda x_prev: x_prev, initial=lambda b: b)
+    dbn.add("y", lambda x, b: bmc.Normal(x + 0.3 * b, 0.7))
+    return dbn, {"y": np.random.default_rng(3).normal(0.0, 2.0, size=30)}
+
+
 MODELS: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
-    "growth": growth, "several": several, "vector": vector,
+    "growth": growth, "several": several, "vector": vector, "lagged": lagged,
 }  # fmt: skip
 
 
 def passed(name: str, monkeypatch: pytest.MonkeyPatch, code: bool, **options: Any) -> Any:
     made: list[compiled_step.SliceCode] = []
-    kind = compiled_step.SliceCode
+    kind, read = compiled_step.SliceCode, options.pop("read", False)
     with monkeypatch.context() as patch:
         patch.setattr(compiled_step, "SliceCode", lambda step: made.append(kind(step)) or made[-1])
         patch.setattr(compiled_step, "_WORTH", 0.0 if code else np.inf)
+        patch.setattr(compiled_step, "_READ", 0 if read else np.inf)
         dbn, seen = MODELS[name]()
         inputs = {"u": np.linspace(0, 1, 25)} if name == "several" else None
         seed = options.pop("rng", 0)
@@ -97,7 +113,9 @@ def test_means_agree_in_every_slice(
         missing = "drawn from a family without machine code"  # counts that are not seen
         assert all(missing in why for why in code.refused.values())
         assert sum(made is not None for made in code._made.values()) >= 2
-        for node in ("level", "scale", "both") if name == "several" else ("x",):
+        for node in {"several": ("level", "scale", "both"), "lagged": ("x", "b", "l")}.get(
+            name, "x"
+        ):
             np.testing.assert_allclose(fast.mean(node), plain.mean(node), rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(fast.var(node), plain.var(node), rtol=1e-8, atol=1e-9)
         assert fast.log_marginal_likelihood == pytest.approx(
@@ -171,9 +189,9 @@ def test_planted_faults_leave_it_to_the_plain_steps(
 
         monkeypatch.setattr(writer.Writer, "_table", wrong)
     elif fault == "noise":
-        draw = compiled_step._draw
+        draw = slice_densities._draw
         monkeypatch.setattr(
-            compiled_step, "_draw", lambda n, f, z: draw(n, f, elementwise(np.multiply, z, 1.001))
+            slice_densities, "_draw", lambda n, f, z: draw(n, f, elementwise(np.multiply, z, 1.001))
         )
     else:
         call = compiled_step._Slice.__call__

@@ -224,7 +224,7 @@ MUTANTS = [
     ),
     Mutant(
         "the stated error of a mean is halved",
-        (Edit("bayesmc.engines.particles.errors:_by_shares",
+        (Edit("bayesmc.engines.particles.errors:by_shares",
               "(parts**2 /", "0.25 * (parts**2 /"),),
         stated(line, {"y": LONG["y"][:16]}, bmc.ParticleFilter(300), 600),
         "stated_errors_test, 600 runs of 300 particles",

@@ -10,7 +10,7 @@ import numpy as np
 from bayesmc.engines.averages import as_event, called
 from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors
-from bayesmc.engines.particles.genealogy import Families
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.smc import Layout, Particles
 from bayesmc.errors import QueryError, UnknownNodeError
 from bayesmc.network import CompiledNode, Model

@@ -12,8 +12,9 @@ from bayesmc.engines.beliefs import OnlineBelief
 from bayesmc.engines.particles.answers import Answers, numbers_of
 from bayesmc.engines.particles.blocks import Block
 from bayesmc.engines.particles.errors import ByFamily, node_errors
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
-from bayesmc.engines.particles.genealogy import Families, evidence_error
+from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.smc import Bare, Particles
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError, UnknownNodeError

@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from bayesmc.engines.particles.blocks import Block
-from bayesmc.engines.particles.genealogy import OLD, YOUNG, Families, family_sums
+from bayesmc.engines.particles.families import OLD, YOUNG, Families
+from bayesmc.engines.particles.genealogy import family_sums
 from bayesmc.network import CompiledNode
 from bayesmc.results.shares import is_share, steps
 
@@ -82,11 +83,11 @@ class ByFamily(Variances):
         weighted = off * self.block.weights[:, :, None] if weighted is None else weighted
         weighted = weighted.reshape(-1, *off.shape[2:])
         bounds, shares = self.old
-        found = _by_shares(family_sums(weighted, bounds) / self.total, shares)
+        found = by_shares(family_sums(weighted, bounds) / self.total, shares)
         if self.few is not None:
             bounds, shares = self.young
             parts = family_sums(weighted[self.few], bounds) / self.total[self.few]
-            young = _by_shares(parts, shares)
+            young = by_shares(parts, shares)
             was = found[self.few]
             found[self.few] = np.maximum(np.where(np.isinf(was), 0.0, was), young)
         return found.reshape(off.shape[:3])
@@ -149,6 +150,18 @@ def function_errors(
     return np.sqrt(found).reshape(len(values), *values[0].shape[1:])
 
 
+def by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
+    """Variances by parts ``(rows, numbers, groups)`` of means, with what these owe to each family.
+
+    ``shares`` are those of the families, ``(rows, 1, groups)``. Variances are as much larger as the square of
+    Student's t is than that of a normal figure; infinite where too few families are left to say.
+    """
+    even = 1.0 / np.vecdot(shares, shares)
+    free = np.maximum(even - 1.0, LAST - 1.0)
+    found = (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=-1) * (free / (free - 2.0))
+    return np.where(even < LAST, np.inf, found)
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
@@ -177,15 +190,3 @@ def _unseen(share: np.ndarray, worth: np.ndarray) -> np.ndarray:
     centre = (share * ess + 2.0) / (ess + 4.0)
     rare = np.minimum(share, 1.0 - share) * ess < 1.0
     return np.where(rare, centre * (1.0 - centre) / (ess + 4.0), 0.0)
-
-
-def _by_shares(parts: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Variances by parts ``(rows, numbers, groups)`` of means, with what these owe to each family.
-
-    They are as much larger as the square of Student's t is than that of a normal figure; infinite where too
-    few families are left to say.
-    """
-    even = 1.0 / np.vecdot(shares, shares)
-    free = np.maximum(even - 1.0, LAST - 1.0)
-    found = (parts**2 / np.maximum(1.0 - shares, 1e-12)).sum(axis=-1) * (free / (free - 2.0))
-    return np.where(even < LAST, np.inf, found)

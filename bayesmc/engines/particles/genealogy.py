@@ -27,16 +27,17 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
+from bayesmc.engines.particles.families import LONGEST, OLD, YOUNG, Families
 from bayesmc.engines.particles.smc import Layout, Particles
 
 #: families of an origin, and founders of each, at least, where there are particles enough
 GROUPS, LEAST = 32, 4
-#: slices after which the younger origin takes over, at the latest and at the soonest
-LONGEST, SHORTEST = 50, 6
+#: slices after which the younger origin takes over at the soonest
+SHORTEST = 6
 #: slices from one look at the families to the next
 STRIDE = 3
 #: share of the families that must be left to an origin, by their evenness; below it is given up sooner
@@ -61,112 +62,6 @@ LONG = 0.2
 MOST = 1.0
 #: sum of the moves of a mean, in units of its spread, from which on particles seem to be missing
 SEEMS = 2.8
-
-OLD, YOUNG = 0, 1
-
-
-class Lost(NamedTuple):
-    """Particles of a slice that could not be trusted, and what has happened since.
-
-    Attributes
-    ----------
-    where : ndarray of bool, shape (*apart,)
-        Elements that are lost.
-    wide : tuple of ndarray, shapes (many, numbers)
-        Variances of the numbers of each node then; of finite nodes, 1.
-    gone : tuple of ndarray, shapes (many, numbers)
-        Variances of what was random since.
-    since : int
-        Slice of the last measurement.
-    roots : ndarray of int or None, shape (particles, *apart)
-        Whom each particle descends from there; None where everybody has itself.
-    """
-
-    where: np.ndarray
-    wide: tuple[np.ndarray, ...]
-    gone: tuple[np.ndarray, ...]
-    since: int
-    roots: np.ndarray | None = None
-
-
-class Drift(NamedTuple):
-    """Moves of the means of numbers so far, in units of their spreads.
-
-    Attributes
-    ----------
-    moves : ndarray, shape (2, elements, numbers)
-        Their sums, and the variances of these.
-    worst : ndarray, shape (*apart,)
-        The largest sum of moves of any number, in units of what is expected of it.
-    largest : float
-        That of the elements.
-    limit : float
-        From which on particles are missing.
-    """
-
-    moves: np.ndarray
-    worst: Any
-    largest: float
-    limit: float
-
-
-class Scouts(NamedTuple):
-    """Those who are where no particle is.
-
-    Attributes
-    ----------
-    values : dict
-        All nodes of the slice, shape ``(scouts, *plates, *event)``.
-    log_weights : ndarray, shape (scouts,)
-        Relative to those of all particles together.
-    share : float
-        The sum of their weights, less that of the particles in such states.
-    """
-
-    values: dict[str, np.ndarray]
-    log_weights: np.ndarray
-    share: float
-
-
-class Families(NamedTuple):
-    """Families of an old and a young origin, as they stand in the present slice.
-
-    Attributes
-    ----------
-    bounds : ndarray of int, shape (2, groups + 1, *apart)
-        Positions between which each family's particles lie.
-    shares : ndarray, shape (2, groups, *apart)
-        Their shares of the weight at the origin.
-    kept : ndarray, shape (2, groups, *apart)
-        Logs of what a family's weight is worth: where resampling gave it more particles than its weight
-        demands, it counts for less.
-    explained : ndarray, shape (2, 2, *apart)
-        Variance of the log evidence that the weights of the slices since would make by themselves: of all
-        slices, and of those whose weights have no tail.
-    born : ndarray of int, shape (2, *apart)
-        Slices of the origins.
-    settled : ndarray, shape (*apart,)
-        Variance of the log evidence up to the old origin.
-    lost : Lost or None
-        What the filter has lost sight of.
-    scouts : Scouts or None
-        Where states have no particle: what the rows make of these.
-    drift : Drift or None
-        Whether rows pull the particles the same way; None where particles are not drawn from the model.
-    doubted : int or ndarray of int, shape (*apart)
-        The last slice in which families differed by more than weights explain, if many did.
-    """
-
-    bounds: np.ndarray
-    shares: np.ndarray
-    kept: np.ndarray
-    explained: np.ndarray
-    born: np.ndarray
-    settled: Any
-    lost: Lost | None = None
-    scouts: Scouts | None = None
-    drift: Drift | None = None
-    doubted: Any = -LONGEST
 
 
 def rested(now: Particles) -> Any:
@@ -213,6 +108,27 @@ def followed(
         families, more = _renewed(families, earlier, now)
         gained = gained + more
     return families, gained
+
+
+def unremarkable(
+    families: Families, earlier: Particles, now: Particles
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """Bounds and what is explained one slice later, where that is all that changes; None elsewhere.
+
+    Of a filter without plates, whose families' weights are what their particles are.
+    """
+    chosen = now.ancestors
+    if chosen is None:
+        return families.bounds, families.explained
+    bounds = _searched(chosen, families.bounds)
+    explained = families.explained + _explained(earlier)
+    if now.t % STRIDE == 0:
+        n = len(chosen)
+        counts = (bounds[:, 1:] - bounds[:, :-1]) / n
+        off = counts - families.shares
+        if _matters(families, explained, now, counts, off):
+            return None
+    return bounds, explained
 
 
 def evidence_error(families: Families, now: Particles) -> Any:
@@ -303,7 +219,7 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
         off = _off(families, counts * np.exp(families.kept))
     else:
         off = counts - families.shares
-        if off.ndim == 2 and not _matters(families, now, counts, off):
+        if off.ndim == 2 and not _matters(families, families.explained, now, counts, off):
             return families, 0.0
     resampled = np.asarray(now.resampled)
     variance = _variance(families, off)
@@ -326,16 +242,16 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
     return _begun_again(families, now, due, False), gained
 
 
-def _matters(families: Families, now: Particles, counts: np.ndarray, off: np.ndarray) -> bool:
+def _matters(
+    families: Families, explained: np.ndarray, now: Particles, counts: np.ndarray, off: np.ndarray
+) -> bool:
     """Whether anything is due, or seems odd, in a filter without plates: the same in Python's numbers."""
     level, age = _level(len(now.weights)), now.t - int(families.born[YOUNG])
     shares, far = _square(families.shares, 1).tolist(), _square(off, 1).tolist()
     few = shares[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
     if age > LONGEST or (age > SHORTEST and few):
         return True
-    for even, spread, (every, bounded) in zip(
-        shares, far, families.explained.tolist(), strict=True
-    ):
+    for even, spread, (every, bounded) in zip(shares, far, explained.tolist(), strict=True):
         left = 1.0 - spread / (1.0 - even) if even < 1.0 else 0.0
         variance = -math.log(left) if left > 1e-9 else math.inf
         if variance > min(max(level, EDGE * every), max(LONG, EDGE * bounded), MOST):

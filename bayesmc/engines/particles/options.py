@@ -13,7 +13,7 @@ import numpy as np
 from bayesmc.dbn import SeriesProblem, Slices
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.particles.auxiliary import PluggedIn
-from bayesmc.engines.particles.genealogy import Families
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.optimal import guidance
 from bayesmc.engines.particles.record import FilteredParticles
 from bayesmc.engines.particles.smc import Particles

@@ -65,6 +65,7 @@ class Replicates:
     ) -> None:
         self.slices, self.rng, self.steps = problem.slices, rng, problem.steps
         self.plan = SlicePlan(problem.slices, plan.apart, plan.static)
+        self.plan.is_read = plan.is_read
         self.lead = tuple(problem.slices.first.sizes[p] for p in plan.apart)
         self.names = tuple(problem.series.observed)
         self._wide = _numbers_seen(problem) >= WIDE

@@ -18,7 +18,7 @@ import numpy as np
 
 from bayesmc.categorical import pick
 from bayesmc.dbn import PREVIOUS, Row, Slices
-from bayesmc.engines.particles.genealogy import Scouts
+from bayesmc.engines.particles.families import Scouts
 from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import BayesmcError

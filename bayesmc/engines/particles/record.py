@@ -18,12 +18,14 @@ from bayesmc.engines.filtering import (
     refuse_forecast,
 )
 from bayesmc.engines.particles.answers import Answers, at_scouts, evaluated
-from bayesmc.engines.particles.blocks import NUMBERS, Block, alike
+from bayesmc.engines.particles.blocks import NUMBERS, Block, Figures, alike, diagnosed, figures_of
 from bayesmc.engines.particles.errors import ByFamily, Variances, function_errors, node_errors
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
-from bayesmc.engines.particles.genealogy import Families, evidence_error
+from bayesmc.engines.particles.genealogy import evidence_error
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Layout, Particles, quiet
+from bayesmc.engines.particles.sums import Tally, answers
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
@@ -88,11 +90,21 @@ class Record:
         self._written: list[Written] = []
         self._room: dict[Any, np.ndarray] = {}
         self.keep = keep
+        #: takes sums of slices as they come, or None; and what is summed and not written yet
+        self._summing = None if tracker is None or queries else tracker.summing(self._nodes)
+        self._tallies: list[Tally] = []
+        self._figures: list[Figures] = []
+        self._summed: list[Particles] = []
 
     def add(
         self, k: int, particles: Particles, row: Row | None = None, families: Families | None = None
     ) -> None:
         """Take in the particles of the k-th slice."""
+        if self._summing is not None and row is not None and self._summing.fits(particles):
+            self._sum(particles, row)
+            return
+        if self._tallies:
+            self.write()
         values = {}
         for name, function in self.asked.items():
             with naming(name):
@@ -107,23 +119,50 @@ class Record:
 
     @property
     def is_written(self) -> bool:
-        """Whether nothing waits: then particles of the past are not needed any more."""
+        """Whether no particles wait: then those of the past are not needed any more."""
         return not self._waiting
 
     @property
     def families(self) -> Families | None:
-        """Those of the last slice that is written."""
-        return (
-            self._written[-1].families[-1] if self._written and self._written[-1].families else None
-        )
+        """Those of the last slice that is written, or summed."""
+        if self._tallies:
+            return self._tallies[-1].families
+        last = self._written[-1].families if self._written else []
+        return last[-1] if last else None
 
     def write(self) -> None:
         """Work out the answers about all slices that wait, or none where it ends early."""
-        if self._waiting:
-            written, earlier = self._worked_out(self._waiting), self._written
-            if earlier and not self.keep:
-                earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
-            self._written, self._waiting = [*earlier, written], []
+        if not self._waiting and not self._tallies:
+            return
+        worked_out = self._worked_out(self._waiting) if self._waiting else self._tallied()
+        earlier = self._written
+        if earlier and not self.keep:
+            earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
+        self._written, self._waiting = [*earlier, worked_out], []
+        self._tallies, self._figures, self._summed = [], [], []
+
+    def _sum(self, now: Particles, row: Row) -> None:
+        """Take the sums of a slice."""
+        assert self.tracker is not None and self._summing is not None
+        if self._waiting or len(self._tallies) >= TOGETHER:
+            self.write()
+        earlier = self._summed[-1] if self._summed else None
+        if earlier is None and self._written:
+            earlier = self._written[-1].particles[-1]
+        tally = self.tracker.tally(self.families, earlier, now, row, self._summing)
+        self._tallies.append(tally)
+        self._figures.append(figures_of(now))
+        self._summed = [*self._summed, now] if self.keep else [now]
+
+    def _tallied(self) -> Written:
+        """The answers about slices of which there are sums."""
+        found, rows = answers(self._tallies), Rows({what: {} for what in _KINDS})
+        for node in self._nodes:
+            for what, own in zip(("means", "variances", "errors"), found[node.name], strict=True):
+                rows[what][node.name] = own.reshape(-1, *node.value_shape)
+        rows["filter"] = diagnosed(self._figures, self.layout.lead)
+        families = [t.families for t in self._tallies]
+        return Written(rows, families if self.keep else families[-1:], self._summed)
 
     def _worked_out(self, waiting: Sequence[Waiting]) -> Written:
         slices = [w.particles for w in waiting]
@@ -148,7 +187,7 @@ class Record:
                 pairs = zip(slices, families, strict=True)
                 there = [at_scouts(self.layout, p, f, model, function) for p, f in pairs]
                 rows["query errors"][name] = function_errors(by, block, values, there)
-        rows["filter"] = _diagnosed(slices, self.layout.lead)
+        rows["filter"] = diagnosed([figures_of(p) for p in slices], self.layout.lead)
         return Written(
             rows, families if self.keep else families[-1:], slices if self.keep else slices[-1:]
         )
@@ -408,34 +447,3 @@ def filtered_by(
         so_far = partial(record.posterior, engine, "filter")
         pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         return record.posterior(engine, predictive=None if looks is None else looks.found())
-
-
-# ---- private ------------------------------------------------------------------------------------
-
-
-def _diagnosed(slices: Sequence[Particles], lead: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """Figures of the filter itself."""
-
-    def flags(each: list[Any]) -> np.ndarray:
-        return np.array(each if not lead else [np.broadcast_to(e, lead) for e in each], dtype=bool)
-
-    return {
-        "increments": np.array([p.increment for p in slices], dtype=float),
-        "weight_ess": np.array([p.ess for p in slices], dtype=float),
-        "resampled": flags([p.resampled for p in slices]),
-        "rejuvenated": flags([p.rejuvenated for p in slices]),
-        "counts": np.array([len(p.weights) for p in slices]),
-        "injected": np.array([p.injected for p in slices]),
-        "unique_ancestors": np.array([_unique(p, lead) for p in slices]),
-    }
-
-
-def _unique(particles: Particles, lead: tuple[int, ...]) -> Any:
-    """How many particles of the slice before have offspring, shape ``(*apart)``."""
-    chosen = particles.ancestors
-    if chosen is None:
-        found: Any = np.full(lead, len(particles.weights))
-    else:  # without an axis it is ten times faster
-        along = 0 if lead else None
-        found = np.count_nonzero(chosen[1:] != chosen[:-1], axis=along) + 1
-    return found if particles.rejuvenated is False else np.where(particles.rejuvenated, 0, found)

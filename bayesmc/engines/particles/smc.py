@@ -161,6 +161,8 @@ class SMCStep:
         chains: int | None = None,
     ) -> None:
         self.layout, self.resample, self.threshold = layout, resample, threshold
+        #: what decides on offspring, whatever does it
+        self.scheme = resample
         self.batch = () if chains is None else (chains,)
         own = layout.apart[: len(self.batch)]
         self.kept = tuple(dict.fromkeys((*interface, *kept)))

@@ -12,7 +12,7 @@ from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.filtering import Queries
 from bayesmc.engines.particles.backward import TRAJECTORIES, Backward, lagged
 from bayesmc.engines.particles.coalescence import Sharing
-from bayesmc.engines.particles.genealogy import Families
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.record import FilteredParticles, Record, filtered_by
 from bayesmc.engines.particles.smc import Particles, quiet
 from bayesmc.engines.particles.tracking import Tracker

@@ -28,19 +28,12 @@ import numpy as np
 
 from bayesmc.dbn import Row
 from bayesmc.engines.particles.blocks import Block
+from bayesmc.engines.particles.families import LONGEST, Drift, Families, Lost
 from bayesmc.engines.particles.filter_step import FilterStep
-from bayesmc.engines.particles.genealogy import (
-    LONGEST,
-    SEEMS,
-    Drift,
-    Families,
-    Lost,
-    begun,
-    followed,
-    rested,
-)
+from bayesmc.engines.particles.genealogy import SEEMS, begun, followed, rested, unremarkable
 from bayesmc.engines.particles.rare_states import Scouting
 from bayesmc.engines.particles.smc import Layout, Particles
+from bayesmc.engines.particles.sums import MANY, NUMBERS, Moments, Summing, Tally
 from bayesmc.network import CompiledNode
 from bayesmc.resampling import ssp, stratified, systematic
 
@@ -58,6 +51,8 @@ BACK = 4.0
 #: share of the belief in states without particles, over that of all particles, up to which it is an error
 LEFT_OUT = 0.1
 
+#: where nothing was lost, without plates
+_NOWHERE = np.asarray(False)
 _FADED = np.array([FADING, FADING**2]).reshape(2, 1, 1)
 
 
@@ -82,7 +77,8 @@ class Tracker:
         self.compass = compass if compass.nodes and not blind else None
         # after a first stage, what a family should have is not what its weight says
         schemes = (stratified, systematic, ssp)
-        self.steady = step.resample in schemes or step.first_stage is not None
+        self.steady = step.scheme in schemes or step.first_stage is not None
+        self._is_plain = self.steady and not step.layout.apart and self.scouting is None
 
     def after(
         self,
@@ -114,6 +110,31 @@ class Tracker:
         block = Block(self.layout, [now], room=self.room)
         return self.after(families, earlier, block, [row])[0]
 
+    def summing(self, nodes: Sequence[CompiledNode]) -> Summing | None:
+        """What takes the sums of slices with these nodes, where these say all; else None."""
+        every = {n.name: n for n in (*nodes, *self.sight.nodes)}.values()
+        if self.layout.particles < MANY or not self._is_plain:
+            return None
+        if any(n.domain is not None or n.angles is not None for n in every):
+            return None
+        few = sum(math.prod(n.value_shape) for n in every) <= NUMBERS
+        return Summing(list(every), self.layout.particles) if few else None
+
+    def tally(
+        self,
+        families: Families | None,
+        earlier: Particles | None,
+        now: Particles,
+        row: Row,
+        summing: Summing,
+    ) -> Tally:
+        """A slice by its sums, given the families of the slice before."""
+        drift, moments = None, summing.moments(earlier, now)
+        if self.compass is not None:
+            drift = None if families is None else families.drift
+            drift = self.compass.after_moments(drift, moments)
+        return summing.tally(now, moments, self._followed(families, earlier, now, row, drift))
+
     # ---- private -------------------------------------------------------------------------------
 
     def _followed(
@@ -125,6 +146,10 @@ class Tracker:
         drift: Drift | None,
     ) -> Families:
         gained: Any = 0.0
+        if self._is_plain and families is not None and earlier is not None:
+            found = self._quickly(families, earlier, now, drift)
+            if found is not None:
+                return found
         if families is None or earlier is None:
             families = begun(now, self.layout)
         else:
@@ -140,6 +165,22 @@ class Tracker:
         if missing is not False or lost is not None:
             lost = self.sight.after(lost, np.asarray(missing), now)
         return families._replace(settled=settled, lost=lost, scouts=scouts, drift=drift)
+
+    def _quickly(
+        self, families: Families, earlier: Particles, now: Particles, drift: Drift | None
+    ) -> Families | None:
+        """The same where nothing is to be said about a slice, in few calls; None elsewhere."""
+        lost = families.lost
+        if now.rejuvenated is not False or self._missing(families, now, drift) is not False:
+            return None
+        moved = unremarkable(families, earlier, now)
+        if moved is None:
+            return None
+        if lost is not None:
+            lost = self.sight.after(lost, _NOWHERE, now)
+        _, shares, kept, _, born, settled, _, _, _, doubted = families
+        bounds, explained = moved
+        return Families(bounds, shares, kept, explained, born, settled, lost, None, drift, doubted)
 
     def _missing(self, families: Families, now: Particles, drift: Drift | None) -> Any:
         """Whether a slice rests on next to none of its particles, or rows go on pulling the same way."""
@@ -292,6 +333,22 @@ class Compass:
             return [Drift(steps[:, k], own, own, self.limit) for k, own in enumerate(each)]
         largest, worst = worst.max(axis=-1).tolist(), worst.reshape(-1, *self.layout.lead)
         return [Drift(steps[:, k], worst[k], most, self.limit) for k, most in enumerate(largest)]
+
+    def after_moments(self, drift: Drift | None, found: Moments) -> Drift:
+        """The same in one slice without plates, by the moments of its few numbers."""
+        moves = np.zeros((2, 1, sum(self.counts))) if drift is None else _FADED * drift.moves
+        worst, k = 0.0 if drift is None else KEPT * drift.largest, 0
+        for node, count in zip(self.nodes, self.counts, strict=True):
+            low, high = found.places.get(node.name, (0, 0))
+            for at in range(low, high):
+                wide, own = found.wide[at], k + at - low
+                if wide > 0.0:
+                    moves[0, 0, own] -= found.shift[at] / math.sqrt(wide)
+                    moves[1, 0, own] += max(1.0 - found.variance[at] / wide, 0.0)
+            k += count
+        for moved, variance in moves[:, 0].T.tolist():
+            worst = max(worst, abs(moved) / math.sqrt(variance + _LEAST))
+        return Drift(moves, worst, worst, self.limit)
 
     def after_one(
         self, drift: Drift | None, earlier: Particles | None, now: Particles
