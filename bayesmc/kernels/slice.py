@@ -22,6 +22,8 @@ from bayesmc.structure.target import Values
 
 #: widths by which an interval may grow
 _GROWTH = 64
+#: evaluations that a move takes, about: both ends, two steps out, two shrinkages
+EVALUATIONS = 6.0
 #: shrinkages after which the density cannot be what it was
 _SHRINKAGES = 400
 #: shrunk intervals tried in one call, for arrays up to a size where calls cost more than numbers
@@ -161,6 +163,7 @@ class Slice(Kernel):
     """Slice sampling of a node of numbers; components of a vector one after the other."""
 
     label = "slice"
+    evaluations = EVALUATIONS
 
     def __init__(self, blanket: Blanket) -> None:
         self.blanket = blanket
