@@ -176,9 +176,7 @@ def _regression(scales: float | Sequence[float], at: Sequence[float] | None = No
 
 def _kilpisjarvi(case: Case, root: Path) -> Data:
     found = _published(case, root)
-    at, scales = (
-        [found[f"{kind}{name}"] for name in ("alpha", "beta")] for kind in ("pmu", "ps")
-    )
+    at, scales = ([found[f"{kind}{name}"] for name in ("alpha", "beta")] for kind in ("pmu", "ps"))
     return dict(_regression(scales, at)(case, root))
 
 
