@@ -266,7 +266,7 @@ def test_gibbs_keeps_what_is_asked_for(keep: Any) -> None:
 
 
 def test_what_is_computed_from_the_chains_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Derived and predicted nodes that are kept reach the size asked for; what no chain moves is not waited for."""
+    """Derived and predicted nodes that are kept reach the size asked for."""
     net, data = schools()
     net.add("share", lambda tau: tau / (1.0 + tau))
     net.add("new", lambda mu, tau: bmc.Normal(mu, tau))

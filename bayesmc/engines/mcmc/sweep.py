@@ -136,7 +136,7 @@ def block_name(kernel: Kernel) -> str:
 
 
 def _apart(target: Target) -> frozenset[str]:
-    """Nodes in which the chains have no part; all else that is computed or drawn from them shows how they mix."""
+    """Nodes in which the chains have no part: all else, if only computed from them, shows how they mix."""
     moved = {*target.chain, *target.links}
     for name in target.forward:  # parents first
         if moved.intersection(target.problem.model[name].parents):
