@@ -25,6 +25,7 @@ from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.coupling import coupled_blocks, deterministic_constraints
 from bayesmc.kernels.ensemble import BlockWalk
 from bayesmc.kernels.enumerate import Enumerate, FiniteTerms
+from bayesmc.kernels.enumerate_at_once import enumerate_kernel
 from bayesmc.kernels.factor_slice import FactorSlice
 from bayesmc.kernels.forest_block import ForestBlock
 from bayesmc.kernels.forest_search import forest_blocks
@@ -379,7 +380,7 @@ def _finite(
             alone.append(block[0])
     groups, alone = stacks(target, blankets, alone, forms)
     kernels += [Stacked(group, Enumerate) for group in groups]
-    kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
+    kernels += [enumerate_kernel(blankets[n]) for n in alone]
     tied = deterministic_constraints(target, [*joined, *blocks], terms)
     return kernels, (*tight, *(n for n in tied if n in blankets))
 
