@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.kernels.accepted import Accepted, finite_kernel
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate, FiniteTerms, JointStates
-from bayesmc.kernels.enumerate_at_once import EnumerateAtOnce, enumerate_kernel
 from bayesmc.kernels.forest_block import ForestBlock
 from bayesmc.kernels.jump import Jump
 from bayesmc.kernels.labels import Labels, label_kernel
@@ -208,12 +208,12 @@ def enumerate_(colours: bool = True, prior: bool = True) -> Make:
 
 def at_once(tie: bool = True, proposal: bool = True) -> Make:
     def make(target: Target) -> Kernel:
-        kernel = enumerate_kernel(Blanket(target, "z"))
-        assert isinstance(kernel, EnumerateAtOnce) and len(kernel.tying) == 1
+        kernel = finite_kernel(Blanket(target, "z"))
+        assert isinstance(kernel, Accepted) and len(kernel.left_out) == 1
         if not tie:
-            kernel.tying = []
+            kernel.left_out = []
         if not proposal:
-            kernel.proposal.blanket.own = None
+            kernel.proposal.blanket.own = None  # type: ignore[attr-defined]
         return kernel
 
     return make
