@@ -29,7 +29,11 @@ def main(cases: Sequence[Case], root: Path, named: Sequence[str]) -> int:
         version, measure = _PEERS[peer]
         about = {peer: f"{version()}, {today}"}
         for case in cases:
-            found = measure(case, root)
+            try:
+                found = measure(case, root)
+            except RuntimeError as error:  # the others go on
+                print(f"{case.name}: {error}", flush=True)
+                continue
             for name, run in found.items():
                 said = f"{run.how:24}{run.ess:9.0f}{run.seconds:9.2f} s{run.rate:10.0f} / s"
                 print(f"{case.name:28}{name:10}{said}", flush=True)

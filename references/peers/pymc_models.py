@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import pymc.math as pmm
+from scipy.special import gammaln
 
 Data = dict[str, Any]
 
@@ -108,7 +109,7 @@ def salm(sigma: Any) -> Any:
         fit = star + beta * (log_x - log_x.mean()) + gamma * (x - x.mean())
         z = pm.Normal("z", 0.0, 1.0, shape=y.shape)
         eta = fit[:, None] + sigma() * z
-        density = y * eta - pmm.exp(eta) - pmm.gammaln(y + 1)
+        density = y * eta - pmm.exp(eta) - gammaln(y + 1)
         pm.Deterministic("deviance", -2 * density.sum())
         pm.Poisson("y", pmm.exp(eta), observed=y)
         return ["alpha", "beta", "gamma", "sigma", "deviance"]
