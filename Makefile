@@ -22,7 +22,7 @@ help:
 	@echo "make docs    run every snippet of README, docs and docstrings"
 	@echo "make bench   time bayesmc beside hand-written code (and peers, after 'make peers')"
 	@echo "make peers   install the packages that the benchmarks compare with, in .venv-peers"
-	@echo "make references  hold Gibbs against BUGS and posteriordb, and write docs/accuracy.md (long)"
+	@echo "make references  hold bayesmc against BUGS and posteriordb, beside JAGS and PyMC: docs/accuracy.md (long)"
 	@echo "make clean   remove what the other targets made"
 
 demo: .venv/.extras-plot,robotics

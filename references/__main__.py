@@ -1,7 +1,7 @@
-"""``python -m references``: hold bayesmc against published posteriors.
+"""``python -m references``: hold bayesmc against published posteriors, and beside JAGS and PyMC.
 
 ``--only rats pump`` runs the cases whose names hold one of the words; a run of all writes
-``docs/accuracy.md``.
+``docs/accuracy.md``. ``--peers`` measures the peers instead, for the page to quote.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from references import CASES, data_folder
-from references.run import report, run_all
+from references.page import report
+from references.peers import figures, measure
+from references.run import run_all
+from references.speed import compiled_anew, measured
 
 _PAGE = Path(__file__).resolve().parents[1] / "docs" / "accuracy.md"
 
@@ -26,6 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--out", type=Path, help="write the page there, also for a part of the cases"
     )
+    parser.add_argument(
+        "--peers",
+        nargs="*",
+        choices=measure.PEERS,
+        help="measure these (all that are installed, if none is named) and keep their figures",
+    )
     options = parser.parse_args(arguments)
     cases = [c for c in CASES if not options.only or any(w in c.name for w in options.only)]
     if options.list:
@@ -38,10 +47,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not cases:
         print(f"no case is called like {' or '.join(options.only)}; see --list", file=sys.stderr)
         return 2
-    outcomes = run_all(cases, root, options.rng)
+    if options.peers is not None:
+        return measure.main(cases, root, options.peers)
+    with compiled_anew():
+        outcomes = run_all(cases, root, options.rng)
     page = options.out or (None if options.only else _PAGE)
     if page is not None:
-        page.write_text(report(outcomes, options.rng), encoding="utf-8")
+        engines = {o.case.name: o.judged.engine for o in outcomes if o.judged is not None}
+        plain = measured(engines, "plain", None, options.rng)
+        more = measured(engines, "fast", 4000, options.rng)
+        text = report(outcomes, plain, more, figures.read(), options.rng)
+        page.write_text(text, encoding="utf-8")
         print(f"written: {page}")
     return 0 if all(outcome.passed for outcome in outcomes) else 1
 

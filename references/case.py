@@ -53,9 +53,9 @@ class Figures:
     cdf: Callable[[Any], Any] | None = None
 
 
-def gibbs(**settings: Any) -> Any:
-    """The engine of every case, unless it says otherwise."""
-    return bmc.Gibbs(**settings)
+def none() -> None:
+    """The engine of every case, unless it says otherwise: what a user gets who names none."""
+    return None
 
 
 @dataclass(frozen=True)
@@ -77,12 +77,8 @@ class Case:
     monitors : mapping
         Exceptions from ``locate``'s own reading: a reference name, with or without its index, -> the
         node's name, or the node's name and an index from 0.
-    settings : mapping
-        Options of the engine other than its defaults.
-    factory : callable
-        Settings, by name -> engine.
-    remark : str
-        Why it takes more than the default settings, where it does.
+    engine : callable
+        Makes the engine; None for what ``bmc.infer`` takes by itself.
     """
 
     model: str
@@ -92,9 +88,7 @@ class Case:
     publish: Callable[[Any], Mapping[str, Figures]]
     rule: Rule
     monitors: Mapping[str, str | tuple[str, Index]] = field(default_factory=dict)
-    settings: Mapping[str, int] = field(default_factory=dict)
-    factory: Callable[..., Any] = gibbs
-    remark: str = ""
+    engine: Callable[[], Any] = none
 
     @property
     def name(self) -> str:
@@ -116,16 +110,12 @@ class Case:
         """The figures published, by reference name."""
         return self.publish(self.read(root))
 
-    def engine(self) -> Any:
-        """The engine that the case is run with."""
-        return self.factory(**self.settings)
-
     def locate(self, reference: str) -> tuple[str, Index]:
         """Node and index (from 0) of a reference name.
 
         ``"r.hat[3]"`` is ``("r_hat", (2,))`` unless ``monitors`` says otherwise.
         """
-        base, index = _split(reference)
+        base, index = split(reference)
         target = self.monitors.get(reference, self.monitors.get(base, base.replace(".", "_")))
         return (target, index) if isinstance(target, str) else target
 
@@ -137,7 +127,8 @@ def data_folder() -> Path:
     return Path(named) if named else beside
 
 
-def _split(reference: str) -> tuple[str, Index]:
+def split(reference: str) -> tuple[str, Index]:
+    """Name and index (from 0) of a reference name."""
     match = re.fullmatch(r"([^\[\]]+)(?:\[([\d,]+)\])?", reference)
     if match is None:
         raise ValueError(f"reference name {reference!r}: expected a name or name[i,j] from 1")

@@ -5,7 +5,10 @@
   sample size of 1,000. Where an exact cdf is known, quartiles replace moments: the cdf at our quartiles
   within 4 standard errors of 1/4, 1/2, 3/4.
 - ``posteriordb``: means within 4 standard errors (ours and the reference's together), standard deviations
-  within 10 %.
+  within 10 %; the same effective size.
+
+R-hat (nested, of many short chains) is below 1.01, or below what chance gives so many groups of draws that
+agree but for 1 scalar in 10,000.
 """
 
 from __future__ import annotations
@@ -18,11 +21,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtri
 
 import bayesmc as bmc
 from references.case import Case, Figures, Index
 
 LEAST_ESS = 1000
+_MOST_RHAT, _ALARM = 1.01, 1e-4
 
 
 @dataclass(frozen=True)
@@ -32,7 +37,7 @@ class Deviation:
     Attributes
     ----------
     name, what : str
-        The reference name; mean, sd, quartile or ess.
+        The reference name; mean, sd, quartile, ess or R-hat.
     ours, published, allowed : float
         What we found, what stands in print, and how far apart they may be.
     """
@@ -65,15 +70,14 @@ def deviations(case: Case, posterior: bmc.Posterior, root: Path) -> list[Deviati
             found += _by_quartiles(name, figures, scalar)
         else:
             found += _by_benchmark(name, figures, scalar)
-        if case.rule == "bugs":
-            found.append(Deviation(name, "ess", scalar.ess, LEAST_ESS, 1.0))
+        found += _by_chains(name, scalar)
     return found
 
 
-def effective_sizes(case: Case, posterior: bmc.Posterior, root: Path) -> dict[str, float]:
-    """Effective sample size of every parameter published."""
-    names = case.published(root)
-    return {name: _Scalar(posterior, *case.locate(name)).ess for name in names}
+def figures_of(case: Case, posterior: bmc.Posterior, root: Path) -> dict[str, tuple[float, float]]:
+    """Effective sample size and R-hat of every parameter published."""
+    scalars = {name: _Scalar(posterior, *case.locate(name)) for name in case.published(root)}
+    return {name: (scalar.ess, scalar.rhat) for name, scalar in scalars.items()}
 
 
 class _Scalar:
@@ -89,6 +93,16 @@ class _Scalar:
     @property
     def ess(self) -> float:
         return float(self._posterior.ess(self._of(lambda x: x)))
+
+    @property
+    def rhat(self) -> float:
+        return float(self._posterior.rhat(self._of(lambda x: x)))
+
+    @property
+    def groups(self) -> int:
+        """Groups of draws that R-hat compares: superchains, else halves of chains."""
+        superchains = int(getattr(self._posterior, "superchains", 0))
+        return superchains or 2 * len(self._posterior[self.node])
 
     @property
     def mcse(self) -> float:
@@ -142,6 +156,16 @@ def _by_quartiles(name: str, figures: Figures, scalar: _Scalar) -> Iterator[Devi
     for q in (0.25, 0.5, 0.75):
         at = scalar.quantile(q)
         yield Deviation(name, "quartile", float(figures.cdf(at)), q, 4 * scalar.error_below(at))
+
+
+def _by_chains(name: str, scalar: _Scalar) -> Iterator[Deviation]:
+    yield Deviation(name, "ess", scalar.ess, LEAST_ESS, 1.0)
+    rhat = scalar.rhat
+    if not math.isnan(rhat):  # independent draws have none
+        groups = scalar.groups
+        chance = chdtri(groups - 1, _ALARM) * groups / (groups - 1) / max(scalar.ess, 1.0)
+        most = max(_MOST_RHAT, math.sqrt(1.0 + chance))
+        yield Deviation(name, "R-hat", max(rhat, 1.0), 1.0, most - 1.0)
 
 
 def _zero_allowed(difference: float) -> float:

@@ -55,13 +55,17 @@ class Blanket:
             if term is not self.own
         )
         self.size = math.prod(self.node.plate_shape)
-        self.classes = _classes(self)
+        self.classes = self.colours()
         #: whether candidates may have size 1 along plates: every term broadcasts them
         self.broadcasts = all(c.relation.kind == "aligned" for c in self.children)
 
     @property
     def event_shape(self) -> Shape:
         return self.node.event_shape
+
+    def colours(self) -> tuple[np.ndarray | None, ...]:
+        """``classes``, worked out from the children."""
+        return _classes(self)
 
     def current(self, values: Mapping[str, np.ndarray], members: np.ndarray | None) -> np.ndarray:
         """The node's value ``(chains, *plates, *event)``; of a class ``(chains, members, *event)``."""

@@ -7,6 +7,7 @@ Python. Models stand beside this file as ``jags_*.bug``; that of a discrete netw
 
 from __future__ import annotations
 
+import resource
 import shutil
 import subprocess
 import tempfile
@@ -26,11 +27,13 @@ class Run:
     """One run of JAGS.
 
     ``seconds`` is the whole process, start and writing of draws included; ``sampling`` is the kept
-    sweeps alone. ``draws`` maps names such as ``theta[3]`` to (chain, draw).
+    sweeps alone; ``cpu`` is what the process and the reading of its draws used of a processor, which
+    others on the machine do not lengthen. ``draws`` maps names such as ``theta[3]`` to (chain, draw).
     """
 
     seconds: float
     sampling: float
+    cpu: float
     draws: dict[str, np.ndarray]
 
 
@@ -50,13 +53,18 @@ def run(
     thin: int = 1,
     starts: Mapping[str, Any] | None = None,
     seed: int = 1,
+    modules: Sequence[str] = (),
 ) -> Run:
-    """Run a model's text; ``draws`` are sweeps after warmup, of which every ``thin``-th is kept."""
+    """Run a model's text; ``draws`` are sweeps after warmup, of which every ``thin``-th is kept.
+
+    ``modules`` are JAGS's own to load beside the usual ones, such as ``glm``.
+    """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "model.bug").write_text(model)
         (folder / "data.R").write_text(_dump(data))
-        lines = ['model in "model.bug"', 'data in "data.R"', f"compile, nchains({chains})"]
+        lines = [f"load {module}" for module in modules]
+        lines += ['model in "model.bug"', 'data in "data.R"', f"compile, nchains({chains})"]
         for chain in range(1, chains + 1):
             own = {".RNG.name": "base::Mersenne-Twister", ".RNG.seed": 1000 * seed + chain}
             (folder / f"start{chain}.R").write_text(_dump({**(starts or {}), **own}))
@@ -65,8 +73,10 @@ def run(
         lines += [f"monitor {node}, thin({thin})" for node in monitors]
         lines += [f"update {draws}", "pwd", "coda *", "exit"]
         (folder / "script.txt").write_text("\n".join(lines) + "\n")
+        before = _used()
         seconds, sampling = _watch(folder)
-        return Run(seconds, sampling, _coda(folder, chains))
+        found = _coda(folder, chains)
+        return Run(seconds, sampling, _used() - before, found)
 
 
 def packaged(name: str) -> str:
@@ -115,6 +125,12 @@ def _watch(folder: Path) -> tuple[float, float]:
     return time.perf_counter() - start, ended - began
 
 
+def _used() -> float:
+    """Seconds of processor time of this process and of its children that have ended."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
 def _coda(folder: Path, chains: int) -> dict[str, np.ndarray]:
     places = [line.split() for line in (folder / "CODAindex.txt").read_text().splitlines()]
     values = np.stack(
@@ -132,7 +148,7 @@ def _literal(value: Any) -> str:
     if isinstance(value, str):
         return f'"{value}"'
     array = np.asarray(value)
-    text = ", ".join(repr(x) for x in array.ravel(order="F").tolist())
+    text = ", ".join("NA" if x != x else repr(x) for x in array.ravel(order="F").tolist())
     if array.ndim == 0:
         return text
     if array.ndim == 1:

@@ -11,8 +11,6 @@ from scipy.special import expit, ndtr, rel_entr
 
 import bayesmc as bmc
 from references.bugs.common import (
-    MANY_CHAINS,
-    MOST_CHAINS,
     VAGUE,
     VAGUE_4,
     VAGUE_PRECISION,
@@ -173,35 +171,24 @@ def _complementary_log_log(eta: Any) -> Any:
     return 1 - np.exp(-np.exp(eta))
 
 
-_FUNNEL = (
-    "the scale of the random effects may be all but zero, where effects and scale bind each other"
-)
-_COUPLED = _FUNNEL + "; their mean ties all plots together, so that each is updated by itself"
-
 CASES = (
-    jags_case("seeds", "test1", seeds, settings=MOST_CHAINS, remark=_FUNNEL),
-    jags_case(
-        "seeds", "test2", seeds_zero, settings={"chains": 64, "draws": 1000}, remark=_COUPLED
-    ),
+    jags_case("seeds", "test1", seeds),
+    jags_case("seeds", "test2", seeds_zero),
     jags_case(
         "seeds",
         "test3",
         functools.partial(seeds_scaled, bmc.Exponential(1.0)),
-        settings=MANY_CHAINS,
     ),
     jags_case(
         "seeds",
         "test4",
         functools.partial(seeds_scaled, bmc.Uniform(0.0, 10.0)),
-        settings=MANY_CHAINS,
     ),
-    jags_case("seeds", "test5", seeds_pareto, settings=MOST_CHAINS, remark=_FUNNEL),
+    jags_case("seeds", "test5", seeds_pareto),
     openbugs_case("surgical", "fixed", "Surgical", surgical_fixed),
-    openbugs_case(
-        "surgical", "random", "Surgicalrand", surgical_random, data="Surgical", settings=MANY_CHAINS
-    ),
+    openbugs_case("surgical", "random", "Surgicalrand", surgical_random, data="Surgical"),
     jags_case("beetles", "test1", functools.partial(beetles, expit)),
     jags_case("beetles", "test2", functools.partial(beetles, ndtr)),
     jags_case("beetles", "test3", functools.partial(beetles, _complementary_log_log)),
-    jags_case("hearts", "test1", hearts, settings=MANY_CHAINS),
+    jags_case("hearts", "test1", hearts),
 )

@@ -15,10 +15,6 @@ VAGUE_4 = bmc.Normal(0.0, 1e2)
 #: the usual prior of a precision
 VAGUE_PRECISION = bmc.Gamma(0.001, 0.001)
 
-#: chains are one array, so many of them cost little more than a few
-MANY_CHAINS = {"chains": 16}
-MOST_CHAINS = {"chains": 64, "draws": 2000}
-
 _OPENBUGS = "bugs/openbugs_doc/r2openbugs_valid_results.dev.json"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.special import gammaln
 
 import bayesmc as bmc
-from references.bugs.common import MANY_CHAINS, VAGUE_4, VAGUE_PRECISION, jags_case
+from references.bugs.common import VAGUE_4, VAGUE_PRECISION, jags_case
 from references.case import Question
 
 
@@ -132,9 +132,9 @@ _EPIL_MONITORS = {
 }
 
 CASES = (
-    jags_case("pump", "test1", pump, settings=MANY_CHAINS),
-    jags_case("salm", "test1", salm, settings=MANY_CHAINS),
-    jags_case("salm", "test2", salm_pareto, settings=MANY_CHAINS),
-    jags_case("epil", "test1", epil, monitors=_EPIL_MONITORS, settings=MANY_CHAINS),
-    jags_case("epil", "test2", epil_visits, monitors=_EPIL_MONITORS, settings=MANY_CHAINS),
+    jags_case("pump", "test1", pump),
+    jags_case("salm", "test1", salm),
+    jags_case("salm", "test2", salm_pareto),
+    jags_case("epil", "test1", epil, monitors=_EPIL_MONITORS),
+    jags_case("epil", "test2", epil_visits, monitors=_EPIL_MONITORS),
 )

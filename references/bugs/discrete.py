@@ -86,7 +86,5 @@ CASES = (
         "test1",
         eyes,
         monitors={"lambda[1]": ("lambda1", ()), "lambda[2]": ("lambda2", ())},
-        settings={"chains": 16, "draws": 2000},
-        remark="that both groups exist ties all eyes, so that they move one after the other",
     ),
 )

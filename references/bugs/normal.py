@@ -8,7 +8,6 @@ import numpy as np
 
 import bayesmc as bmc
 from references.bugs.common import (
-    MANY_CHAINS,
     VAGUE,
     VAGUE_4,
     VAGUE_5,
@@ -182,11 +181,8 @@ CASES = (
         "test1",
         dyes,
         cdfs=lambda data: dyes_cdfs(data["y"]),
-        settings=MANY_CHAINS,
-        remark="six batches hardly tell their variance from zero, and near zero a batch's mean and "
-        "the precision hold each other fast",
     ),
-    jags_case("equiv", "test1", equiv, settings=MANY_CHAINS),
-    jags_case("equiv", "test2", equiv, settings=MANY_CHAINS),
+    jags_case("equiv", "test1", equiv),
+    jags_case("equiv", "test2", equiv),
     openbugs_case("stacks", "", "Stacks", stacks),
 )

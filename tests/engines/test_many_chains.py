@@ -22,6 +22,7 @@ from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.engines.unrolled import pose_any
 from bayesmc.errors import ConvergenceWarning, UnsupportedError
 from bayesmc.network import Problem
+from bayesmc.structure.target import target_of
 
 #: standard errors that a mean of right runs exceeds once in 50,000 times
 LIMIT = 4.3
@@ -262,6 +263,27 @@ def test_gibbs_keeps_what_is_asked_for(keep: Any) -> None:
     assert abs(posterior.mean("mu") - exact.mean("mu")) < LIMIT * np.hypot(
         posterior.mcse("mu"), exact.mcse("mu")
     )
+
+
+def test_what_is_computed_from_the_chains_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Derived and predicted nodes that are kept reach the size asked for."""
+    net, data = schools()
+    net.add("share", lambda tau: tau / (1.0 + tau))
+    net.add("new", lambda mu, tau: bmc.Normal(mu, tau))
+    net.add("apart", bmc.Normal(0.0, 1.0))
+
+    def sizes() -> list[float]:
+        posterior = bmc.infer(
+            net, data, engine=bmc.Gibbs(chains=16), rng=8, keep=["share", "new", "apart"]
+        )
+        return [float(posterior.ess(name)) for name in ("share", "new")]
+
+    assert min(sizes()) >= 1000
+    assert sweep.SweepSampler(target_of(pose_any(net, data, None, None)), []).forward_nodes == {
+        "apart"
+    }
+    monkeypatch.setattr(sweep, "_apart", lambda target: frozenset(target.forward))
+    assert min(sizes()) < 1000
 
 
 def test_labels_that_chains_name_differently_do_not_cost_the_budget() -> None:

@@ -16,6 +16,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.distributions.circular import wrap_angle
 from bayesmc.kernels import slice
+from bayesmc.kernels.accepted import Accepted, number_kernel
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.factor_slice import FactorSlice
@@ -203,3 +204,58 @@ STACKED = {
 @pytest.mark.parametrize(("name", "fault", "test"), each_test(STACKED))
 def test_like_nodes(name: str, fault: str, test: str) -> None:
     STACKED[name].check(test, fault)
+
+
+# ---- closed forms that some terms accept -----------------------------------------------------------------
+
+
+def ordered_means() -> Model:
+    """Two means that like to be in order."""
+    net = bmc.BayesNet(plates={"k": 2})
+    net.add("x", bmc.Normal([-0.3, 0.3], 1.0), plates="k")
+    net.add("y", lambda x: bmc.Normal(x, 0.8), plates="k")
+    net.potential("ordered", lambda x: np.where(x[0] < x[1], 0.0, -2.0))
+
+    def draw(rng: np.random.Generator, rows: int) -> dict[str, np.ndarray]:
+        x = rng.normal([-0.3, 0.3], 1.0, (6 * rows + 100, 2))
+        kept = (x[:, 0] < x[:, 1]) | (rng.random(len(x)) < np.exp(-2.0))
+        return {"x": x[kept][:rows]}
+
+    def respond(state: Any, rng: np.random.Generator) -> dict[str, np.ndarray]:
+        return {"y": rng.normal(state["x"], 0.8)}
+
+    return Model(net, ("y",), draw=draw, respond=respond)
+
+
+def ordered_kernel(decides: bool = True, prior: bool = True) -> Make:
+    def make(target: Target) -> Kernel:
+        kernel = number_kernel(Blanket(target, "x"))
+        assert isinstance(kernel, Accepted) and kernel.label == "conjugate"
+        if not decides:
+            kernel.left_out = []
+        if not prior:
+            kernel._log = _twice(kernel)  # type: ignore[method-assign]
+        return kernel
+
+    return make
+
+
+def _twice(kernel: Accepted) -> Any:
+    """The terms of the proposal count once more."""
+    log, own = kernel._log, kernel.blanket.own
+    assert own is not None
+    return lambda values: log(values) + own.log(values).sum(axis=-1)
+
+
+ACCEPTED = {
+    "order": Case(
+        ordered_means(), ordered_kernel(),
+        {"order forgotten": ordered_kernel(False), "prior counted twice": ordered_kernel(prior=False)},
+        statistics={"gap": lambda s, y: s["x"][:, 1] - s["x"][:, 0]}, how="moving",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "fault", "test"), each_test(ACCEPTED))
+def test_accepted(name: str, fault: str, test: str) -> None:
+    ACCEPTED[name].check(test, fault)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.kernels.accepted import Accepted, finite_kernel
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.enumerate import Enumerate, FiniteTerms, JointStates
 from bayesmc.kernels.forest_block import ForestBlock
@@ -48,6 +49,16 @@ def labels() -> Model:
     net.add("z", bmc.Categorical(SHARES), plates="i")
     net.add("y", lambda z: bmc.Normal(CENTRES[z], 1.0), plates="i")
     return Model(net, ("y",))
+
+
+def totals() -> Model:
+    """Labels that a count of one state ties."""
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("z", bmc.Categorical(SHARES), plates="i")
+    net.add("y", lambda z: bmc.Normal(CENTRES[z], 1.0), plates="i")
+    net.add("count", lambda z: (z == 2).sum("i"))
+    net.add("total", lambda count: bmc.Normal(count, 0.7))
+    return Model(net, ("y", "total"))
 
 
 def ring(sd: float = 0.5) -> Model:
@@ -195,6 +206,19 @@ def enumerate_(colours: bool = True, prior: bool = True) -> Make:
     return make
 
 
+def at_once(tie: bool = True, proposal: bool = True) -> Make:
+    def make(target: Target) -> Kernel:
+        kernel = finite_kernel(Blanket(target, "z"))
+        assert isinstance(kernel, Accepted) and len(kernel.left_out) == 1
+        if not tie:
+            kernel.left_out = []
+        if not proposal:
+            kernel.proposal.blanket.own = None  # type: ignore[attr-defined]
+        return kernel
+
+    return make
+
+
 def sweep(power: float = 1.0) -> Make:
     def make(target: Target) -> Kernel:
         (kernel,), left = table_kernels(target, [(n,) for n in "abcd"] + [("b", "d")])
@@ -332,6 +356,10 @@ CASES = {
         ring(), enumerate_(), {"colours merged": enumerate_(colours=False)}, backwards,
         statistics=alike("z"),
     ),
+    "enumerate at once": Case(
+        totals(), at_once(), {"tie left out": at_once(False), "no prior": at_once(proposal=False)},
+        statistics={"top": lambda s, y: (s["z"] == 2).sum(axis=1)},
+    ),
     "labels of pixels": Case(
         mixture(True), products(), {"steep": products(3.0)}, how="posed"
     ),
@@ -394,3 +422,20 @@ ALL += [(SLOW, fault, "ranks") for fault in ("", *CASES[SLOW].faults)]
 @pytest.mark.parametrize(("name", "fault", "test"), ALL)
 def test_kernel(name: str, fault: str, test: str) -> None:
     CASES[name].check(test, fault)
+
+
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+def test_elements_move_alone_where_they_are_tied_tightly() -> None:
+    """A count that is all but known: at once they are refused, and each element comes there all the same."""
+
+    def run(total: float, sd: float) -> bmc.Posterior:
+        net = bmc.BayesNet(plates={"i": 8})
+        net.add("z", bmc.Bernoulli(0.3), plates="i")
+        net.add("total", lambda z: bmc.Normal(z.sum("i"), sd))
+        engine = bmc.Gibbs(50, warmup=100, chains=40)
+        return bmc.infer(net, {"total": total}, engine=engine, rng=3)
+
+    tight = run(7.6, 0.05)
+    assert np.mean(tight.acceptance["z"]) < 0.25
+    assert set(tight["z"].sum(axis=-1)[:, -1]) == {8}
+    assert np.mean(run(3.0, 2.0).acceptance["z"]) > 0.5

@@ -18,6 +18,7 @@ from bayesmc.engines.mcmc.cost import shares
 from bayesmc.engines.mcmc.jointly import trajectories_of
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import treatment
+from bayesmc.kernels.accepted import finite_kernel, number_kernel
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
@@ -40,7 +41,6 @@ from bayesmc.kernels.stacked import Stacked
 from bayesmc.kernels.tables import joint_states, table_kernel, table_kernels
 from bayesmc.network import Problem
 from bayesmc.structure.blanket import Blanket, colours
-from bayesmc.structure.like_terms import with_like_children
 from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
@@ -369,7 +369,7 @@ def _finite(
             alone.append(block[0])
     groups, alone = stacks(target, blankets, alone, forms)
     kernels += [Stacked(group, Enumerate) for group in groups]
-    kernels += [Enumerate(with_like_children(blankets[n])) for n in alone]
+    kernels += [finite_kernel(blankets[n]) for n in alone]
     tied = deterministic_constraints(target, [*joined, *blocks], terms)
     return kernels, (*tight, *(n for n in tied if n in blankets))
 
@@ -402,7 +402,7 @@ def _numbers(
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
             left = [n for n in left if n not in group]
-    return kernels + [Slice(with_like_children(blankets[n])) for n in left]
+    return kernels + [number_kernel(blankets[n]) for n in left]
 
 
 def _kind(target: Target, blanket: Blanket) -> str:

@@ -40,7 +40,7 @@ class Sampler(Protocol):
     -----
     Some attributes are optional. ``ensemble`` (default 1): every chain is an ensemble of that many
     members, and consecutive calls of ``values`` hand out one member after the other, draw by draw.
-    ``forward_nodes`` (none): nodes drawn afresh for each draw, which tell nothing about mixing.
+    ``forward_nodes`` (none): nodes in which the chains have no part, which tell nothing about mixing.
     ``acceptance_band`` (0.1, 0.9): useful acceptance rates, or a dict from block to a pair, or to None
     where any rate will do. ``given`` (none): stored values at which the user wants chains to start.
     Methods are, too: ``renewals(state)`` says how often finite nodes were moved with what hangs on them,

@@ -41,7 +41,7 @@ class SweepSampler:
         steps = fast_steps(bare, problem.observed, problem.inputs)
         by_name = dict(zip(bare.nodes, steps, strict=True))
         self._forward = [by_name[n] for n in target.forward]
-        self.forward_nodes = target.forward
+        self.forward_nodes = _apart(target)
         #: useful rates of acceptance, where some are
         self.acceptance_band: dict[str, tuple[float, float] | None]
         self.acceptance_band = {block_name(k): k.band for k in self.kernels}
@@ -159,6 +159,15 @@ def refused(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _apart(target: Target) -> frozenset[str]:
+    """Nodes in which the chains have no part: all else, if only computed from them, shows how they mix."""
+    moved = {*target.chain, *target.links}
+    for name in target.forward:  # parents first
+        if moved.intersection(target.problem.model[name].parents):
+            moved.add(name)
+    return frozenset(target.forward) - moved
 
 
 def _check_moved(kernel: Kernel, new: Mapping[str, Any], values: Mapping[str, Any]) -> None:

@@ -1,0 +1,145 @@
+"""Draws from a full conditional that leaves some terms out, accepted or refused by these.
+
+A potential that orders two means has no conjugate pair; a term that reads all labels together (both groups of
+a mixture exist; a total was seen) ties them. Without such terms the conditional is drawn at once. That draw
+knows nothing of where the chain stands, and so the ratio of the terms left out alone decides (an independence
+Metropolis-Hastings step). Terms that say little accept nearly always; where they refuse most draws the node
+moves by the kernel that sees them, too.
+
+References
+----------
+Tierney (1994), Markov chains for exploring posterior distributions, Annals of Statistics 22(4), sec. 2.3.3.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from bayesmc.kernels.base import Kernel, Memory, counted
+from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
+from bayesmc.kernels.enumerate import Enumerate
+from bayesmc.kernels.slice import Slice
+from bayesmc.structure.blanket import Blanket, Child
+from bayesmc.structure.like_terms import with_like_children
+from bayesmc.structure.target import Values
+
+#: rate of acceptance below which the node moves by the other kernel, too, and how fast it is learnt
+_OFTEN, _RATE = 0.25, 0.1
+
+
+class Accepted(Kernel):
+    """Proposes a node from its conditional without some terms.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    left_out : sequence of Child
+        Terms that decide.
+    proposal : Kernel
+        Draws the whole node from its conditional without them, wherever it stands: what has one colour.
+    other : Kernel
+        Moves it where these terms refuse most draws.
+    """
+
+    band = None  # where few are accepted the node moves otherwise
+
+    def __init__(
+        self, blanket: Blanket, left_out: Sequence[Child], proposal: Kernel, other: Kernel
+    ) -> None:
+        self.blanket = blanket
+        self.names = (blanket.name,)
+        self.left_out = [child.term for child in left_out]
+        self.proposal, self.other = proposal, other
+        self.label = proposal.label
+        names = ", ".join(repr(term.name) for term in self.left_out)
+        self.match = f"{proposal.match}, accepted by {names}"
+        self.evaluations = proposal.evaluations + 2
+
+    def expect(self, steps: int, chains: int) -> None:
+        """Both kernels may want to know."""
+        self.proposal.expect(steps, chains)
+        self.other.expect(steps, chains)
+
+    def start(self, values: Values, chains: int) -> Memory:
+        """What the kernels remember, counts of what is accepted, and the rate learnt so far."""
+        own, other = self.proposal.start(values, chains), self.other.start(values, chains)
+        counts = {"accepted": np.zeros(chains), "moves": 0, "rate": 1.0}
+        return {"proposal": own, "other": other, **counts}
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        name, target = self.blanket.name, self.blanket.target
+        drawn, own = self.proposal.step(values, memory["proposal"], rng, warmup)
+        new = drawn[name]
+        state = {**values, name: new}
+        target.compute(state, self.blanket.path)
+        with np.errstate(
+            invalid="ignore"
+        ):  # of impossible places, which are left for possible ones
+            ratio = self._log(state) - self._log(values)
+        taken = rng.random(len(new)) < np.exp(np.minimum(ratio, 0.0))
+        chosen = taken.reshape(-1, *(1,) * (new.ndim - 1))
+        moved = {name: np.where(chosen, new, values[name])}
+        memory = {**memory, "proposal": own}
+        if memory["rate"] < _OFTEN:
+            state = {**values, **moved}
+            target.compute(state, self.blanket.path)
+            moved, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
+        if not warmup:
+            return moved, counted(memory, taken)
+        rate = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
+        return moved, {**memory, "rate": rate}
+
+    def end_warmup(self, memory: Memory) -> Memory:
+        """Which kernels go on is settled."""
+        own = self.proposal.end_warmup(memory["proposal"])
+        return {**memory, "proposal": own, "other": self.other.end_warmup(memory["other"])}
+
+    def _log(self, values: Values) -> np.ndarray:
+        """Log of the terms left out, shape ``(chains,)``."""
+        total = np.zeros(len(values[self.blanket.name]))
+        for term in self.left_out:
+            log = np.asarray(term.log(values))
+            lead = log.shape[: log.ndim - len(term.plates)]
+            whole = np.broadcast_to(log, lead + term.shape)
+            total = total + whole.reshape(*lead, math.prod(term.shape)).sum(axis=-1)
+        return total
+
+
+def finite_kernel(blanket: Blanket) -> Kernel:
+    """All elements at once where only terms that read all of them tie them, else one colour at a time."""
+    tying = [child for child in blanket.children if child.relation.kind == "whole"]
+    if len(blanket.classes) > 1 and tying:
+        free = _without(blanket, tying)
+        if all(child.relation.kind == "aligned" for child in free.children):
+            return Accepted(blanket, tying, Enumerate(free), Enumerate(blanket))
+    return Enumerate(with_like_children(blanket))
+
+
+def number_kernel(blanket: Blanket) -> Kernel:
+    """The closed form that a node has but for potentials, accepted by these; slices where it has none."""
+    slices = Slice(with_like_children(blanket))
+    potentials = [child for child in blanket.children if child.term.is_potential]
+    if not potentials:
+        return slices
+    found = conjugate_kernel(_without(blanket, potentials))
+    if not isinstance(found, Conjugate) or len(found.blanket.classes) > 1:
+        return slices
+    return Accepted(blanket, potentials, found, slices)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _without(blanket: Blanket, children: Sequence[Child]) -> Blanket:
+    """The blanket of a target without some terms."""
+    free = copy.copy(blanket)
+    free.children = tuple(child for child in blanket.children if child not in children)
+    free.classes = free.colours()
+    free.broadcasts = all(c.relation.kind == "aligned" for c in free.children)
+    return free

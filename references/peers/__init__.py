@@ -1,0 +1,1 @@
+"""What the reference models cost elsewhere: JAGS and PyMC."""
