@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.conditional import Conditional, conditional_of
 from bayesmc.structure.target import Values
 
 #: widths by which an interval may grow
@@ -220,13 +222,19 @@ class Slice(Kernel):
             x = np.log(x - low)
             low, high = -np.inf, np.inf
 
+        conditional = None if self._conditional is None else self._conditional.given(values)
+
         def log_density(tried: np.ndarray) -> np.ndarray:
             candidate, volume = line.candidate(tried, now.dtype)
             if component:
                 whole = np.array(np.broadcast_to(now, tried.shape + blanket.event_shape))
                 whole[at] = candidate
                 candidate = whole
-            log = blanket.log_density(values, candidate, members)
+            log = None if conditional is None else conditional(candidate)
+            if (
+                log is None or not np.isfinite(log).all()
+            ):  # what that means the model's functions know
+                log = blanket.log_density(values, candidate, members)
             return np.broadcast_to(log if volume is None else log + volume, tried.shape)
 
         try:
@@ -241,6 +249,11 @@ class Slice(Kernel):
         new = now.copy()
         new[at] = moved
         return new
+
+    @cached_property
+    def _conditional(self) -> Conditional | None:
+        """Its full conditional without a call of the model's functions, where they were followed."""
+        return conditional_of(self.blanket)
 
     def _support(self, values: Values, component: tuple[int, ...]) -> Support:
         """Where one component may lie, given the parents."""

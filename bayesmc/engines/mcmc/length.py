@@ -30,7 +30,7 @@ from bayesmc.structure.target import target_of
 #: numbers of all chains up to which a sweep costs little more than that of one chain
 _NUMBERS = 4096
 #: chains, least and most; effective draws that each must give at least, so that its own memory is judged
-LEAST, _MOST, _EACH = 4, 128, 8
+LEAST, _MOST, _EACH = 4, 256, 8
 #: superchains where there are enough chains, and chains that each has at least
 _SUPERCHAINS, _MEMBERS = 8, 2
 #: sweeps of a warmup where none are said, at most where its end is judged

@@ -77,7 +77,7 @@ def looked_at(
     for name, group in itertools.groupby(some_scalars(nodes, model), key=lambda s: s[0]):
         values = stored.get(name)
         indices = [index for _, index in group]
-        if values is None or values.shape[1] == 1:
+        if values is None or values.shape[:2] == (1, 1):
             continue
         flat = values.reshape(*values.shape[:2], -1)
         if model[name].value_shape:
