@@ -154,3 +154,15 @@ def test_slices_take_the_program(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(conditional.Conditional, "given", lambda self, values: None)
     plain = kernel.step(values, memory, np.random.default_rng(0), True)[0]["spread"]
     np.testing.assert_allclose(first, plain, rtol=1e-9)
+
+
+def test_debug_holds_the_program_against_the_functions(monkeypatch: pytest.MonkeyPatch) -> None:
+    target = target_of(pose(*hierarchy()))
+    kernel = Slice(Blanket(target, "spread"), debug=True)
+    values = drawn(hierarchy, target, 5, 1)
+    memory = kernel.start(values, 5)
+    kernel.step(values, memory, np.random.default_rng(0), True)
+    honest = conditional.At.__call__
+    monkeypatch.setattr(conditional.At, "__call__", lambda at, x: honest(at, x) + 1e-6 * x)
+    with pytest.raises(DensityError, match="node 'spread': the program .* is off by"):
+        kernel.step(values, memory, np.random.default_rng(0), True)
