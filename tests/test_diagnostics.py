@@ -107,6 +107,10 @@ def test_pareto_k_needs_only_the_tail():
     )
 
 
+def test_pareto_k_of_weights_of_which_one_is_all():
+    assert diagnostics.pareto_k(np.linspace(-9000.0, 0.0, 100), 100) == np.inf
+
+
 def test_pareto_k_of_equal_and_of_few_weights():
     assert diagnostics.pareto_k(np.zeros(1000), 1000) == -np.inf
     assert np.isnan(diagnostics.pareto_k(np.arange(10.0), 10))

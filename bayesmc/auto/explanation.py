@@ -34,7 +34,7 @@ class Explanation:
     nodes : dict
         Node -> what the engine does to it.
     table : tuple of Treatment
-        The same in columns (node, kernel, why, plates, colour), for engines that move nodes one by one.
+        The same in columns (node, kernel, why, plates, colour, cost), for engines that move nodes one by one.
     effort : str
         How many chains, and how long, of engines that run some.
 
@@ -72,7 +72,9 @@ class Explanation:
         return "\n".join(lines)
 
 
-def together(lines: Sequence[tuple[str, ...]], varied: Sequence[int] = ()) -> list[tuple[str, ...]]:
+def together(
+    lines: Sequence[tuple[str, ...]], varied: Sequence[int] = (), summed: Sequence[int] = ()
+) -> list[tuple[str, ...]]:
     """Lines with the like ones as one, where the first of them stood.
 
     Parameters
@@ -82,6 +84,8 @@ def together(lines: Sequence[tuple[str, ...]], varied: Sequence[int] = ()) -> li
         brackets, and so is all they say.
     varied : sequence of int
         Entries that may differ; all of them are shown.
+    summed : sequence of int
+        Entries that are numbers, or empty, and add up.
 
     Returns
     -------
@@ -98,14 +102,14 @@ def together(lines: Sequence[tuple[str, ...]], varied: Sequence[int] = ()) -> li
     for at, (name, *said) in enumerate(lines):
         found = _NUMBERED.match(name)
         if found is not None:
-            kept = [_general(s) for k, s in enumerate(said, 1) if k not in varied]
+            kept = [_general(s) for k, s in enumerate(said, 1) if k not in (*varied, *summed)]
             groups.setdefault((found[1], *kept), []).append(at)
     first = {members[0]: members for members in groups.values() if len(members) >= _FEWEST}
     hidden = {at for members in first.values() for at in members[1:]}
     result = []
     for at, line in enumerate(lines):
         if at in first:
-            result.append(_joined([lines[k] for k in first[at]], varied))
+            result.append(_joined([lines[k] for k in first[at]], varied, summed))
         elif at not in hidden:
             result.append(line)
     return result
@@ -118,8 +122,11 @@ def _columns(table: Sequence[Treatment]) -> list[str]:
     """A table of nodes in aligned columns; columns that are empty throughout are left out."""
     names = [f.name for f in fields(Treatment) if f.name != "why"] + ["why"]
     shown = [n for n in names if any(getattr(row, n) for row in table)]
-    rows = [tuple(getattr(row, n) for n in shown) for row in table]
-    rows = together(rows, [shown.index("colour")] if "colour" in shown else [])
+    rows = [tuple(str(getattr(row, n) or "") for n in shown) for row in table]
+    varied, summed = ([shown.index(n)] if n in shown else [] for n in ("colour", "cost"))
+    rows = together(rows, varied, summed)
+    for at in summed:
+        rows = [(*row[:at], _percent(row[at]), *row[at + 1 :]) for row in rows]
     cells = [tuple(shown), *rows[:60]]
     widths = [max(len(row[i]) for row in cells) for i in range(len(shown))]
     lines = [
@@ -131,20 +138,29 @@ def _columns(table: Sequence[Treatment]) -> list[str]:
     return lines
 
 
+def _percent(share: str) -> str:
+    """A share in per cent; empty where there is none."""
+    return share and (f"{float(share):.0%}".replace("%", " %") if float(share) >= 0.01 else "< 1 %")
+
+
 def _general(words: str) -> str:
     return _REPEATED.sub(r"\1", _NUMBER.sub("[t]", words) + ", ")[:-2]
 
 
-def _joined(lines: Sequence[tuple[str, ...]], varied: Sequence[int]) -> tuple[str, ...]:
+def _joined(
+    lines: Sequence[tuple[str, ...]], varied: Sequence[int], summed: Sequence[int]
+) -> tuple[str, ...]:
     found = [_NUMBERED.match(line[0]) for line in lines]
     numbers = [int(f[2]) for f in found if f is not None]
     base = found[0][1] if found[0] is not None else ""
-    said = [
-        ", ".join(dict.fromkeys(line[k] for line in lines))
-        if k in varied
-        else _general(lines[0][k])
-        for k in range(1, len(lines[0]))
-    ]
+    said = []
+    for k in range(1, len(lines[0])):
+        if k in varied:
+            said.append(", ".join(dict.fromkeys(line[k] for line in lines)))
+        elif k in summed:
+            said.append(str(sum(float(line[k] or 0) for line in lines) or ""))
+        else:
+            said.append(_general(lines[0][k]))
     return (f"{base}[{_stretches(sorted(numbers))}]", *said)
 
 

@@ -29,6 +29,8 @@ class Treatment:
         Plates with their sizes.
     colour : str
         Nodes of one colour share no factor.
+    cost : float
+        Share of a sweep that is spent on the node, by counted numbers; 0 where there is none to tell.
     """
 
     node: str
@@ -36,6 +38,7 @@ class Treatment:
     why: str = ""
     plates: str = ""
     colour: str = ""
+    cost: float = 0.0
 
     def __str__(self) -> str:
         return f"{self.kernel}: {self.why}" if self.kernel and self.why else self.kernel or self.why

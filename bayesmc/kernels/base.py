@@ -33,6 +33,8 @@ class Kernel:
     match: str = ""
     #: rates of acceptance that are no reason to worry; None where any will do
     band: tuple[float, float] | None = (0.1, 0.9)
+    #: how often a move asks for the densities that its nodes enter, about
+    evaluations: float = 1.0
 
     def words(self, name: str) -> tuple[str, str]:
         """What it does to one of its nodes: the kind of move, and what that rests on."""

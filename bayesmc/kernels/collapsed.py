@@ -62,6 +62,7 @@ class CollapsedBlock(Kernel):
         self.alone = dict(alone)
         self.names = (*block.names, *blankets)
         self.blankets = dict(blankets)
+        self.evaluations = 1.0 + sum(k.evaluations for k in self.alone.values())
         self.transforms: dict[str, Transform] = {}
         for name in blankets:
             support = target.model[name].support

@@ -46,6 +46,7 @@ class Enumerate(Kernel):
         assert domain is not None
         self.states = np.arange(domain.size, dtype=domain.dtype)
         self.match = f"{domain.size} states"
+        self.evaluations = float(domain.size)
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool

@@ -19,7 +19,7 @@ import numpy as np
 from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import DensityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.slice import slice_move
+from bayesmc.kernels.slice import EVALUATIONS, slice_move
 from bayesmc.network import CompiledNode
 from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.target import Target, Values
@@ -48,6 +48,7 @@ class FactorSlice(Kernel):
         self.shapes = [target.model[n].value_shape for n in names]
         self.sizes = [int(np.prod(s, dtype=int)) for s in self.shapes]
         self.size = sum(self.sizes)
+        self.evaluations = EVALUATIONS * self.size
         self.order = range(self.size)
         self.transforms = [_transform(target.model[n]) for n in names]
         self.match = "jointly with " + ", ".join(names) if len(names) > 1 else "as one vector"

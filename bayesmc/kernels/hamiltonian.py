@@ -92,6 +92,7 @@ class Hamiltonian(Kernel):
     """
 
     label = "Hamiltonian"
+    evaluations = 3.0 * GRADIENTS  # a gradient takes about three
     band = None
 
     def __init__(

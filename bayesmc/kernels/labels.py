@@ -75,6 +75,7 @@ class Labels(Kernel):
         assert domain is not None
         self.states, self.dtype = domain.size, domain.dtype
         self.match = f"{domain.size} states, as one matrix product"
+        self.evaluations = float(domain.size)
         self.members = blanket.classes[0]
         self._plain = Enumerate(blanket)
         self._prior = LabelPrior(blanket, self.members)

@@ -77,6 +77,7 @@ class _Lattice(Kernel):
         domain = blanket.node.domain
         assert domain is not None
         self.states = domain.size
+        self.evaluations = float(domain.size)
         self.dtype = domain.dtype
         every = np.arange(blanket.size)
         self.classes = [every if c is None else c for c in blanket.classes]

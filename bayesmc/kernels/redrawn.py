@@ -57,6 +57,7 @@ class Redrawn(Kernel):
     """
 
     label = "redrawn"
+    evaluations = 2.0  # before and after
 
     def __init__(
         self,

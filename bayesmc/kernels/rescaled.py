@@ -21,7 +21,7 @@ import numpy as np
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, DensityError
 from bayesmc.kernels.base import Kernel, Memory
-from bayesmc.kernels.slice import slice_move
+from bayesmc.kernels.slice import EVALUATIONS, slice_move
 from bayesmc.shapes import Shape
 from bayesmc.structure.like_terms import TermSum
 from bayesmc.structure.target import Target, Values
@@ -46,6 +46,7 @@ class Rescaled(Kernel):
     """
 
     label = "rescaled"
+    evaluations = EVALUATIONS
 
     def __init__(self, target: Target, name: str, below: Sequence[str], power: int) -> None:
         self.target = target

@@ -24,6 +24,8 @@ from bayesmc.structure.target import Values
 
 #: widths by which an interval may grow
 _GROWTH = 64
+#: evaluations that a move takes, about: both ends, two steps out, two shrinkages
+EVALUATIONS = 6.0
 #: shrinkages after which the density cannot be what it was
 _SHRINKAGES = 400
 #: shrunk intervals tried in one call, for arrays up to a size where calls cost more than numbers
@@ -170,6 +172,7 @@ class Slice(Kernel):
     """
 
     label = "slice"
+    evaluations = EVALUATIONS
 
     def __init__(self, blanket: Blanket, debug: bool = False) -> None:
         self.blanket, self.debug = blanket, debug

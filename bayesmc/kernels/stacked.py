@@ -54,6 +54,7 @@ class Stacked(Kernel):
         self.kernel = make(stack.one)
         self.label = self.kernel.label
         self.match = self.kernel.match
+        self.evaluations = self.kernel.evaluations
 
     def words(self, name: str) -> tuple[str, str]:
         label, match = self.kernel.words(self.stack.one.name)

@@ -32,6 +32,9 @@ def datatree(posterior: Posterior) -> Any:
     seen = {n: _with_gaps(model[n].decode(o.value), o) for n, o in posterior._seen.items()}
     if seen:
         groups["observed_data"] = {n: _labelled(v) for n, v in seen.items()}
+    diverged = getattr(posterior, "divergences", None)
+    if diverged is not None:
+        groups["sample_stats"] = {"diverging": diverged}
     dims = {
         n: [*model[n].plates, *(f"{n}_dim_{i}" for i in range(len(model[n].event_shape)))]
         for n in [*free, *seen]

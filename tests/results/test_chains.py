@@ -366,3 +366,15 @@ def test_to_datatree() -> None:
     tree = posterior_of(draws_of(4, 50)).to_datatree()
     assert tree["posterior"]["x"].dims == ("chain", "draw", "p")
     assert tree["posterior"]["x"].shape == (4, 50, 2)
+    assert "sample_stats" not in tree.children
+
+
+def test_to_datatree_shows_which_trajectories_diverged() -> None:
+    pytest.importorskip("arviz_base")
+    diverged = np.zeros((4, 50), dtype=bool)
+    diverged[2, 7] = True
+    posterior = posterior_of(draws_of(4, 50))
+    posterior.divergences = diverged
+    found = posterior.to_datatree()["sample_stats"]["diverging"]
+    assert found.dims == ("chain", "draw")
+    assert (found.values == diverged).all()

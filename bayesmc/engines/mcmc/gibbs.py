@@ -15,6 +15,7 @@ import numpy as np
 
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
+from bayesmc.engines.mcmc.cost import shares
 from bayesmc.engines.mcmc.jointly import trajectories_of
 from bayesmc.engines.mcmc.sweep import SweepSampler
 from bayesmc.engines.weighted.drawing import treatment
@@ -171,7 +172,7 @@ class Plan:
         for kernel in self.kernels:
             for name in kernel.names:
                 by_name.setdefault(name, []).append(kernel)
-        number = self._colours()
+        number, cost = self._colours(), shares(self.kernels, self.target)
         rows = []
         for name, node in model.nodes.items():
             plates = ", ".join(f"{p}={model.sizes[p]}" for p in node.plates)
@@ -187,7 +188,8 @@ class Plan:
                 why += f"{', ' if why else ''}since {self.refusals[name]}"
             classes = len(self.blankets[name].classes)
             colour = f"{number[name]}" + (f" (elements: {classes})" if classes > 1 else "")
-            rows.append(Treatment(name, " + ".join(dict.fromkeys(kinds)), why, plates, colour))
+            kinds_told = " + ".join(dict.fromkeys(kinds))
+            rows.append(Treatment(name, kinds_told, why, plates, colour, cost.get(name, 0.0)))
         return rows
 
     def _given(self, name: str) -> str:
