@@ -286,8 +286,7 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     joint = trajectories_of(problem, refusals, closed, governed, keys) if refusals else []
     moved = {n for k in joint for n in k.names}
     kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
-    left = [n for n in refusals if n not in moved]
-    kernels += [*joint, *_numbers(blankets, forms, left, debug)]
+    kernels += [*joint, *_numbers(blankets, forms, [n for n in refusals if n not in moved], debug)]
     for block, scales in zip(blocks, scales_of, strict=True):
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
