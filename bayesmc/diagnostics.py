@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
-import scipy.special
+
+from bayesmc.ranks import normal_scores
 
 #: below this effective size a weighted answer has no reliable error bar either
 MIN_WEIGHT_ESS = 100.0
@@ -200,51 +201,39 @@ def chain_statistic(
     >>> chain_statistic("rhat", draws).round(2).item()
     1.0
     """
-    chains, whole = values.shape[0], values.shape[1] // block * block
-    if whole < 4 * block or not values.size:
-        return np.full(values.shape[2:], np.nan)
-    flat = values[:, :whole].reshape(chains, whole, -1)
-    step = max(_AT_ONCE // (chains * whole), 1)
-    with np.errstate(all="ignore"):
-        found = []
-        for at in range(0, flat.shape[2], step):
-            some = np.array(np.moveaxis(flat[..., at : at + step], -1, 0), dtype=float, order="C")
-            found.append(_figures(kind, some, block, superchains))
-    return np.concatenate(found).reshape(values.shape[2:])
+    (found,) = _by_scalar(values, block, lambda some: (_figures(kind, some, block, superchains),))
+    return found
 
 
-def normal_scores(values: np.ndarray) -> np.ndarray:
-    """Values as quantiles of a standard Normal by their ranks, those of equal ones averaged.
+class ChainFigures(NamedTuple):
+    """Figures of ``chain_statistic``; ``spread_ess`` is the bulk one of distances from the median."""
+
+    ess: np.ndarray
+    tail_ess: np.ndarray
+    rhat: np.ndarray
+    spread_ess: np.ndarray
+
+
+def chain_figures(values: np.ndarray, block: int = 1, superchains: int = 0) -> ChainFigures:
+    """All figures by which chains are judged, for little more than one of them: draws are ranked once.
 
     Parameters
     ----------
-    values : ndarray, shape (scalar, ...)
-        Ranked within each scalar.
-
-    References
-    ----------
-    Blom (1958), Statistical Estimates and Transformed Beta-Variables; Vehtari et al. (2021), eq. 14.
+    values : ndarray, shape (chain, draw, ...)
+    block, superchains : int
+        As in ``chain_statistic``.
 
     Examples
     --------
     >>> import numpy as np
-    >>> normal_scores(np.array([[3.0, 1.0, 2.0]])).round(2).tolist()
-    [[0.87, -0.87, 0.0]]
+    >>> draws = np.random.default_rng(0).normal(size=(4, 1000))
+    >>> found = chain_figures(draws)
+    >>> bool(found.rhat == chain_statistic("rhat", draws)), bool(found.ess == chain_statistic("ess", draws))
+    (True, True)
     """
-    flat = values.reshape(len(values), -1)
-    order = np.argsort(flat, axis=1)
-    sorted_ = np.take_along_axis(flat, order, axis=1)
-    size = flat.shape[1]
-    at = np.arange(size)
-    new = np.ones(flat.shape, dtype=bool)
-    new[:, 1:] = sorted_[:, 1:] != sorted_[:, :-1]
-    first = np.maximum.accumulate(np.where(new, at, 0), axis=1)
-    ends = np.ones(flat.shape, dtype=bool)
-    ends[:, :-1] = new[:, 1:]
-    last = np.minimum.accumulate(np.where(ends, at, size)[:, ::-1], axis=1)[:, ::-1]
-    ranks = np.empty(flat.shape)
-    np.put_along_axis(ranks, order, 0.5 * (first + last) + 1.0, axis=1)
-    return scipy.special.ndtri((ranks - 0.375) / (size + 0.25)).reshape(values.shape)
+    return ChainFigures(
+        *_by_scalar(values, block, lambda some: _all_figures(some, block, superchains), 4)
+    )
 
 
 # ---- private: scalars of chains in whole blocks, shape (scalar, chain, draw) -----------------------
@@ -255,6 +244,42 @@ def normal_scores(values: np.ndarray) -> np.ndarray:
 _STILL = 1e6
 #: numbers that figures are worked out of at once
 _AT_ONCE = 1 << 19
+
+
+def _by_scalar(
+    values: np.ndarray,
+    block: int,
+    figures: Callable[[np.ndarray], tuple[np.ndarray, ...]],
+    count: int = 1,
+) -> list[np.ndarray]:
+    """Figures of whole blocks of draws, of some scalars at a time; NaN where there are too few."""
+    chains, whole = values.shape[0], values.shape[1] // block * block
+    if whole < 4 * block or not values.size:
+        return [np.full(values.shape[2:], np.nan) for _ in range(count)]
+    flat = values[:, :whole].reshape(chains, whole, -1)
+    step = max(_AT_ONCE // (chains * whole), 1)
+    with np.errstate(all="ignore"):
+        found = []
+        for at in range(0, flat.shape[2], step):
+            some = np.array(np.moveaxis(flat[..., at : at + step], -1, 0), dtype=float, order="C")
+            found.append(figures(some))
+    return [np.concatenate(f).reshape(values.shape[2:]) for f in zip(*found, strict=True)]
+
+
+def _all_figures(values: np.ndarray, block: int, superchains: int) -> tuple[np.ndarray, ...]:
+    """Effective sizes in bulk and tails, R-hat, and the effective size of distances from the median."""
+    lost = np.isnan(values).any(axis=(1, 2))
+    tail = _ess("tail_ess", values, block)
+    if block > 1 or len(values[0]) == 1:  # R-hat splits other draws than effective sizes
+        far = np.abs(values - np.median(values, axis=(1, 2), keepdims=True))
+        rhat = _rhat(values, superchains)
+        ess, spread = _ess("ess", values, block), _ess("ess", far, block)
+    else:
+        split = _split(values)
+        scores, folded = normal_scores(split), normal_scores(_folded(split))
+        ess, spread = _ess_of_halves(scores), _ess_of_halves(folded)
+        rhat = _rhat_of(scores, folded, superchains)
+    return tuple(np.where(lost, np.nan, figure) for figure in (ess, tail, rhat, spread))
 
 
 def _figures(kind: str, values: np.ndarray, block: int, superchains: int) -> np.ndarray:
@@ -276,9 +301,18 @@ def _rhat(values: np.ndarray, superchains: int) -> np.ndarray:
     if values.shape[2] < 4:
         return np.full(len(values), np.nan)
     split = _split(values)
-    folded = np.abs(split - np.median(split, axis=(1, 2), keepdims=True))
+    return _rhat_of(normal_scores(split), normal_scores(_folded(split)), superchains)
+
+
+def _folded(split: np.ndarray) -> np.ndarray:
+    """Distances from the median."""
+    return np.abs(split - np.median(split, axis=(1, 2), keepdims=True))
+
+
+def _rhat_of(scores: np.ndarray, folded: np.ndarray, superchains: int) -> np.ndarray:
+    """R-hat of half-chains, by the scores of their values and of their distances from the median."""
     ratio = _nested(superchains) if superchains > 1 else _between_and_within
-    found = np.maximum(ratio(normal_scores(split)), ratio(normal_scores(folded)))
+    found = np.maximum(ratio(scores), ratio(folded))
     return np.where(found > _STILL, np.inf, found)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.special
+import scipy.stats
 from arviz_stats.base import array_stats
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,6 +13,7 @@ from hypothesis.extra import numpy as hnp
 
 from bayesmc import diagnostics
 from bayesmc.categorical import log_sum_exp
+from bayesmc.ranks import normal_scores
 
 logs = hnp.arrays(float, st.integers(1, 20), elements=st.floats(-700, 700) | st.just(-np.inf))
 
@@ -196,3 +198,36 @@ def test_nested_rhat_asks_whether_starts_are_forgotten():
     assert diagnostics.chain_statistic("rhat", slow, superchains=8) < 1.04
     assert diagnostics.chain_statistic("rhat", remembered, superchains=8) > 1.2
     assert diagnostics.chain_statistic("rhat", short, superchains=8) < 1.01
+
+
+@pytest.mark.parametrize(
+    ("chains", "draws", "block", "superchains"),
+    [(8, 57, 1, 0), (8, 57, 1, 4), (8, 60, 1, 4), (1, 90, 1, 0), (8, 61, 3, 0), (8, 61, 3, 4)],
+)
+def test_all_figures_at_once_are_those_one_by_one(
+    chains: int, draws: int, block: int, superchains: int
+) -> None:
+    rng = np.random.default_rng(5)
+    values = rng.normal(size=(chains, draws, 3, 2)).cumsum(axis=1) * 0.1 + rng.normal(size=(3, 2))
+    values[..., 1, 0] = values[..., 1, 0].round()  # ties
+    values[0, 3, 2, 1] = np.nan
+    found = diagnostics.chain_figures(values, block, superchains)
+    far = np.abs(values - np.median(values, axis=(0, 1)))
+    for got, kind, of in (
+        (found.ess, "ess", values),
+        (found.tail_ess, "tail_ess", values),
+        (found.rhat, "rhat", values),
+        (found.spread_ess, "ess", far),
+    ):
+        wanted = diagnostics.chain_statistic(kind, of, block, superchains)
+        odd = draws % 2 and of is far  # its median counts the draw between the halves
+        np.testing.assert_allclose(got, wanted, rtol=0.05 if odd else 1e-12)
+
+
+def test_normal_scores_are_those_of_average_ranks() -> None:
+    rng = np.random.default_rng(2)
+    values = np.stack([rng.normal(size=40), rng.integers(0, 6, size=40), np.ones(40)])
+    for rows in (values, values[:1]):
+        ranks = scipy.stats.rankdata(rows, axis=1)
+        wanted = scipy.stats.norm.ppf((ranks - 0.375) / 40.25)
+        np.testing.assert_allclose(normal_scores(rows), wanted, rtol=1e-13, atol=1e-13)

@@ -121,13 +121,13 @@ def finite_kernel(blanket: Blanket) -> Kernel:
     return Enumerate(with_like_children(blanket))
 
 
-def number_kernel(blanket: Blanket) -> Kernel:
+def number_kernel(blanket: Blanket, debug: bool = False) -> Kernel:
     """The closed form that a node has but for potentials, accepted by these; slices where it has none."""
-    slices = Slice(with_like_children(blanket))
+    slices = Slice(with_like_children(blanket), debug)
     potentials = [child for child in blanket.children if child.term.is_potential]
     if not potentials:
         return slices
-    found = conjugate_kernel(_without(blanket, potentials))
+    found = conjugate_kernel(_without(blanket, potentials), debug)
     if not isinstance(found, Conjugate) or len(found.blanket.classes) > 1:
         return slices
     return Accepted(blanket, potentials, found, slices)

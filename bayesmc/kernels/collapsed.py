@@ -33,6 +33,8 @@ _DRAWS = 800
 _ENOUGH = 50
 #: lags, and the autocorrelations there that count as slow
 _SLOW = ((1, 0.6), (10, 0.1))
+#: of so many chains one is not looked at
+_FAR = 8
 #: components of a block that is worth it
 _MAX_DENSE, _MAX_LOCAL = 64, 2000
 _KINDS = ("real", "interval")
@@ -199,7 +201,7 @@ class CollapsedBlock(Kernel):
         if min(len(seen) for seen in series.values()) < enough:
             return memory
         slow = {
-            name: any(_autocorrelation(seen, lag) > limit for lag, limit in _SLOW)
+            name: any(_autocorrelation(_settled(seen), lag) > limit for lag, limit in _SLOW)
             for name, seen in series.items()
         }
         return {**memory, "slow": slow, "series": {n: s[:0] for n, s in series.items()}}
@@ -264,6 +266,13 @@ def _widened(memory: Memory, name: str, step: float) -> Memory:
         "step": {**memory["step"], name: mean},
         "width": {**memory["width"], name: width},
     }
+
+
+def _settled(series: np.ndarray) -> np.ndarray:
+    """The chains but for those farthest from the rest: one that is not yet home makes all look slow."""
+    far = ((series - np.median(series)) ** 2).mean(axis=0)
+    kept = far.size - far.size // _FAR
+    return series[:, np.argsort(far, kind="stable")[:kept]]
 
 
 def _autocorrelation(series: np.ndarray, lag: int) -> float:

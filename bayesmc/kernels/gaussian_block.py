@@ -27,7 +27,7 @@ from bayesmc.kernels.base import Kernel, Memory, check_ratio
 from bayesmc.kernels.gaussian_layout import BlockSums, Components, Layout
 from bayesmc.kernels.gaussian_rows import NormalRows
 from bayesmc.kernels.gaussian_terms import NormalTerms
-from bayesmc.linalg.patterns import cholesky, lapack
+from bayesmc.linalg.patterns import cholesky, lapack, triangular
 from bayesmc.structure.target import Target, Values
 
 #: components that one dense matrix may have, and how far from the diagonal a band may reach
@@ -393,8 +393,7 @@ def _are_joint(normal: NormalTerms, owner: dict[str, _Group], one: _Group, other
 def _triangle(factor: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:
     """Lower triangles, or their transposes, solved for one vector each ``(chains, d)``."""
     if factor.shape[-1] <= _SMALL:
-        lower = factor if trans == "N" else np.swapaxes(factor, -1, -2)
-        return np.linalg.solve(lower, right[..., None])[..., 0]
+        return triangular(factor, right[..., None], trans == "T")[..., 0]
     trtrs = lapack().dtrtrs
     if len(factor) == 1:
         return trtrs(factor[0], right.T, lower=1, trans=int(trans == "T"))[0].T

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,8 +17,9 @@ import numpy as np
 from bayesmc.distributions.support import Support, is_half_line
 from bayesmc.distributions.transforms import Transform, transform_of
 from bayesmc.errors import DensityError
-from bayesmc.kernels.base import Kernel, Memory
+from bayesmc.kernels.base import TOLERANCE, Kernel, Memory
 from bayesmc.structure.blanket import Blanket
+from bayesmc.structure.conditional import Conditional, conditional_of
 from bayesmc.structure.target import Values
 
 #: widths by which an interval may grow
@@ -160,13 +162,20 @@ class _Line:
 
 
 class Slice(Kernel):
-    """Slice sampling of a node of numbers; components of a vector one after the other."""
+    """Slice sampling of a node of numbers; components of a vector one after the other.
+
+    Parameters
+    ----------
+    blanket : Blanket
+    debug : bool
+        Hold the program of its full conditional against the model's functions wherever it is asked.
+    """
 
     label = "slice"
     evaluations = EVALUATIONS
 
-    def __init__(self, blanket: Blanket) -> None:
-        self.blanket = blanket
+    def __init__(self, blanket: Blanket, debug: bool = False) -> None:
+        self.blanket, self.debug = blanket, debug
         self.names = (blanket.name,)
         self.is_integer = blanket.node.is_discrete
         support = blanket.node.support
@@ -223,13 +232,15 @@ class Slice(Kernel):
             x = np.log(x - low)
             low, high = -np.inf, np.inf
 
+        full_conditional = self._full_conditional(values, members)
+
         def log_density(tried: np.ndarray) -> np.ndarray:
             candidate, volume = line.candidate(tried, now.dtype)
             if component:
                 whole = np.array(np.broadcast_to(now, tried.shape + blanket.event_shape))
                 whole[at] = candidate
                 candidate = whole
-            log = blanket.log_density(values, candidate, members)
+            log = full_conditional(candidate)
             return np.broadcast_to(log if volume is None else log + volume, tried.shape)
 
         try:
@@ -244,6 +255,35 @@ class Slice(Kernel):
         new = now.copy()
         new[at] = moved
         return new
+
+    def _full_conditional(
+        self, values: Values, members: np.ndarray | None
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """The log full conditional as a program, where it can be had and gives numbers."""
+        at = None if self._conditional is None else self._conditional.given(values)
+
+        def log_density(candidate: np.ndarray) -> np.ndarray:
+            log = None if at is None else at(candidate)
+            if log is None or not np.isfinite(log).all():  # what that means the functions know
+                return self.blanket.log_density(values, candidate, members)
+            if self.debug:
+                self._check(log, self.blanket.log_density(values, candidate, members))
+            return log
+
+        return log_density
+
+    @cached_property
+    def _conditional(self) -> Conditional | None:
+        return conditional_of(self.blanket)
+
+    def _check(self, log: np.ndarray, wanted: np.ndarray) -> None:
+        """Refuse a program that does not say what the model's functions say."""
+        apart = np.abs(log - wanted).max()
+        if not apart <= TOLERANCE * (1.0 + np.abs(log).max()):
+            raise DensityError(
+                f"node {self.blanket.name!r}: the program of its full conditional is off by {apart:.3g}; "
+                "please report the model"
+            )
 
     def _support(self, values: Values, component: tuple[int, ...]) -> Support:
         """Where one component may lie, given the parents."""

@@ -19,6 +19,9 @@ import numpy as np
 
 from bayesmc.gaussian import try_cholesky
 
+#: rows up to which a triangle is solved row by row for all matrices at once
+_BY_ROW = 4
+
 
 class Pattern(ABC):
     """Symmetric matrices whose entries outside a pattern are zero.
@@ -96,18 +99,16 @@ class Blocks(Pattern):
         return root, log_det, np.asarray(wrong.any(axis=-1))
 
     def lower(self, root: np.ndarray, right: np.ndarray) -> np.ndarray:
-        return self._solved(root, right)
+        return triangular(root, self._columns(right), False).reshape(right.shape)
 
     def upper(self, root: np.ndarray, right: np.ndarray) -> np.ndarray:
-        return self._solved(np.swapaxes(root, -1, -2), right)
+        return triangular(root, self._columns(right), True).reshape(right.shape)
+
+    def _columns(self, right: np.ndarray) -> np.ndarray:
+        return right.reshape(len(right), self.count, self.width, -1)
 
     def _apart(self, stored: np.ndarray) -> np.ndarray:
         return stored.reshape(len(stored), self.count, self.width, self.width)
-
-    def _solved(self, factor: np.ndarray, right: np.ndarray) -> np.ndarray:
-        apart = right.reshape(len(right), self.count, self.width, -1)
-        found = apart / factor if self.width == 1 else np.linalg.solve(factor, apart)
-        return found.reshape(right.shape)
 
 
 class Band(Pattern):
@@ -188,13 +189,45 @@ class Band(Pattern):
         return np.ascontiguousarray(np.moveaxis(found.reshape(size, lead, count), 1, 0))
 
 
+def triangular(root: np.ndarray, right: np.ndarray, transposed: bool) -> np.ndarray:
+    """Many small lower triangles, or their transposes, solved for columns.
+
+    Parameters
+    ----------
+    root : ndarray, shape (*lead, width, width)
+        Zero above the diagonal.
+    right : ndarray, shape (*lead, width, columns)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.linalg.patterns import triangular
+    >>> triangular(np.array([[2.0, 0.0], [1.0, 4.0]]), np.array([[2.0], [9.0]]), False).ravel().tolist()
+    [1.0, 2.0]
+    """
+    width = root.shape[-1]
+    if width > _BY_ROW:
+        return np.linalg.solve(np.swapaxes(root, -1, -2) if transposed else root, right)
+    lead = np.broadcast_shapes(root.shape[:-2], right.shape[:-2])
+    found = np.empty((*lead, *right.shape[-2:]))
+    done: list[int] = []
+    for k in reversed(range(width)) if transposed else range(width):
+        row = right[..., k, :]
+        for j in done:
+            factor = root[..., j, k, None] if transposed else root[..., k, j, None]
+            row = row - factor * found[..., j, :]
+        np.divide(row, root[..., k, k, None], out=found[..., k, :])
+        done.append(k)
+    return found
+
+
 def cholesky(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cholesky factors, and which matrices have none (those get the identity)."""
     try:
         if matrices.shape[-1] == 1:
             wrong = np.asarray(~((matrices > 0) & (matrices < np.inf))[..., 0, 0])
             return np.sqrt(np.where(wrong[..., None, None], 1.0, matrices)), wrong
-        factor = np.linalg.cholesky(matrices)
+        factor = _of_two(matrices) if matrices.shape[-1] == 2 else np.linalg.cholesky(matrices)
         wrong = np.asarray(~np.isfinite(factor).all(axis=(-2, -1)))
         if not wrong.any():
             return factor, wrong
@@ -214,6 +247,19 @@ def lapack() -> Any:
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _of_two(matrices: np.ndarray) -> np.ndarray:
+    """Cholesky factors of matrices of two rows."""
+    factor = np.zeros(matrices.shape)
+    with np.errstate(all="ignore"):
+        first = np.sqrt(matrices[..., 0, 0])
+        below = matrices[..., 1, 0] / first
+        last = np.sqrt(matrices[..., 1, 1] - below * below)
+    if not (last > 0).all():  # NaN, too, where the first is no number
+        raise np.linalg.LinAlgError
+    factor[..., 0, 0], factor[..., 1, 0], factor[..., 1, 1] = first, below, last
+    return factor
 
 
 def _tbtrs(root: np.ndarray, right: np.ndarray, trans: str) -> np.ndarray:

@@ -311,5 +311,5 @@ def test_models_of_any_size_choose_their_chains() -> None:
         return bmc.Gibbs(**options).lengths(problem).chains
 
     assert [chains(n) for n in (3, 100, 500, 10_000)] == [64, 32, 8, 4]
-    assert chains(3, ess=4000) == 128
+    assert chains(3, ess=4000) == 256
     assert chains(3, ess=100) == 8

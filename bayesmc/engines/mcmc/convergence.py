@@ -19,9 +19,10 @@ import numpy as np
 import scipy.special
 
 from bayesmc import diagnostics
+from bayesmc.engines.mcmc.screening import Looked, looked_at, screened, spread
 from bayesmc.network import CompiledNode, Model
+from bayesmc.ranks import normal_scores
 from bayesmc.results import ChainsPosterior, ChainsSums
-from bayesmc.results.posterior import near
 from bayesmc.results.relabelling import ordered, pivot_of, symmetries
 
 #: R-hat above which chains disagree (Vehtari et al. 2021, sec. 5)
@@ -32,22 +33,14 @@ MIN_ESS, _POOLED = 100, 4
 #: chance that superchains which agree look apart, or chains that mix as if each kept to where it was; how
 #: much of the variance between chains must last to be worth a word; draws of a chain to tell it by
 _ALARM, _LASTING, _THIRDS = 1e-4, 0.02, 12
-#: scalars looked at
+#: scalars looked at where draws were summed
 _SCALARS = 200
-#: of these, scalars judged by their R-hat, and as many by their effective size
+#: scalars judged by their R-hat, and as many by their effective size
 _JUDGED = 6
 #: share of the effective size that is asked for below which it may be for names that components exchange
 _HOPELESS = 0.1
 #: draws of all scalars and chains that are judged: of large scalars fewer are, though at least two
 _ELEMENTS = 250_000
-#: draws of one scalar in all chains to which more are thinned, though not below ``_DRAWS`` per chain
-_ONE = 50_000
-_DRAWS = 1000
-#: chains looked at; of more, some more or less stuck ones hardly change the figures
-_CHAINS = 64
-#: batches of a chain in the screen, and draws of a scalar from which it learns its quantiles
-_BATCHES = 20
-_SAMPLE = 1000
 
 
 def poor_mixing(
@@ -75,11 +68,11 @@ def share_reached(
     """
     if isinstance(posterior, ChainsSums):
         return _share(_summed_figures(posterior, forward), ess)
-    share = _share(_figures(posterior, posterior._stored, forward), ess)
+    share = _share(_sizes(posterior, posterior._stored, forward), ess)
     if share < _HOPELESS:
         stored = _named(posterior)[0]
         if stored is not posterior._stored:
-            return max(share, _share(_figures(posterior, stored, forward), ess))
+            return max(share, _share(_sizes(posterior, stored, forward), ess))
     return share
 
 
@@ -283,96 +276,79 @@ def _figures(
     posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
 ) -> _Judged:
     """What ArviZ says of those scalars that the screen finds worst; scalars that never move are left out."""
-    block, chains = posterior.ensemble_size, posterior._chains_and_draws[0]
-    groups = posterior.superchains
-    names, columns = [], []
-    for name, index in some_scalars(_moving(posterior, forward), posterior.model):
-        if name not in stored:
-            continue
-        at: tuple[Any, ...] = (slice(None), slice(None), *index)
-        values = stored[name][at]
-        if (values != values[0, 0]).any():  # a state never left in any chain is nothing to judge by
-            names.append(scalar_name(posterior.model, name, index))
-            columns.append(uncut(posterior.model[name], index, _thinned(values, block, groups)))
+    block, groups = posterior.ensemble_size, posterior.superchains
+    looked, names, apart, slow = _worst(posterior, stored, forward)
     if not names:
         return _Judged(0, {}, {})
-    share = len(columns[0]) / chains
-    many = min(_JUDGED, max(2, _ELEMENTS // max(columns[0].size, 1)))
-    disagreement, ess = np.transpose([_screen(values, block) for values in columns])
-    apart = np.argsort(-disagreement, kind="stable")[:many]  # NaN, of which nothing is known, last
-    slow = np.argsort(ess, kind="stable")[:many]
-
-    def figure(kind: str, at: int) -> float:
-        found = diagnostics.chain_statistic(kind, columns[at], block, groups)
-        return float(found.item() if kind == "rhat" else found.item() / share)
-
-    sizes = {names[at]: (figure("ess", at), figure("tail_ess", at)) for at in slow}
-    ratios = {names[at]: figure("rhat", at) for at in apart}
+    these = np.union1d(apart, slow)
+    draws = looked.draws[these]
+    figures = diagnostics.chain_figures(np.moveaxis(draws, 0, -1), block, groups)
+    at = {scalar: k for k, scalar in enumerate(these.tolist())}
+    sizes, ratios, chance = {}, {}, {}
+    for scalar in slow.tolist():
+        k = at[scalar]
+        sizes[names[scalar]] = (
+            float(figures.ess[k] / looked.share),
+            float(figures.tail_ess[k] / looked.share),
+        )
+    for scalar in apart.tolist():
+        k = at[scalar]
+        ratios[names[scalar]] = float(figures.rhat[k])
+        # the means of superchains, of values or of their distances from the median, then have the variance
+        # of ``ess / groups`` independent draws
+        chance[names[scalar]] = (
+            float(by_chance(min(figures.ess[k], figures.spread_ess[k]), groups)) if groups else 0.0
+        )
     if not groups:
         return _Judged(len(names), ratios, sizes)
-    chance = {names[at]: _chance(columns[at], block, groups) for at in apart}
-    lasting = {names[at]: _memory(columns[at]) for at in {*apart, *slow}}
-    lasting = {name: memory for name, memory in lasting.items() if memory > 0}
-    return _Judged(len(names), ratios, sizes, chance, lasting)
+    memory = {names[s]: m for s, m in zip(these.tolist(), _memory(draws), strict=True) if m > 0}
+    return _Judged(len(names), ratios, sizes, chance, memory)
 
 
-def _chance(values: np.ndarray, block: int, groups: int) -> float:
-    """Nested R-hat of so many superchains that have mixed, or ``MAX_RHAT``, seldom exceeded.
+def _sizes(
+    posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
+) -> _Judged:
+    """Of the same scalars the effective sizes alone."""
+    looked, names, _, slow = _worst(posterior, stored, forward)
+    if not names:
+        return _Judged(0, {}, {})
+    draws, block = np.moveaxis(looked.draws[slow], 0, -1), posterior.ensemble_size
+    bulk, tail = (diagnostics.chain_statistic(k, draws, block) for k in ("ess", "tail_ess"))
+    sizes = np.stack([bulk, tail], axis=1) / looked.share
+    return _Judged(
+        len(names), {}, {names[s]: tuple(f) for s, f in zip(slow, sizes.tolist(), strict=True)}
+    )
 
-    The means of superchains, of values or of their distances from the median, then have the variance of
-    ``ess / groups`` independent draws.
-    """
-    far = np.abs(values - np.median(values))
-    ess = min(float(diagnostics.chain_statistic("ess", x, block)) for x in (values, far))
-    return float(by_chance(ess, groups))
+
+def _worst(
+    posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
+) -> tuple[Looked, list[str], np.ndarray, np.ndarray]:
+    """What was looked at, the scalars' names; which of them differ most between chains, and are slowest."""
+    block, model = posterior.ensemble_size, posterior.model
+    looked = looked_at(_moving(posterior, forward), model, stored, block, posterior.superchains)
+    names = [scalar_name(model, name, index) for name, index in looked.scalars]
+    many = min(_JUDGED, max(2, _ELEMENTS // max(math.prod(looked.draws.shape[1:]), 1)))
+    disagreement, ess = screened(looked.draws, block)
+    apart = np.argsort(-disagreement, kind="stable")[:many]  # NaN, of which nothing is known, last
+    return looked, names, apart, np.argsort(ess, kind="stable")[:many]
 
 
-def _memory(values: np.ndarray) -> float:
-    """Correlation over chains of the means of their first and last thirds; 0 where it is chance."""
-    chains, draws = values.shape
-    if draws < _THIRDS or chains < 2 * _POOLED:
-        return 0.0
-    scores = diagnostics.normal_scores(values[None])[0]
-    third = draws // 3
-    first, last = scores[:, :third].mean(axis=1), scores[:, -third:].mean(axis=1)
+def _memory(draws: np.ndarray) -> np.ndarray:
+    """Correlation over chains of the means of the first and the last third of each; 0 by chance."""
+    count, chains, length = draws.shape
+    if length < _THIRDS or chains < 2 * _POOLED:
+        return np.zeros(count)
+    scores = normal_scores(draws)
+    third = length // 3
+    first, last = scores[..., :third].mean(axis=-1), scores[..., -third:].mean(axis=-1)
     with np.errstate(all="ignore"):
-        correlation = float(np.corrcoef(first, last)[0, 1])
+        first, last = (m - m.mean(axis=1, keepdims=True) for m in (first, last))
+        together = (first * last).mean(axis=1)
+        correlation = together / (first.std(axis=1) * last.std(axis=1))
         z = np.arctanh(correlation) * math.sqrt(chains - 3)
-        lasting = correlation * first.std() * last.std() / scores.var()
-    return correlation if z > scipy.special.ndtri(1 - _ALARM) and lasting > _LASTING else 0.0
-
-
-def _screen(values: np.ndarray, block: int) -> tuple[float, float]:
-    """How far halves of chains differ, and an effective size: rough, to rank scalars by and no more.
-
-    Both come from batch means (Flegal and Jones 2010), the first as the variance between halves over the
-    whole one, of the values and of their distance from the median, both squashed so that heavy tails do
-    not hide anything; the second as the smallest of the squashed values' and both tails'. No ranks are
-    taken and nothing is corrected for few batches. NaN if there are fewer than four blocks of draws.
-    """
-    chains, draws = values.shape
-    if draws < 4 * block:
-        return np.nan, np.nan
-    count = min(_BATCHES, draws // block)
-    values = values[:, : draws // block // count * block * count].astype(float, copy=False)  # flags
-    sample = values.ravel()[:: (values.size // _SAMPLE) | 1]
-    with np.errstate(all="ignore"):  # infinite draws, and scalars that hardly ever move
-        low, middle, high = np.quantile(sample, [0.05, 0.5, 0.95])
-        offset = (values - middle) / (high - low or values.std())
-        far = np.abs(offset)
-        far /= 1.0 + far
-        series = np.stack([np.copysign(far, offset), far, values <= low, values <= high])
-        means = series.reshape(4, chains, count, -1).mean(axis=-1)
-        variance = of_blocks = series.var(axis=(1, 2))
-        if block > 1:
-            of_blocks = series.reshape(4, chains, -1, block).mean(axis=-1).var(axis=(1, 2))
-        half = count // 2
-        halves = np.stack([means[..., :half].mean(axis=-1), means[..., -half:].mean(axis=-1)])
-        between = halves.var(axis=(0, 2)) / of_blocks
-        ess = chains * count * variance / means.var(axis=(1, 2))
-        if chains >= 2 * _POOLED:  # what batches of few draws do not show of each other
-            ess = np.fmin(ess, chains * variance / means.mean(axis=2).var(axis=1))
-    return float(np.fmax(*between[:2])), float(np.fmin.reduce(ess[[0, 2, 3]]))
+        lasting = together / scores.var(axis=(1, 2))
+    found = (z > scipy.special.ndtri(1 - _ALARM)) & (lasting > _LASTING)
+    return np.where(found, correlation, 0.0)
 
 
 def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
@@ -384,7 +360,7 @@ def _summed_figures(posterior: ChainsSums, forward: frozenset[str]) -> _Judged:
             continue
         rhat, ess = posterior.rhat(name), posterior.ess(name)
         moves = posterior.moves(name)
-        for index in _spread(moves.shape, _SCALARS):
+        for index in spread(moves.shape, _SCALARS):
             if moves[index]:
                 scalar = scalar_name(posterior.model, name, index[: len(node.value_shape)])
                 if len(index) > len(node.value_shape) and node.domain is not None:
@@ -402,42 +378,3 @@ def _moving(posterior: ChainsPosterior, forward: frozenset[str]) -> list[Compile
         if name not in forward and name not in posterior._observed and values.size
         and posterior.model[name].kind not in ("input", "fixed")
     ]  # fmt: skip
-
-
-def some_scalars(nodes: list[CompiledNode], model: Model) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Node and index of up to ``_SCALARS`` scalars, spread evenly over nodes and within them."""
-    if len(nodes) > _SCALARS:
-        picked = np.linspace(0, len(nodes) - 1, _SCALARS).round().astype(int)
-        nodes = [nodes[i] for i in picked]
-    left = _SCALARS
-    small_first = sorted(nodes, key=lambda node: math.prod(node.value_shape))
-    for position, node in enumerate(small_first):
-        share = left // (len(small_first) - position)
-        chosen = list(_spread(node.value_shape, share))
-        left -= len(chosen)
-        for index in chosen:
-            yield node.name, index
-
-
-def _spread(shape: tuple[int, ...], count: int) -> Iterator[tuple[int, ...]]:
-    total = math.prod(shape)
-    flat = np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int))
-    for at in zip(*np.unravel_index(flat, shape), strict=True) if shape else [()]:
-        yield tuple(int(i) for i in at)
-
-
-def _thinned(values: np.ndarray, block: int, superchains: int = 0) -> np.ndarray:
-    """Every k-th block of draws of long chains, of some chains if there are many; shape (chain, draw)."""
-    if len(values) > _CHAINS and not superchains:
-        values = values[np.linspace(0, len(values) - 1, _CHAINS).round().astype(int)]
-    chains, draws = values.shape
-    step = max(1, min(draws // _DRAWS, -(-chains * draws // _ONE)))
-    whole = draws // block * block
-    return values[:, :whole].reshape(chains, -1, block)[:, ::step].reshape(chains, -1)
-
-
-def uncut(node: CompiledNode, index: tuple[int, ...], values: np.ndarray) -> np.ndarray:
-    """The draws of a scalar, those of an angle near their mean: cut in two they would look faster mixed."""
-    if node.angles is None or not node.angles[index[len(node.plates) :]]:
-        return values
-    return near(values, np.angle(np.exp(1j * values).mean()))

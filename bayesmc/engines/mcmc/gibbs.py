@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -275,7 +276,7 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     joint = trajectories_of(problem, refusals, closed, governed, keys, debug) if refusals else []
     moved = {n for k in joint for n in k.names}
     kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
-    kernels += [*joint, *_numbers(target, blankets, forms, [n for n in refusals if n not in moved])]
+    kernels += [*joint, *_numbers(blankets, forms, [n for n in refusals if n not in moved], debug)]
     for block, scales in zip(blocks, scales_of, strict=True):
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
@@ -384,9 +385,10 @@ def _mixture_label(target: Target, blanket: Blanket, debug: bool) -> Labels | No
 
 
 def _numbers(
-    target: Target, blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str]
+    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool
 ) -> list[Kernel]:
     """Kernels of nodes without a closed form that have too many values to try."""
+    target = forms.target
     kernels: list[Kernel] = []
     left = []
     for name in names:
@@ -397,12 +399,12 @@ def _numbers(
         else:
             kernels.append(AdaptiveWalk(blankets[name]))
     stacked, left = stacks(target, blankets, left, forms)
-    kernels += [Stacked(group, Slice) for group in stacked]
+    kernels += [Stacked(group, partial(Slice, debug=debug)) for group in stacked]
     for group in _together(target, blankets, left):
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
             left = [n for n in left if n not in group]
-    return kernels + [number_kernel(blankets[n]) for n in left]
+    return kernels + [number_kernel(blankets[n], debug) for n in left]
 
 
 def _kind(target: Target, blanket: Blanket) -> str:

@@ -21,15 +21,16 @@ from typing import Any
 import numpy as np
 
 from bayesmc import diagnostics
-from bayesmc.engines.mcmc.convergence import MAX_RHAT, by_chance, some_scalars, uncut
+from bayesmc.engines.mcmc.convergence import MAX_RHAT, by_chance
 from bayesmc.engines.mcmc.loop import Lengths
+from bayesmc.engines.mcmc.screening import some_scalars, uncut
 from bayesmc.network import Model, Problem
 from bayesmc.structure.target import target_of
 
 #: numbers of all chains up to which a sweep costs little more than that of one chain
 _NUMBERS = 4096
 #: chains, least and most; effective draws that each must give at least, so that its own memory is judged
-LEAST, _MOST, _EACH = 4, 128, 8
+LEAST, _MOST, _EACH = 4, 256, 8
 #: superchains where there are enough chains, and chains that each has at least
 _SUPERCHAINS, _MEMBERS = 8, 2
 #: sweeps of a warmup where none are said, at most where its end is judged
@@ -107,9 +108,9 @@ def forgotten(stored: Mapping[str, np.ndarray], model: Model, superchains: int) 
     draws = np.stack([column[:, ::every] for column in columns[::some]], axis=-1)
     half = draws.shape[1] // 2
     times = np.concatenate([draws[:, :half], draws[:, -half:]])  # the early ones as a superchain
-    starts = diagnostics.chain_statistic("rhat", draws, superchains=superchains)
+    figures = diagnostics.chain_figures(draws, superchains=superchains)
+    starts, ess = figures.rhat, figures.ess
     drift = diagnostics.chain_statistic("rhat", times, superchains=2)
-    ess = diagnostics.chain_statistic("ess", draws)
     enough = (ess >= _ENOUGH) | (np.fmax(starts, drift) <= MAX_RHAT)
     agree = (starts <= by_chance(ess, superchains or 2 * chains)) & (drift <= by_chance(ess, 2))
     return bool((enough & agree).all())

@@ -269,7 +269,13 @@ def _apart(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _errors_below(figure: np.ndarray, block: int) -> float:
-    """Standard errors by which a mean lies below zero, or fewer where skewness explains it (Hall 1992)."""
+    """Standard errors by which a mean lies below zero, or fewer where skewness explains it (Hall 1992).
+
+    Zero where they cannot be worth a word: an effective size is at most n log10(n).
+    """
+    least = float(figure.std()) / math.sqrt(figure.size * max(math.log10(figure.size), 1.0))
+    if not -float(figure.mean()) > _LIMIT * least:
+        return 0.0
     error = float(diagnostics.chain_statistic("mcse", figure, block))
     if not error > 0:
         return 0.0
