@@ -43,13 +43,17 @@ class Rescaled(Kernel):
     below : sequence of str
         What it scales.
     power : int
+    every : int
+        Sweeps of which one moves.
     """
 
     label = "rescaled"
     evaluations = EVALUATIONS
 
-    def __init__(self, target: Target, name: str, below: Sequence[str], power: int) -> None:
-        self.target = target
+    def __init__(
+        self, target: Target, name: str, below: Sequence[str], power: int, every: int = 1
+    ) -> None:
+        self.target, self.every = target, every
         self.name, self.below, self.power = name, tuple(below), power
         self.names = (name, *below)
         self.terms = TermSum(target, target.terms_of(self.names))
@@ -65,11 +69,14 @@ class Rescaled(Kernel):
         return self.label, f"in proportion to {self.name}"
 
     def start(self, values: Values, chains: int) -> Memory:
-        return {"width": 1.0, "moved": 0.0, "count": 0}
+        return {"width": 1.0, "moved": 0.0, "count": 0, "sweep": 0}
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
+        memory = {**memory, "sweep": memory["sweep"] + 1}
+        if memory["sweep"] % self.every:
+            return {n: values[n] for n in self.names}, memory
         centres = {n: centre_of(self.target, n, values) for n in self.below}
         start = np.zeros(len(values[self.name]))
         # heavy tails may have no mean: such chains stay, and are the same wherever the move would lead
@@ -88,7 +95,7 @@ class Rescaled(Kernel):
             count = memory["count"] + 1
             rate = max(1.0 / count, 0.02)
             moved = (1 - rate) * memory["moved"] + rate * float(np.abs(t).mean())
-            memory = {"width": 3.0 * moved or 1.0, "moved": moved, "count": count}
+            memory |= {"width": 3.0 * moved or 1.0, "moved": moved, "count": count}
         return self._scaled(values, centres, t), memory
 
     # ---- private -------------------------------------------------------------------------------
@@ -148,7 +155,7 @@ def centre_of(target: Target, name: str, values: Values) -> np.ndarray:
     return np.broadcast_to(np.asarray(dist.mean, dtype=float), values[name].shape)
 
 
-def rescaled_kernels(target: Target, slow: Collection[str]) -> list[Kernel]:
+def rescaled_kernels(target: Target, slow: Collection[str], every: int = 1) -> list[Kernel]:
     """The kernels for all scales of nodes that have no closed form.
 
     Parameters
@@ -156,6 +163,8 @@ def rescaled_kernels(target: Target, slow: Collection[str]) -> list[Kernel]:
     target : Target
     slow : collection of str
         Nodes that are moved number by number.
+    every : int
+        Sweeps of which one moves them.
 
     Examples
     --------
@@ -192,7 +201,7 @@ def rescaled_kernels(target: Target, slow: Collection[str]) -> list[Kernel]:
             if power is not None:
                 above.setdefault((scale, power), []).append(name)
     return [
-        Rescaled(target, scale, below, power)
+        Rescaled(target, scale, below, power, every)
         for (scale, power), below in above.items()
         if sum(math.prod(target.model[n].value_shape) for n in below) > 1
     ]

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
+import pickle
+import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.errors import TraceError
 from bayesmc.kernels import hamiltonian
+from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.lowering import checked, writer
+from bayesmc.lowering.no_u_turn import transitions
+from bayesmc.network import pose
 from bayesmc.structure.compiled_density import CompiledDensity
+from tests.mutants.faults import Edit
 
 pytest.importorskip("llvmlite", reason="llvmlite is not installed")
 
@@ -85,3 +93,93 @@ def test_explain_names_it() -> None:
     assert effort(net, {"y": np.ones(2)}, warmup=9000).endswith(
         "gradients in NumPy: inv has no machine code"
     )
+
+
+# ---- whole trajectories ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever is asked is worth a compiler's time."""
+    for name in ("_WORTH", "_ONE", "_PAIR"):
+        monkeypatch.setattr(checked, name, 0.0)
+
+
+def answers(net: bmc.BayesNet, evidence: Any, engine: Any, **options: Any) -> Any:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return bmc.infer(net, evidence, engine=engine, rng=5, **options)
+
+
+def machine_code_of(net: bmc.BayesNet, evidence: Any, engine: Any) -> list[Hamiltonian]:
+    problem = pose(net, evidence)
+    kernels = [k for k in engine.sampler(problem).kernels if isinstance(k, Hamiltonian)]
+    for kernel in kernels:
+        kernel.expect(100, 4)
+        assert kernel._compiled is not None
+    return kernels
+
+
+def waves() -> bmc.BayesNet:
+    """An angle too large for the machine's own sine in the tails: NumPy tells such leaves."""
+    net = bmc.BayesNet(plates={"i": 3})
+    net.add("a", bmc.Normal(0.0, 1.0))
+    net.add("b", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda a, b: bmc.Normal(b + np.sin(1e6 * a) * 1e-9, 1.0), plates="i")
+    return net
+
+
+@pytest.mark.usefixtures("at_once")
+def test_resumed_trajectories_are_those_of_one_run() -> None:
+    half, whole = (bmc.HamiltonianMonteCarlo(n, warmup=60, chains=3) for n in (40, 80))
+    assert machine_code_of(schools(), EVIDENCE, half)
+    first = pickle.loads(pickle.dumps(answers(schools(), EVIDENCE, half)))
+    more = answers(schools(), EVIDENCE, half, resume=first)
+    once = answers(schools(), EVIDENCE, whole)
+    threads = answers(schools(), EVIDENCE, replace(whole, threads=2))
+    for name in ("mu", "z"):
+        assert np.array_equal(more[name], once[name])
+        assert np.array_equal(threads[name], once[name])
+
+
+@pytest.mark.usefixtures("at_once")
+def test_leaves_that_machine_code_cannot_tell() -> None:
+    net, evidence = waves(), {"y": np.array([0.3, 0.1, 1.2])}
+    engine = bmc.HamiltonianMonteCarlo(500, warmup=200, chains=8, debug=True)
+    assert machine_code_of(net, evidence, engine)
+    posterior = answers(net, evidence, engine)
+    assert (np.abs(posterior["a"]) > 1.0).mean() > 0.25  # a sine of more than a million
+    for name, mean, sd in (("a", 0.0, 1.0), ("b", 0.4, 0.5)):
+        assert abs(posterior.mean(name) - mean) < 4.9 * posterior.mcse(name)
+        np.testing.assert_allclose(posterior.std(name), sd, rtol=0.15)
+
+
+@pytest.mark.usefixtures("at_once")
+def test_gibbs_moves_beside_them() -> None:
+    """Labels that others draw are read where each chain has them; every step is compared."""
+    net = bmc.BayesNet(plates={"i": 6})
+    net.add("a", bmc.Laplace(0.0, 1.0))
+    net.add("b", bmc.Laplace(0.0, 1.0))
+    net.add("on", bmc.Bernoulli(0.4), plates="i")
+    net.add("y", lambda a, b, on: bmc.Normal(a + b * on, 0.7), plates="i")
+    evidence = {"y": np.array([0.1, 1.4, -0.2, 2.2, 0.4, 1.9])}
+    engine = bmc.Gibbs(1000, warmup=200, chains=8, debug=True)
+    assert [k.given for k in machine_code_of(net, evidence, engine)] == [("on",)]
+    found = answers(net, evidence, engine)
+    wanted = answers(net, evidence, bmc.LikelihoodWeighting(200_000))
+    for name in ("a", "b", "on"):
+        error = np.hypot(found.mcse(name), wanted.mcse(name))
+        assert np.abs((found.mean(name) - wanted.mean(name)) / error).max() < 4.9
+
+
+@pytest.mark.usefixtures("at_once")
+def test_trees_that_differ_are_left_to_numpy() -> None:
+    engine = bmc.HamiltonianMonteCarlo(20, warmup=20, debug=False)
+    with Edit("bayesmc.lowering.no_u_turn:_Text._leapt", "2.0 * half", "1.9 * half").planted():
+        transitions.cache_clear()
+        found = answers(schools(), EVIDENCE, engine)
+        with pytest.raises(TraceError, match="in machine code ends at"):
+            answers(schools(), EVIDENCE, replace(engine, debug=True))
+    transitions.cache_clear()
+    right = answers(schools(), EVIDENCE, engine)
+    assert not np.array_equal(found["z"], right["z"])

@@ -25,6 +25,8 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.compiled_density import in_machine_code
 from bayesmc.structure.target import target_of
 
+#: sweeps of which one moves scales with what they scale: a trajectory in machine code costs far less
+_RESCALED = 4
 _METRICS = ("diagonal", "dense")
 
 
@@ -182,6 +184,6 @@ class HamiltonianMonteCarlo(ChainEngine):
             debug=self.debug,
         )
         blankets = {n: plan.blankets.get(n) or Blanket(target, n) for n in target.chain}
-        kernels = [*plan.kernels, kernel, *rescaled_kernels(target, moving)]
+        kernels = [*plan.kernels, kernel, *rescaled_kernels(target, moving, _RESCALED)]
         kernels += redrawn_kernels(target, blankets, kernels) if finite else []
         return replace(plan, kernels=kernels, blankets=blankets)
