@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
-
-from bayesmc.ranks import normal_scores
+import scipy.special
 
 #: below this effective size a weighted answer has no reliable error bar either
 MIN_WEIGHT_ESS = 100.0
@@ -139,29 +138,6 @@ def share_mcse(error: Any, count: Any, step: Any = 1.0) -> np.ndarray:
     return np.hypot(error, np.multiply(step, unseen))
 
 
-def weighted_share_count(mine: Any, heavy: Any, heaviest: float) -> Any:
-    """Effective draws behind shares of weighted draws, as far as what was not seen is concerned.
-
-    What one more draw of the smaller side would weigh is guessed from those that are there: their mean
-    weight, by weight; or the heaviest of all draws, where there are none, and with a chance of ``exp(-k)``
-    where there are k effective ones. (Draws that a proposal makes of a rare event, with tiny weights, leave
-    little room.)
-
-    Parameters
-    ----------
-    mine, heavy : array_like
-        Sum of the weights on the smaller side, and of their squares; all weights sum to 1.
-    heaviest : float
-        The largest weight.
-    """
-    mine, heavy = np.asarray(mine, dtype=float), np.asarray(heavy, dtype=float)
-    seen = (mine > 1e-300) & (heavy > 1e-300)
-    mine, heavy = np.where(seen, mine, 1.0), np.where(seen, heavy, 1.0)
-    typical = np.where(seen, np.minimum(heavy / mine, heaviest), heaviest)
-    missed = np.where(seen, heaviest**2 * np.exp(-(mine**2) / heavy), 0.0)
-    return 1.0 / np.sqrt(typical**2 + missed)
-
-
 def chain_statistic(
     kind: str, values: np.ndarray, block: int = 1, superchains: int = 0
 ) -> np.ndarray:
@@ -234,6 +210,46 @@ def chain_figures(values: np.ndarray, block: int = 1, superchains: int = 0) -> C
     return ChainFigures(
         *_by_scalar(values, block, lambda some: _all_figures(some, block, superchains), 4)
     )
+
+
+def normal_scores(values: np.ndarray) -> np.ndarray:
+    """Values as quantiles of a standard Normal by their ranks, those of equal ones averaged.
+
+    Parameters
+    ----------
+    values : ndarray, shape (scalar, ...)
+        Ranked within each scalar.
+
+    References
+    ----------
+    Blom (1958), Statistical Estimates and Transformed Beta-Variables; Vehtari et al. (2021), eq. 14.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> normal_scores(np.array([[3.0, 1.0, 2.0]])).round(2).tolist()
+    [[0.87, -0.87, 0.0]]
+    """
+    flat = values.reshape(len(values), -1)
+    order = np.argsort(flat, axis=1)
+    sorted_ = np.take_along_axis(flat, order, axis=1)
+    size = flat.shape[1]
+    new = np.ones(flat.shape, dtype=bool)
+    np.not_equal(sorted_[:, 1:], sorted_[:, :-1], out=new[:, 1:])
+    # quantiles of the ranks 1, 1.5, 2, ...: each is worked out once
+    ranks = np.arange(1.0, size + 0.5, 1.0 if new.all() else 0.5)
+    quantiles = scipy.special.ndtri((ranks - 0.375) / (size + 0.25))
+    scores = np.empty(flat.shape)
+    if new.all():
+        np.put_along_axis(scores, order, quantiles[None], axis=1)
+        return scores.reshape(values.shape)
+    at = np.arange(size)
+    first = np.maximum.accumulate(np.where(new, at, 0), axis=1)
+    ends = np.ones(flat.shape, dtype=bool)
+    ends[:, :-1] = new[:, 1:]
+    last = np.minimum.accumulate(np.where(ends, at, size)[:, ::-1], axis=1)[:, ::-1]
+    np.put_along_axis(scores, order, quantiles[first + last], axis=1)
+    return scores.reshape(values.shape)
 
 
 # ---- private: scalars of chains in whole blocks, shape (scalar, chain, draw) -----------------------

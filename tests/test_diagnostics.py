@@ -13,7 +13,6 @@ from hypothesis.extra import numpy as hnp
 
 from bayesmc import diagnostics
 from bayesmc.categorical import log_sum_exp
-from bayesmc.ranks import normal_scores
 
 logs = hnp.arrays(float, st.integers(1, 20), elements=st.floats(-700, 700) | st.just(-np.inf))
 
@@ -230,4 +229,4 @@ def test_normal_scores_are_those_of_average_ranks() -> None:
     for rows in (values, values[:1]):
         ranks = scipy.stats.rankdata(rows, axis=1)
         wanted = scipy.stats.norm.ppf((ranks - 0.375) / 40.25)
-        np.testing.assert_allclose(normal_scores(rows), wanted, rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(diagnostics.normal_scores(rows), wanted, rtol=1e-13, atol=1e-13)

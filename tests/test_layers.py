@@ -37,7 +37,7 @@ distributions
 expression
 linalg
 resampling | gaussian | diagnostics | markov | plates | states | randomness | progress
-categorical | ranks
+categorical
 errors | shapes
 """
 DEPTH = {

@@ -78,8 +78,31 @@ def weighted_count(values: np.ndarray, weights: np.ndarray) -> np.ndarray:
     above, below = (np.tensordot(weight, side, axes=(0, 0)) for side in (upper, lower))
     smaller = np.where(above > below, lower, upper)  # summed itself: a difference would be rounding
     heavy = np.tensordot(weight**2, smaller, axes=(0, 0))
-    two = diagnostics.weighted_share_count(np.minimum(above, below), heavy, heaviest)
+    two = weighted_share_count(np.minimum(above, below), heavy, heaviest)
     return np.where(many, 1.0 / squares, two)
+
+
+def weighted_share_count(mine: Any, heavy: Any, heaviest: float) -> Any:
+    """Effective draws behind shares of weighted draws, as far as what was not seen is concerned.
+
+    What one more draw of the smaller side would weigh is guessed from those that are there: their mean
+    weight, by weight; or the heaviest of all draws, where there are none, and with a chance of ``exp(-k)``
+    where there are k effective ones. (Draws that a proposal makes of a rare event, with tiny weights, leave
+    little room.)
+
+    Parameters
+    ----------
+    mine, heavy : array_like
+        Sum of the weights on the smaller side, and of their squares; all weights sum to 1.
+    heaviest : float
+        The largest weight.
+    """
+    mine, heavy = np.asarray(mine, dtype=float), np.asarray(heavy, dtype=float)
+    seen = (mine > 1e-300) & (heavy > 1e-300)
+    mine, heavy = np.where(seen, mine, 1.0), np.where(seen, heavy, 1.0)
+    typical = np.where(seen, np.minimum(heavy / mine, heaviest), heaviest)
+    missed = np.where(seen, heaviest**2 * np.exp(-(mine**2) / heavy), 0.0)
+    return 1.0 / np.sqrt(typical**2 + missed)
 
 
 def chain_count(values: np.ndarray, moving: Any, block: int, step: Any) -> np.ndarray:

@@ -18,7 +18,7 @@ from bayesmc.errors import UnsupportedError
 from bayesmc.network import CompiledNode, Model, Problem
 from bayesmc.results.posterior import Posterior, circular_variance, table_variance
 from bayesmc.results.running import Sums
-from bayesmc.results.shares import steps
+from bayesmc.results.shares import steps, weighted_share_count
 
 #: share of a variance that is rounding
 _NONE = 1e-20
@@ -110,7 +110,7 @@ class SumsPosterior(Posterior):
             np.where(flipped, rest, share) / total,
             np.where(flipped, light, heavy) / total**2,
         )
-        found = diagnostics.weighted_share_count(mine, own, 1.0 / total)
+        found = weighted_share_count(mine, own, 1.0 / total)
         if node.domain.labels is not None:
             return found
         several = (share > 0).sum(axis=-1) > 2

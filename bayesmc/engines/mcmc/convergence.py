@@ -21,7 +21,6 @@ import scipy.special
 from bayesmc import diagnostics
 from bayesmc.engines.mcmc.screening import Looked, looked_at, screened, spread
 from bayesmc.network import CompiledNode, Model
-from bayesmc.ranks import normal_scores
 from bayesmc.results import ChainsPosterior, ChainsSums
 from bayesmc.results.relabelling import ordered, pivot_of, symmetries
 
@@ -338,7 +337,7 @@ def _memory(draws: np.ndarray) -> np.ndarray:
     count, chains, length = draws.shape
     if length < _THIRDS or chains < 2 * _POOLED:
         return np.zeros(count)
-    scores = normal_scores(draws)
+    scores = diagnostics.normal_scores(draws)
     third = length // 3
     first, last = scores[..., :third].mean(axis=-1), scores[..., -third:].mean(axis=-1)
     with np.errstate(all="ignore"):
