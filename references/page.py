@@ -213,7 +213,7 @@ function for all, of the same parameters, and is the smallest of them.
   run alone counts); as it comes or with its module `glm`, whichever is better.
 - **PyMC**: its defaults (NUTS, four chains of 1,000 draws after 1,000 of tuning), one core; from the
   model's declaration to its draws, compiling included, imports not. Only where NUTS suits the model and
-  its compiling does not decide.
+  its compiling does not decide; a blank where it was not run.
 
 The peers' figures were measured before, by `python -m references --peers` ({about}), and stand in
 `references/peers/figures.json`. *Ratio* is ours with `[fast]` over the better peer. JAGS starts in some

@@ -252,7 +252,7 @@ def test_every_case_has_a_text_and_figures():
         for ess in (1000, 4000):
             run = figures.of(name, ess)["JAGS"]
             assert run.seconds > 30 or run.ess >= ess > 0, name  # patience ends
-    assert set(nuts.MODELS) == {name for name, runs in figures.runs.items() if "PyMC" in runs}
+    assert {name for name, runs in figures.runs.items() if "PyMC" in runs} <= set(nuts.MODELS)
 
 
 def test_figures_are_kept_beside_older_ones(tmp_path: Path):

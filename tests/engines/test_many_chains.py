@@ -16,7 +16,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.engines.mcmc import chains as running
-from bayesmc.engines.mcmc import sweep
+from bayesmc.engines.mcmc import length, sweep
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.engines.unrolled import pose_any
@@ -286,7 +286,9 @@ def test_what_is_computed_from_the_chains_counts(monkeypatch: pytest.MonkeyPatch
     assert min(sizes()) < 1000
 
 
-def test_labels_that_chains_name_differently_do_not_cost_the_budget() -> None:
+def test_labels_that_chains_name_differently_do_not_cost_the_budget(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     rng = np.random.default_rng(5)
     data = np.concatenate([rng.normal(-2.0, 0.7, 30), rng.normal(2.5, 0.7, 20)])
     net = bmc.BayesNet(plates={"cluster": 2, "point": 50})
@@ -300,6 +302,10 @@ def test_labels_that_chains_name_differently_do_not_cost_the_budget() -> None:
     assert posterior.label_switching is not None
     assert posterior["mean"].shape[1] < 1000
     assert posterior.relabelled("mean").ess("mean").min() >= 1000
+    # nor does the warmup wait for chains to name them alike
+    assert posterior.warmup < 500
+    monkeypatch.setattr(length, "symmetries", lambda problem, values: [])
+    assert bmc.infer(net, {"x": data}, engine=bmc.Gibbs(), rng=1).warmup == 1000
 
 
 def test_models_of_any_size_choose_their_chains() -> None:

@@ -25,6 +25,7 @@ from bayesmc.engines.mcmc.convergence import MAX_RHAT, by_chance
 from bayesmc.engines.mcmc.loop import Lengths
 from bayesmc.engines.mcmc.screening import some_scalars, uncut
 from bayesmc.network import Model, Problem
+from bayesmc.results.relabelling import ordered, pivot_of, symmetries
 from bayesmc.structure.target import target_of
 
 #: numbers of all chains up to which a sweep costs little more than that of one chain
@@ -77,12 +78,27 @@ def chosen(
     groups = 0 if ensembles else _superchains(chains)
     judge = None
     if judges and warmup is None:
-        judge = partial(forgotten, model=problem.model, superchains=groups)
+        judge = partial(settled, problem=problem, superchains=groups)
     budget = _BUDGET
     if kept is not None:
         numbers = sum(math.prod(problem.model[n].value_shape) for n in kept)
         budget = min(budget, max(_KEPT // max(numbers * chains, 1), _FEWEST))
     return Lengths(chains, WARMUP if warmup is None else warmup, budget, groups, ess, judge)
+
+
+def settled(stored: Mapping[str, np.ndarray], problem: Problem, superchains: int) -> bool:
+    """Whether a warmup's draws have forgotten where they started, but for names that components exchange."""
+    if forgotten(stored, problem.model, superchains):
+        return True
+    last = {**target_of(problem).known, **{n: v[:, -1] for n, v in stored.items()}}
+    if last.keys() < problem.model.nodes.keys():
+        return False
+    named: Mapping[str, np.ndarray] = stored
+    for symmetry in symmetries(problem, last):
+        pivot = pivot_of(symmetry, problem.model)
+        if pivot is not None and pivot in stored:
+            named = ordered(problem, named, symmetry, pivot)
+    return named is not stored and forgotten(named, problem.model, superchains)
 
 
 def forgotten(stored: Mapping[str, np.ndarray], model: Model, superchains: int) -> bool:
