@@ -172,7 +172,6 @@ class Slice(Kernel):
     """
 
     label = "slice"
-    evaluations = EVALUATIONS
 
     def __init__(self, blanket: Blanket, debug: bool = False) -> None:
         self.blanket, self.debug = blanket, debug
@@ -181,6 +180,8 @@ class Slice(Kernel):
         support = blanket.node.support
         self.on_logs = support is not None and is_half_line(support)
         self.components = tuple(np.ndindex(blanket.event_shape))
+        turns = 1 if blanket.broadcasts else len(blanket.classes)  # each asks for whole terms
+        self.evaluations = EVALUATIONS * len(self.components) * turns
 
     def start(self, values: Values, chains: int) -> Memory:
         spread = np.ones(values[self.blanket.name].shape[1:])

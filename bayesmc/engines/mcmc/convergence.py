@@ -36,6 +36,9 @@ _ALARM, _LASTING, _THIRDS = 1e-4, 0.02, 12
 _SCALARS = 200
 #: scalars judged by their R-hat, and as many by their effective size
 _JUDGED = 6
+#: how far the rough screen may be off: whoever seems to have less than so many times what is needed is
+#: judged as well, as far as their draws are few
+_DOUBT = 4.0
 #: share of the effective size that is asked for below which it may be for names that components exchange
 _HOPELESS = 0.1
 #: draws of all scalars and chains that are judged: of large scalars fewer are, though at least two
@@ -54,7 +57,7 @@ def poor_mixing(
     """
     if isinstance(posterior, ChainsSums):
         return _faults(_summed_figures(posterior, forward), posterior, ess)
-    found = _faults(_figures(posterior, posterior._stored, forward), posterior, ess)
+    found = _faults(_figures(posterior, posterior._stored, forward, ess), posterior, ess)
     return _but_for_labels(posterior, forward, found, ess) if found else []
 
 
@@ -63,16 +66,22 @@ def share_reached(
 ) -> float:
     """The smallest effective size as a share of what is asked for; of tails a few hundred are enough.
 
+    Of few chains R-hat, too, must not tell them apart: what it exceeds 1 by falls with the draws.
     Where chains name components differently that the model does not tell apart, by their order.
     """
     if isinstance(posterior, ChainsSums):
         return _share(_summed_figures(posterior, forward), ess)
-    share = _share(_sizes(posterior, posterior._stored, forward), ess)
+    stored: Mapping[str, np.ndarray] = posterior._stored
+    share = _share(_sizes(posterior, stored, forward, ess), ess)
     if share < _HOPELESS:
         stored = _named(posterior)[0]
         if stored is not posterior._stored:
-            return max(share, _share(_sizes(posterior, stored, forward), ess))
-    return share
+            share = max(share, _share(_sizes(posterior, stored, forward, ess), ess))
+    if share < 1 or posterior.superchains:
+        return share
+    judged = _figures(posterior, stored, forward, ess)
+    worst = max(np.nan_to_num(list(judged.rhat.values()), nan=np.inf), default=MAX_RHAT)
+    return min(share, (MAX_RHAT - 1.0) / max(worst - 1.0, 1e-9))
 
 
 def poor_acceptance(acceptance: Mapping[str, np.ndarray], band: Any) -> Iterator[str]:
@@ -155,7 +164,7 @@ def _but_for_labels(
     stored, orders, words = _named(posterior)
     if not words:
         return found
-    left = _faults(_figures(posterior, stored, forward), posterior, ess)
+    left = _faults(_figures(posterior, stored, forward, ess), posterior, ess)
     if left:
         return [_ordered(fault, orders) for fault in left]
     posterior.label_switching = "; ".join(words)
@@ -272,11 +281,14 @@ def _others(bad: list[bool], looked: int) -> str:
 
 
 def _figures(
-    posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
+    posterior: ChainsPosterior,
+    stored: Mapping[str, np.ndarray],
+    forward: frozenset[str],
+    ess: float | None,
 ) -> _Judged:
     """What ArviZ says of those scalars that the screen finds worst; scalars that never move are left out."""
     block, groups = posterior.ensemble_size, posterior.superchains
-    looked, names, apart, slow = _worst(posterior, stored, forward)
+    looked, names, apart, slow = _worst(posterior, stored, forward, ess)
     if not names:
         return _Judged(0, {}, {})
     these = np.union1d(apart, slow)
@@ -305,10 +317,13 @@ def _figures(
 
 
 def _sizes(
-    posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
+    posterior: ChainsPosterior,
+    stored: Mapping[str, np.ndarray],
+    forward: frozenset[str],
+    ess: float | None,
 ) -> _Judged:
     """Of the same scalars the effective sizes alone."""
-    looked, names, _, slow = _worst(posterior, stored, forward)
+    looked, names, _, slow = _worst(posterior, stored, forward, ess)
     if not names:
         return _Judged(0, {}, {})
     draws, block = np.moveaxis(looked.draws[slow], 0, -1), posterior.ensemble_size
@@ -320,16 +335,23 @@ def _sizes(
 
 
 def _worst(
-    posterior: ChainsPosterior, stored: Mapping[str, np.ndarray], forward: frozenset[str]
+    posterior: ChainsPosterior,
+    stored: Mapping[str, np.ndarray],
+    forward: frozenset[str],
+    asked: float | None,
 ) -> tuple[Looked, list[str], np.ndarray, np.ndarray]:
     """What was looked at, the scalars' names; which of them differ most between chains, and are slowest."""
     block, model = posterior.ensemble_size, posterior.model
     looked = looked_at(_moving(posterior, forward), model, stored, block, posterior.superchains)
     names = [scalar_name(model, name, index) for name, index in looked.scalars]
-    many = min(_JUDGED, max(2, _ELEMENTS // max(math.prod(looked.draws.shape[1:]), 1)))
+    most = max(2, _ELEMENTS // max(math.prod(looked.draws.shape[1:]), 1))
+    many = min(_JUDGED, most)
     disagreement, ess = screened(looked.draws, block)
+    if asked is None:
+        asked = MIN_ESS * min(posterior._chains_and_draws[0], _POOLED)
+    doubtful = int((ess < _DOUBT * asked * looked.share).sum())
     apart = np.argsort(-disagreement, kind="stable")[:many]  # NaN, of which nothing is known, last
-    return looked, names, apart, np.argsort(ess, kind="stable")[:many]
+    return looked, names, apart, np.argsort(ess, kind="stable")[: max(many, min(doubtful, most))]
 
 
 def _memory(draws: np.ndarray) -> np.ndarray:
