@@ -80,7 +80,7 @@ def share_reached(
     if share < 1 or posterior.superchains:
         return share
     judged = _figures(posterior, stored, forward, ess)
-    worst = max(np.nan_to_num(list(judged.rhat.values()), nan=np.inf), default=MAX_RHAT)
+    worst = max(np.nan_to_num(list(judged.rhat.values()), nan=0.0), default=0.0)
     return min(share, (MAX_RHAT - 1.0) / max(worst - 1.0, 1e-9))
 
 

@@ -72,7 +72,7 @@ class Gibbs(ChainEngine):
         they started, 1,000 at most (with ``draws``: 1,000).
     chains : int, optional
         Chains, all in one array: many cost little more than one. By default as many as the model's size lets
-        run at little cost, 4 to 128, in groups that start as one (with ``draws``: 4).
+        run at little cost, 4 to 256, in groups that start as one (with ``draws``: 4).
     thinning : int
         Sweeps per kept draw.
     debug : bool

@@ -49,7 +49,7 @@ class HamiltonianMonteCarlo(ChainEngine):
         Draws before that, in which the step and the metric are learnt from all chains together; by default
         until chains have forgotten where they started, 1,000 at most (with ``draws``: 1,000).
     chains : int, optional
-        Chains, all in one array. By default as many as the model's size lets run at little cost, 4 to 128,
+        Chains, all in one array. By default as many as the model's size lets run at little cost, 4 to 256,
         in groups that start as one (with ``draws``: 4).
     thinning : int
         Transitions per kept draw.
