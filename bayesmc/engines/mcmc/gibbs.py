@@ -19,7 +19,7 @@ from bayesmc.engines.mcmc.cost import shares
 from bayesmc.engines.mcmc.jointly import trajectories_of
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import treatment
-from bayesmc.kernels.accepted import finite_kernel, number_kernel
+from bayesmc.kernels.accepted import Accepted, finite_kernel, number_kernel
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
@@ -320,6 +320,8 @@ def _conjugate(
 
 
 def _is_slice(kernel: Kernel) -> bool:
+    if isinstance(kernel, Accepted):
+        return not kernel.constraints and _is_slice(kernel.other)
     return isinstance(
         kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice, Hamiltonian)
     )
