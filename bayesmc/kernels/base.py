@@ -43,6 +43,10 @@ class Kernel:
     def expect(self, steps: int, chains: int) -> None:  # noqa: B027 - most need not know
         """Told before a run how many steps its warmup takes, and of how many chains."""
 
+    def told(self, steps: int, chains: int) -> str:
+        """What else there is to say of such a run: whether it is machine code, and why not."""
+        return ""
+
     def start(self, values: Values, chains: int) -> Memory:
         """Its memory before the first step."""
         return {}

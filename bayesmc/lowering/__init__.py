@@ -11,6 +11,7 @@ from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.slices import Slices, Turns
 from bayesmc.lowering.trajectory import Told, Trajectories
 from bayesmc.lowering.weights import weight_loops
 
@@ -19,8 +20,10 @@ __all__ = [
     "Compiled",
     "Kernel",
     "SliceKernel",
+    "Slices",
     "Told",
     "Trajectories",
+    "Turns",
     "compiled",
     "held_against_numpy",
     "is_available",

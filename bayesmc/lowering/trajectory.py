@@ -113,11 +113,8 @@ class Trajectories:
         arrays = (*place, momenta, step, root, seeds, told)
         addresses = [address_of(a) for a in arrays]
         fallback = _callback(ask, size, failed)
-        parts = [chains * k // threads for k in range(threads + 1)]
 
         def part(first: int, last: int) -> None:
-            if first == last:
-                return
             direct, table = 0, np.zeros(1, np.uintp)
             kept: list[np.ndarray] = []  # lives as long as the call
             if self._way is not None:
@@ -128,10 +125,7 @@ class Trajectories:
             self._run(*wholes, *pointers, *addresses)
             del kept, table
 
-        if threads == 1:
-            part(0, chains)
-        else:
-            list(_pool(threads).map(part, parts[:-1], parts[1:]))
+        shared(part, chains, threads)
         del held
         if failed[0] is not None:
             raise failed[0]
@@ -149,6 +143,16 @@ class Trajectories:
             held.append(np.ascontiguousarray(np.broadcast_to(array, (chains, *node.shape))))
             row[:] = place, address_of(held[-1]), dtype.itemsize * math.prod(node.shape)
         return moving, held
+
+
+def shared(part: Callable[[int, int], None], chains: int, threads: int) -> None:
+    """``part(first, last)`` of chains that threads share."""
+    if threads == 1:
+        part(0, chains)
+        return
+    ends = [chains * k // threads for k in range(threads + 1)]
+    parts = [(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True) if a < b]
+    list(_pool(threads).map(part, *zip(*parts, strict=True)))
 
 
 # ---- private ------------------------------------------------------------------------------------

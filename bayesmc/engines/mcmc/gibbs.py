@@ -76,7 +76,14 @@ class Gibbs(ChainEngine):
     thinning : int
         Sweeps per kept draw.
     debug : bool
-        Check every conjugate draw against the densities of the model (slow): an error names the node.
+        Check every conjugate draw against the densities of the model, and every move in machine code against
+        that in NumPy (slow): an error names the node.
+    compiled : bool, optional
+        Whether slices and trajectories are machine code, which needs the extra `[fast]`: always, never, or by
+        default where the sweeps of the warmup would take longer in NumPy than compiling. `explain` says of
+        each node what it is, and why; what has no machine code goes on in NumPy.
+    threads : int
+        Threads that share the chains in machine code; the answer is the same.
     ess : float
         Effective size that every number of the answer is to have where ``draws`` is left out.
     start : dict, optional
@@ -106,15 +113,23 @@ class Gibbs(ChainEngine):
     chains: int | None = None
     thinning: int = 1
     debug: bool = False
+    compiled: bool | None = None
+    threads: int = field(default=1, compare=False)
     ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 
     label: ClassVar[str] = "Gibbs sampling"
     judges: ClassVar[bool] = True
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count(self, "threads", self.threads, "2")
+        if self.compiled not in (None, True, False):
+            raise ValueError(f"Gibbs(compiled={self.compiled!r}): compiled is True, False or None")
+
     def refusal(self, problem: Problem) -> str | None:
         def planned(problem: Problem) -> None:
-            plan_of(problem, self.debug)
+            self._plan(problem)
 
         return refused(problem, "Gibbs", "has no kernel for this net", planned)
 
@@ -122,16 +137,20 @@ class Gibbs(ChainEngine):
         return {row.node: str(row) for row in self.table(problem)}
 
     def table(self, problem: Problem) -> list[Treatment]:
-        return plan_of(problem, self.debug).table()
+        lengths = self.lengths(problem)
+        return self._plan(problem).table(lengths.warmup, lengths.chains)
 
     def tied(self, problem: Problem) -> Sequence[str]:
-        return plan_of(problem, self.debug).constraints
+        return self._plan(problem).constraints
 
     def sampler(self, problem: Problem) -> SweepSampler:
-        plan = plan_of(problem, self.debug)
+        plan = self._plan(problem)
         sampler = SweepSampler(plan.target, plan.kernels)
         sampler.climbs = any(_is_slice(k) for k in plan.kernels)
         return sampler
+
+    def _plan(self, problem: Problem) -> Plan:
+        return plan_of(problem, self.debug, how=How(self.compiled, self.threads))
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,8 +174,8 @@ class Plan:
     refusals: dict[str, str] = field(default_factory=dict)
     constraints: tuple[str, ...] = ()
 
-    def table(self) -> list[Treatment]:
-        """What happens to each node."""
+    def table(self, steps: int = 0, chains: int = 1) -> list[Treatment]:
+        """What happens to each node, in a run of so many sweeps of warmup."""
         model = self.problem.model
         by_name: dict[str, list[Kernel]] = {}
         for kernel in self.kernels:
@@ -173,6 +192,9 @@ class Plan:
                 rows.append(Treatment(name, "forward" if barren else "", why, plates))
                 continue
             kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
+            told = [k.told(steps, chains) for k in by_name[name]]
+            pairs = zip(words, told, strict=True)
+            words = tuple(", ".join(part for part in pair if part) for pair in pairs)
             why = "; then ".join(dict.fromkeys(w for w in words if w))
             if name in self.refusals:
                 why += f"{', ' if why else ''}since {self.refusals[name]}"
@@ -221,13 +243,20 @@ class Plan:
         return found
 
 
-def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None = None) -> Plan:
+def plan_of(
+    problem: Problem,
+    debug: bool = False,
+    only: Collection[str] | None = None,
+    how: How = How(),  # noqa: B008 - it is frozen
+) -> Plan:
     """The plan for a posed problem, made once.
 
     Parameters
     ----------
     only : collection of str, optional
         Nodes that the plan is to move; the rest of the chain is moved by others. By default all of it.
+    how : How
+        What of it is machine code.
 
     Examples
     --------
@@ -241,18 +270,18 @@ def plan_of(problem: Problem, debug: bool = False, only: Collection[str] | None 
     >>> [kernel.names for kernel in plan_of(pose(net, {"seen": 3}), only=("rate",)).kernels]
     [('rate',)]
     """
-    key = f"gibbs plan, debug={debug}"
+    key = f"gibbs plan, debug={debug}, {how}"
     if only is not None:
         key += f", only {sorted(only)}"
     if key not in problem.cache:
-        problem.cache[key] = _planned(problem, debug, only)
+        problem.cache[key] = _planned(problem, debug, only, how)
     return problem.cache[key]
 
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Plan:
+def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: How) -> Plan:
     target = target_of(problem)
     names = tuple(n for n in target.chain if only is None or n in only)
     blankets = {name: Blanket(target, name) for name in names}
@@ -273,10 +302,11 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
     governed = {n for scales in scales_of for n in scales}
     closed = [n for k in kernels if isinstance(k, Conjugate) for n in k.names]
     keys = {n: forms.key(blankets[n]) for n in refusals} if len(refusals) >= FEWEST else {}
-    joint = trajectories_of(problem, refusals, closed, governed, keys, debug) if refusals else []
+    joint = trajectories_of(problem, refusals, closed, governed, keys, debug, how) if refusals else []
     moved = {n for k in joint for n in k.names}
     kernels = [k for k in kernels if not (isinstance(k, Conjugate) and moved >= set(k.names))]
-    kernels += [*joint, *_numbers(blankets, forms, [n for n in refusals if n not in moved], debug)]
+    left = [n for n in refusals if n not in moved]
+    kernels += [*joint, *_numbers(blankets, forms, left, debug, how)]
     for block, scales in zip(blocks, scales_of, strict=True):
         alone = {k.names[0]: k for k in kernels if len(k.names) == 1 and k.names[0] in scales}
         kernels = [k for k in kernels if k not in alone.values()]
@@ -387,7 +417,7 @@ def _mixture_label(target: Target, blanket: Blanket, debug: bool) -> Labels | No
 
 
 def _numbers(
-    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool
+    blankets: Mapping[str, Blanket], forms: Forms, names: Sequence[str], debug: bool, how: How
 ) -> list[Kernel]:
     """Kernels of nodes without a closed form that have too many values to try."""
     target = forms.target
@@ -406,7 +436,7 @@ def _numbers(
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
             left = [n for n in left if n not in group]
-    return kernels + [number_kernel(blankets[n], debug) for n in left]
+    return kernels + [number_kernel(blankets[n], debug, how) for n in left]
 
 
 def _kind(target: Target, blanket: Blanket) -> str:
