@@ -93,8 +93,8 @@ def _levels(node: Expression) -> frozenset[float] | None:
     if math.prod(map(len, known)) > _LEVELS**2:
         return None
     with np.errstate(all="ignore"):
-        values = frozenset(float(node.function(*at)) for at in itertools.product(*known))
-    return values if len(values) <= _LEVELS else None
+        reached = frozenset(float(node.function(*at)) for at in itertools.product(*known))
+    return reached if len(reached) <= _LEVELS else None
 
 
 def _is_branch(node: Expression, name: str) -> bool:
