@@ -25,7 +25,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bayesmc.kernels.base import Kernel, Memory, counted
+from bayesmc.kernels.base import ANYHOW, How, Kernel, Memory, counted
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.slice import Slice
@@ -137,9 +137,9 @@ def finite_kernel(blanket: Blanket) -> Kernel:
     return Enumerate(with_like_children(blanket))
 
 
-def number_kernel(blanket: Blanket, debug: bool = False) -> Kernel:
+def number_kernel(blanket: Blanket, debug: bool = False, how: How = ANYHOW) -> Kernel:
     """The closed form that a node has but for potentials, accepted by these; slices where it has none."""
-    slices = Slice(with_like_children(blanket), debug)
+    slices = Slice(with_like_children(blanket), debug, how)
     potentials = [child for child in blanket.children if child.term.is_potential]
     if not potentials:
         return slices

@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.distributions.transforms import transform_of
 from bayesmc.errors import DensityError, TraceError
-from bayesmc.kernels.base import TOLERANCE, Kernel, Memory
+from bayesmc.kernels.base import ANYHOW, TOLERANCE, How, Kernel, Memory
 from bayesmc.kernels.compiled_slice import CompiledSlice, Streams, compare, why_not
 from bayesmc.kernels.slice_sites import Line, Sites
 from bayesmc.lowering import is_available, is_worth_it
@@ -135,10 +135,8 @@ class Slice(Kernel):
     debug : bool
         Hold the program of its full conditional against the model's functions wherever it is asked, and
         every move in machine code against that in NumPy.
-    compiled : bool, optional
-        Whether moves are machine code; by default where a run that it expects is long enough to pay for it.
-    threads : int
-        Threads that share the chains where moves are machine code; the result is the same.
+    how : How
+        Whether moves are machine code.
 
     Notes
     -----
@@ -148,16 +146,8 @@ class Slice(Kernel):
 
     label = "slice"
 
-    def __init__(
-        self,
-        blanket: Blanket,
-        debug: bool = False,
-        *,
-        compiled: bool | None = None,
-        threads: int = 1,
-    ) -> None:
-        self.blanket, self.debug = blanket, debug
-        self.compiled, self.threads = compiled, threads
+    def __init__(self, blanket: Blanket, debug: bool = False, how: How = ANYHOW) -> None:
+        self.blanket, self.debug, self.how = blanket, debug, how
         self._expects = False
         self._made: tuple[Any, Any, CompiledSlice | str] | None = None
         self.names = (blanket.name,)
@@ -199,8 +189,8 @@ class Slice(Kernel):
 
     def _pays(self, steps: int, chains: int) -> bool:
         """Whether so many steps take longer in NumPy than compiling."""
-        if self.compiled is not None:
-            return self.compiled
+        if self.how.compiled is not None:
+            return self.how.compiled
         if isinstance(self._followed, str):
             return False
         calls = int(self.evaluations * steps)
@@ -224,7 +214,7 @@ class Slice(Kernel):
     def _compiled(self, conditional: Conditional) -> CompiledSlice | str:
         try:
             turns = self.sites.turns_in_machine_code(_GROWTH)
-            return CompiledSlice(conditional, turns, self.threads)
+            return CompiledSlice(conditional, turns, self.how.threads)
         except TraceError as error:
             return str(error)
 

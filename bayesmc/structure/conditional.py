@@ -83,7 +83,7 @@ class Conditional:
         target = blanket.target
         read = {p for t in self.terms for p in target.model.above(t.scope, lambda _: True)}
         self._known = [(n, target.known[n]) for n in sorted(read) if n in target.known]
-        _hold(blanket, self.terms, logs)
+        _hold(blanket, self.terms, [*logs, self.root])
 
     def given(self, values: Mapping[str, np.ndarray]) -> At | None:
         """The conditional in a state; None where somebody has put other data there than those it knows."""
@@ -178,6 +178,11 @@ def _hold(blanket: Blanket, terms: Sequence[Term], logs: Sequence[Expression]) -
     """Refuse what differs from the model's functions at reachable values of all nodes.
 
     Term by term, as all together may be impossible wherever it is tried; then their sums, of any numbers.
+
+    Parameters
+    ----------
+    logs : sequence of Expression
+        Log factors of the terms, and their sum.
     """
     target, name = blanket.target, blanket.name
     if target.states is None:
@@ -191,9 +196,10 @@ def _hold(blanket: Blanket, terms: Sequence[Term], logs: Sequence[Expression]) -
                 state = blanket.placed(states, np.roll(states[name], k, axis=0))
             except BayesmcError:
                 continue
-            found = program(state)
+            *found, total = program(state)
             for at, (term, given) in enumerate(zip(terms, found, strict=True)):
                 seen[at] |= _is_alike(term, state, given)
+            _hold_total(blanket, states, state[name], total)
     if not all(seen):
         raise UnsupportedError("some term is zero at all reachable values")
     if blanket.node.plates:
@@ -220,6 +226,27 @@ def _is_alike(term: Term, state: Values, given: np.ndarray) -> bool:
     if np.isfinite(wanted[given == -np.inf]).any():
         raise UnsupportedError("it is zero where the model's functions are not")
     return bool(finite.any()) or not given.size
+
+
+def _hold_total(
+    blanket: Blanket, states: Values, candidate: np.ndarray, total: np.ndarray
+) -> None:
+    """Refuse a sum of all terms that is not the blanket's, where both are numbers."""
+    flat = blanket.size, *blanket.event_shape
+    for members in blanket.classes:
+        at: Any = slice(None) if members is None else members
+        own = candidate if members is None else candidate.reshape(-1, *flat)[:, at]
+        try:
+            wanted = blanket.log_density(states, own, members)
+        except BayesmcError:
+            continue
+        wanted = np.broadcast_to(wanted, own.shape[: own.ndim - len(blanket.event_shape)])
+        wanted = wanted.reshape(len(own), -1)
+        given = np.broadcast_to(total.reshape(-1, blanket.size)[:, at], wanted.shape)
+        both = np.isfinite(given) & np.isfinite(wanted)
+        scale = 1.0 + np.abs(given[both]).max(initial=0.0)
+        if not (np.abs(given - wanted)[both] <= _RTOL * scale).all():
+            raise UnsupportedError("it differs from the model's functions at reachable values")
 
 
 def _hold_sums(blanket: Blanket, terms: Sequence[Term], states: Values) -> None:
