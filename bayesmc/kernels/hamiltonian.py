@@ -212,7 +212,7 @@ class Hamiltonian(Kernel):
     # ---- private -------------------------------------------------------------------------------
 
     def _calls(self, steps: int) -> int:
-        """Gradients that a run asks for at least; where it is said, as many as pay for machine code, or none."""
+        """Gradients that a run asks for at least; where it is said, as many as pay for it, or none."""
         if self.compiled is None:
             return GRADIENTS * steps
         return _MANY if self.compiled else 0

@@ -29,6 +29,8 @@ from bayesmc.structure.target import Term, Values
 _TERMS = 64
 #: how far it may be off at the probe points, relative to itself and to the largest part
 _RTOL = 1e-9
+#: classes of elements whose sums are held against the functions; the others' are added up alike
+_CLASSES = 4
 
 
 class Conditional:
@@ -83,7 +85,7 @@ class Conditional:
         target = blanket.target
         read = {p for t in self.terms for p in target.model.above(t.scope, lambda _: True)}
         self._known = [(n, target.known[n]) for n in sorted(read) if n in target.known]
-        _hold(blanket, self.terms, [*logs, self.root])
+        _hold(blanket, self.terms, logs, self.root)
 
     def given(self, values: Mapping[str, np.ndarray]) -> At | None:
         """The conditional in a state; None where somebody has put other data there than those it knows."""
@@ -174,32 +176,29 @@ def _sum(blanket: Blanket, terms: Sequence[Term], logs: Sequence[Expression]) ->
     return broadcast(total, blanket.node.plate_shape)
 
 
-def _hold(blanket: Blanket, terms: Sequence[Term], logs: Sequence[Expression]) -> None:
+def _hold(
+    blanket: Blanket, terms: Sequence[Term], logs: Sequence[Expression], root: Expression
+) -> None:
     """Refuse what differs from the model's functions at reachable values of all nodes.
 
     Term by term, as all together may be impossible wherever it is tried; then their sums, of any numbers.
-
-    Parameters
-    ----------
-    logs : sequence of Expression
-        Log factors of the terms, and their sum.
     """
     target, name = blanket.target, blanket.name
     if target.states is None:
         raise UnsupportedError("no reachable values are known to try it on")
     states: Values = {**target.states, **target.known}
-    program = Program(for_arrays(logs))
+    program, total = Program(for_arrays(logs)), Program(for_arrays([root]))
     seen = [False] * len(terms)
     with marking_invalid(), np.errstate(all="ignore"):
         for k in range(3):
+            candidate = np.roll(states[name], k, axis=0)
+            _hold_total(blanket, states, candidate, total)
             try:
-                state = blanket.placed(states, np.roll(states[name], k, axis=0))
+                state = blanket.placed(states, candidate)
             except BayesmcError:
                 continue
-            *found, total = program(state)
-            for at, (term, given) in enumerate(zip(terms, found, strict=True)):
+            for at, (term, given) in enumerate(zip(terms, program(state), strict=True)):
                 seen[at] |= _is_alike(term, state, given)
-            _hold_total(blanket, states, state[name], total)
     if not all(seen):
         raise UnsupportedError("some term is zero at all reachable values")
     if blanket.node.plates:
@@ -228,21 +227,19 @@ def _is_alike(term: Term, state: Values, given: np.ndarray) -> bool:
     return bool(finite.any()) or not given.size
 
 
-def _hold_total(
-    blanket: Blanket, states: Values, candidate: np.ndarray, total: np.ndarray
-) -> None:
+def _hold_total(blanket: Blanket, states: Values, candidate: np.ndarray, total: Program) -> None:
     """Refuse a sum of all terms that is not the blanket's, where both are numbers."""
-    flat = blanket.size, *blanket.event_shape
-    for members in blanket.classes:
+    shape = blanket.size, *blanket.event_shape
+    for members in blanket.classes[:_CLASSES]:
         at: Any = slice(None) if members is None else members
-        own = candidate if members is None else candidate.reshape(-1, *flat)[:, at]
+        own = candidate if members is None else candidate.reshape(-1, *shape)[:, at]
         try:
             wanted = blanket.log_density(states, own, members)
         except BayesmcError:
             continue
-        wanted = np.broadcast_to(wanted, own.shape[: own.ndim - len(blanket.event_shape)])
-        wanted = wanted.reshape(len(own), -1)
-        given = np.broadcast_to(total.reshape(-1, blanket.size)[:, at], wanted.shape)
+        (found,) = total({**states, blanket.name: blanket.filled(states, own, members)})
+        given = found.reshape(-1, blanket.size)[:, at]
+        given, wanted = np.broadcast_arrays(given, wanted.reshape(len(wanted), -1))
         both = np.isfinite(given) & np.isfinite(wanted)
         scale = 1.0 + np.abs(given[both]).max(initial=0.0)
         if not (np.abs(given - wanted)[both] <= _RTOL * scale).all():

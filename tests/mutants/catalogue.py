@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.mutants import chains, densities, draws, exact, filters, hamiltonian
+from tests.mutants import chains, densities, draws, exact, filters, hamiltonian, slices
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -11,5 +11,6 @@ MUTANTS: tuple[Mutant, ...] = (
     *exact.MUTANTS,
     *filters.MUTANTS,
     *hamiltonian.MUTANTS,
+    *slices.MUTANTS,
     *densities.MUTANTS,
 )
