@@ -98,7 +98,7 @@ class Streams:
     >>> from bayesmc.kernels.compiled_slice import Streams
     >>> Streams(np.arange(1, 9, dtype=np.uint64).reshape(2, 4) << 60).random((2, 2))
     array([[0.0625, 0.4375],
-           [0.0625, 0.4375]])
+           [0.3125, 0.6875]])
     """
 
     def __init__(self, seeds: np.ndarray) -> None:

@@ -163,7 +163,7 @@ class Slice(Kernel):
         if not is_available() or not self._pays(steps, chains):
             return ""
         why = self._followed if isinstance(self._followed, str) else why_not(self._followed)
-        return f"in NumPy: {why}" if why else "in machine code"
+        return f"slices in NumPy: {why}" if why else "slices in machine code"
 
     def start(self, values: Values, chains: int) -> Memory:
         spread = np.ones(values[self.blanket.name].shape[1:])

@@ -112,7 +112,7 @@ class Gibbs(ChainEngine):
     thinning: int = 1
     debug: bool = False
     compiled: bool | None = None
-    threads: int = field(default=1, compare=False)
+    threads: int = field(default=1, compare=False, repr=False)
     ess: float = 1000
     start: Mapping[str, Any] | None = field(default=None, compare=False, repr=False)
 

@@ -55,12 +55,11 @@ class Plan:
                 rows.append(Treatment(name, "forward" if barren else "", why, plates))
                 continue
             kinds, words = zip(*(k.words(name) for k in by_name[name]), strict=True)
-            told = [k.told(steps, chains) for k in by_name[name]]
-            pairs = zip(words, told, strict=True)
-            words = tuple(", ".join(part for part in pair if part) for pair in pairs)
             why = "; then ".join(dict.fromkeys(w for w in words if w))
             if name in self.refusals:
                 why += f"{', ' if why else ''}since {self.refusals[name]}"
+            told = dict.fromkeys(k.told(steps, chains) for k in by_name[name])
+            why = "; ".join(part for part in (why, *told) if part)
             classes = len(self.blankets[name].classes)
             colour = f"{number[name]}" + (f" (elements: {classes})" if classes > 1 else "")
             kinds_told = " + ".join(dict.fromkeys(kinds))
