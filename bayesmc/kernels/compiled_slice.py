@@ -10,6 +10,7 @@ from bayesmc.errors import DensityError, TraceError
 from bayesmc.expression import Expression, Leaf, Program, ordered
 from bayesmc.expression.graph import replaced
 from bayesmc.lowering import Kernel, Slices, Turns
+from bayesmc.lowering.slice_moves import ZERO
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.guarded import guarded
 from bayesmc.structure.conditional import Conditional, standing
@@ -21,12 +22,15 @@ _ANEW = 256
 _OFF = 1e-7
 
 
-class CompiledSlice:
-    """Moves of a node along slices of its full conditional, by random numbers of their own.
+class CompiledMoves:
+    """Moves of some numbers along slices, by random numbers of their own.
 
     Parameters
     ----------
-    conditional : Conditional
+    root : Expression
+        Log densities.
+    name : str
+        The leaf that moves.
     turns : Turns
     threads : int
         Threads that share the chains; the result is the same.
@@ -37,12 +41,12 @@ class CompiledSlice:
         There is no machine code of it.
     """
 
-    def __init__(self, conditional: Conditional, turns: Turns, threads: int = 1) -> None:
-        root, parts = machine_root(conditional)
-        self.conditional, self.threads = conditional, threads
+    def __init__(self, root: Expression, name: str, turns: Turns, threads: int = 1) -> None:
+        root, parts = machine_root(root, name)
+        self.threads = threads
         self._parts = [part.name for part in parts.values()]
         self._standing = Program(for_arrays(parts)) if parts else None
-        self.slices = Slices(root, conditional.name, turns)
+        self.slices = Slices(root, name, turns)
         self.is_checked = False
         #: how its first moves were others than those in NumPy; empty if they were not
         self.differs = ""
@@ -56,12 +60,12 @@ class CompiledSlice:
         seeds: np.ndarray,
         ask: Callable[[int, np.ndarray], np.ndarray],
     ) -> np.ndarray:
-        """The node's values after moves of all chains.
+        """The leaf's values after moves of all chains.
 
         Parameters
         ----------
         values : dict
-            Stored values, of data that the conditional knows.
+            Stored values, of data that the log density knows, and the leaf's.
         width, low, high : ndarray, shape (chains, sites)
         seeds : ndarray of uint64, shape (chains, turns, 4)
             Of each chain's random numbers in each turn.
@@ -73,16 +77,30 @@ class CompiledSlice:
         DensityError
             A chain is where its density is zero, or finds no other place.
         """
-        slices, name = self.slices, self.conditional.name
+        slices, before = self.slices, values[self.slices.name]
         others = dict(values)
         if self._standing is not None:
             others.update(zip(self._parts, self._standing(values), strict=True))
-        value = np.array(values[name], slices.dtype, order="C")
+        value = np.array(before, slices.dtype, order="C")
         told = slices.move(value, width, low, high, seeds.copy(), others, ask, self.threads)
         if told[:, 0].any():
-            zero = (told[:, 0] == 1).any()
-            raise DensityError(AT_ZERO if zero else LOST)
-        return value.astype(values[name].dtype, copy=False)
+            raise DensityError(AT_ZERO if (told[:, 0] == ZERO).any() else LOST)
+        return value.astype(before.dtype, copy=False)
+
+
+class CompiledSlice(CompiledMoves):
+    """Moves of a node along slices of its full conditional.
+
+    Parameters
+    ----------
+    conditional : Conditional
+    turns : Turns
+    threads : int
+    """
+
+    def __init__(self, conditional: Conditional, turns: Turns, threads: int = 1) -> None:
+        self.conditional = conditional
+        super().__init__(conditional.root, conditional.name, turns, threads)
 
 
 class Streams:
@@ -132,27 +150,21 @@ LOST = (
 )
 
 
-def machine_root(conditional: Conditional) -> tuple[Expression, dict[Expression, Leaf]]:
-    """What is compiled of a full conditional, and what of it is computed by NumPy, once for every move.
-
-    Raises
-    ------
-    TraceError
-        Other leaves than stored values of hidden nodes are read.
-    """
-    (root,) = guarded([conditional.root])
-    parts = standing(root, conditional.name)
+def machine_root(root: Expression, name: str) -> tuple[Expression, dict[Expression, Leaf]]:
+    """What is compiled of log densities, and what of them is computed by NumPy, once for every move."""
+    (root,) = guarded([root])
+    parts = standing(root, name)
     below = [n for n in ordered(*parts) if n.leaves] if parts else []
     if sum(n.size for n in below) <= _ANEW:
         parts = {}
     return (replaced(root, dict(parts)) if parts else root), parts
 
 
-def why_not(conditional: Conditional) -> str:
-    """Why there is no machine code of it; empty where there is. Nothing is compiled to know."""
-    root, _ = machine_root(conditional)
+def why_not(root: Expression, name: str) -> str:
+    """Why there is no machine code of log densities; empty where there is. Nothing is compiled to know."""
+    root, _ = machine_root(root, name)
     try:
-        Kernel([root], frozenset([conditional.name]))
+        Kernel([root], frozenset([name]))
     except TraceError as error:
         return str(error)
     return ""

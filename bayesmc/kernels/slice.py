@@ -24,7 +24,7 @@ from bayesmc.structure.conditional import At, Conditional, conditional_or_reason
 from bayesmc.structure.target import Values
 
 #: widths by which an interval may grow
-_GROWTH = 64
+GROWTH = 64
 #: evaluations that a move takes, about: both ends, two steps out, two shrinkages
 EVALUATIONS = 6.0
 #: shrinkages after which the density cannot be what it was
@@ -33,7 +33,7 @@ _SHRINKAGES = 400
 _AHEAD = 4
 _SMALL = 4096
 #: steps in NumPy of a move, besides those of the density, for each time that it is asked
-_BESIDE = 40
+BESIDE = 40
 
 
 def slice_move(
@@ -43,7 +43,7 @@ def slice_move(
     rng: np.random.Generator,
     low: Any = -np.inf,
     high: Any = np.inf,
-    growth: int = _GROWTH,
+    growth: int = GROWTH,
 ) -> np.ndarray:
     """One step from every element of ``x``, each on its own slice.
 
@@ -162,7 +162,8 @@ class Slice(Kernel):
     def told(self, steps: int, chains: int) -> str:
         if not is_available() or not self._pays(steps, chains):
             return ""
-        why = self._followed if isinstance(self._followed, str) else why_not(self._followed)
+        found = self._followed
+        why = found if isinstance(found, str) else why_not(found.root, found.name)
         return f"slices in NumPy: {why}" if why else "slices in machine code"
 
     def start(self, values: Values, chains: int) -> Memory:
@@ -194,7 +195,7 @@ class Slice(Kernel):
         if isinstance(self._followed, str):
             return False
         calls = int(self.evaluations * steps)
-        return is_worth_it([self._followed.root], calls, chains, _BESIDE)
+        return is_worth_it([self._followed.root], calls, chains, BESIDE)
 
     @property
     def sites(self) -> Sites:
@@ -213,7 +214,7 @@ class Slice(Kernel):
 
     def _compiled(self, conditional: Conditional) -> CompiledSlice | str:
         try:
-            turns = self.sites.turns_in_machine_code(_GROWTH)
+            turns = self.sites.turns_in_machine_code(GROWTH)
             return CompiledSlice(conditional, turns, self.how.threads)
         except TraceError as error:
             return str(error)
@@ -314,7 +315,7 @@ class Slice(Kernel):
             width = width.ravel()[members]
         support = self.sites.support(values, component)
         low, high = self.sites.bounds(support, members)
-        growth, circle = _GROWTH, transform_of(support) if support.kind == "circle" else None
+        growth, circle = GROWTH, transform_of(support) if support.kind == "circle" else None
         if circle is not None:  # one turn holds everything
             width, growth = np.full(width.shape, 2 * np.pi), 0
         if self.sites.is_integer:  # a number uniform in the cell of each integer

@@ -88,7 +88,7 @@ def test_conditionals_are_those_of_the_functions(seed: int) -> None:
     asked = 0
     for name in ("a", "b", "s"):
         blanket = Blanket(target, name)
-        root, parts = machine_root(Conditional(blanket))
+        root, parts = machine_root(Conditional(blanket).root, name)
         assert not parts
         run = compiled([root])
         for members in blanket.classes:
@@ -235,8 +235,8 @@ def test_moves_are_those_of_numpy(model: Any) -> None:
 
 def test_what_does_not_move_is_computed_once() -> None:
     kernel, _, _ = moved(heavy, How(True), 1)
-    assert len(machine_root(kernel._followed)[1]) == 1
-    assert not machine_root(moved(line, How(True), 1)[0]._followed)[1]
+    assert len(machine_root(kernel._followed.root, "x")[1]) == 1
+    assert not machine_root(moved(line, How(True), 1)[0]._followed.root, "x")[1]
 
 
 @pytest.mark.parametrize("model", [line, in_turn, looked_up])

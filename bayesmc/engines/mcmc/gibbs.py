@@ -227,7 +227,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: H
     slow = [n for k in kernels if _is_slice(k) for n in k.names]
     moved = set(names)
     if slow:
-        kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
+        found = rescaled_kernels(target, slow, how=how, debug=debug)
+        kernels += [k for k in found if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets, kernels)
     if slow and may_be_drawn_anew(target, names):
         kernels.append(BlockWalk(target, names, anew=1.0))
