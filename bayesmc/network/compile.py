@@ -164,7 +164,7 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
         raise BroadcastError(
             f"node {node.name!r} works on one value at a time but not on arrays of them: "
             f"{str(error).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
-            "(np.where for if, axis=-1 for components), or declare vectorize=True (slow)"
+            "(np.where for if, np.exp for math.exp, axis=-1 for components), or declare vectorize=True (slow)"
         ) from error
 
 
