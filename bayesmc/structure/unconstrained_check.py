@@ -95,8 +95,8 @@ def hold_against_model(
     for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
             raise UnsupportedError(
-                f"the density of {name!r} is zero, or no number, at all points where it was tried, so that "
-                "its expression cannot be held against its function"
+                f"the density of {name!r} is zero, or no number, at all points where it was tried (is the "
+                "evidence possible?), so that its expression cannot be held against its function"
             )
     if not all(agreed):
         name = [*names, *density.names][agreed.index(False)]

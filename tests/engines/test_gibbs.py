@@ -189,6 +189,12 @@ def test_resume_is_bit_for_bit(build, keep) -> None:
         np.testing.assert_array_equal(whole.mean(name), both.mean(name))
 
 
+def test_resumed_by_the_engine_that_made_it() -> None:
+    net, evidence = mixture()
+    first = bmc.infer(net, evidence, engine=bmc.Gibbs(5, warmup=2, chains=2), rng=1)
+    assert bmc.infer(net, evidence, resume=first)["mean"].shape[:2] == (2, 10)
+
+
 def test_the_same_seed_gives_the_same_draws() -> None:
     net, evidence = everything()
     engine = bmc.Gibbs(draws=15, warmup=15, chains=2)

@@ -80,7 +80,9 @@ def exact_change() -> tuple[float, float]:
     return mean, float(np.sqrt(weights @ (middle - mean) ** 2 + 1.0 / 12.0))
 
 
-@pytest.mark.parametrize("engine", [bmc.HamiltonianMonteCarlo(), bmc.Gibbs()], ids=lambda e: type(e).__name__)
+@pytest.mark.parametrize(
+    "engine", [bmc.HamiltonianMonteCarlo(), bmc.Gibbs()], ids=lambda e: type(e).__name__
+)
 def test_a_change_point_is_answered(engine: Any) -> None:
     """False-alarm rate: a mean beyond 4.5 standard errors: 1e-5 each."""
     with warnings.catch_warnings():

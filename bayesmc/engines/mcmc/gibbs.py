@@ -43,6 +43,8 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
+#: sweeps of which one draws all numbers anew where trajectories move them, too
+_SELDOM = 4
 #: components that move together along learnt directions, at most
 _FACTOR_SIZE = 24
 #: supports that are boxes: every number on its own
@@ -231,7 +233,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None, how: H
         kernels += [k for k in found if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets, kernels)
     if slow and may_be_drawn_anew(target, names):
-        kernels.append(BlockWalk(target, names, anew=1.0))
+        every = _SELDOM if any(isinstance(k, Hamiltonian) for k in kernels) else 1
+        kernels.append(BlockWalk(target, names, anew=1.0, every=every))
     return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 
