@@ -96,7 +96,7 @@ class Rescaled(Kernel):
             return ""
         orbit = self._orbit
         why = orbit if isinstance(orbit, str) else why_not(orbit.root, STEP)
-        return f"rescaled in NumPy: {why}" if why else "rescaled in machine code"
+        return f"rescaled in NumPy: {why}" if why else "in machine code"
 
     def start(self, values: Values, chains: int) -> Memory:
         machine = self._expects and isinstance(self._code, CompiledMoves)

@@ -164,7 +164,7 @@ class Slice(Kernel):
             return ""
         found = self._followed
         why = found if isinstance(found, str) else why_not(found.root, found.name)
-        return f"slices in NumPy: {why}" if why else "slices in machine code"
+        return f"slices in NumPy: {why}" if why else "in machine code"
 
     def start(self, values: Values, chains: int) -> Memory:
         spread = np.ones(values[self.blanket.name].shape[1:])

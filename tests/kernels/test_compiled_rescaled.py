@@ -176,4 +176,4 @@ def test_a_resumed_run_draws_the_same() -> None:
     for name in ("tau", "b"):
         np.testing.assert_array_equal(whole[name], rest[name])
     said = str(bmc.explain(net, {"r": np.arange(30) % 15}, engine=engine))
-    assert "slices in machine code" in said and "rescaled in machine code" in said
+    assert said.count("; in machine code") == 2

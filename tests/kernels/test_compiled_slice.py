@@ -480,7 +480,7 @@ def test_runs_are_compiled_where_that_pays(monkeypatch: pytest.MonkeyPatch) -> N
 def test_the_table_says_what_is_machine_code() -> None:
     net, evidence, _ = looked_up()
     said = bmc.explain(net, evidence, engine=bmc.Gibbs(draws=10, warmup=1000))
-    assert "slices in machine code" in str(said)
+    assert "; in machine code" in str(said)
     said = bmc.explain(net, evidence, engine=bmc.Gibbs(draws=10, warmup=10))
     assert "machine code" not in str(said)
     net.add("z", lambda x: bmc.Normal(float(x.array.max()), 1.0), vectorize=True)
