@@ -13,6 +13,7 @@ from bayesmc.lowering import Kernel, Slices, Turns
 from bayesmc.lowering.slice_moves import ZERO
 from bayesmc.passes.arrays import for_arrays
 from bayesmc.passes.guarded import guarded
+from bayesmc.passes.sorting import by_comparisons
 from bayesmc.structure.conditional import Conditional, standing
 from bayesmc.structure.target import Values
 
@@ -152,7 +153,7 @@ LOST = (
 
 def machine_root(root: Expression, name: str) -> tuple[Expression, dict[Expression, Leaf]]:
     """What is compiled of log densities, and what of them is computed by NumPy, once for every move."""
-    (root,) = guarded([root])
+    (root,) = by_comparisons(guarded([root]))
     parts = standing(root, name)
     below = [n for n in ordered(*parts) if n.leaves] if parts else []
     if sum(n.size for n in below) <= _ANEW:

@@ -182,6 +182,15 @@ def all_together() -> tuple[bmc.BayesNet, Any, str]:
     return net, {"y": [3.0, 5.0, 6.0]}, "x"
 
 
+def in_order() -> tuple[bmc.BayesNet, Any, str]:
+    """Numbers of which the smallest and the largest are read."""
+    net = bmc.BayesNet(plates={"i": 4, "k": 3})
+    net.add("x", bmc.Laplace(0.0, 1.0), plates="k")
+    net.add("sorted", lambda x: np.sort(x.array, axis=-1))
+    net.add("y", lambda sorted: bmc.Normal(sorted[..., 0] * 2 - sorted[..., 2], 1.0), plates="i")
+    return net, {"y": [3.0, np.nan, -6.0, 1.0]}, "x"
+
+
 def partly_seen() -> tuple[bmc.BayesNet, Any, str]:
     net = bmc.BayesNet(plates={"i": 4})
     net.add("x", bmc.Laplace(0.0, 1.0), plates="i")
@@ -202,7 +211,7 @@ def heavy() -> tuple[bmc.BayesNet, Any, str]:
 
 MODELS = [
     line, above_a_bound, bounds_of_parents, integers, circle, looked_up, vectors, in_turn, all_together,
-    partly_seen, heavy,
+    in_order, partly_seen, heavy,
 ]  # fmt: skip
 
 
