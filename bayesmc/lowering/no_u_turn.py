@@ -65,7 +65,7 @@ def transitions() -> Any:
     ``arguments``, the address of the first chain's value and the bytes to the next one's.
     """
     module = Module()
-    texts = [_turns(module), uniform(module), _Text(module).text]
+    texts = [_turns(module), _copied(module), uniform(module), _Text(module).text]
     code = loaded("\n".join([str(module), *texts]), module.foreign)
     types = [ctypes.c_int64] * len(_WHOLES) + [ctypes.c_void_p] * len(_POINTERS)
     found = code.function("transitions", None, *types)
@@ -119,7 +119,16 @@ def _turns(module: Module) -> str:
         fine = fine & (c.get(place, REAL) > 0.0)
     c.do(f"ret i1 {(~fine).text}")
     head = "i64 %n, ptr %af, ptr %al, ptr %as, ptr %bf, ptr %bl, ptr %bs"
-    return f"define internal i1 @turns({head}) {{\n{c}\n}}"
+    return f"define internal i1 @turns({head}) noinline {{\n{c}\n}}"
+
+
+def _copied(module: Module) -> str:
+    """A vector to another place: one function, since its loop would else be compiled wherever it is used."""
+    c = Code(module)
+    n = Number(c, "%n", WHOLE)
+    c.loop(n, lambda i: c.store("%to", i, c.load("%from", i, REAL)))
+    c.do("ret void")
+    return f"define internal void @copied(i64 %n, ptr noalias %from, ptr noalias %to) noinline {{\n{c}\n}}"
 
 
 class _Text:
@@ -175,7 +184,7 @@ class _Text:
         self.c.loop(self.n, body)
 
     def _copy(self, source: str, target: str) -> None:
-        self._each(lambda i: self.c.store(target, i, self.c.load(source, i, REAL)))
+        self.c.do(f"call void @copied(i64 {self.n.text}, ptr {source}, ptr {target})")
 
     def _drawn(self) -> Number:
         """The logarithm of a uniform number."""
