@@ -126,7 +126,7 @@ class Streams:
     def random(self, shape: tuple[int, ...]) -> np.ndarray:
         """Uniform numbers above 0, by xoshiro256++: those of each chain one after the other."""
         found = np.empty(shape)
-        flat = found.reshape(shape[0], -1)
+        flat = found.reshape(len(self._state[0]), -1)
         for k in range(flat.shape[1]):
             flat[:, k] = self._next()
         return found

@@ -154,10 +154,9 @@ class Rescaled(Kernel):
         centres = {n: given[centre_key(n)] for n in self.below}
 
         def ask(chain: int, t: np.ndarray) -> np.ndarray:
-            one, known = slice(chain, chain + 1), self.target.known
-            state = {
-                n: v if v is known.get(n) or not np.ndim(v) else v[one] for n, v in values.items()
-            }
+            one, target = slice(chain, chain + 1), self.target
+            nodes = ((n, v) for n, v in values.items() if n in target.model.nodes)
+            state = {n: v if v is target.known.get(n) else v[one] for n, v in nodes}
             own = {n: c[one] for n, c in centres.items()}
             return self._log(state, own, t[None], np.zeros(1, bool))
 

@@ -7,6 +7,7 @@ Neal (2003), Slice sampling, Annals of Statistics 31, sections 4.1 (stepping out
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import cached_property
 from typing import Any
@@ -137,6 +138,8 @@ class Slice(Kernel):
         every move in machine code against that in NumPy.
     how : How
         Whether moves are machine code.
+    reads_data : bool
+        Whether what is known is read from the state: for like nodes as one, whose data differ.
 
     Notes
     -----
@@ -146,8 +149,15 @@ class Slice(Kernel):
 
     label = "slice"
 
-    def __init__(self, blanket: Blanket, debug: bool = False, how: How = ANYHOW) -> None:
+    def __init__(
+        self,
+        blanket: Blanket,
+        debug: bool = False,
+        how: How = ANYHOW,
+        reads_data: bool = False,
+    ) -> None:
         self.blanket, self.debug, self.how = blanket, debug, how
+        self.reads_data = reads_data
         self._expects = False
         self._made: tuple[Any, Any, CompiledSlice | str] | None = None
         self.names = (blanket.name,)
@@ -223,7 +233,7 @@ class Slice(Kernel):
         self, values: Values, memory: Memory, rng: np.random.Generator
     ) -> tuple[np.ndarray, Memory]:
         """New values by machine code, where it says what NumPy does."""
-        chains = len(values[self.blanket.name])
+        chains = math.prod(self.sites.lead(values))
         turns = len(self.blanket.classes) * len(self.components)
         seeds = rng.integers(0, 1 << 64, (chains, turns, 4), np.uint64)
         code = self._code
@@ -251,11 +261,7 @@ class Slice(Kernel):
 
     def _asked(self, values: Values, chain: int, value: np.ndarray) -> np.ndarray:
         """Log densities of one chain by the model's functions, where its elements stand at a value."""
-        known = self.blanket.target.known
-        state = {
-            n: v if v is known.get(n) or not np.ndim(v) else v[chain : chain + 1]
-            for n, v in values.items()
-        }
+        state = self._row(values, np.unravel_index(chain, self.sites.lead(values)))
         shape = self.blanket.node.plate_shape
         found = np.zeros(shape).reshape(-1)
         for members in self.blanket.classes:
@@ -263,9 +269,20 @@ class Slice(Kernel):
             flat = value.reshape(-1, *self.blanket.event_shape)
             candidate = (value if members is None else flat[at])[None]
             log = self.blanket.log_density(state, candidate, members)
-            found[at] = np.broadcast_to(
-                log, (1, *shape) if members is None else (1, len(at))
-            ).ravel()
+            own = shape if members is None else (len(at),)
+            found[at] = np.broadcast_to(log.reshape(log.shape[log.ndim - len(own) :]), own).ravel()
+        return found
+
+    def _row(self, values: Values, at: tuple[Any, ...]) -> Values:
+        """The state of one chain (of one of like nodes), an axis of size 1 before the plates."""
+        target, found = self.blanket.target, dict[str, np.ndarray]()
+        for name, value in values.items():
+            if name in target.model.nodes:
+                axes = np.ndim(value) - len(target.model[name].value_shape)
+                # known values have no chains; what all share has an axis of size 1
+                own = at[len(at) - axes :] if axes else ()
+                place = tuple(int(min(k, n - 1)) for k, n in zip(own, value.shape, strict=False))
+                found[name] = value[place][None] if axes else value
         return found
 
     def _of_node(self, error: DensityError) -> DensityError:
@@ -379,7 +396,7 @@ class Slice(Kernel):
 
     @cached_property
     def _followed(self) -> Conditional | str:
-        return conditional_or_reason(self.blanket)
+        return conditional_or_reason(self.blanket, self.reads_data)
 
     def _check(self, log: np.ndarray, wanted: np.ndarray) -> None:
         """Refuse a program that does not say what the model's functions say."""

@@ -12,6 +12,7 @@ import numpy as np
 from bayesmc.distributions.support import Support, is_half_line
 from bayesmc.distributions.transforms import Transform
 from bayesmc.lowering import Turns
+from bayesmc.shapes import Shape
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.target import Values
 
@@ -93,11 +94,19 @@ class Sites:
         lines = [self._line(component) for _, component in turns]
         return Turns(places, elements, lines, [0 if x == "circle" else growth for x in lines])
 
+    def lead(self, values: Values) -> Shape:
+        """The axes of the node's value before its plates."""
+        shape = values[self.blanket.name].shape
+        return shape[: len(shape) - len(self.blanket.node.value_shape)]
+
     def intervals(
         self, values: Values, width: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Widths and bounds of all numbers, in the order in which they move, each (chains, numbers)."""
-        chains = len(values[self.blanket.name])
+        """Widths and bounds of all numbers, in the order in which they move, each (chains, numbers).
+
+        Members of a group of like nodes (``structure.stacked``) are chains, too.
+        """
+        lead = self.lead(values)
         found: list[list[np.ndarray]] = [[], [], []]
         for members, component in self.turns():
             at: Any = (Ellipsis, *component)
@@ -105,11 +114,12 @@ class Sites:
             support = self.support(values, component)
             if support.kind == "circle":
                 own = np.full(own.shape, 2 * np.pi)
+            ndim = len(self.blanket.node.plates)
             if members is not None:
-                own = own.ravel()[members]
+                own, ndim = own.ravel()[members], 1
             for part, what in zip(found, (own, *self.bounds(support, members)), strict=True):
-                wide = np.broadcast_to(what, (chains, *own.shape))
-                part.append(wide.reshape(chains, own.size))
+                wide = np.broadcast_to(what, (*lead, *own.shape[own.ndim - ndim :]))
+                part.append(wide.reshape(math.prod(lead), -1))
         joined = [p[0] if len(p) == 1 else np.concatenate(p, axis=1) for p in found]
         widths, low, high = (np.ascontiguousarray(a, float) for a in joined)
         return widths, low, high

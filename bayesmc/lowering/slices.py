@@ -123,14 +123,15 @@ class Slices:
 
         Parameters
         ----------
-        value : ndarray, shape (chains, *leaf)
-            Of the leaf's type; it is written to.
+        value : ndarray, shape (*lead, *leaf)
+            Of the leaf's type; it is written to. The lead is that of the chains, and of what else moves alike
+            and apart: all are called chains here.
         width, low, high : ndarray, shape (chains, sites)
             Sizes of first intervals, and bounds, of all sites in the order of the turns.
         seeds : ndarray of uint64, shape (chains, turns, 4)
             Of each chain's random numbers in each turn; it is written to.
         others : mapping
-            Stored values of the other leaves, chains first.
+            Stored values of the other leaves, ``(*lead, *leaf)`` or what broadcasts to it.
         ask : callable
             Tells what machine code cannot.
         threads : int
@@ -140,9 +141,10 @@ class Slices:
         -------
         ndarray, shape (chains, len(TOLD))
         """
-        chains, sites = len(value), self.turns.sites
+        lead, sites = value.shape[: value.ndim - len(self.leaf.shape)], self.turns.sites
+        chains = math.prod(lead)
         told = np.empty((chains, len(TOLD)))
-        moving, held = self._moving(others, chains)
+        moving, held = self._moving(others, lead)
         asking = self._asking.begun(ask, self.leaf.shape, self.dtype, self.root.size)
         wholes = (len(self.turns.places), sites, self.leaf.size, self.root.size,
                   int(self.dtype.kind == "i"), len(self._others))  # fmt: skip
@@ -165,7 +167,7 @@ class Slices:
     # ---- private -------------------------------------------------------------------------------
 
     def _moving(
-        self, values: Mapping[str, np.ndarray], chains: int
+        self, values: Mapping[str, np.ndarray], lead: tuple[int, ...]
     ) -> tuple[np.ndarray, list[np.ndarray]]:
         """Where each other leaf's value of every chain lies, and the memory behind it."""
         moving, held = np.zeros((len(self._others) + 1, 3), np.int64), []
@@ -174,8 +176,8 @@ class Slices:
             step = dtype.itemsize * math.prod(node.shape)
             if array.ndim == len(node.shape):
                 step = 0  # one for all chains
-            elif array.shape != (chains, *node.shape):
-                array = np.ascontiguousarray(np.broadcast_to(array, (chains, *node.shape)))
+            elif array.shape != (*lead, *node.shape):
+                array = np.ascontiguousarray(np.broadcast_to(array, (*lead, *node.shape)))
             held.append(array)
             row[:] = place, address_of(array), step
         return moving, held

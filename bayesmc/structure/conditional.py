@@ -17,6 +17,7 @@ from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import BayesmcError, TraceError, UnsupportedError
 from bayesmc.expression import Constant, Expression, Leaf, Program, broadcast, leaf, ordered
 from bayesmc.expression.graph import replaced
+from bayesmc.network.expressions import stored_leaf
 from bayesmc.passes.alike import sums_of
 from bayesmc.passes.arithmetic import add
 from bayesmc.passes.arrays import for_arrays
@@ -41,6 +42,8 @@ class Conditional:
     Parameters
     ----------
     blanket : Blanket
+    reads_data : bool
+        Whether what is known is read from the state, too: for like nodes as one, whose data differ.
 
     Attributes
     ----------
@@ -72,19 +75,21 @@ class Conditional:
     True
     """
 
-    def __init__(self, blanket: Blanket) -> None:
+    def __init__(self, blanket: Blanket, reads_data: bool = False) -> None:
         self.blanket, self.name = blanket, blanket.name
         self.terms = _terms(blanket)
-        logs = [elements(blanket.target, term, {}) for term in self.terms]
+        model, known = blanket.target.model, blanket.target.known
+        read = {n for t in self.terms for n in t.scope} & known.keys() if reads_data else set()
+        above = {n: stored_leaf(model, model[n]) for n in read}
+        logs = [elements(blanket.target, term, above) for term in self.terms]
         #: log full conditionals of all elements, shape the node's plates
         self.root = _sum(blanket, self.terms, logs)
         parts = standing(self.root, self.name)
         self._parts = [part.name for part in parts.values()]
         self._standing = Program(for_arrays(parts))
         self._moving = Program(for_arrays([replaced(self.root, dict(parts))]))
-        target = blanket.target
-        read = {p for t in self.terms for p in target.model.above(t.scope, lambda _: True)}
-        self._known = [(n, target.known[n]) for n in sorted(read) if n in target.known]
+        put_in = {p for t in self.terms for p in model.above(t.scope, lambda _: True)}
+        self._known = [] if reads_data else [(n, known[n]) for n in sorted(put_in & known.keys())]
         _hold(blanket, self.terms, logs, self.root)
 
     def given(self, values: Mapping[str, np.ndarray]) -> At | None:
@@ -112,11 +117,11 @@ class At:
         return found
 
 
-def conditional_or_reason(blanket: Blanket) -> Conditional | str:
+def conditional_or_reason(blanket: Blanket, reads_data: bool = False) -> Conditional | str:
     """The full conditional as a program, or why there is none."""
     try:
         with np.errstate(all="ignore"):
-            return Conditional(blanket)
+            return Conditional(blanket, reads_data)
     except (BayesmcError, TraceError) as error:
         return str(error)
 

@@ -7,6 +7,7 @@ Statistical tests are Geweke's and the rank test at a chance of false alarm of 1
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from bayesmc.kernels import slice as slices
 from bayesmc.kernels.base import How
 from bayesmc.kernels.compiled_slice import CompiledSlice, machine_root
 from bayesmc.kernels.slice import Slice
+from bayesmc.kernels.stacked import Stacked
 from bayesmc.lowering import compiled, is_available
 from bayesmc.lowering import slices as machine
 from bayesmc.lowering.slice_moves import slice_moves
@@ -27,6 +29,7 @@ from bayesmc.passes.arithmetic import add
 from bayesmc.structure import conditional
 from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.conditional import Conditional
+from bayesmc.structure.stacked import stacks
 from bayesmc.structure.target import target_of
 from tests.kernels import invariance_models as models
 from tests.kernels.invariance import Case, Make, Model, each_test, running
@@ -256,6 +259,59 @@ def test_threads_change_nothing(model: Any) -> None:
     _, few, _ = moved(model, How(True, 3), chains=2)
     _, same, _ = moved(model, How(True, 1), chains=2)
     np.testing.assert_array_equal(few["x"], same["x"])
+
+
+@pytest.mark.parametrize("model", [line, looked_up, in_turn, all_together, vectors])
+def test_functions_are_asked_for_one_chain(model: Any) -> None:
+    kernel, values, _ = moved(model, How(True), 3)
+    blanket, value = kernel.blanket, values["x"]
+    with running():
+        wanted = np.zeros((50, blanket.size))
+        for members in blanket.classes:
+            at = slice(None) if members is None else members
+            own = blanket.current(values, members)
+            log = blanket.log_density(values, own, members).reshape(50, -1)
+            wanted[:, at] = log
+        for chain in (0, 17, 49):
+            found = kernel._asked(values, chain, value[chain])
+            np.testing.assert_allclose(found, wanted[chain], rtol=1e-9)
+
+
+def walk() -> tuple[Stacked, Any, dict[str, np.ndarray]]:
+    """Steps of an unrolled walk, every other of which moves at once, with data of their own."""
+    net = bmc.BayesNet()
+    net.add("s", bmc.LogNormal(0.0, 0.3))
+    net.add("x[0]", bmc.Laplace(0.0, 1.0))
+    for t in range(1, 13):
+        parents = [f"x[{t - 1}]", "s"]
+        net.add(f"x[{t}]", lambda x, s: bmc.Laplace(0.8 * x, s), parents=parents)
+        net.add(f"y[{t}]", lambda x: bmc.Poisson(np.exp(x)), parents=[f"x[{t}]"])
+    target = target_of(pose(net, {f"y[{t}]": t % 4 for t in range(1, 13)}))
+    blankets = {name: Blanket(target, name) for name in target.chain}
+    (stack, *_), _ = stacks(target, blankets, target.chain)
+    kernel = Stacked(stack, partial(Slice, debug=True, how=How(True, 2), reads_data=True))
+    return kernel, target, drawn(net, target, 30)
+
+
+def test_like_nodes_move_as_in_numpy() -> None:
+    kernel, target, values = walk()
+    kernel.expect(1000, 30)
+    assert kernel.told(1000, 30) == "in machine code"
+    rng = np.random.default_rng(4)
+    with running():
+        memory = kernel.start(values, 30)
+        for _ in range(6):  # ``debug`` compares them all
+            new, memory = kernel.step(values, memory, rng, True)
+            values = {**values, **new}
+        assert memory["machine"] and memory["width"].shape == (len(kernel.names),)
+        inner: Any = kernel.kernel
+        state = kernel.stack.gathered(values)
+        name = kernel.stack.one.name
+        wanted = kernel.stack.one.log_density(state, state[name])
+        for row in (0, 7, 30 * len(kernel.names) - 1):
+            chain, member = divmod(row, len(kernel.names))
+            found = inner._asked(state, row, state[name][chain, member])
+            np.testing.assert_allclose(found, wanted[chain, member], rtol=1e-9)
 
 
 # ---- invariance --------------------------------------------------------------------------------------

@@ -345,7 +345,8 @@ def _numbers(
         else:
             kernels.append(AdaptiveWalk(blankets[name]))
     stacked, left = stacks(target, blankets, left, forms)
-    kernels += [Stacked(group, partial(Slice, debug=debug)) for group in stacked]
+    alike = partial(Slice, debug=debug, how=how, reads_data=True)
+    kernels += [Stacked(group, alike) for group in stacked]
     for group in _together(target, blankets, left):
         if len(group) > 1 or target.model[group[0]].event_shape:
             kernels.append(FactorSlice(target, group))
