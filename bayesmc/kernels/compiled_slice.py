@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -101,6 +102,8 @@ class CompiledSlice(CompiledMoves):
 
     def __init__(self, conditional: Conditional, turns: Turns, threads: int = 1) -> None:
         self.conditional = conditional
+        #: widths and bounds of the last move, and what they were made of
+        self.intervals: Any = None
         super().__init__(conditional.root, conditional.name, turns, threads)
 
 

@@ -247,7 +247,7 @@ class Slice(Kernel):
             return self._asked(values, chain, value)
 
         try:
-            found = code(values, *self.sites.intervals(values, memory["width"]), seeds, ask)
+            found = code(values, *self._intervals(code, values, memory["width"]), seeds, ask)
         except DensityError as error:
             raise self._of_node(error) from error
         if not (self.debug or not code.is_checked):
@@ -258,6 +258,19 @@ class Slice(Kernel):
             raise DensityError(f"node {self.blanket.name!r}: {code.differs}")
         code.is_checked = True
         return (wanted, {**memory, "machine": False}) if code.differs else (found, memory)
+
+    def _intervals(
+        self, code: CompiledSlice, values: Values, width: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Widths and bounds: those of the last move, where neither can have changed."""
+        key = width, self.sites.lead(values)
+        last: Any = code.intervals
+        if last is None or last[0][0] is not width or last[0][1] != key[1]:
+            found = self.sites.intervals(values, width)
+            last = key, found
+            if self.blanket.node.support is not None:
+                code.intervals = last
+        return last[1]
 
     def _asked(self, values: Values, chain: int, value: np.ndarray) -> np.ndarray:
         """Log densities of one chain by the model's functions, where its elements stand at a value."""

@@ -105,6 +105,7 @@ class Slices:
         self._tables.append(np.array(turns.growth, float))
         joined = (np.concatenate(a) for a in (turns.places, turns.answers))
         self._tables += [np.ascontiguousarray(a, np.int64) for a in joined]
+        self._addresses = [address_of(a) for a in self._tables]
         self._most = max(len(p) for p in turns.places)
         self._asking = _Asking()
 
@@ -149,7 +150,8 @@ class Slices:
         wholes = (len(self.turns.places), sites, self.leaf.size, self.root.size,
                   int(self.dtype.kind == "i"), len(self._others))  # fmt: skip
         before = [address_of(moving), asking.address]
-        behind = [address_of(a) for a in (value, *self._tables, width, low, high, seeds, told)]
+        ends = [address_of(a) for a in (width, low, high, seeds, told)]
+        behind = [address_of(value), *self._addresses, *ends]
         needed = numbers_of(self._most, self.leaf.size, self.root.size)
 
         def part(first: int, last: int) -> None:

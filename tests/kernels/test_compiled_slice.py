@@ -542,6 +542,23 @@ def test_runs_are_compiled_where_that_pays(monkeypatch: pytest.MonkeyPatch) -> N
     assert not asked
 
 
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
+def test_trajectories_are_compiled_where_that_is_said() -> None:
+    net = bmc.BayesNet()
+    net.add("a", bmc.Laplace(0.0, 1.0))
+    net.add("b", bmc.Laplace(0.0, 1.0))
+    net.add("y", lambda a, b: bmc.Normal(a * b, 1.0))
+
+    def is_machine(**has: Any) -> bool:
+        engine = bmc.Gibbs(draws=3, chains=4, **has)
+        found = bmc.infer(net, {"y": 1.0}, engine=engine, rng=1)
+        memories = found.checkpoint.state["memory"]
+        return any(m.get("machine") for m in memories)
+
+    assert is_machine(warmup=5, compiled=True) and not is_machine(warmup=5)
+    assert is_machine(warmup=1000) and not is_machine(warmup=1000, compiled=False)
+
+
 def test_the_table_says_what_is_machine_code() -> None:
     net, evidence, _ = looked_up()
     said = bmc.explain(net, evidence, engine=bmc.Gibbs(draws=10, warmup=1000))
