@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextvars
 import ctypes
 import math
 import os
@@ -146,13 +147,18 @@ class Trajectories:
 
 
 def shared(part: Callable[[int, int], None], chains: int, threads: int) -> None:
-    """``part(first, last)`` of chains that threads share."""
+    """``part(first, last)`` of chains that threads share, with what the caller has set (``np.errstate``)."""
     if threads == 1:
         part(0, chains)
         return
     ends = [chains * k // threads for k in range(threads + 1)]
     parts = [(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True) if a < b]
-    list(_pool(threads).map(part, *zip(*parts, strict=True)))
+    settings = [contextvars.copy_context() for _ in parts]  # what C asks Python runs in these
+
+    def run(own: contextvars.Context, ends: tuple[int, int]) -> None:
+        own.run(part, *ends)
+
+    list(_pool(threads).map(run, settings, parts))
 
 
 # ---- private ------------------------------------------------------------------------------------

@@ -6,6 +6,7 @@ Statistical tests are Geweke's and the rank test at a chance of false alarm of 1
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -14,8 +15,10 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.distributions import base
 from bayesmc.distributions.base import marking_invalid
 from bayesmc.errors import DensityError
+from bayesmc.expression import elementwise, leaf
 from bayesmc.kernels import slice as slices
 from bayesmc.kernels.base import How
 from bayesmc.kernels.compiled_slice import CompiledSlice, machine_root
@@ -312,6 +315,27 @@ def test_like_nodes_move_as_in_numpy() -> None:
             chain, member = divmod(row, len(kernel.names))
             found = inner._asked(state, row, state[name][chain, member])
             np.testing.assert_allclose(found, wanted[chain, member], rtol=1e-9)
+
+
+def test_functions_are_asked_as_in_the_thread_that_began() -> None:
+    """What is asked of Python from other threads heeds ``np.errstate`` and ``marking_invalid``, too."""
+    x = leaf("x", ())
+    root = elementwise(np.multiply, elementwise(np.log, elementwise(np.minimum, x, -1.0)), 1.0)
+    one = np.zeros(1, int)
+    slices = machine.Slices(root, "x", machine.Turns([one], [one], ["real"], [8]))
+    seen: list[tuple[int, str, bool]] = []
+
+    def ask(chain: int, value: np.ndarray) -> np.ndarray:
+        seen.append((threading.get_ident(), np.geterr()["divide"], base._mark_invalid.get()))
+        return -0.5 * value**2
+
+    ends, seeds = np.full((6, 1), np.inf), np.arange(1, 25, dtype=np.uint64).reshape(6, 1, 4) << 40
+    value = np.zeros(6)
+    with running(), np.errstate(divide="print"):
+        slices.move(value, np.ones((6, 1)), -ends, ends, seeds, {}, ask, 3)
+    assert (value != 0).all()
+    assert {s[0] for s in seen} - {threading.get_ident()}
+    assert {s[1:] for s in seen} == {("print", True)}
 
 
 # ---- invariance --------------------------------------------------------------------------------------
