@@ -64,9 +64,10 @@ class Modes:
         names = [n for n in slices.dynamic if n in read]
         for name in slices.dynamic:  # what needs the mode before to be answered for is part of it
             node = slices.later[name]
-            late = any(
-                p.endswith(PREVIOUS) and p.removesuffix(PREVIOUS) in names for p in node.parents
-            )
+            stems = {p.removesuffix(PREVIOUS) for p in node.parents if p.endswith(PREVIOUS)}
+            late = bool(stems & set(names))
+            if not node.is_stochastic:
+                late |= name in slices.interface
             known = name in seen or name in bent or name in names
             if late and not known and node.domain is not None and not node.event_shape:
                 names.append(name)

@@ -94,9 +94,12 @@ class Beliefs(NamedTuple):
         spreads = Spreads(flat(self.factor), np.arange(steps * count))
         return View(self.layout, flat(self.mean), spreads, known)
 
+    def split(self, values: np.ndarray) -> np.ndarray:
+        """What ``view`` says, shape (time * modes, ...), as (time, modes, ...)."""
+        return values.reshape(*self.weights.shape[:2], *values.shape[1:])
+
     def over_modes(self, values: np.ndarray) -> np.ndarray:
-        """Averages of what ``view`` says, shape (time * modes, *lead, ...) -> (time, *lead, ...)."""
-        values = values.reshape(*self.weights.shape[:2], *values.shape[1:])
+        """Averages, shape (time, modes, *lead, ...) -> (time, *lead, ...)."""
         weights = self.weights.reshape(
             self.weights.shape + (1,) * (values.ndim - self.weights.ndim)
         )
@@ -194,14 +197,14 @@ class SwitchingSeries(SeriesPosterior):
                     f"cov({name!r}): the node is finite, or averaged over; name numbers"
                 )
         view = beliefs.view()
-        within = beliefs.over_modes(view.cov(names))
+        within = beliefs.over_modes(beliefs.split(view.cov(names)))
         parts = [
             view.mean[..., layout.rows[n]] if n in layout.rows
             else np.zeros((*view.mean.shape[:-1], layout.size(n)))
             for n in names
         ]  # fmt: skip
-        means = np.concatenate(parts, axis=-1).reshape(*beliefs.weights.shape, -1)
-        centre = beliefs.over_modes(means.reshape(-1, *means.shape[2:]))
+        means = beliefs.split(np.concatenate(parts, axis=-1))
+        centre = beliefs.over_modes(means)
         off = means - centre[:, None]
         weighted = np.sqrt(beliefs.weights)[..., None] * off
         between = np.moveaxis(weighted, 1, -1)
@@ -274,9 +277,9 @@ def answers(
             mean = means[name] = beliefs.average(node, one)
             variances[name] = beliefs.average(node, two + (one - mean[:, None]) ** 2)
         _put_seen(name, node, observed, tables, means, variances)
-    whole = beliefs.over_modes(beliefs.mean.reshape(-1, *beliefs.mean.shape[2:]))
+    whole = beliefs.over_modes(beliefs.mean)
     spread = np.vecdot(beliefs.factor, beliefs.factor) + (beliefs.mean - whole[:, None]) ** 2
-    spread = beliefs.over_modes(spread.reshape(-1, *spread.shape[2:]))
+    spread = beliefs.over_modes(spread)
     for name, place in layout.rows.items():
         means[name] = layout.unpacked(model[name], whole[..., place])
         variances[name] = layout.unpacked(model[name], spread[..., place])
@@ -304,7 +307,7 @@ def _expectation(
                 "not answered for; use a ParticleFilter"
             )
     mean, error = expectation(beliefs.view(), function, event)
-    return beliefs.over_modes(mean), beliefs.over_modes(error)
+    return tuple(beliefs.over_modes(beliefs.split(a)) for a in (mean, error))  # type: ignore[return-value]
 
 
 def _spread_out(told: np.ndarray | None, stretch: Stretch, now: np.ndarray) -> np.ndarray | None:
