@@ -78,9 +78,7 @@ def read_given(
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _read(
-    model: Model, name: str, known: Mapping[str, np.ndarray], cut: frozenset[str]
-) -> Any:
+def _read(model: Model, name: str, known: Mapping[str, np.ndarray], cut: frozenset[str]) -> Any:
     node = model[name]
     if node.declaration.vectorize:
         raise TraceError("it is called element by element (vectorize=True)")

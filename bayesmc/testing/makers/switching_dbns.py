@@ -59,7 +59,9 @@ class _SwitchingMaker(LinearMaker):
         self.has_sensor = rng.random() < 0.3
         return super().made()
 
-    def _mode(self, name: str, card: int, plates: tuple[str, ...], reads: Sequence[str] = ()) -> None:
+    def _mode(
+        self, name: str, card: int, plates: tuple[str, ...], reads: Sequence[str] = ()
+    ) -> None:
         """A finite node with memory or without."""
         rng = self.rng
         within = [n for n in reads if rng.random() < 0.6]
@@ -82,7 +84,9 @@ class _SwitchingMaker(LinearMaker):
         if self.has_sensor:
             name = next(iter(self.modes))
             table = self.rng.dirichlet(np.ones(2), size=self.modes[name])
-            self.dbn.add("sensor", lambda mode: Categorical(table[mode]), [name], plates=self.within[name])
+            self.dbn.add(
+                "sensor", lambda mode: Categorical(table[mode]), [name], plates=self.within[name]
+            )
             observed = [*observed, "sensor"]
         return super()._with_data(observed)
 
