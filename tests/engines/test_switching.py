@@ -1,4 +1,4 @@
-"""``SwitchingKalmanFilter`` against exact conditioning, published and independent figures, and a plain loop."""
+"""``SwitchingKalmanFilter`` against exact conditioning, published and independent figures, a plain loop."""
 
 from __future__ import annotations
 
@@ -566,8 +566,9 @@ def test_modes_that_cannot_be_are_left_out() -> None:
 def test_it_is_chosen_for_switching_templates_and_says_what_it_is() -> None:
     dbn = bmc.DynamicBayesNet()
     dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.1, 0.9]], initial=[0.5, 0.5])
-    dbn.add("x", lambda x_prev, s: bmc.MvNormal(0.9 * x_prev, np.array([1.0, 4.0])[s][..., None, None] * np.eye(2)),
-            initial=bmc.MvNormal(np.zeros(2), np.eye(2)))  # fmt: skip
+    covs = np.array([1.0, 4.0])[:, None, None] * np.eye(2)
+    start = bmc.MvNormal(np.zeros(2), np.eye(2))
+    dbn.add("x", lambda x_prev, s: bmc.MvNormal(0.9 * x_prev, covs[s]), initial=start)
     dbn.add("y", lambda x: bmc.Normal(x[..., 0], 1.0))
     found = bmc.explain(dbn, {"y": [0.0, 1.0, 2.0]})
     assert isinstance(found.engine, SwitchingKalmanFilter) and found.engine.merging == "gpb2"

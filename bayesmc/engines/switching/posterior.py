@@ -58,8 +58,13 @@ class Beliefs(NamedTuple):
         """Of the last so many slices."""
         known = {n: v[-steps:] for n, v in self.known.items()}
         by_mode = {n: v[-steps:] for n, v in self.by_mode.items()}
-        cut = (a[-steps:] for a in (self.weights, self.mean, self.factor))
-        return Beliefs(self.layout, self.modes, self.now, *cut, known, by_mode)
+        return self._replace(
+            weights=self.weights[-steps:],
+            mean=self.mean[-steps:],
+            factor=self.factor[-steps:],
+            known=known,
+            by_mode=by_mode,
+        )
 
     def on_plates(self, node: CompiledNode) -> np.ndarray:
         """Weights as they broadcast with a node's values, shape (time, modes, *plates or ones)."""
@@ -303,8 +308,8 @@ def _expectation(
     for name in nodes_read(function):
         if name in beliefs.modes.leaves:
             raise UnsupportedError(
-                f"a query reads {name!r}, which is averaged over where it is missing, and functions of it are "
-                "not answered for; use a ParticleFilter"
+                f"a query reads {name!r}, which is averaged over where it is missing, and functions of it "
+                "are not answered for; use a ParticleFilter"
             )
     mean, error = expectation(beliefs.view(), function, event)
     return tuple(beliefs.over_modes(beliefs.split(a)) for a in (mean, error))  # type: ignore[return-value]
