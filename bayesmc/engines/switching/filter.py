@@ -99,11 +99,11 @@ class SwitchingKalmanFilter(FilterEngine):
     Notes
     -----
     ``smooth`` is Kim's smoother, on the filter's Gaussians whatever rule made them: given the mode of the
-    next slice, later rows are taken to tell no more of this one's. Gaussians are carried as triangular roots
-    of their covariances, and merged as such; no covariance is subtracted or inverted. All pairs of modes are
-    one array operation, with ``linearize`` one after the other. Plates whose elements never meet have a mode for
-    each element. Finite nodes that nothing reads are averaged over where they are missing, and so are other
-    families that depend on modes alone.
+    next slice, later rows are taken to tell no more of this one's. Gaussians are carried as triangular
+    roots of their covariances, and merged as such; no covariance is subtracted or inverted. All pairs of
+    modes are one array operation, with ``linearize`` one after the other. Plates whose elements never
+    meet have a mode for each element. Finite nodes that nothing reads are averaged over where they are
+    missing, and so are other families that depend on modes alone.
 
     References
     ----------
