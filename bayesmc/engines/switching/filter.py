@@ -49,7 +49,7 @@ class SwitchingBelief(SliceBelief):
     >>> engine = SwitchingKalmanFilter()
     >>> belief = engine.step(engine.step(engine.start(dbn), {"y": 0.1}), {"y": 2.0})
     >>> belief.t, belief.probabilities("s").round(3).tolist()
-    (1, [0.375, 0.625])
+    (1, [0.315, 0.685])
     """
 
     def cov(self, *names: str) -> np.ndarray:
@@ -125,9 +125,9 @@ class SwitchingKalmanFilter(FilterEngine):
     >>> rows = {"y": [0.1, -0.2, 0.1, 6.2, 5.9]}
     >>> smoothed = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter())
     >>> smoothed.probabilities("s")[:, 1].round(2).tolist()
-    [0.05, 0.01, 0.03, 1.0, 0.03]
+    [0.06, 0.02, 0.07, 1.0, 0.13]
     >>> smoothed.mean("x").round(1).tolist()
-    [0.0, -0.0, 0.0, 6.0, 6.0]
+    [0.0, 0.0, 0.0, 6.0, 6.0]
     """
 
     merging: Literal["gpb1", "imm", "gpb2"] = "gpb2"

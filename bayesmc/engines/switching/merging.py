@@ -44,7 +44,7 @@ def shares(log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     --------
     >>> import numpy as np
     >>> from bayesmc.engines.switching.merging import shares
-    >>> total, share = shares(np.log([[0.1, 0.3], [0.0, 0.0]]))
+    >>> total, share = shares(np.array([[np.log(0.1), np.log(0.3)], [-np.inf, -np.inf]]))
     >>> np.exp(total).round(6).tolist(), share.round(6).tolist()
     ([0.4, 0.0], [[0.25, 0.75], [1.0, 0.0]])
     """

@@ -136,7 +136,7 @@ class SwitchingSeries(SeriesPosterior):
     >>> filtered.quantile("x", [0.1, 0.9]).shape, filtered.cov("x").shape
     ((3, 2), (3, 1, 1))
     >>> filtered.probability(lambda x, s: (s == "rough") & (x > 4.0)).round(2).tolist()
-    [0.0, 0.0, 0.98]
+    [0.0, 0.0, 0.95]
     """
 
     beliefs: Beliefs
