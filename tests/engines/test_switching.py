@@ -463,6 +463,11 @@ def test_linearised_slices_are_those_of_the_extended_filter() -> None:
         assert off(one.mean("x"), two.mean("x")) < 1e-10
         assert off(one.var("x"), two.var("x")) < 1e-10
         assert off(one.log_marginal_likelihood, two.log_marginal_likelihood) < 1e-10
+    dbn.add("z", lambda x: bmc.Gamma(9.0, 9.0 / np.exp(x)))  # missing now and then, it tells nothing then
+    rows["z"] = [1.0, 0.7, np.nan, 2.0]
+    one = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter(linearize=True))
+    two = bmc.smooth(dbn, rows, engine=bmc.ExtendedKalmanFilter())
+    assert off(one.mean("x"), two.mean("x")) < 1e-10 and off(one.mean("z"), two.mean("z")) < 1e-10
     rows = {n: ROWS[n] for n in ("y", "alarm")}
     for rule in RULES:
         given = [

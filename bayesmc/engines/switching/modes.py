@@ -60,6 +60,7 @@ class Modes:
         finite = {n for n in slices.stochastic if slices.first[n].domain is not None}
         loose = _loose(slices, seen)
         bent = always_unknown(slices, seen | finite | loose)
+        loose = {n for n in loose if not _reads(slices, n, bent)}
         read = variables_of(slices, seen, True) - bent
         names = [n for n in slices.dynamic if n in read]
         for name in slices.dynamic:  # what needs the mode before to be answered for is part of it
@@ -161,6 +162,12 @@ def _loose(slices: Slices, seen: frozenset[str]) -> set[str]:
         if not _is_gaussian(slices.later, name):
             found.add(name)
     return found
+
+
+def _reads(slices: Slices, name: str, others: frozenset[str]) -> bool:
+    """Whether a node depends on some others, of its slice or the one before."""
+    parents = (*slices.first[name].parents, *slices.later[name].parents)
+    return any(p.removesuffix(PREVIOUS) in others for p in parents)
 
 
 def _size(node: Any) -> int:
