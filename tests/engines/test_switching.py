@@ -13,7 +13,9 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc import SwitchingKalmanFilter
+from bayesmc.engines.switching import run
 from bayesmc.errors import BudgetError, QueryError, UnsupportedError, ZeroProbabilityError
+from bayesmc.lowering import is_available
 from bayesmc.testing import exact, session
 from bayesmc.testing.makers.linear_dbns import LinearSeries
 from bayesmc.testing.makers.switching_dbns import random_switching_dbn
@@ -463,7 +465,9 @@ def test_linearised_slices_are_those_of_the_extended_filter() -> None:
         assert off(one.mean("x"), two.mean("x")) < 1e-10
         assert off(one.var("x"), two.var("x")) < 1e-10
         assert off(one.log_marginal_likelihood, two.log_marginal_likelihood) < 1e-10
-    dbn.add("z", lambda x: bmc.Gamma(9.0, 9.0 / np.exp(x)))  # missing now and then, it tells nothing then
+    dbn.add(
+        "z", lambda x: bmc.Gamma(9.0, 9.0 / np.exp(x))
+    )  # missing now and then, it tells nothing then
     rows["z"] = [1.0, 0.7, np.nan, 2.0]
     one = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter(linearize=True))
     two = bmc.smooth(dbn, rows, engine=bmc.ExtendedKalmanFilter())
@@ -579,3 +583,36 @@ def test_it_is_chosen_for_switching_templates_and_says_what_it_is() -> None:
     assert isinstance(found.engine, SwitchingKalmanFilter) and found.engine.merging == "gpb2"
     assert "approximation of unknown error" in str(found)
     assert bmc.filter(dbn, {"y": [0.0, 1.0, 2.0]}).log_marginal_likelihood_mcse is None
+
+
+@pytest.mark.skipif(not is_available(), reason="llvmlite is not installed")
+@pytest.mark.parametrize("merging", RULES)
+def test_machine_code_gives_the_same(merging: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of random templates, and of one without noise in its readings, which it leaves to NumPy."""
+    singular = bmc.DynamicBayesNet()
+    singular.table("mode", ["mode_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
+    singular.add("a", lambda a_prev: bmc.Normal(0.9 * a_prev, 1.0), initial=bmc.Normal(0.0, 1.0))
+    singular.add("b", lambda b_prev: bmc.Normal(b_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    singular.add("y", lambda a, b, mode: bmc.Normal(a + b + 3.0 * mode, 0.0))
+    rows = {"y": np.random.default_rng(0).normal(size=6)}
+    made = [random_switching_dbn(seed) for seed in SEEDS]
+    cases = [(c.dbn, c.observations, c.inputs) for c in made] + [(singular, rows, {})]
+    compiled = 0
+    for dbn, observations, inputs in cases:
+        found = []
+        for least in (1, 10**9):
+            monkeypatch.setattr(run, "_LONG", least)
+            engine = SwitchingKalmanFilter(merging)
+            compiled += "machine code" in str(
+                bmc.explain(dbn, observations, engine=engine, inputs=inputs)
+            )
+            found.append(bmc.smooth(dbn, observations, inputs=inputs, engine=engine))
+        one, two = found
+        assert off(one.log_marginal_increments, two.log_marginal_increments) < 1e-10
+        for name in one.names:
+            if dbn[name].is_discrete:
+                assert off(one.probabilities(name), two.probabilities(name)) < 1e-10
+            else:
+                assert off(one.mean(name), two.mean(name)) < 1e-10
+                assert off(one.var(name), two.var(name)) < 1e-10
+    assert compiled > len(cases) / 3

@@ -205,8 +205,9 @@ class SwitchingKalmanFilter(FilterEngine):
         run = self._run(problem)
         pairs = run.stretches[-1].pairs
         filters = len(pairs.dst) if self.merging == "gpb2" else len(pairs.of_kind)
+        how = " in machine code" if run.is_compiled else ""
         return (
-            f"{len(run.now)} modes, {filters} Kalman filters a slice; the log marginal likelihood is an "
+            f"{len(run.now)} modes, {filters} Kalman filters a slice{how}; the log marginal likelihood is an "
             "approximation of unknown error"
         )
 

@@ -30,7 +30,11 @@ from bayesmc.engines.switching.passes import (
 from bayesmc.engines.switching.posterior import Beliefs, SwitchingSeries, answers, by_modes
 from bayesmc.engines.switching.stretches import Stretch
 from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityError
+from bayesmc.lowering import gaussian_loops, is_available
 from bayesmc.network import Observed
+
+#: slices from which on machine code is loaded
+_LONG = 300
 
 
 class Options(NamedTuple):
@@ -78,13 +82,14 @@ class SwitchingRun:
     def forward(self, advance: Callable[[], None]) -> tuple[list[Mixture], np.ndarray]:
         """Mixtures over modes of every slice given the rows up to it, and log densities of the rows."""
         data, merging = self.data, self.options.merging
+        loops = gaussian_loops() if self.is_compiled else None
         found: list[Mixture] = []
         increments = np.empty((data.steps, *data.layouts[0].lead))
         places = self.places
 
         def move(k: int) -> None:
             place = places[k]
-            after, increments[k] = advanced(merging, found[-1] if found else None, place)
+            after, increments[k] = advanced(merging, found[-1] if found else None, place, loops)
             check_row(data.series.start + k, increments[k])
             found.append(after if k else self._over_all(after))
 
@@ -179,6 +184,12 @@ class SwitchingRun:
         return answers(
             self.options.engine, beliefs, kind, increments, told, seen, series.start, queries
         )  # fmt: skip
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether there is machine code for it, and enough to do."""
+        plain = self.options.rule is None and not self.data.layouts[0].lead
+        return plain and self.data.steps >= _LONG and is_available()
 
     @cached_property
     def told(self) -> dict[str, tuple[Any, Any]]:
