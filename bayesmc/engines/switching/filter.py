@@ -64,7 +64,7 @@ class SwitchingBelief(SliceBelief):
         return self.state.posterior(self.t)
 
     def _without_functions(self) -> SwitchingState:
-        return self.state
+        return self.state._replace(memory=None)
 
 
 @dataclass(frozen=True)
