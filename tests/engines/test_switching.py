@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gzip
 import json
 import pickle
@@ -38,13 +39,14 @@ def figures(answer: Any, names: Any, finite: Any) -> list[np.ndarray]:
     ]
 
 
-def exact_of(case: LinearSeries, count: int | None = None) -> Any:
-    """None where histories are too many."""
-    rows = case.observations if count is None else case.rows(count)
+@functools.cache
+def answered(seed: int, difference: float) -> tuple[LinearSeries, Any]:
+    """A random template and its exact answer, None where histories are too many."""
+    case = random_switching_dbn(seed, difference)
     try:
-        return exact(case.dbn, rows, case.inputs or None)
+        return case, exact(case.dbn, case.observations, case.inputs or None)
     except (UnsupportedError, BudgetError):
-        return None
+        return case, None
 
 
 def finite(case: LinearSeries) -> set[str]:
@@ -58,8 +60,7 @@ def finite(case: LinearSeries) -> set[str]:
 def test_modes_that_make_no_difference_leave_all_exact(merging: str) -> None:
     asked = 0
     for seed in SEEDS:
-        case = random_switching_dbn(seed, difference=0.0)
-        right = exact_of(case)
+        case, right = answered(seed, 0.0)
         if right is None:
             continue
         options: dict[str, Any] = {"inputs": case.inputs, "engine": SwitchingKalmanFilter(merging)}
@@ -112,9 +113,8 @@ def test_random_templates_are_near_exact_answers_and_rules_in_order() -> None:
     """Bounds are some three times what 57 templates gave: .0013, .014, .042 on average."""
     errors: dict[str, list[float]] = {rule: [] for rule in RULES}
     shares: dict[str, list[float]] = {rule: [] for rule in RULES}
-    for seed in range(session.scaled(24, 4)):
-        case = random_switching_dbn(seed)
-        right = exact_of(case)
+    for seed in range(session.scaled(16, 5)):
+        case, right = answered(seed, 1.0)
         if right is None:
             continue
         for rule in RULES:
