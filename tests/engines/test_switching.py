@@ -130,6 +130,32 @@ def test_random_templates_are_near_exact_answers_and_rules_in_order() -> None:
     assert np.mean(shares["gpb2"]) < 0.02, shares
 
 
+def test_vague_starts_lose_no_digits() -> None:
+    """Two modes that are alike, of a level and a slope of which nothing is known."""
+    found = []
+    for modes in (0, 1):
+        dbn = bmc.DynamicBayesNet()
+        if modes:
+            dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.4, 0.6]], initial=[0.5, 0.5])
+        dbn.add("v", lambda v_prev: bmc.Normal(v_prev, 0.1), initial=bmc.Normal(0.0, 1e7))
+        dbn.add(
+            "x",
+            lambda x_prev, v_prev: bmc.Normal(x_prev + v_prev, 0.1),
+            initial=bmc.Normal(0.0, 1e7),
+        )
+        if modes:
+            dbn.add("y", lambda x, s: bmc.Normal(x + 0.0 * s, 0.5))
+        else:
+            dbn.add("y", lambda x: bmc.Normal(x, 0.5))
+        engine = SwitchingKalmanFilter() if modes else bmc.KalmanFilter()
+        found.append(bmc.smooth(dbn, {"y": [1.0, 2.5, 2.9, np.nan, 5.2]}, engine=engine))
+    one, two = found
+    assert off(one.log_marginal_increments, two.log_marginal_increments) < 1e-9
+    for name in ("x", "v"):
+        assert off(one.mean(name), two.mean(name)) < 1e-8
+        assert off(one.var(name), two.var(name)) < 1e-8
+
+
 # ---- published and independent figures ----------------------------------------------------------
 
 

@@ -274,6 +274,8 @@ class SwitchingKalmanFilter(FilterEngine):
             )
         if self.linearize:
             return f"{why}; use ParticleFilter"
+        if not modes.names:
+            return f"{why}; use ExtendedKalmanFilter or ParticleFilter"
         return f"{why}; use SwitchingKalmanFilter(linearize=True) or ParticleFilter"
 
     # ---- private -------------------------------------------------------------------------------
