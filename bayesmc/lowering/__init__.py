@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
+from bayesmc.lowering.gaussians import Coefficients, GaussianLoops, gaussian_loops
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available
 from bayesmc.lowering.slices import Slices, Turns
@@ -17,7 +18,9 @@ from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
     "Bound",
+    "Coefficients",
     "Compiled",
+    "GaussianLoops",
     "Kernel",
     "SliceKernel",
     "Slices",
@@ -25,6 +28,7 @@ __all__ = [
     "Trajectories",
     "Turns",
     "compiled",
+    "gaussian_loops",
     "held_against_numpy",
     "is_available",
     "is_worth_it",
