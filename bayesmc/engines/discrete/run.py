@@ -6,12 +6,12 @@ that memory holds beliefs and a few stretches.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.categorical import log_sum_exp
+from bayesmc.categorical import log_sum_exp, pick
 from bayesmc.dbn import Series
 from bayesmc.engines.discrete.chain import Passed, filtered, lagged, smoothed
 from bayesmc.engines.discrete.rows import Piece, Rows, Variable
@@ -137,6 +137,41 @@ class Run:
 
     # ---- reading ----------------------------------------------------------------------------
 
+    def last(self) -> Any:
+        """What the slice after the last one goes on from: logs of the beliefs of each chain."""
+        return [p.logs(slice(-1, None))[0] for p in self.passed]
+
+    def alone(self, variable: Variable) -> np.ndarray | None:
+        """Probabilities of a variable, (steps, sequences, states), where they stand by themselves."""
+        number = self.plan.chain_of(variable)
+        if self.plan.chains[number].state != (variable,):
+            return None
+        return self.beliefs[number].belief
+
+    def entries(self, variables: Iterable[Variable]) -> float:
+        """Entries of the largest table of a slice that joint probabilities of variables take."""
+        found, asked = 1.0, set(variables)
+        for number in {self.plan.chain_of(v) for v in asked}:
+            chain = self.plan.chains[number]
+            plain = asked <= set(chain.state)
+            found = max(found, float(chain.size) if plain else self.plan.widest[number])
+        return found
+
+    def drawn(self, at: int, rng: np.random.Generator, count: int) -> dict[Variable, np.ndarray]:
+        """Draws of all that the next slice reads from the filtered belief of slice ``first + at``.
+
+        Each has shape (count, sequences).
+        """
+        found: dict[Variable, np.ndarray] = {}
+        for chain, passed in zip(self.plan.chains, self.passed, strict=True):
+            belief = passed.belief[at]
+            sizes = [self.plan.cards[v] for v in chain.state]
+            flat = pick(belief.T, rng.random((count, len(belief))))
+            if sizes:
+                codes = np.unravel_index(flat, sizes)
+                found.update(zip(chain.state, codes, strict=True))
+        return found
+
     def joint(self, scope: Sequence[Variable], start: int, stop: int) -> np.ndarray:
         """Probabilities of variables in slices of one kind, shape (rows, sequences, *cards)."""
         scope = tuple(scope)
@@ -156,6 +191,10 @@ class Run:
     def _stretches(self, number: int | None) -> list[tuple[int, int]]:
         entries = self.sequences if number is None else self.plan.row_entries[number]
         return self.stretches(float(entries))
+
+    def _increments(self, number: int) -> np.ndarray:
+        """Log densities of the rows of one chain, shape (steps, sequences)."""
+        return self.passed[number].increments
 
     def _is_of(self, piece: Piece, number: int) -> bool:
         return self.plan.chain_of(piece.scope[0]) == number
@@ -235,7 +274,7 @@ class Run:
                 return piece.node
         order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
         for number in range(len(self.plan.chains)):
-            if self.passed[number].increments[t - self.first, sequence] > -np.inf:
+            if self._increments(number)[t - self.first, sequence] > -np.inf:
                 continue
             pieces = sorted(self.pieces(number, rows), key=lambda p: order[p.node])
             taken = [p for p in pieces if not p.is_evidence]
