@@ -78,12 +78,8 @@ class Run:
                 if piece.invalid is not None and piece.invalid.any():
                     row = int(np.argmax(piece.invalid.reshape(len(piece.invalid), -1).any(axis=1)))
                     raise bad_parameters(piece.node, start + row)
-        for number, chain in enumerate(self.plan.chains):
-            last = None if self.before is None else self.before[number]
-            found = filtered(self.blocks(number), self.steps, self.sequences, chain.size, last)
-            increments += found.increments
-            self.passed.append(found)
-        self.beliefs = self.passed
+        for number in range(len(self.plan.chains)):
+            increments += self._passed(number)
         if not (increments > -np.inf).all():
             self._refuse_impossible(increments)
         self._refuse_invalid()
@@ -192,6 +188,15 @@ class Run:
         entries = self.sequences if number is None else self.plan.row_entries[number]
         return self.stretches(float(entries))
 
+    def _passed(self, number: int) -> np.ndarray:
+        """Filter one chain; log densities of its rows, shape (steps, sequences)."""
+        last = None if self.before is None else self.before[number]
+        size = self.plan.chains[number].size
+        found = filtered(self.blocks(number), self.steps, self.sequences, size, last)
+        self.passed.append(found)
+        self.beliefs = self.passed
+        return found.increments
+
     def _increments(self, number: int) -> np.ndarray:
         """Log densities of the rows of one chain, shape (steps, sequences)."""
         return self.passed[number].increments
@@ -211,6 +216,13 @@ class Run:
             out = tuple(2 + k for k, v in enumerate(chain.state) if v not in scope)
             left = tuple(v for v in chain.state if v in scope)
             return aligned(Named(left, shaped.sum(axis=out) if out else shaped), scope)
+        return self._eliminated(number, scope, start, stop)
+
+    def _eliminated(
+        self, number: int, scope: tuple[Variable, ...], start: int, stop: int
+    ) -> np.ndarray:
+        """The joint of some variables of one chain, all others summed out of its slices."""
+        cards = self.plan.cards
         rows = self.plan.rows(self.series, start, stop)
         pieces = [*self.pieces(number, rows), *self._around(number, start, stop)]
         table = summed(pieces, scope, cards, log_sum_exp)
