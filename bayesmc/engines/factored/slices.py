@@ -61,6 +61,7 @@ class FactoredSlices(DiscreteSlices):
                 s for k, name, s in self._scopes[number] if k == kind and self._has_density(name)
             ]
             scopes += [c.scope for c in clusters] + [c.before for c in clusters if kind]
+            scopes += [(v,) for v in (*chain.state, *chain.inside)]  # what was seen of one
             cards = {v: self.cards[v] for v in variables}
             self._trees[number, kind] = SliceTree(cards, scopes, self.reader.sequences)
         return self._trees[number, kind]
