@@ -13,6 +13,7 @@ from bayesmc.engines.discrete.finite import FiniteFilter
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.factored.clusters import check_clusters, in_words, named_clusters
+from bayesmc.engines.factored.coupling import coupled_clusters
 from bayesmc.engines.factored.run import FactoredRun
 from bayesmc.engines.factored.slices import FactoredSlices
 from bayesmc.engines.slice_steps import plates_apart
@@ -44,14 +45,15 @@ class BoyenKoller(FiniteFilter):
         leaves: bool = True,
         absent: frozenset[str] = frozenset(),
     ) -> DiscreteSlices:
+        apart = plates_apart(slices)
+
         def choose(plan: DiscreteSlices) -> Sequence[Any]:
             if self.clusters is not None:
                 return named_clusters(self.clusters, plan)
-            return [(v,) for chain in plan.chains for v in chain.state]
+            first = {n: v[0] for n, v in series.inputs.items()}
+            return coupled_clusters(slices, apart, static, first)
 
-        return FactoredSlices(
-            slices, plates_apart(slices), seen, static, leaves, absent, choose
-        )
+        return FactoredSlices(slices, apart, seen, static, leaves, absent, choose)
 
     def _run(self, plan: Any, series: Series, first: int = 0, before: Any = None) -> Run:
         return FactoredRun(plan, series, first, before)

@@ -129,6 +129,16 @@ class FactoredRun(Run):
             found |= beliefs.drawn(at, rng, count)
         return found
 
+    def calibrated(self, number: int, t: int) -> Calibrated:
+        """The tables of one slice of a chain, not the first, before they are projected."""
+        rows = self.plan.rows(self.series, t, t + 1)
+        stretch = self.plan.stretch(number, self.pieces(number, rows), rows)
+        before = self._forwards[number].at(t - 1 - self.first)
+        with np.errstate(all="ignore"):
+            found = _calibrated(stretch, 0, self.plan.clusters[number], before, None, LOG)
+        assert found is not None
+        return found
+
     # ---- private ----------------------------------------------------------------------------
 
     def _increments(self, number: int) -> np.ndarray:

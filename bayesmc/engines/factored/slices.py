@@ -55,16 +55,20 @@ class FactoredSlices(DiscreteSlices):
     def tree(self, number: int, kind: int) -> SliceTree:
         """The clique tree of a chain in slices of a kind; later ones have the slice before in it."""
         if (number, kind) not in self._trees:
-            chain, clusters = self.chains[number], self.clusters[number]
-            variables = [*chain.state, *chain.inside, *(chain.before if kind else ())]
-            scopes = [
-                s for k, name, s in self._scopes[number] if k == kind and self._has_density(name)
-            ]
-            scopes += [c.scope for c in clusters] + [c.before for c in clusters if kind]
-            scopes += [(v,) for v in (*chain.state, *chain.inside)]  # what was seen of one
-            cards = {v: self.cards[v] for v in variables}
-            self._trees[number, kind] = SliceTree(cards, scopes, self.reader.sequences)
+            self._trees[number, kind] = self.tree_of(number, kind, self.clusters[number])
         return self._trees[number, kind]
+
+    def tree_of(self, number: int, kind: int, clusters: Sequence[Cluster]) -> SliceTree:
+        """The same with other clusters."""
+        chain = self.chains[number]
+        variables = [*chain.state, *chain.inside, *(chain.before if kind else ())]
+        scopes = [
+            s for k, name, s in self._scopes[number] if k == kind and self._has_density(name)
+        ]
+        scopes += [c.scope for c in clusters] + [c.before for c in clusters if kind]
+        scopes += [(v,) for v in (*chain.state, *chain.inside)]  # what was seen of one
+        cards = {v: self.cards[v] for v in variables}
+        return SliceTree(cards, scopes, self.reader.sequences)
 
     @cached_property
     def widest(self) -> list[float]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from bayesmc.categorical import log_sum_exp
 from bayesmc.engines.discrete.rows import Variable
+from bayesmc.factors import calibrated
 from bayesmc.factors.cliquetree import CliqueTree, Placement
 from bayesmc.factors.elimination import Elimination, elimination_order
 from bayesmc.factors.propagation import (
@@ -81,18 +82,18 @@ class SliceTree:
         self, cards: Mapping[Variable, int], scopes: Iterable[Scope], sequences: int
     ) -> None:
         self.sequences = sequences
-        self._lead = (_SEQUENCE,) if sequences > 1 else ()
+        self.lead = (_SEQUENCE,) if sequences > 1 else ()
         wanted = [s for s in dict.fromkeys(map(tuple, scopes)) if s]
         index = {v: k for k, v in enumerate(cards)}
         found = elimination_order(list(cards.values()), [[index[v] for v in s] for s in wanted])
         sizes = dict(cards)
-        if self._lead:  # it leaves last, so that it is in every clique
+        if self.lead:  # it leaves last, so that it is in every clique
             last = len(cards)
             sizes[_SEQUENCE] = sequences
             cliques = (*((*c, last) for c in found.cliques), (last,))
             entries = found.entries * sequences + sequences
             found = Elimination((*found.order, last), cliques, entries, found.fill)
-        self._tree = tree = CliqueTree(sizes, [(*self._lead, *s) for s in wanted], found)
+        self._tree = tree = CliqueTree(sizes, [(*self.lead, *s) for s in wanted], found)
         self.entries, self.largest = tree.cost.total_entries, tree.cost.largest_entries
         self._place: dict[Scope, Placement] = dict(zip(wanted, tree.placements, strict=True))
         self._readings: dict[Scope, Reading | None] = {}
@@ -101,7 +102,7 @@ class SliceTree:
     def reading(self, scope: Scope) -> Reading | None:
         """How the table of some variables is read off; None where no clique holds them all."""
         if scope not in self._readings:
-            tree, wanted = self._tree, (*self._lead, *scope)
+            tree, wanted = self._tree, (*self.lead, *scope)
             at = [tree.index[v] for v in wanted]
             shared = set.intersection(*(set(tree.containing[v]) for v in at)) if at else {0}
             if not shared:
@@ -128,11 +129,11 @@ class SliceTree:
         where = self._place[scope]
         front = table.ndim - 1 - len(scope)
         own = table
-        if not self._lead:
+        if not self.lead:
             own = table.reshape(*table.shape[:front], *table.shape[front + 1 :])
         axes = (*range(front), *(front + a for a in where.axes))
         order = self._tree.cliques[where.clique].variables
-        held = {self._tree.index[v] for v in (*self._lead, *scope)}
+        held = {self._tree.index[v] for v in (*self.lead, *scope)}
         aligned = own.transpose(axes)
         sizes = iter(aligned.shape[front:])
         shape = (next(sizes) if v in held else 1 for v in order)
@@ -150,6 +151,13 @@ class SliceTree:
             return None
         ratios, _ = distribute(cliques, program, found, semiring)
         return Calibrated(self, semiring, found, ratios)
+
+    def answers(
+        self, semiring: Semiring, collected: Sequence[Collected], ratios: Sequence[np.ndarray]
+    ) -> calibrated.Calibrated:
+        """What the tables say of variables that no clique holds together."""
+        context = calibrated.Context(self._tree, self._bare, semiring, {})
+        return calibrated.Calibrated(context, 0.0, collected, ratios, np.zeros(0))
 
     @property
     def _bare(self) -> Program:
@@ -202,6 +210,20 @@ class Calibrated:
             flat = found.reshape(len(found), -1)
             return found - log_sum_exp(flat, -1).reshape(-1, *(1,) * len(over))
         return found / found.sum(axis=over, keepdims=True)
+
+    def joint(self, scope: Scope) -> np.ndarray:
+        """Probabilities of any variables, (sequences, *cards)."""
+        tree = self._tree
+        if tree.reading(scope) is not None:
+            found = self.table(scope)
+        else:
+            found = tree.answers(self.semiring, self._collected, self._ratios).joint(
+                (*tree.lead, *scope)
+            )
+            found = found if tree.sequences > 1 else found[None]
+            return found / found.sum(axis=tuple(range(1, found.ndim)), keepdims=True)
+        with np.errstate(under="ignore"):
+            return self.semiring.to_linear(found)
 
     def _read(self, reading: Reading) -> np.ndarray:
         k, semiring = reading.clique, self.semiring

@@ -1,0 +1,207 @@
+"""The weakly coupled parts of a template: clusters of nodes that a slice ties together most.
+
+How much two nodes have to do with each other is measured, not read off the graph: by the mutual information
+that one slice gives them when the belief before it was a product, along a series drawn from the template
+itself. That is what a belief over single nodes would forget in each slice. The pair of clusters with most of
+it is put together first, as long as the joint states stay few.
+
+References
+----------
+Boyen and Koller (1999), Exploiting the architecture of dynamic systems, AAAI (weak and sparse interaction
+bounds the error of the projection).
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from bayesmc.dbn import PREVIOUS, Row, Series, Slices
+from bayesmc.engines.discrete.rows import Variable
+from bayesmc.engines.discrete.slices import Chain, DiscreteSlices
+from bayesmc.engines.factored.clusters import Scope, junction_tree
+from bayesmc.engines.factored.run import FactoredRun
+from bayesmc.engines.factored.slices import FactoredSlices
+from bayesmc.engines.filtering import quiet
+from bayesmc.engines.slice_steps import SlicePlan
+from bayesmc.errors import BayesmcError
+from bayesmc.network import Observed
+from bayesmc.network.forward import Pass
+from bayesmc.network.forward import run as passed
+from bayesmc.randomness import Purpose, stream
+
+#: joint states of a cluster, and entries of a chain's tables in a slice, up to which clusters are put together
+STATES, ENTRIES = 1 << 8, 1 << 17
+#: nats a slice below which two nodes have nothing to do with each other
+_NOTHING = 1e-6
+#: slices that are drawn, and those of them in which is measured
+_STEPS, _MEASURED = 13, (3, 6, 9, 12)
+
+
+def coupled_clusters(
+    slices: Slices,
+    apart: tuple[str, ...],
+    static: Mapping[str, np.ndarray],
+    inputs: Mapping[str, np.ndarray],
+) -> list[Scope]:
+    """Clusters of all finite nodes that a slice hands on.
+
+    Parameters
+    ----------
+    inputs : dict
+        Of slice 0; they are taken to stay as they are.
+    """
+    readings = _readings(slices)
+    plan = FactoredSlices(slices, apart, readings, static, True, frozenset(), singles)
+    try:
+        with quiet():
+            series = _drawn(slices, apart, static, inputs, readings)
+            weights = _measured(plan, series)
+    except (BayesmcError, ArithmeticError):  # nothing that can be drawn: whatever meets is coupled
+        weights = {pair: 1.0 for k in range(len(plan.chains)) for pair in _pairs(plan, k)}
+    return [
+        cluster
+        for number, chain in enumerate(plan.chains)
+        for cluster in _grown(plan, number, chain, weights)
+    ]
+
+
+def singles(plan: DiscreteSlices) -> list[Scope]:
+    """Every node that a slice hands on by itself."""
+    return [(v,) for chain in plan.chains for v in chain.state]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _readings(slices: Slices) -> frozenset[str]:
+    """Nodes that will be seen, as far as the template tells: those that no node reads, and numbers."""
+    read = {
+        parent.removesuffix(PREVIOUS)
+        for model in (slices.first, slices.later)
+        for name in slices.dynamic
+        for parent in model[name].parents
+    }
+    return frozenset(
+        n
+        for n in slices.dynamic
+        if slices.first[n].is_stochastic and (n not in read or slices.first[n].domain is None)
+    )
+
+
+def _drawn(
+    slices: Slices,
+    apart: tuple[str, ...],
+    static: Mapping[str, np.ndarray],
+    inputs: Mapping[str, np.ndarray],
+    readings: frozenset[str],
+) -> Series:
+    """A series of what is seen, drawn from the template; the same at each call."""
+    steps = SlicePlan(slices, apart, static)
+    rng = stream(np.random.SeedSequence(0), Purpose.CHECK)
+    rows = {n: np.repeat(np.asarray(v)[None], _STEPS, axis=0) for n, v in inputs.items()}
+    empty = Series(_STEPS, {}, rows)
+    before: dict[str, np.ndarray] = {}
+    seen: dict[str, list[np.ndarray]] = {n: [] for n in readings}
+    for t in range(_STEPS):
+        row: Row = empty.row(t)
+        values = passed(steps.steps(row), Pass(rng, (1,), {**steps.known(row), **before})).values
+        for name, found in seen.items():
+            shape = slices.first[name].value_shape
+            value = np.asarray(values[name])
+            value = value.reshape((1,) * (1 + len(shape) - value.ndim) + value.shape)
+            found.append(np.broadcast_to(value, (1, *shape))[0])
+        before = {n + PREVIOUS: values[n] for n in slices.interface}
+    return Series(_STEPS, {n: Observed(np.stack(v)) for n, v in seen.items()}, rows)
+
+
+def _pairs(plan: FactoredSlices, number: int) -> list[tuple[Variable, Variable]]:
+    """Nodes handed on that a density of a slice ties, or that have to do with one variable that is summed."""
+    chain = plan.chains[number]
+    own = set(chain.state)
+    meeting: dict[Variable, dict[Variable, None]] = {}
+    for _, scope in plan._later(number):
+        here = [v for v in scope if v in own]
+        for v in scope:
+            meeting.setdefault(v, {}).update(dict.fromkeys(here))
+    order = {v: k for k, v in enumerate(chain.state)}
+    found = {
+        tuple(sorted(pair, key=order.__getitem__)): None
+        for tied in meeting.values()
+        for pair in itertools.combinations(tied, 2)
+    }
+    return list(found)  # type: ignore[arg-type]
+
+
+def _measured(plan: FactoredSlices, series: Series) -> dict[tuple[Variable, Variable], float]:
+    """Mean mutual information of pairs of nodes in a slice, in nats."""
+    run = FactoredRun(plan, series)
+    run.forward()
+    found: dict[tuple[Variable, Variable], float] = {}
+    for number in range(len(plan.chains)):
+        pairs = _pairs(plan, number)
+        if not pairs:
+            continue
+        for t in _MEASURED:
+            slice_ = run.calibrated(number, t)
+            for pair in pairs:
+                joint = slice_.joint(pair)
+                found[pair] = found.get(pair, 0.0) + _information(joint) / len(_MEASURED)
+    return found
+
+
+def _information(joint: np.ndarray) -> float:
+    """Mean mutual information of tables (sequences, a, b)."""
+    product = joint.sum(axis=2, keepdims=True) * joint.sum(axis=1, keepdims=True)
+    held = joint > 0
+    ratio = np.where(held, joint, 1.0) / np.where(held, product, 1.0)
+    return float((joint * np.log(ratio)).sum() / len(joint))
+
+
+def _grown(
+    plan: FactoredSlices,
+    number: int,
+    chain: Chain,
+    weights: Mapping[tuple[Variable, Variable], float],
+) -> list[Scope]:
+    """Clusters of one chain, as large as its clique tree allows."""
+    states = STATES
+    while True:
+        found = _merged(plan, chain, weights, states)
+        tree = plan.tree_of(number, 2, junction_tree(found, chain.state, plan))
+        if states == 1 or tree.entries <= ENTRIES * plan.reader.sequences:
+            return found
+        states //= 4
+
+
+def _merged(
+    plan: DiscreteSlices,
+    chain: Chain,
+    weights: Mapping[tuple[Variable, Variable], float],
+    states: int,
+) -> list[Scope]:
+    """Pairs of clusters put together, the most coupled first; ties go to those that come first."""
+    members: dict[int, list[Variable]] = {k: [v] for k, v in enumerate(chain.state)}
+    sizes = {k: plan.cards[v] for k, v in enumerate(chain.state)}
+    at = {v: k for k, v in enumerate(chain.state)}
+    ties: dict[tuple[int, int], float] = {}
+    for (u, v), weight in weights.items():
+        if u in at and weight > _NOTHING:
+            ties[at[u], at[v]] = weight
+    while True:
+        able = {p: w for p, w in ties.items() if sizes[p[0]] * sizes[p[1]] <= states}
+        if not able:
+            break
+        a, b = max(able, key=lambda p: (able[p], -p[0], -p[1]))
+        members[a] += members.pop(b)
+        sizes[a] *= sizes.pop(b)
+        moved: dict[tuple[int, int], float] = {}
+        for (i, j), weight in ties.items():
+            pair = tuple(sorted({a if i == b else i, a if j == b else j}))
+            if len(pair) == 2:
+                moved[pair] = moved.get(pair, 0.0) + weight  # type: ignore[index]
+        ties = moved
+    order = {v: k for k, v in enumerate(chain.state)}
+    return [tuple(sorted(vs, key=order.__getitem__)) for vs in members.values()]
