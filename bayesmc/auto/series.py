@@ -12,6 +12,7 @@ from bayesmc.auto.explanation import Explanation
 from bayesmc.dbn import DynamicBayesNet, SeriesProblem, pose_series
 from bayesmc.dbn.given import check_steps
 from bayesmc.engines.discrete.filter import DiscreteFilter
+from bayesmc.engines.factored.filter import BoyenKoller
 from bayesmc.engines.filtering import Asked, FilterEngine, Queries, common_refusal, read_queries
 from bayesmc.engines.grid.filter import GridFilter
 from bayesmc.engines.kalman.filter import KalmanFilter
@@ -23,12 +24,14 @@ from bayesmc.results import SeriesPosterior
 #: engines in the order in which they are tried
 _CANDIDATES: tuple[type[FilterEngine], ...] = (
     DiscreteFilter,
+    BoyenKoller,
     KalmanFilter,
     GridFilter,
     ParticleFilter,
 )
 _WHY = {
     "DiscreteFilter": "all hidden nodes are finite",
+    "BoyenKoller": "all hidden nodes are finite, but too many for one joint state",
     "KalmanFilter": "all hidden nodes are linear-Gaussian",
     "ParticleFilter": "every hidden node can be sampled given its parents",
     "GridFilter": "hidden nodes are finite, angles, on bounded intervals, or the one number of a slice",
@@ -283,6 +286,8 @@ def _choose(problem: SeriesProblem, asked: Asked) -> _Chosen:
     plain = Asked(asked.what)
     for candidate in _CANDIDATES:
         engine, name = candidate(), candidate.__name__
+        if isinstance(engine, BoyenKoller) and not DiscreteFilter().is_out_of_room(problem):
+            continue  # it has nothing to say that an exact filter does not
         reason = engine.refusal(problem)
         if reason is None:
             reason = engine.unable(problem, asked)

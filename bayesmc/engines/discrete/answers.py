@@ -51,7 +51,8 @@ class SliceAnswers:
 
     def hands_on(self, name: str) -> bool:
         """Whether a node is part of the state of a chain."""
-        return any(v[1] == name for c in self.plan.chains for v in c.state)
+        is_kept = any(v[1] == name for c in self.plan.chains for v in c.state)
+        return is_kept and self.run.ties_slices
 
     def pairs(self, name: str) -> np.ndarray:
         """Joint tables of a node and itself in the slice before, (steps - 1, *plates, states, states)."""

@@ -110,5 +110,9 @@ class DiscreteFilter(FiniteFilter):
         assert path is not None
         return path_values(run, path, problem.hidden)
 
+    def is_out_of_room(self, problem: SeriesProblem) -> bool:
+        """Whether it refuses for want of room alone: a joint state too large, all else being finite."""
+        return isinstance(self._why_not(problem), BudgetError)
+
     def _too_large(self, plan: DiscreteSlices, steps: int) -> BudgetError | None:
         return size_refusal(plan, steps, self.max_states, self.max_bytes)

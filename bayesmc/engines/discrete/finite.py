@@ -102,7 +102,7 @@ class FiniteFilter(FilterEngine):
     def _bound(
         self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> DiscreteBelief:
-        plan = self._online(dbn, slices, belief.static, belief.state.series)
+        plan = self._online(slices, belief.static, belief.state.series)
         run = self._run(plan, belief.state.series, belief.t, belief.state.before)
         run.forward()  # the slice once more, from the beliefs before it
         return belief.bound(dbn, slices, run)
@@ -111,7 +111,7 @@ class FiniteFilter(FilterEngine):
         t, run = belief.t + 1, belief.state
         series = window(slices, None if run is None else run.series, row)
         if run is None:
-            plan = self._online(belief.dbn, slices, belief.static, series)
+            plan = self._online(slices, belief.static, series)
             error = self._too_large(plan, 1)
             if error is not None:
                 raise error
@@ -128,7 +128,6 @@ class FiniteFilter(FilterEngine):
 
     def _planned(
         self,
-        dbn: DynamicBayesNet,
         slices: Slices,
         static: Mapping[str, np.ndarray],
         series: Series,
@@ -159,11 +158,9 @@ class FiniteFilter(FilterEngine):
             "ParticleFilter(particles)"
         )
 
-    def _online(
-        self, dbn: DynamicBayesNet, slices: Slices, static: Mapping[str, Any], series: Series
-    ) -> DiscreteSlices:
+    def _online(self, slices: Slices, static: Mapping[str, Any], series: Series) -> DiscreteSlices:
         """A plan for any rows."""
-        return self._planned(dbn, slices, read_static(slices, static), series)
+        return self._planned(slices, read_static(slices, static), series)
 
     def _answer(
         self,
@@ -245,6 +242,6 @@ class FiniteFilter(FilterEngine):
             )
             static = {n: o.value for n, o in problem.series.static.items()}
             problem.cache[key] = self._planned(
-                problem.dbn, problem.slices, static, problem.series, seen, leaves, absent
+                problem.slices, static, problem.series, seen, leaves, absent
             )
         return problem.cache[key]

@@ -36,6 +36,9 @@ class Run:
         Logs of the beliefs in the slice before, by chain, shape (sequences, states).
     """
 
+    #: whether it knows joint tables of two slices in a row
+    ties_slices = True
+
     def __init__(
         self,
         plan: DiscreteSlices,
@@ -284,19 +287,26 @@ class Run:
         for piece in self.pieces(None, rows):
             if not (piece.values > -np.inf).all():
                 return piece.node
-        order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
         for number in range(len(self.plan.chains)):
-            if self._increments(number)[t - self.first, sequence] > -np.inf:
-                continue
-            pieces = sorted(self.pieces(number, rows), key=lambda p: order[p.node])
-            taken = [p for p in pieces if not p.is_evidence]
-            now = [p for p in self._around(number, t, t + 1) if p.scope and p.scope[0][0] == 1]
-            for piece in (p for p in pieces if p.is_evidence):
-                taken.append(piece)
-                total = summed([*taken, *now], (), self.plan.cards, log_sum_exp)
-                if np.broadcast_to(total, (1, self.sequences))[0, sequence] == -np.inf:
-                    return piece.node
+            if not self._increments(number)[t - self.first, sequence] > -np.inf:
+                node = self._culprit_of(number, t, sequence)
+                if node is not None:
+                    return node
         return self.plan.slices.dynamic[-1]
+
+    def _culprit_of(self, number: int, t: int, sequence: int) -> str | None:
+        """That node of one chain."""
+        rows = self.plan.rows(self.series, t, t + 1)
+        order = {n: k for k, n in enumerate(self.plan.slices.dynamic)}
+        pieces = sorted(self.pieces(number, rows), key=lambda p: order[p.node])
+        taken = [p for p in pieces if not p.is_evidence]
+        now = [p for p in self._around(number, t, t + 1) if p.scope and p.scope[0][0] == 1]
+        for piece in (p for p in pieces if p.is_evidence):
+            taken.append(piece)
+            total = summed([*taken, *now], (), self.plan.cards, log_sum_exp)
+            if np.broadcast_to(total, (1, self.sequences))[0, sequence] == -np.inf:
+                return piece.node
+        return None
 
 
 # ---- private ------------------------------------------------------------------------------------

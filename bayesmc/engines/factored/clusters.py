@@ -5,8 +5,8 @@ must form a tree in which whatever two of them share is in all between.
 
 References
 ----------
-Boyen and Koller (1998), Tractable inference for complex stochastic processes, UAI; Koller and Friedman (2009),
-sec. 15.3.2 (factored and conditionally factored beliefs) and theorem 4.12 (the maximum spanning tree).
+Boyen and Koller (1998), Tractable inference for complex stochastic processes, UAI; Koller and Friedman
+(2009), sec. 15.3.2 (factored and conditionally factored beliefs) and 10.4.2 (the maximum spanning tree).
 """
 
 from __future__ import annotations
@@ -126,11 +126,15 @@ def junction_tree(scopes: Sequence[Scope], state: Scope, plan: DiscreteSlices) -
         The clusters form no junction tree.
     """
     inside = {v: k for k, v in enumerate(state)}
-    own = dict.fromkeys(tuple(sorted((v for v in s if v in inside), key=inside.get)) for s in scopes)
+    own = dict.fromkeys(
+        tuple(sorted((v for v in s if v in inside), key=inside.__getitem__)) for s in scopes
+    )
     sets = [(s, frozenset(s)) for s in own if s]
     kept = [(s, f) for s, f in sets if not any(f < g for _, g in sets)]
     found: list[Cluster] = []
-    left, placed, seen = list(kept), [], set()
+    left = list(kept)
+    placed: list[frozenset[Variable]] = []
+    seen: frozenset[Variable] = frozenset()
     while left:
         shared = [max((len(f & g) for g in placed), default=0) for _, f in left]
         scope, own_set = left.pop(int(np.argmax(shared)))
@@ -201,8 +205,8 @@ def _check_handed_on(name: str, slices: Slices, plan: DiscreteSlices) -> None:
         return
     names = list(dict.fromkeys(v[1] for c in plan.chains for v in c.state))
     raise UnsupportedError(
-        f"BoyenKoller(clusters=): the next slice does not read {name!r}, so that no belief keeps it; leave it "
-        f"out: clusters are made of {names}"
+        f"BoyenKoller(clusters=): the next slice does not read {name!r}, so that no belief keeps it; leave "
+        f"it out: clusters are made of {names}"
     )
 
 

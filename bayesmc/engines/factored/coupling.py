@@ -14,7 +14,7 @@ bounds the error of the projection).
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -32,8 +32,10 @@ from bayesmc.network.forward import Pass
 from bayesmc.network.forward import run as passed
 from bayesmc.randomness import Purpose, stream
 
-#: joint states of a cluster, and entries of a chain's tables in a slice, up to which clusters are put together
+#: joint states of a cluster, and entries of a chain's tables in a slice, up to which clusters are merged
 STATES, ENTRIES = 1 << 8, 1 << 17
+#: entries of the same with single nodes above which nothing is measured
+MEASURABLE = 1 << 22
 #: nats a slice below which two nodes have nothing to do with each other
 _NOTHING = 1e-6
 #: slices that are drawn, and those of them in which is measured
@@ -55,6 +57,8 @@ def coupled_clusters(
     """
     readings = _readings(slices)
     plan = FactoredSlices(slices, apart, readings, static, True, frozenset(), singles)
+    if max((plan.tree(k, 2).entries for k in range(len(plan.chains))), default=0.0) > MEASURABLE:
+        return singles(plan)
     try:
         with quiet():
             series = _drawn(slices, apart, static, inputs, readings)
@@ -201,7 +205,7 @@ def _merged(
         for (i, j), weight in ties.items():
             pair = tuple(sorted({a if i == b else i, a if j == b else j}))
             if len(pair) == 2:
-                moved[pair] = moved.get(pair, 0.0) + weight  # type: ignore[index]
+                moved[pair] = moved.get(pair, 0.0) + weight
         ties = moved
     order = {v: k for k, v in enumerate(chain.state)}
     return [tuple(sorted(vs, key=order.__getitem__)) for vs in members.values()]

@@ -2,8 +2,8 @@
 
 Forwards, the clusters' probabilities of the slice before times the slice's densities are calibrated, and the
 clusters' own read off: the product of these over the separators' is the nearest one to what the slice says
-(in the sense of KL divergence from it). Backwards, a slice is calibrated once more with what the rows after it
-say of its clusters, smoothed over filtered.
+(in the sense of KL divergence from it). Backwards, a slice is calibrated once more with what the rows after
+it say of its clusters, smoothed over filtered.
 
 References
 ----------
@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 
 from bayesmc.dbn import Series
-from bayesmc.engines.discrete.rows import Piece, Variable
+from bayesmc.engines.discrete.rows import Piece, Rows, Variable
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.factored.beliefs import Belief, Beliefs, belief_of
 from bayesmc.engines.factored.clusters import Cluster, Scope
-from bayesmc.engines.factored.slices import FactoredSlices, Stretch
+from bayesmc.engines.factored.slices import FactoredSlices
 from bayesmc.engines.factored.tree import Calibrated, Tables
 from bayesmc.factors.named import largest
 from bayesmc.factors.propagation import LINEAR, LOG, Semiring
@@ -39,7 +39,7 @@ class FactoredRun(Run):
         plan: FactoredSlices,
         series: Series,
         first: int = 0,
-        before: Sequence[Sequence[np.ndarray]] | None = None,
+        before: Any = None,
     ) -> None:
         super().__init__(plan, series, first, before)
         self._forwards: list[Beliefs] = []
@@ -57,10 +57,8 @@ class FactoredRun(Run):
         beliefs = self._empty(number)
         self._forwards.append(beliefs)
         self._answers = self._forwards
-        clusters = self.plan.clusters[number]
-        last = None
-        if self.before is not None:
-            last = belief_of(self.before[number], LOG)
+        clusters = self._clusters(number)
+        last = self._at(number, -1)
         for t, stretch, k in self._slices(number, False):
             found = self._read(stretch, k, clusters, last, None, [[c.scope for c in clusters]])
             if found is None:
@@ -74,7 +72,7 @@ class FactoredRun(Run):
 
     def _backward(self, number: int, lag: int | None) -> tuple[Beliefs, Beliefs]:
         """Answers about every slice, and what is known of its clusters, given rows after it."""
-        clusters, forwards = self.plan.clusters[number], self._forwards[number]
+        clusters, forwards = self._clusters(number), self._forwards[number]
         now, before = [c.scope for c in clusters], [c.before for c in clusters]
         answers, later = self._empty(number), self._empty(number)
         answers.increments = later.increments = forwards.increments
@@ -132,28 +130,39 @@ class FactoredRun(Run):
     def calibrated(self, number: int, t: int) -> Calibrated:
         """The tables of one slice of a chain, not the first, before they are projected."""
         rows = self.plan.rows(self.series, t, t + 1)
-        stretch = self.plan.stretch(number, self.pieces(number, rows), rows)
-        before = self._forwards[number].at(t - 1 - self.first)
+        stretch = self._stretch(number, rows)
+        before = self._at(number, t - self.first - 1)
         with np.errstate(all="ignore"):
-            found = _calibrated(stretch, 0, self.plan.clusters[number], before, None, LOG)
-        assert found is not None
-        return found
+            return self._calibrated(stretch, 0, self._clusters(number), before, None, LOG)
 
     # ---- private ----------------------------------------------------------------------------
+
+    def _clusters(self, number: int) -> Sequence[Cluster]:
+        return self.plan.clusters[number]
+
+    def _stretch(self, number: int, rows: Rows) -> Any:
+        """What the slices are calibrated with."""
+        return self.plan.stretch(number, self.pieces(number, rows), rows)
+
+    def _at(self, number: int, t: int) -> Belief | None:
+        """The filtered belief about a slice, counted from the first; before it, what was given."""
+        if t >= 0:
+            return self._forwards[number].at(t)
+        before: Any = self.before
+        return None if before is None else belief_of(before[number], LOG)
 
     def _increments(self, number: int) -> np.ndarray:
         return self._forwards[number].increments
 
     def _empty(self, number: int) -> Beliefs:
-        clusters = self.plan.clusters[number]
-        return Beliefs(clusters, self.plan.cards, self.steps, self.sequences)
+        return Beliefs(self._clusters(number), self.plan.cards, self.steps, self.sequences)
 
-    def _slices(self, number: int, backwards: bool) -> Iterator[tuple[int, Stretch, int]]:
-        """Slices from the first or the last, each with the tables it is part of, and where it stands there."""
+    def _slices(self, number: int, backwards: bool) -> Iterator[tuple[int, Any, int]]:
+        """Slices from the first or the last, with the tables that each is part of, and where there."""
         cuts = self._stretches(number)
         for start, stop in reversed(cuts) if backwards else cuts:
             rows = self.plan.rows(self.series, start, stop)
-            stretch = self.plan.stretch(number, self.pieces(number, rows), rows)
+            stretch = self._stretch(number, rows)
             places = range(stop - start)
             for k in reversed(places) if backwards else places:
                 yield start + k - self.first, stretch, k
@@ -161,23 +170,22 @@ class FactoredRun(Run):
     def _again(
         self,
         number: int,
-        stretch: Stretch,
+        stretch: Any,
         k: int,
         t: int,
         later: Beliefs,
         wanted: Sequence[Sequence[Scope]],
     ) -> Sequence[Belief]:
         """Beliefs of a slice with what later rows say of its clusters."""
-        clusters, forwards = self.plan.clusters[number], self._forwards[number]
-        before = forwards.at(t - 1) if t else None
+        clusters, forwards = self._clusters(number), self._forwards[number]
         after = later.at(t), forwards.at(t)
-        found = self._read(stretch, k, clusters, before, after, wanted)
+        found = self._read(stretch, k, clusters, self._at(number, t - 1), after, wanted)
         assert found is not None  # the pass forwards has been through
         return found[1]
 
     def _read(
         self,
-        stretch: Stretch,
+        stretch: Any,
         k: int,
         clusters: Sequence[Cluster],
         before: Belief | None,
@@ -189,10 +197,9 @@ class FactoredRun(Run):
         As numbers where these do, and in logs where one that is not zero would leave their range.
         """
         for semiring in (LINEAR, LOG):
-            harsh = "raise" if semiring is LINEAR else "ignore"
             try:
-                with np.errstate(under=harsh, over=harsh, divide="ignore", invalid="ignore"):
-                    found = _calibrated(stretch, k, clusters, before, after, semiring)
+                with np.errstate(all="ignore"), _strict(semiring):
+                    found = self._calibrated(stretch, k, clusters, before, after, semiring)
                     if found is None:
                         return None
                     log_z = found.log_z + stretch.log_scale[k]
@@ -227,26 +234,34 @@ class FactoredRun(Run):
                 found.append(Piece("", cluster.scope, LOG.ratio(after, now)))
         return found
 
+    def _calibrated(
+        self,
+        stretch: Any,
+        k: int,
+        clusters: Sequence[Cluster],
+        before: Belief | None,
+        after: tuple[Belief, Belief] | None,
+        semiring: Semiring,
+    ) -> Any:
+        """A slice with what is known of the clusters before it, and from later rows of its own.
+
+        ``after`` are beliefs with and without these rows. None where nothing is possible.
+        """
+        tree, further = stretch.tree, stretch.further(k, semiring)
+        if before is not None:
+            for cluster, table in zip(clusters, before.in_(semiring), strict=True):
+                further.append(tree.placed(cluster.before, cluster.conditional(table, semiring)))
+        if after is not None:
+            both = (belief.in_(semiring) for belief in after)
+            for cluster, *tables in zip(clusters, *both, strict=True):
+                later, now = (cluster.conditional(t, semiring) for t in tables)
+                further.append(tree.placed(cluster.scope, semiring.ratio(later, now)))
+        return tree.calibrated(Tables(stretch.always(semiring), further), semiring)
+
 
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _calibrated(
-    stretch: Stretch,
-    k: int,
-    clusters: Sequence[Cluster],
-    before: Belief | None,
-    after: tuple[Belief, Belief] | None,
-    semiring: Semiring,
-) -> Calibrated | None:
-    """A slice after both passes, with what is known of the clusters before it, and from later rows of its own."""
-    tree, further = stretch.tree, stretch.further(k, semiring)
-    if before is not None:
-        for cluster, table in zip(clusters, before.in_(semiring), strict=True):
-            further.append(tree.placed(cluster.before, cluster.conditional(table, semiring)))
-    if after is not None:
-        both = (belief.in_(semiring) for belief in after)
-        for cluster, *tables in zip(clusters, *both, strict=True):
-            later, now = (cluster.conditional(t, semiring) for t in tables)
-            further.append(tree.placed(cluster.scope, semiring.ratio(later, now)))
-    return tree.calibrated(Tables(stretch.always(semiring), further), semiring)
+def _strict(semiring: Semiring) -> np.errstate:
+    """Has what leaves the range of numbers raise FloatingPointError."""
+    return np.errstate(under="raise", over="raise") if semiring is LINEAR else np.errstate()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
 
@@ -62,9 +63,7 @@ class FactoredSlices(DiscreteSlices):
         """The same with other clusters."""
         chain = self.chains[number]
         variables = [*chain.state, *chain.inside, *(chain.before if kind else ())]
-        scopes = [
-            s for k, name, s in self._scopes[number] if k == kind and self._has_density(name)
-        ]
+        scopes = [s for k, name, s in self._scopes[number] if k == kind and self._has_density(name)]
         scopes += [c.scope for c in clusters] + [c.before for c in clusters if kind]
         scopes += [(v,) for v in (*chain.state, *chain.inside)]  # what was seen of one
         cards = {v: self.cards[v] for v in variables}
@@ -81,7 +80,7 @@ class FactoredSlices(DiscreteSlices):
         found = []
         for number in range(len(self.chains)):
             moving = [s for n, s in self._later(number) if self._may_move(n)]
-            found.append(sum(np.prod([float(self.cards[v]) for v in s]) for s in moving))
+            found.append(sum(math.prod(float(self.cards[v]) for v in s) for s in moving))
         return [max(1.0, n) * self.reader.sequences for n in found]
 
     def stretch(self, number: int, pieces: Sequence[Piece], rows: Rows) -> Stretch:
@@ -119,7 +118,9 @@ class Always:
         tops = [float(s.max(initial=-np.inf)) for s in sums]
         tops = [t if np.isfinite(t) else 0.0 for t in tops]
         self.logs = [s - t for s, t in zip(sums, tops, strict=True)]
-        self.linear = None if any(_is_lost(s) for s in self.logs) else [np.exp(s) for s in self.logs]
+        self.linear = (
+            None if any(_is_lost(s) for s in self.logs) else [np.exp(s) for s in self.logs]
+        )
         self.log_scale = sum(tops)
 
 

@@ -1,7 +1,7 @@
-"""The clique tree of two slices in a row: its shapes, found once, and both passes over the tables of one slice.
+"""The clique tree of two slices in a row: its shapes, found once, and both passes over one slice's tables.
 
-Sequences that are filtered separately are one more variable, which every factor has: it is in every clique and
-every separator, so that they share the passes and never meet.
+Sequences that are filtered separately are one more variable, which every factor has: it is in every clique
+and every separator, so that they share the passes and never meet.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 
 from bayesmc.categorical import log_sum_exp
 from bayesmc.engines.discrete.rows import Variable
-from bayesmc.factors import calibrated
+from bayesmc.factors import calibrated as answering
 from bayesmc.factors.cliquetree import CliqueTree, Placement
 from bayesmc.factors.elimination import Elimination, elimination_order
 from bayesmc.factors.propagation import (
@@ -154,10 +154,10 @@ class SliceTree:
 
     def answers(
         self, semiring: Semiring, collected: Sequence[Collected], ratios: Sequence[np.ndarray]
-    ) -> calibrated.Calibrated:
+    ) -> answering.Calibrated:
         """What the tables say of variables that no clique holds together."""
-        context = calibrated.Context(self._tree, self._bare, semiring, {})
-        return calibrated.Calibrated(context, 0.0, collected, ratios, np.zeros(0))
+        context = answering.Context(self._tree, self._bare, semiring, {})
+        return answering.Calibrated(context, 0.0, collected, ratios, np.zeros(0))
 
     @property
     def _bare(self) -> Program:
