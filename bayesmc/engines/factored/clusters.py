@@ -129,22 +129,29 @@ def junction_tree(scopes: Sequence[Scope], state: Scope, plan: DiscreteSlices) -
     own = dict.fromkeys(
         tuple(sorted((v for v in s if v in inside), key=inside.__getitem__)) for s in scopes
     )
-    sets = [(s, frozenset(s)) for s in own if s]
-    kept = [(s, f) for s, f in sets if not any(f < g for _, g in sets)]
+    holding: dict[Variable, list[Scope]] = {}
+    for scope in own:
+        for v in scope:
+            holding.setdefault(v, []).append(scope)
+    left = [s for s in own if s and not any(set(s) < set(other) for other in holding[s[0]])]
+    shared = dict.fromkeys(left, 0)  # variables with the cluster of the tree that has most of them
     found: list[Cluster] = []
-    left = list(kept)
     placed: list[frozenset[Variable]] = []
-    seen: frozenset[Variable] = frozenset()
-    while left:
-        shared = [max((len(f & g) for g in placed), default=0) for _, f in left]
-        scope, own_set = left.pop(int(np.argmax(shared)))
-        separator = own_set & seen
-        if not any(separator <= g for g in placed) and separator:
-            raise _no_tree(scope, [g for g in placed if g & separator])
+    seen: set[Variable] = set()
+    while shared:
+        scope = max(shared, key=shared.__getitem__)
+        del shared[scope]
+        members = frozenset(scope)
+        separator = members & seen
+        around = [g for g in placed if g & separator] if separator else []
+        if separator and not any(separator <= g for g in around):
+            raise _no_tree(scope, around)
         size = math.prod(plan.cards[v] for v in scope)
         found.append(Cluster(scope, tuple(v for v in scope if v in separator), size))
-        placed.append(own_set)
-        seen |= own_set
+        placed.append(members)
+        seen.update(members)
+        for other in (s for v in scope for s in holding[v] if s in shared):
+            shared[other] = max(shared[other], len(members.intersection(other)))
     return found
 
 

@@ -37,9 +37,9 @@ STATES, ENTRIES = 1 << 8, 1 << 17
 #: entries of the same with single nodes above which nothing is measured
 MEASURABLE = 1 << 22
 #: nats a slice below which two nodes have nothing to do with each other
-_NOTHING = 1e-6
+_NOTHING = 1e-9
 #: slices that are drawn, and those of them in which is measured
-_STEPS, _MEASURED = 13, (3, 6, 9, 12)
+_STEPS, _MEASURED = 25, (1, 3, 6, 12, 24)
 
 
 def coupled_clusters(
