@@ -18,7 +18,7 @@ def coupled() -> bmc.DynamicBayesNet:
     dbn.table("x", ["w_prev", "x_prev"], table, initial=[0.7, 0.3])
     dbn.table("z", ["x_prev", "z_prev"], table, ("low", "high"), initial=[0.2, 0.8])
     dbn.table("y", ["x"], [[0.8, 0.2], [0.3, 0.7]])
-    dbn.table("u", ["w", "z"], table)
+    dbn.table("u", ["x", "z"], table)
     return dbn
 
 
@@ -30,7 +30,7 @@ def alone() -> bmc.DynamicBayesNet:
     return dbn
 
 
-#: two slices: whatever the clusters, the second is exact, as the nodes are independent at first
+#: two slices, the second of which is exact: what rows tie in the first is within a cluster
 TWO = {"y": [0, 1], "u": [1, 1]}
 ROWS = {"y": [0, 1, 1, 0], "u": [1, 1, 0, 0]}
 OVERLAPPING = bmc.BoyenKoller([["w", "x"], ["x", "z"]])
