@@ -261,7 +261,7 @@ def test_clusters_that_are_found_do_no_worse_than_those_of_the_files(reference_d
                 np.abs(found.probabilities(n)[1:] - np.array(run["marginals"][n])).sum(axis=-1)
                 for n in kept
             ]
-        assert np.mean(off) <= 1.01 * np.mean([run["approx"][hand]["l1_mean"] for run in runs])
+        assert np.mean(off) <= 0.8 * np.mean([run["approx"][hand]["l1_mean"] for run in runs])
 
 
 def test_clusters_that_are_found_are_better_than_drawn_ones() -> None:
@@ -524,7 +524,9 @@ def test_what_is_tied_most_is_put_together_first() -> None:
         )
         dbn.table(f"y{k}", [f"x{k}"], [[0.7, 0.3], [0.3, 0.7]])
     rows = {"y0": [0, 1]}
-    plan: Any = bmc.BoyenKoller()._plan(pose_series(dbn, rows))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(coupling, "STATES", 16)  # parts of four joint states: the pairs
+        plan: Any = bmc.BoyenKoller()._plan(pose_series(dbn, rows))
     for cluster in plan.clusters[0]:
         members = {int(v[1][1:]) for v in cluster.scope}
         assert members == {k ^ 1 for k in members}, "a pair was torn apart"

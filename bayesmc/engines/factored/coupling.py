@@ -2,18 +2,21 @@
 
 How much two nodes have to do with each other is measured, not read off the graph: by the mutual information
 that one slice gives them when the belief before it was a product, along a series drawn from the template
-itself. That is what a belief over single nodes would forget in each slice. The pair of clusters with most of
-it is put together first, as long as the joint states stay few.
+itself. That is what a belief over single nodes would forget in each slice. The parts with most of it between
+them are put together first, as long as their joint states stay few; then each part is kept together with its
+neighbours in the tree that has most of what is left, so that the clusters overlap and form a junction tree.
 
 References
 ----------
-Boyen and Koller (1999), Exploiting the architecture of dynamic systems, AAAI (weak and sparse interaction
-bounds the error of the projection).
+Boyen and Koller (1999), Exploiting the architecture of dynamic systems, AAAI (weak interaction bounds
+the error of the projection; conditionally factored beliefs); Chow and Liu (1968), Approximating discrete
+probability distributions with dependence trees, IEEE Transactions on Information Theory 14 (the tree).
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -170,13 +173,20 @@ def _grown(
     chain: Chain,
     weights: Mapping[tuple[Variable, Variable], float],
 ) -> list[Scope]:
-    """Clusters of one chain, as large as its clique tree allows."""
+    """Clusters of one chain, as large as its clique tree allows: parts with their neighbours in a tree."""
     states = STATES
     while True:
-        found = _merged(plan, chain, weights, states)
-        tree = plan.tree_of(number, 2, junction_tree(found, chain.state, plan))
+        whole, _ = _merged(plan, chain, weights, states)
+        if len(whole) > 1:
+            parts, ties = _merged(plan, chain, weights, math.isqrt(states))
+            found = _neighbours(plan, parts, ties, states)
+        else:
+            found = list(whole.values())
+        order = {v: k for k, v in enumerate(chain.state)}
+        scopes = [tuple(sorted(vs, key=order.__getitem__)) for vs in found]
+        tree = plan.tree_of(number, 2, junction_tree(scopes, chain.state, plan))
         if states == 1 or tree.entries <= ENTRIES * plan.reader.sequences:
-            return found
+            return scopes
         states //= 4
 
 
@@ -185,8 +195,11 @@ def _merged(
     chain: Chain,
     weights: Mapping[tuple[Variable, Variable], float],
     states: int,
-) -> list[Scope]:
-    """Pairs of clusters put together, the most coupled first; ties go to those that come first."""
+) -> tuple[dict[int, list[Variable]], dict[tuple[int, int], float]]:
+    """Parts put together, the most coupled first, and what is left between them.
+
+    Ties go to those that come first.
+    """
     members: dict[int, list[Variable]] = {k: [v] for k, v in enumerate(chain.state)}
     sizes = {k: plan.cards[v] for k, v in enumerate(chain.state)}
     at = {v: k for k, v in enumerate(chain.state)}
@@ -197,7 +210,7 @@ def _merged(
     while True:
         able = {p: w for p, w in ties.items() if sizes[p[0]] * sizes[p[1]] <= states}
         if not able:
-            break
+            return members, ties
         a, b = max(able, key=lambda p: (able[p], -p[0], -p[1]))
         members[a] += members.pop(b)
         sizes[a] *= sizes.pop(b)
@@ -207,5 +220,27 @@ def _merged(
             if len(pair) == 2:
                 moved[pair] = moved.get(pair, 0.0) + weight
         ties = moved
-    order = {v: k for k, v in enumerate(chain.state)}
-    return [tuple(sorted(vs, key=order.__getitem__)) for vs in members.values()]
+
+
+def _neighbours(
+    plan: DiscreteSlices,
+    parts: Mapping[int, list[Variable]],
+    ties: Mapping[tuple[int, int], float],
+    states: int,
+) -> list[list[Variable]]:
+    """Pairs of parts along the maximum spanning tree of what ties them, where they are not too large."""
+    sizes = {k: math.prod(plan.cards[v] for v in vs) for k, vs in parts.items()}
+    top = {k: k for k in parts}
+
+    def root(k: int) -> int:
+        while top[k] != k:
+            k = top[k]
+        return k
+
+    found = []
+    for a, b in sorted(ties, key=lambda p: (-ties[p], p)):
+        if root(a) != root(b) and sizes[a] * sizes[b] <= states:
+            top[root(b)] = root(a)
+            found.append(parts[a] + parts[b])
+    held = {v for vs in found for v in vs}
+    return found + [vs for vs in parts.values() if vs[0] not in held]

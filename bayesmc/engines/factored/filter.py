@@ -99,8 +99,9 @@ class BoyenKoller(FactoredFilter):
         plate, and a cluster that names nodes in plates stands for one of each element. Clusters may overlap
         where they form a tree (what two share is in all between): the belief is then their product over that
         of what neighbours share, conditionally factored. By default those nodes are put together that have
-        most mutual information after one slice, measured on a short series drawn from the template, up to 256
-        joint states: the same clusters for any data.
+        most mutual information after one slice, measured on a short series drawn from the template: parts of
+        up to 16 joint states, each in clusters with its neighbours of the tree that has most of what is left
+        (256 joint states). They are the same for any data.
     max_bytes : float
         Memory above which it refuses, with the figure, before allocating.
 
