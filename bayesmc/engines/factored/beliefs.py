@@ -70,6 +70,7 @@ class Beliefs:
         ]
         self.increments = np.full((steps, sequences), np.nan)
         self._logs: dict[int, Sequence[np.ndarray]] = {}
+        self._beside: dict[Scope, np.ndarray] = {}
 
     def put(self, t: int, found: Belief) -> None:
         """Keep what is known of a slice."""
@@ -78,6 +79,13 @@ class Beliefs:
         self._logs.pop(t, None)
         if found.logs is not None:
             self._logs[t] = found.logs
+
+    def put_beside(self, t: int, scopes: Sequence[Scope], found: Belief) -> None:
+        """Keep what was read off a slice besides."""
+        for scope, table in zip(scopes, found.tables, strict=True):
+            if scope not in self._beside:
+                self._beside[scope] = np.full((*self.increments.shape, *table.shape[1:]), np.nan)
+            self._beside[scope][t] = table
 
     def at(self, t: int) -> Belief:
         """What is known of a slice."""
@@ -98,10 +106,12 @@ class Beliefs:
         return min(able, key=lambda k: self.clusters[k].size, default=None)
 
     def table(self, scope: Scope, start: int, stop: int) -> np.ndarray | None:
-        """Probabilities of variables of one cluster, (rows, sequences, *cards); None where none has them."""
+        """Probabilities of variables kept together, (rows, sequences, *cards); None where they are not."""
         number = self.holding(scope)
         if number is None:
-            return None
+            beside = self._beside.get(scope)
+            known = beside is not None and not np.isnan(beside[start:stop]).any()
+            return beside[start:stop] if beside is not None and known else None
         own, table = self.clusters[number].scope, self.tables[number][start:stop]
         out = tuple(2 + k for k, v in enumerate(own) if v not in scope)
         left = [v for v in own if v in scope]

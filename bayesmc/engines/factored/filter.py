@@ -6,6 +6,7 @@ passed in ``run`` and ``frontier``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -189,7 +190,10 @@ class BoyenKoller(FactoredFilter):
         total = 0.0
         for number, clusters in enumerate(plan.clusters):
             tree = plan.tree(number, 2)
-            kept = sum(float(c.size) for c in clusters) * plan.reader.sequences
+            kept = sum(float(c.size) for c in clusters) + sum(
+                math.prod(float(plan.cards[v]) for v in s) for s in plan.beside(number, 2)
+            )
+            kept *= plan.reader.sequences
             total += 8.0 * (6.0 * tree.entries + 3.0 * steps * kept)
             if total > self.max_bytes:
                 names = ", ".join(dict.fromkeys(v[1] for v in plan.chains[number].state))

@@ -39,6 +39,9 @@ class FrontierRun(FactoredRun):
         chain, cards = self.plan.chains[number], self.plan.cards
         return [Cluster((v,), (), cards[v]) for v in (*chain.state, *chain.inside)]
 
+    def _beside(self, number: int, t: int) -> Sequence[Scope]:
+        return ()
+
     def _stretch(self, number: int, rows: Rows) -> Densities:
         return Densities(self.pieces(number, rows), rows.count, self.sequences)
 

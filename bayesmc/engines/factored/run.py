@@ -57,17 +57,16 @@ class FactoredRun(Run):
         beliefs = self._empty(number)
         self._forwards.append(beliefs)
         self._answers = self._forwards
-        clusters = self._clusters(number)
+        now = [c.scope for c in self._clusters(number)]
         last = self._at(number, -1)
         for t, stretch, k in self._slices(number, False):
-            found = self._read(stretch, k, clusters, last, None, [[c.scope for c in clusters]])
+            beside = self._beside(number, t)
+            beliefs.increments[t], found = self._read(number, stretch, k, last, None, [now, beside])
             if found is None:
-                beliefs.increments[t] = -np.inf
                 break
-            beliefs.increments[t], (last,) = found
-            if last is None:
-                break
+            last = found[0]
             beliefs.put(t, last)
+            beliefs.put_beside(t, beside, found[1])
         return beliefs.increments
 
     def _backward(self, number: int, lag: int | None) -> tuple[Beliefs, Beliefs]:
@@ -84,9 +83,11 @@ class FactoredRun(Run):
                     (found,) = self._again(number, stretch, k, t, later, [before])
                     later.put(t - 1, found)
         for t, stretch, k in self._slices(number, True):
-            wanted = [now, before] if lag is None and t else [now]
-            found, *earlier = self._again(number, stretch, k, t, later, wanted)
+            beside = self._beside(number, t)
+            wanted = [now, beside, before] if lag is None and t else [now, beside]
+            found, aside, *earlier = self._again(number, stretch, k, t, later, wanted)
             answers.put(t, found)
+            answers.put_beside(t, beside, aside)
             if earlier:
                 later.put(t - 1, earlier[0])
         return answers, later
@@ -140,6 +141,10 @@ class FactoredRun(Run):
     def _clusters(self, number: int) -> Sequence[Cluster]:
         return self.plan.clusters[number]
 
+    def _beside(self, number: int, t: int) -> Sequence[Scope]:
+        """What is read off a slice besides its clusters, for answers."""
+        return self.plan.beside(number, self.plan.kind(t + self.first))
+
     def _stretch(self, number: int, rows: Rows) -> Any:
         """What the slices are calibrated with."""
         return self.plan.stretch(number, self.pieces(number, rows), rows)
@@ -177,34 +182,34 @@ class FactoredRun(Run):
         wanted: Sequence[Sequence[Scope]],
     ) -> Sequence[Belief]:
         """Beliefs of a slice with what later rows say of its clusters."""
-        clusters, forwards = self._clusters(number), self._forwards[number]
-        after = later.at(t), forwards.at(t)
-        found = self._read(stretch, k, clusters, self._at(number, t - 1), after, wanted)
+        after = later.at(t), self._forwards[number].at(t)
+        _, found = self._read(number, stretch, k, self._at(number, t - 1), after, wanted)
         assert found is not None  # the pass forwards has been through
-        return found[1]
+        return found
 
     def _read(
         self,
+        number: int,
         stretch: Any,
         k: int,
-        clusters: Sequence[Cluster],
         before: Belief | None,
         after: tuple[Belief, Belief] | None,
         wanted: Sequence[Sequence[Scope]],
-    ) -> tuple[np.ndarray, Sequence[Any]] | None:
+    ) -> tuple[np.ndarray | float, Sequence[Belief] | None]:
         """Log density of a row, and the tables of scopes; none where it is impossible.
 
         As numbers where these do, and in logs where one that is not zero would leave their range.
         """
+        clusters = self._clusters(number)
         for semiring in (LINEAR, LOG):
             try:
                 with np.errstate(all="ignore"), _strict(semiring):
                     found = self._calibrated(stretch, k, clusters, before, after, semiring)
                     if found is None:
-                        return None
+                        return -np.inf, None
                     log_z = found.log_z + stretch.log_scale[k]
                     if not (log_z > -np.inf).all():
-                        return log_z, [None] * len(wanted)
+                        return log_z, None
                     return log_z, [
                         belief_of([found.table(s) for s in scopes], semiring) for scopes in wanted
                     ]

@@ -46,7 +46,8 @@ class FactoredSlices(DiscreteSlices):
         choose: Callable[[DiscreteSlices], Sequence[Scope]],
     ) -> None:
         super().__init__(slices, apart, seen, static, leaves, absent)
-        self.absent = absent
+        self.seen, self.absent = seen, absent
+        self._asked: dict[tuple[int, int], list[Scope]] = {}
         self._trees: dict[tuple[int, int], SliceTree] = {}
         scopes = choose(self)
         self.clusters: list[list[Cluster]] = [
@@ -68,6 +69,32 @@ class FactoredSlices(DiscreteSlices):
         scopes += [(v,) for v in (*chain.state, *chain.inside)]  # what was seen of one
         cards = {v: self.cards[v] for v in variables}
         return SliceTree(cards, scopes, self.reader.sequences)
+
+    def beside(self, number: int, kind: int) -> list[Scope]:
+        """Variables that answers want and no cluster holds, where a clique of such a slice does.
+
+        They are those that are summed out, and what the nodes read that are no variables.
+        """
+        if (number, kind) not in self._asked:
+            scopes: list[Scope] = [(v,) for v in self.chains[number].inside]
+            for name in self.slices.dynamic:
+                if name not in self.reader.variables and name not in self.seen:
+                    term = self.terms[name, kind]
+                    every = range(self.reader.elements(name))
+                    scopes += [self.reader.scope(term, element) for element in every]
+            held = [set(c.scope) for c in self.clusters[number]]
+            own = {*self.chains[number].state, *self.chains[number].inside}
+            own |= set(self.chains[number].before)
+            tree = self.tree(number, kind)
+            self._asked[number, kind] = [
+                s
+                for s in dict.fromkeys(scopes)
+                if s
+                and own.issuperset(s)
+                and not any(set(s) <= h for h in held)
+                and tree.reading(s)
+            ]
+        return self._asked[number, kind]
 
     @cached_property
     def widest(self) -> list[float]:
@@ -139,7 +166,7 @@ class Stretch:
     ) -> None:
         self.tree, self._always = tree, always
         self.log_scale = np.full((count, tree.sequences), always.log_scale)
-        sums: dict[int, np.ndarray] = {}
+        sums: dict[tuple[int, tuple[bool, ...]], np.ndarray] = {}  # of one clique and scope
         for piece in pieces:
             values = piece.values
             over = tuple(range(2, values.ndim))
@@ -147,8 +174,9 @@ class Stretch:
             top = np.where(np.isfinite(top), top, 0.0)
             self.log_scale += top.reshape(top.shape[:2])
             clique, table = tree.placed(piece.scope, values - top)
-            sums[clique] = sums[clique] + table if clique in sums else table
-        self._logs = [(k, np.broadcast_to(t, (count, *t.shape[1:]))) for k, t in sums.items()]
+            key = clique, tuple(n > 1 for n in table.shape[1:])
+            sums[key] = sums[key] + table if key in sums else table
+        self._logs = [(k, np.broadcast_to(t, (count, *t.shape[1:]))) for (k, _), t in sums.items()]
         with np.errstate(under="ignore"):
             self._linear = [(k, np.exp(t)) for k, t in self._logs]
         self._lost = np.zeros(count, dtype=bool)
