@@ -415,6 +415,36 @@ def test_rows_one_by_one_say_what_all_of_them_do(engine: Any) -> None:
     assert belief.log_marginal_likelihood == pytest.approx(whole.log_marginal_likelihood)
 
 
+def test_a_belief_goes_on_with_its_own_clusters() -> None:
+    """Inputs decide what is coupled, and move on; a pickled belief keeps what it was started with."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.input("u")
+    names = [f"x{k}" for k in range(4)]
+    tie = np.array([[[0.9, 0.1], [0.1, 0.9]], [[0.6, 0.4], [0.4, 0.6]]])
+    for k, name in enumerate(names):
+        ahead, across = f"x{(k + 1) % 4}_prev", f"x{(k + 2) % 4}_prev"
+        dbn.add(name, lambda own, a, b, u: bmc.Categorical(tie[own, np.where(u > 0, a, b)]),
+                {"own": f"{name}_prev", "a": ahead, "b": across, "u": "u"},
+                initial=bmc.Categorical([0.5, 0.5]))  # fmt: skip
+        dbn.table(f"y{k}", [name], [[0.8, 0.2], [0.3, 0.7]])
+    rng = np.random.default_rng(0)
+    rows = {f"y{k}": rng.integers(2, size=8) for k in range(4)}
+    inputs = {"u": np.array([1.0] * 4 + [-1.0] * 4)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(coupling, "STATES", 4)
+        for engine in (bmc.BoyenKoller(), bmc.FactoredFrontier()):
+            whole = bmc.filter(dbn, rows, inputs=inputs, engine=engine)
+            belief = engine.start(dbn)
+            for t in range(8):
+                belief = engine.start(dbn, belief=pickle.loads(pickle.dumps(belief)))
+                row = {n: v[t] for n, v in rows.items()}
+                belief = engine.step(belief, row, inputs={"u": inputs["u"][t]})
+                for name in names:
+                    np.testing.assert_allclose(
+                        belief.probabilities(name), whole.probabilities(name)[t], atol=1e-12
+                    )
+
+
 @pytest.mark.parametrize(
     ("clusters", "error", "words"),
     [

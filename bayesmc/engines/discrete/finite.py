@@ -102,7 +102,7 @@ class FiniteFilter(FilterEngine):
     def _bound(
         self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
     ) -> DiscreteBelief:
-        plan = self._online(slices, belief.static, belief.state.series)
+        plan = self._plan_of(belief, slices)
         run = self._run(plan, belief.state.series, belief.t, belief.state.before)
         run.forward()  # the slice once more, from the beliefs before it
         return belief.bound(dbn, slices, run)
@@ -157,6 +157,10 @@ class FiniteFilter(FilterEngine):
             f"{self._name} needs every hidden node to have finitely many values, but {reason}; use "
             "ParticleFilter(particles)"
         )
+
+    def _plan_of(self, belief: DiscreteBelief, slices: Slices) -> DiscreteSlices:
+        """The plan that a belief goes on with."""
+        return self._online(slices, belief.static, belief.state.series)
 
     def _online(self, slices: Slices, static: Mapping[str, Any], series: Series) -> DiscreteSlices:
         """A plan for any rows."""

@@ -176,12 +176,10 @@ def _grown(
     """Clusters of one chain, as large as its clique tree allows: parts with their neighbours in a tree."""
     states = STATES
     while True:
-        whole, _ = _merged(plan, chain, weights, states)
-        if len(whole) > 1:
-            parts, ties = _merged(plan, chain, weights, math.isqrt(states))
-            found = _neighbours(plan, parts, ties, states)
-        else:
-            found = list(whole.values())
+        parts, ties = _merged(plan, chain, weights, math.isqrt(states))
+        found = _neighbours(plan, parts, ties, states)
+        if chain.size <= states:
+            found = [list(chain.state)]
         order = {v: k for k, v in enumerate(chain.state)}
         scopes = [tuple(sorted(vs, key=order.__getitem__)) for vs in found]
         tree = plan.tree_of(number, 2, junction_tree(scopes, chain.state, plan))

@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from bayesmc.dbn import Series, SeriesProblem, Slices
+from bayesmc.dbn import Series, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.finite import FiniteFilter
 from bayesmc.engines.discrete.rows import Variable
 from bayesmc.engines.discrete.run import Run
@@ -182,6 +182,16 @@ class BoyenKoller(FactoredFilter):
             return coupled_clusters(slices, plates_apart(slices), static, inputs)
 
         return choose
+
+    def _plan_of(self, belief: Any, slices: Slices) -> DiscreteSlices:
+        """With the clusters that it has: those found may be others where inputs have moved on."""
+        before = belief.state.before
+        if before is None:
+            return super()._plan_of(belief, slices)
+        scopes = [scope for chain in before for scope in chain]
+        static = read_static(slices, belief.static)
+        apart, nothing = plates_apart(slices), frozenset[str]()
+        return FactoredSlices(slices, apart, nothing, static, True, nothing, lambda plan: scopes)
 
     def _run(self, plan: Any, series: Series, first: int = 0, before: Any = None) -> Run:
         return FactoredRun(plan, series, first, before)

@@ -86,9 +86,8 @@ class FrontierRun(FactoredRun):
         table = self._answers[number].table((own,), max(first - 1, 0), last - 1)
         assert table is not None
         if first == 0:
-            assert self.before is not None
-            at = [c.scope for c in self._clusters(number)].index((own,))
-            table = np.concatenate([np.exp(self.before[number][at])[None], table])
+            before = self._given(number, Cluster((own,), (), self.plan.cards[own]))
+            table = np.concatenate([np.exp(before)[None], table])
         return table
 
     def _culprit_of(self, number: int, t: int, sequence: int) -> str | None:

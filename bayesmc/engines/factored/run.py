@@ -97,7 +97,8 @@ class FactoredRun(Run):
     def last(self) -> Any:
         end = self.steps
         return [
-            [b.logs(k, end - 1, end)[0] for k in range(len(b.clusters))] for b in self._forwards
+            {c.scope: b.logs(k, end - 1, end)[0] for k, c in enumerate(b.clusters)}
+            for b in self._forwards
         ]
 
     def alone(self, variable: Variable) -> np.ndarray | None:
@@ -153,8 +154,14 @@ class FactoredRun(Run):
         """The filtered belief about a slice, counted from the first; before it, what was given."""
         if t >= 0:
             return self._forwards[number].at(t)
+        if self.before is None:
+            return None
+        return belief_of([self._given(number, c) for c in self._clusters(number)], LOG)
+
+    def _given(self, number: int, cluster: Cluster) -> np.ndarray:
+        """Logs of a cluster's table in the slice before the first."""
         before: Any = self.before
-        return None if before is None else belief_of(before[number], LOG)
+        return before[number][cluster.scope]
 
     def _increments(self, number: int) -> np.ndarray:
         return self._forwards[number].increments
@@ -229,8 +236,7 @@ class FactoredRun(Run):
             if start > 0:
                 table = forwards.logs(k, max(first - 1, 0), last - 1)
                 if first == 0:
-                    assert self.before is not None
-                    table = np.concatenate([self.before[number][k][None], table])
+                    table = np.concatenate([self._given(number, cluster)[None], table])
                 table = cluster.conditional(table, LOG)
                 found.append(Piece("", cluster.before, table))
             if self._later:
