@@ -81,11 +81,13 @@ def test_what_is_asked_of_several_clusters_is_answered_before_the_projection() -
         )
 
 
-def test_fixed_lags_grow_from_the_filter_to_the_smoother() -> None:
+@pytest.mark.parametrize(
+    "engine", [bmc.BoyenKoller(named(CLUSTERINGS["chain"])), bmc.FactoredFrontier()]
+)
+def test_fixed_lags_grow_from_the_filter_to_the_smoother(engine: Any) -> None:
     rng = np.random.default_rng(4)
     model = coupled(rng)
     rows = model.rows(6, rng)
-    engine = bmc.BoyenKoller(named(CLUSTERINGS["chain"]))
     whole = bmc.smooth(model.dbn, rows, engine=engine)
     filtered = bmc.filter(model.dbn, rows, engine=engine)
     last = bmc.smooth(model.dbn, rows, engine=engine, lag=20)

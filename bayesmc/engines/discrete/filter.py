@@ -6,7 +6,6 @@ Options, and what they refuse; tables of slices are made in ``slices``, passed a
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -79,26 +78,6 @@ class DiscreteFilter(FiniteFilter):
                 f"DiscreteFilter(max_bytes={self.max_bytes!r}): give a positive number of bytes"
             )
 
-    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
-        plan, observed = self._plan(problem), problem.series.observed
-        sizes = {v[1]: c.size for c in plan.chains for v in c.state}
-
-        def treated(name: str) -> str:
-            if name in sizes:
-                return f"part of a state with {sizes[name]} values"
-            if name in plan.reader.variables:
-                return "summed out in its slice"
-            if not problem.model[name].is_stochastic:
-                return "computed"
-            if name not in observed:
-                return "averaged over"
-            missing = "; averaged over where it is missing"
-            return "observed, a likelihood of the state" + missing * (
-                observed[name].mask is not None
-            )
-
-        return treated
-
     def most_likely(
         self, problem: SeriesProblem, seed: np.random.SeedSequence, progress: bool | None = None
     ) -> dict[str, np.ndarray]:
@@ -116,3 +95,7 @@ class DiscreteFilter(FiniteFilter):
 
     def _too_large(self, plan: DiscreteSlices, steps: int) -> BudgetError | None:
         return size_refusal(plan, steps, self.max_states, self.max_bytes)
+
+    def _kept(self, plan: DiscreteSlices) -> dict[str, str]:
+        sizes = {v[1]: chain.size for chain in plan.chains for v in chain.state}
+        return {name: f"part of a state with {n} values" for name, n in sizes.items()}

@@ -5,7 +5,7 @@ A family says how it plans slices, how it passes them and what is too large for 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -30,6 +30,8 @@ class FiniteFilter(FilterEngine):
     """Base of the filters of templates whose hidden nodes have finitely many values."""
 
     belief: ClassVar[type] = DiscreteBelief
+    #: what is said of finite nodes that no other slice reads
+    _inside: ClassVar[str] = "summed out in its slice"
 
     def refusal(self, problem: SeriesProblem) -> str | None:
         common = super().refusal(problem)
@@ -67,6 +69,26 @@ class FiniteFilter(FilterEngine):
             for n in problem.hidden
             if n not in plan.reader.variables and is_untold(plan, series, n)
         )
+
+    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
+        plan, observed = self._plan(problem), problem.series.observed
+        kept = self._kept(plan)
+
+        def treated(name: str) -> str:
+            if name in kept:
+                return kept[name]
+            if name in plan.reader.variables:
+                return self._inside
+            if not problem.model[name].is_stochastic:
+                return "computed"
+            if name not in observed:
+                return "averaged over"
+            missing = "; averaged over where it is missing"
+            return "observed, a likelihood of the state" + missing * (
+                observed[name].mask is not None
+            )
+
+        return treated
 
     def filter(
         self,
@@ -141,6 +163,10 @@ class FiniteFilter(FilterEngine):
     def _run(self, plan: DiscreteSlices, series: Series, first: int = 0, before: Any = None) -> Run:
         """A pass over a series."""
         return Run(plan, series, first, before)
+
+    def _kept(self, plan: Any) -> dict[str, str]:
+        """What is said of the nodes that a slice hands on."""
+        raise NotImplementedError
 
     def _too_large(self, plan: DiscreteSlices, steps: int) -> BudgetError | None:
         """Why the tables would be too large; None where they are not."""

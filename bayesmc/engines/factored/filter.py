@@ -38,31 +38,6 @@ class FactoredFilter(FiniteFilter):
                 f"{self._name}(max_bytes={self.max_bytes!r}): give a positive number of bytes"
             )
 
-    def treatment(self, problem: SeriesProblem) -> Callable[[str], str]:
-        plan, observed = self._plan(problem), problem.series.observed
-        kept = self._kept(plan)
-
-        def treated(name: str) -> str:
-            if name in kept:
-                return kept[name]
-            if name in plan.reader.variables:
-                return self._inside
-            if not problem.model[name].is_stochastic:
-                return "computed"
-            if name not in observed:
-                return "averaged over"
-            missing = "; averaged over where it is missing"
-            return "observed, a likelihood" + missing * (observed[name].mask is not None)
-
-        return treated
-
-    #: what is said of finite nodes that no other slice reads
-    _inside: ClassVar[str] = "summed out in its slice"
-
-    def _kept(self, plan: Any) -> dict[str, str]:
-        """What is said of the nodes that a slice hands on."""
-        raise NotImplementedError
-
     def _chosen(
         self, slices: Slices, static: Mapping[str, np.ndarray], series: Series
     ) -> Callable[[DiscreteSlices], Sequence[tuple[Variable, ...]]]:
@@ -91,7 +66,7 @@ class BoyenKoller(FactoredFilter):
     slice's densities and what is seen are calibrated on the clique tree of two slices, and the probabilities
     of each cluster, which are exact for that slice, are all that the next one is told. What clusters of the
     slice have to do with each other is forgotten, which is the one approximation; where nodes mix, errors die
-    out and do not add up (Boyen and Koller, theorem 3). One cluster of everything is the exact filter.
+    out and do not add up (Boyen and Koller's contraction). One cluster of everything is the exact filter.
 
     Parameters
     ----------

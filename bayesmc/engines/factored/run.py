@@ -13,6 +13,7 @@ Boyen and Koller (1998), Tractable inference for complex stochastic processes, U
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
@@ -21,10 +22,12 @@ import numpy as np
 from bayesmc.dbn import Series
 from bayesmc.engines.discrete.rows import Piece, Rows, Variable
 from bayesmc.engines.discrete.run import Run
+from bayesmc.engines.discrete.slices import BLOCK_ENTRIES
 from bayesmc.engines.factored.beliefs import Belief, Beliefs, belief_of
 from bayesmc.engines.factored.clusters import Cluster, Scope
 from bayesmc.engines.factored.slices import FactoredSlices
 from bayesmc.engines.factored.tree import Calibrated, Tables
+from bayesmc.errors import BudgetError
 from bayesmc.factors.named import largest
 from bayesmc.factors.propagation import LINEAR, LOG, Semiring
 
@@ -115,6 +118,8 @@ class FactoredRun(Run):
             own = tuple(v for v in asked if self.plan.chain_of(v) == number)
             clusters = self.plan.clusters[number]
             sizes = [c.size for c in clusters if set(own) <= set(c.scope)]
+            if own in self.plan.beside(number, 2):
+                sizes = [math.prod(self.plan.cards[v] for v in own)]
             if sizes:
                 found = max(found, float(min(sizes)))
                 continue
@@ -226,7 +231,17 @@ class FactoredRun(Run):
 
     def _marginal(self, number: int, scope: Scope, start: int, stop: int) -> np.ndarray:
         found = self._answers[number].table(scope, start - self.first, stop - self.first)
-        return found if found is not None else self._eliminated(number, scope, start, stop)
+        if found is not None:
+            return found
+        entries = self.entries(scope)
+        if entries > BLOCK_ENTRIES:
+            names = ", ".join(dict.fromkeys(v[1] for v in scope))
+            raise BudgetError(
+                f"what is asked of {names} together, which no cluster holds, takes a table of {entries:.3g} "
+                "entries; ask about fewer nodes at once, or put them into one cluster",
+                int(min(8 * entries, 2**62)),
+            )
+        return self._eliminated(number, scope, start, stop)
 
     def _around(self, number: int, start: int, stop: int) -> list[Piece]:
         """What clusters of the slices before, and the rows after, say of some slices."""
