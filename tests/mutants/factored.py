@@ -42,8 +42,7 @@ RUN = "bayesmc.engines.factored.run:FactoredRun"
 MUTANTS = [
     Mutant(
         "the projection keeps the marginals of the slice before",
-        (Edit(f"{RUN}._passed", "beliefs.increments[t], (last,) = found",
-              "beliefs.increments[t], (new,) = found; last = last or new"),),
+        (Edit(f"{RUN}._passed", "last = found[0]", "last = last or found[0]"),),
         slices(bmc.filter, coupled, TWO, OVERLAPPING, 2),
         FILTER,
     ),
