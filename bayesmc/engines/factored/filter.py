@@ -131,6 +131,9 @@ class BoyenKoller(FactoredFilter):
         )
 
     def reasons(self, problem: SeriesProblem) -> tuple[str, ...]:
+        plan: Any = self._plan(problem)
+        if all(len(clusters) < 2 for clusters in plan.clusters):
+            return ("all hidden nodes are finite, and on a clique tree there is room to be exact",)
         return (
             "all hidden nodes are finite, but too many for one joint state: beliefs are products over "
             "clusters, an approximation without a stated error",
@@ -200,7 +203,8 @@ class FactoredFrontier(FactoredFilter):
     of its densities and no more. It is one iteration of loopy belief propagation on the unrolled template
     (Murphy and Weiss), less exact than ``BoyenKoller`` with single nodes, whose slices are exact.
 
-    Takes templates that are regular: hidden nodes have their hidden parents in the slice before.
+    Takes templates that are regular: hidden nodes have their hidden parents in the slice before, and readings
+    are of nodes that the next slice reads.
 
     Parameters
     ----------
@@ -274,14 +278,26 @@ class FactoredFrontier(FactoredFilter):
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _why_irregular(plan: DiscreteSlices) -> str | None:
-    """Why a template is not regular: a hidden node with a hidden parent in its own slice; or None."""
+def _why_irregular(plan: Any) -> str | None:
+    """Why what is seen would not reach what later slices read, node by node; or None."""
+    inside = {v for chain in plan.chains for v in chain.inside}
     for kind in (0, 2):
-        for name, scope in plan.scopes(kind):
+        scopes = [(n, s) for n, s in plan.scopes(kind) if plan.has_density(n)]
+        hidden = {s[-1]: n for n, s in scopes if n in plan.reader.variables and len(s) > 1}
+        for name, scope in scopes:
             parents = [v for v in scope[:-1] if v[0] == 0]
             if name in plan.reader.variables and parents:
                 return (
                     f"FactoredFrontier adds hidden nodes one by one, and what is seen of {name!r} would not "
                     f"reach its parent {parents[0][1]!r} in the same slice; use BoyenKoller()"
                 )
+            told = scope if name not in plan.reader.variables else ()
+            if name in plan.reader.variables and name not in plan.absent:
+                told = scope[-1:]
+            for v in told:
+                if v in inside and v in hidden:
+                    return (
+                        f"FactoredFrontier adds hidden nodes one by one, and what is seen of {name!r} would "
+                        f"tell {v[1]!r}, which no later slice reads, and nothing else; use BoyenKoller()"
+                    )
     return None

@@ -1,10 +1,10 @@
 """The factored frontier: node by node, each from the probabilities of its parents one by one.
 
 A node is added to the frontier with its density given parents that are independent, and its own
-probabilities are all that is kept; what is seen is multiplied into the product of its parents' probabilities,
-of which again each parent's own are kept. Backwards, each node tells its parents what was seen of it and
-after it, the other parents being as they were. It is one iteration of loopy belief propagation on the
-unrolled template.
+probabilities are all that is kept. What is seen is multiplied into the product of its parents' probabilities
+as soon as these are there, and again each parent's own are kept. Backwards, each node tells its parents what
+was seen of it and after it, the other parents being as they were. It is one iteration of loopy belief
+propagation on the unrolled template.
 
 References
 ----------
@@ -43,7 +43,7 @@ class FrontierRun(FactoredRun):
         return ()
 
     def _stretch(self, number: int, rows: Rows) -> Densities:
-        return Densities(self.pieces(number, rows), rows.count, self.sequences)
+        return Densities(_in_order(self.pieces(number, rows)), rows.count, self.sequences)
 
     def _calibrated(
         self,
@@ -245,3 +245,21 @@ class Frontier:
 
     def _full(self, table: np.ndarray) -> np.ndarray:
         return np.broadcast_to(table, (self._shape, *table.shape[1:]))
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _in_order(pieces: Sequence[Piece]) -> list[Piece]:
+    """Nodes as they are declared, what is seen as soon as all that it depends on is there."""
+    left = [p for p in pieces if p.is_evidence]
+    there: set[Variable] = set()
+    found: list[Piece] = []
+    for piece in (None, *(p for p in pieces if not p.is_evidence)):
+        if piece is not None:
+            found.append(piece)
+            there.add(piece.scope[-1])
+        ready = [p for p in left if all(v[0] == 1 or v in there for v in p.scope)]
+        found += ready
+        left = [p for p in left if p not in ready]
+    return found

@@ -54,6 +54,10 @@ class FactoredSlices(DiscreteSlices):
             junction_tree(scopes, chain.state, self) for chain in self.chains
         ]
 
+    def has_density(self, name: str) -> bool:
+        """Whether slices have a factor of a node: it is a variable, or it may be observed."""
+        return name in self.reader.variables or name not in self.absent
+
     def tree(self, number: int, kind: int) -> SliceTree:
         """The clique tree of a chain in slices of a kind; later ones have the slice before in it."""
         if (number, kind) not in self._trees:
@@ -64,7 +68,7 @@ class FactoredSlices(DiscreteSlices):
         """The same with other clusters."""
         chain = self.chains[number]
         variables = [*chain.state, *chain.inside, *(chain.before if kind else ())]
-        scopes = [s for k, name, s in self._scopes[number] if k == kind and self._has_density(name)]
+        scopes = [s for k, name, s in self._scopes[number] if k == kind and self.has_density(name)]
         scopes += [c.scope for c in clusters] + [c.before for c in clusters if kind]
         scopes += [(v,) for v in (*chain.state, *chain.inside)]  # what was seen of one
         cards = {v: self.cards[v] for v in variables}
@@ -120,9 +124,6 @@ class FactoredSlices(DiscreteSlices):
             self._fixed[key] = Always(tree, always)
         further = [p for p in pieces if id(p) not in held]
         return Stretch(tree, self._fixed[key], further, rows.count)
-
-    def _has_density(self, name: str) -> bool:
-        return name in self.reader.variables or name not in self.absent
 
 
 class Always:
