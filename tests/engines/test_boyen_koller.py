@@ -641,3 +641,31 @@ def test_the_frontier_has_no_tables_of_two_slices() -> None:
     pairs = bmc.smooth(model.dbn, rows, engine=bmc.BoyenKoller([whole])).pairs("x0")
     right = bmc.smooth(model.dbn, rows, engine=bmc.DiscreteFilter()).pairs("x0")
     np.testing.assert_allclose(pairs, right, atol=1e-10)
+
+
+# ---- what is said -------------------------------------------------------------------------------
+
+
+def test_what_is_exact_is_said_to_be_and_what_is_not_is_not() -> None:
+    model = coupled(np.random.default_rng(12))
+    rows = model.rows(3, np.random.default_rng(13))
+    whole = bmc.explain(model.dbn, rows, engine=bmc.BoyenKoller([[f"x{k}" for k in range(4)]]))
+    assert "exact" in whole.effort and "approximate" not in whole.effort
+    for engine in (bmc.BoyenKoller(named(CLUSTERINGS["pairs"])), bmc.FactoredFrontier()):
+        said = bmc.explain(model.dbn, rows, engine=engine)
+        assert "approximate, the log marginal likelihood too" in said.effort
+        found = bmc.filter(model.dbn, rows, engine=engine)
+        assert found.log_marginal_likelihood_mcse is None
+    words = bmc.explain(model.dbn, rows, engine=bmc.BoyenKoller(named(CLUSTERINGS["pairs"]))).nodes
+    assert "(x0, x2)" in words["x0"] and words["x0"] == words["x2"]
+
+
+def test_what_no_cluster_holds_has_a_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = coupled(np.random.default_rng(14))
+    rows = model.rows(3, np.random.default_rng(15))
+    engine = bmc.BoyenKoller(named(CLUSTERINGS["single"]))
+    found = bmc.filter(model.dbn, rows, engine=engine)
+    monkeypatch.setattr("bayesmc.engines.factored.run.BLOCK_ENTRIES", 8)
+    assert found.expectation(lambda x0: x0 * 1.0).shape == (3,)
+    with pytest.raises(bmc.errors.BudgetError, match="x0, x3 together, which no cluster holds"):
+        found.expectation(lambda x0, x3: x0 * x3 * 1.0)
