@@ -417,6 +417,22 @@ def test_rows_one_by_one_say_what_all_of_them_do(engine: Any) -> None:
     assert belief.log_marginal_likelihood == pytest.approx(whole.log_marginal_likelihood)
 
 
+def test_a_belief_goes_on_with_its_own_kind_of_filter_alone() -> None:
+    model = coupled(np.random.default_rng(16))
+    engines = [bmc.DiscreteFilter(), bmc.BoyenKoller(), bmc.FactoredFrontier()]
+    for one in engines:
+        belief = one.step(one.start(model.dbn), {"y0": 0})
+        for other in engines:
+            if other is not one:
+                with pytest.raises(TypeError, match="what start or step of this kind"):
+                    other.step(belief, {"y0": 1})
+        other = bmc.BoyenKoller(named(CLUSTERINGS["pairs"]))  # the belief keeps its clusters
+        if isinstance(one, bmc.BoyenKoller):
+            again = other.step(belief, {"y0": 1})
+            right = one.step(belief, {"y0": 1})
+            assert again.log_marginal_likelihood == right.log_marginal_likelihood
+
+
 def test_a_belief_goes_on_with_its_own_clusters() -> None:
     """Inputs decide what is coupled, and move on; a pickled belief keeps what it was started with."""
     dbn = bmc.DynamicBayesNet()

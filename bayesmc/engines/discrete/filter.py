@@ -15,6 +15,7 @@ from bayesmc.dbn import SeriesProblem
 from bayesmc.engines.discrete.answers import best_path
 from bayesmc.engines.discrete.finite import FiniteFilter
 from bayesmc.engines.discrete.limits import size_refusal
+from bayesmc.engines.discrete.posterior import DiscreteBelief
 from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.discrete.states import path_values
 from bayesmc.errors import BudgetError
@@ -66,6 +67,7 @@ class DiscreteFilter(FiniteFilter):
 
     label: ClassVar[str] = "discrete filter"
     is_exact: ClassVar[bool] = True
+    belief: ClassVar[type] = DiscreteBelief
 
     def __post_init__(self) -> None:
         n = self.max_states

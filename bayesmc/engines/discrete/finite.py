@@ -13,7 +13,7 @@ import numpy as np
 from bayesmc.dbn import DynamicBayesNet, Row, Series, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.answers import SliceAnswers, answer_queries
 from bayesmc.engines.discrete.limits import is_untold, why_unreadable
-from bayesmc.engines.discrete.posterior import DiscreteBelief, DiscretePosterior, window
+from bayesmc.engines.discrete.posterior import DiscretePosterior, FiniteBelief, window
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
 from bayesmc.engines.discrete.states import rows_compared
@@ -29,7 +29,6 @@ from bayesmc.results.predictive import warn_of_misfit
 class FiniteFilter(FilterEngine):
     """Base of the filters of templates whose hidden nodes have finitely many values."""
 
-    belief: ClassVar[type] = DiscreteBelief
     #: what is said of finite nodes that no other slice reads
     _inside: ClassVar[str] = "summed out in its slice"
 
@@ -121,15 +120,13 @@ class FiniteFilter(FilterEngine):
         warn_of_misfit(found.predictive, "DiscreteFilter", found.start, 3)
         return found
 
-    def _bound(
-        self, belief: DiscreteBelief, dbn: DynamicBayesNet, slices: Slices
-    ) -> DiscreteBelief:
+    def _bound(self, belief: FiniteBelief, dbn: DynamicBayesNet, slices: Slices) -> FiniteBelief:
         plan = self._plan_of(belief, slices)
         run = self._run(plan, belief.state.series, belief.t, belief.state.before)
         run.forward()  # the slice once more, from the beliefs before it
         return belief.bound(dbn, slices, run)
 
-    def _absorbed(self, belief: DiscreteBelief, slices: Slices, row: Row) -> DiscreteBelief:
+    def _absorbed(self, belief: FiniteBelief, slices: Slices, row: Row) -> FiniteBelief:
         t, run = belief.t + 1, belief.state
         series = window(slices, None if run is None else run.series, row)
         if run is None:
@@ -184,7 +181,7 @@ class FiniteFilter(FilterEngine):
             "ParticleFilter(particles)"
         )
 
-    def _plan_of(self, belief: DiscreteBelief, slices: Slices) -> DiscreteSlices:
+    def _plan_of(self, belief: FiniteBelief, slices: Slices) -> DiscreteSlices:
         """The plan that a belief goes on with."""
         return self._online(slices, belief.static, belief.state.series)
 

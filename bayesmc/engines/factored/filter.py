@@ -15,6 +15,7 @@ import numpy as np
 
 from bayesmc.dbn import Series, SeriesProblem, Slices, read_static
 from bayesmc.engines.discrete.finite import FiniteFilter
+from bayesmc.engines.discrete.posterior import FiniteBelief
 from bayesmc.engines.discrete.rows import Variable
 from bayesmc.engines.discrete.run import Run
 from bayesmc.engines.discrete.slices import DiscreteSlices
@@ -25,6 +26,14 @@ from bayesmc.engines.factored.run import FactoredRun
 from bayesmc.engines.factored.slices import FactoredSlices
 from bayesmc.engines.slice_steps import plates_apart
 from bayesmc.errors import BudgetError
+
+
+class FactoredBelief(FiniteBelief):
+    """Probabilities of the nodes of one slice, from tables of clusters, with which it goes on."""
+
+
+class FrontierBelief(FiniteBelief):
+    """Probabilities of the nodes of one slice, each by itself."""
 
 
 class FactoredFilter(FiniteFilter):
@@ -113,6 +122,7 @@ class BoyenKoller(FactoredFilter):
     max_bytes: float = 2.0 * 2**30
 
     label: ClassVar[str] = "Boyen-Koller filter"
+    belief: ClassVar[type] = FactoredBelief
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -237,6 +247,7 @@ class FactoredFrontier(FactoredFilter):
     max_bytes: float = 2.0 * 2**30
 
     label: ClassVar[str] = "factored frontier"
+    belief: ClassVar[type] = FrontierBelief
     _inside: ClassVar[str] = "by itself, in its slice alone"
 
     def refusal(self, problem: SeriesProblem) -> str | None:
