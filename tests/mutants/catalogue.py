@@ -2,7 +2,17 @@
 
 from __future__ import annotations
 
-from tests.mutants import chains, densities, draws, exact, filters, hamiltonian, slices, switching
+from tests.mutants import (
+    chains,
+    densities,
+    draws,
+    exact,
+    factored,
+    filters,
+    hamiltonian,
+    slices,
+    switching,
+)
 from tests.mutants.mutant import Mutant
 
 MUTANTS: tuple[Mutant, ...] = (
@@ -11,6 +21,7 @@ MUTANTS: tuple[Mutant, ...] = (
     *exact.MUTANTS,
     *filters.MUTANTS,
     *switching.MUTANTS,
+    *factored.MUTANTS,
     *hamiltonian.MUTANTS,
     *slices.MUTANTS,
     *densities.MUTANTS,
