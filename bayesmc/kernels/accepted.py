@@ -84,27 +84,25 @@ class Accepted(Kernel):
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
-        name, target = self.blanket.name, self.blanket.target
-        drawn, own = self.proposal.step(values, memory["proposal"], rng, warmup)
-        new = drawn[name]
-        state = {**values, name: new}
-        target.compute(state, self.blanket.path)
-        with np.errstate(
-            invalid="ignore"
-        ):  # of impossible places, which are left for possible ones
-            ratio = self._log(state) - self._log(values)
-        taken = rng.random(len(new)) < np.exp(np.minimum(ratio, 0.0))
-        chosen = taken.reshape(-1, *(1,) * (new.ndim - 1))
-        moved = {name: np.where(chosen, new, values[name])}
-        memory = {**memory, "proposal": own}
-        if not self.constraints or memory["rate"] < _OFTEN:
-            state = {**values, **moved}
-            target.compute(state, self.blanket.path)
-            moved, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
+        memory = dict(memory)
+        both = not self.constraints or memory["rate"] < _OFTEN
+        first = (
+            both and rng.random() < 0.5
+        )  # either order, so that there is a balance of moves and back
+        new = values[self.blanket.name]
+        for one in ("other", "proposal", "other")[not first : 3 - first if both else 2]:
+            state = {**values, self.blanket.name: new}
+            self.blanket.target.compute(state, self.blanket.path)
+            if one == "other":
+                found, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
+                new = found[self.blanket.name]
+            else:
+                new, taken = self._proposed(state, memory, rng, warmup)
+        moved = {self.blanket.name: new}
         if not warmup:
             return moved, counted(memory, taken)
-        rate = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
-        return moved, {**memory, "rate": rate}
+        memory["rate"] = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
+        return moved, memory
 
     def moved(self, values: Values, memory: Memory) -> Memory:
         """What both kernels knew of the old place goes."""
@@ -115,6 +113,20 @@ class Accepted(Kernel):
         """Which kernels go on is settled."""
         own = self.proposal.end_warmup(memory["proposal"])
         return {**memory, "proposal": own, "other": self.other.end_warmup(memory["other"])}
+
+    def _proposed(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """New values where they are accepted, and which are; the proposal's memory is put in place."""
+        name, target = self.blanket.name, self.blanket.target
+        drawn, memory["proposal"] = self.proposal.step(values, memory["proposal"], rng, warmup)
+        state = {**values, name: drawn[name]}
+        target.compute(state, self.blanket.path)
+        with np.errstate(invalid="ignore"):  # of impossible places, left for possible ones
+            ratio = self._log(state) - self._log(values)
+        taken = rng.random(len(ratio)) < np.exp(np.minimum(ratio, 0.0))
+        chosen = taken.reshape(-1, *(1,) * (drawn[name].ndim - 1))
+        return np.where(chosen, drawn[name], values[name]), taken
 
     def _log(self, values: Values) -> np.ndarray:
         """Log of the terms left out, shape ``(chains,)``."""
