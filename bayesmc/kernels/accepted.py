@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -62,7 +62,8 @@ class Accepted(Kernel):
         self.left_out = [child.term for child in left_out]
         found = [term.expression for term in self.left_out]
         self.constraints = all(e is not None and is_constraint(e) for e in found)
-        self.proposal, self.other = proposal, other
+        self.proposal = proposal
+        self.other: Kernel | None = other
         self.label = proposal.label
         names = ", ".join(repr(term.name) for term in self.left_out)
         self.match = f"{proposal.match}, accepted by {names}"
@@ -73,46 +74,48 @@ class Accepted(Kernel):
     def expect(self, steps: int, chains: int) -> None:
         """Both kernels may want to know."""
         self.proposal.expect(steps, chains)
-        self.other.expect(steps, chains)
+        if self.other is not None:
+            self.other.expect(steps, chains)
 
     def start(self, values: Values, chains: int) -> Memory:
         """What the kernels remember, counts of what is accepted, and the rate learnt so far."""
-        own, other = self.proposal.start(values, chains), self.other.start(values, chains)
-        counts = {"accepted": np.zeros(chains), "moves": 0, "rate": 0.0}
-        return {"proposal": own, "other": other, **counts}
+        kernels = {"proposal": self.proposal, "other": self.other}
+        memory = {n: k.start(values, chains) for n, k in kernels.items() if k is not None}
+        return {**memory, "accepted": np.zeros(chains), "moves": 0, "rate": 0.0}
+
+    def alone(self) -> Accepted:
+        """The same without the other kernel: a single update, in balance with the way back."""
+        found = copy.copy(self)
+        found.other = None
+        return found
 
     def step(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
     ) -> tuple[Values, Memory]:
+        name = self.blanket.name
         memory = dict(memory)
-        both = not self.constraints or memory["rate"] < _OFTEN
-        first = (
-            both and rng.random() < 0.5
-        )  # either order, so that there is a balance of moves and back
-        new = values[self.blanket.name]
-        for one in ("other", "proposal", "other")[not first : 3 - first if both else 2]:
-            state = {**values, self.blanket.name: new}
+        new, taken = self._proposed(values, memory, rng, warmup)
+        if self.other is not None and (not self.constraints or memory["rate"] < _OFTEN):
+            state = {**values, name: new}
             self.blanket.target.compute(state, self.blanket.path)
-            if one == "other":
-                found, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
-                new = found[self.blanket.name]
-            else:
-                new, taken = self._proposed(state, memory, rng, warmup)
-        moved = {self.blanket.name: new}
+            found, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
+            new = found[name]
         if not warmup:
-            return moved, counted(memory, taken)
+            return {name: new}, counted(memory, taken)
         memory["rate"] = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
-        return moved, memory
+        return {name: new}, memory
 
     def moved(self, values: Values, memory: Memory) -> Memory:
         """What both kernels knew of the old place goes."""
-        own = self.proposal.moved(values, memory["proposal"])
-        return {**memory, "proposal": own, "other": self.other.moved(values, memory["other"])}
+        return self._each(memory, lambda kernel, own: kernel.moved(values, own))
 
     def end_warmup(self, memory: Memory) -> Memory:
         """Which kernels go on is settled."""
-        own = self.proposal.end_warmup(memory["proposal"])
-        return {**memory, "proposal": own, "other": self.other.end_warmup(memory["other"])}
+        return self._each(memory, lambda kernel, own: kernel.end_warmup(own))
+
+    def _each(self, memory: Memory, done: Callable[[Kernel, Memory], Memory]) -> Memory:
+        kernels = {"proposal": self.proposal, "other": self.other}
+        return memory | {n: done(k, memory[n]) for n, k in kernels.items() if k is not None}
 
     def _proposed(
         self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool

@@ -265,7 +265,8 @@ def _conjugate(
 
 def _is_slice(kernel: Kernel) -> bool:
     if isinstance(kernel, Accepted):
-        return not kernel.constraints and _is_slice(kernel.other)
+        other = kernel.other
+        return other is not None and not kernel.constraints and _is_slice(other)
     return isinstance(
         kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice, Hamiltonian)
     )
