@@ -106,6 +106,18 @@ class Series:
                 inputs[name + PREVIOUS] = values[k - 1, ...]
         return Row(t, seen, inputs)
 
+    def alike(self, k: int, most: int) -> list[Row]:
+        """The k-th row, and as many after it as have the same nodes seen, in full."""
+        found = [self.row(k)]
+        for other in range(k + 1, min(k + most, self.steps)):
+            row = self.row(other)
+            if list(row.seen) != list(found[0].seen):
+                break
+            if any(seen.mask is not None for seen in row.seen.values()):
+                break
+            found.append(row)
+        return found
+
 
 def read_series(
     dbn: Compiled,

@@ -8,16 +8,19 @@ nothing here is used.
 from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
-from bayesmc.lowering.compiled import Bound, Compiled, SliceKernel, compiled
+from bayesmc.lowering.compiled import Bound, Compiled, compiled
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.series import Cloud, Made, SliceCall, SliceKernel, known_column
 from bayesmc.lowering.trajectory import Told, Trajectories
-from bayesmc.lowering.weights import weight_loops
 
 __all__ = [
     "Bound",
+    "Cloud",
     "Compiled",
     "Kernel",
+    "Made",
+    "SliceCall",
     "SliceKernel",
     "Told",
     "Trajectories",
@@ -25,5 +28,5 @@ __all__ = [
     "held_against_numpy",
     "is_available",
     "is_worth_it",
-    "weight_loops",
+    "known_column",
 ]

@@ -247,7 +247,7 @@ class ParticleFilter(FilterEngine):
 
     def effort(self, problem: SeriesProblem) -> str:
         step = self._sized(START).step_of(problem.slices, problem.known_static)
-        return told(step, problem, self.resampling == "systematic")
+        return told(step, problem)
 
     def filter(
         self,
@@ -389,7 +389,7 @@ class ParticleFilter(FilterEngine):
         asked = read_by(queries, problem.slices)
         kept = None if keep else [*problem.hidden, *asked]
         step = self.step_of(problem.slices, problem.known_static, kept)
-        step = compiled_step(step, problem.steps, self.resampling == "systematic")
+        step = compiled_step(step, problem.steps)
         return filtered_by(self, step, problem, seed, keep, queries, progress, unit)
 
     def _sized(self, particles: int) -> ParticleFilter:

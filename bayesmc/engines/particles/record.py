@@ -428,13 +428,17 @@ def filtered_by(
     check = stream(seed, Purpose.CHECK, unit)
     looks = Replicates(problem, step.plan, check) if unit == 0 else None
     now: Particles | None = None
+    made: list[tuple[Row, Particles]] = []  # and not looked at yet
 
     def move(k: int) -> None:
-        nonlocal now
-        row, old = rows.row(k), now
+        nonlocal now, made
+        old = now
+        if not made and step.machine is not None:
+            made = step.machine.several(problem, k, old, rng)[::-1]
+        row, new = made.pop() if made else (rows.row(k), None)
         if looks is not None:
             looks.look(k, old, row)
-        now = step(old, row, rng)
+        now = step(old, row, rng) if new is None else new
         record.add(k, now, row)
         if look_back is not None:
             record.write()

@@ -1,0 +1,212 @@
+"""Slices of one template as machine code: what ``slices`` is given, and the arrays that it fills."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from bayesmc.errors import TraceError
+from bayesmc.expression import Expression
+from bayesmc.lowering.compiled import Way, address_of
+from bayesmc.lowering.generator import is_numpys, put_state, state_of, ziggurat
+from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.slices import TOLD, passes
+from bayesmc.lowering.ufuncs import kind_of
+from bayesmc.lowering.writer import DTYPES
+from bayesmc.shapes import Shape
+
+
+class Cloud(NamedTuple):
+    """Particles of the slice before.
+
+    Attributes
+    ----------
+    values : dict
+        Leaf -> values, particles first.
+    log : ndarray, shape (particles,)
+        Log weights that particles bring along where they are not resampled.
+    weights : ndarray, shape (particles,)
+    log_total, ess : float
+        As ``slices.TOLD`` says.
+    rows : ndarray of int64, optional
+        Ancestors, where particles are not resampled; by default everybody has itself.
+    """
+
+    values: Mapping[str, np.ndarray]
+    log: np.ndarray
+    weights: np.ndarray
+    log_total: float
+    ess: float
+    rows: np.ndarray | None = None
+
+
+class Made(NamedTuple):
+    """Slices that were made, as many as ``told`` has rows.
+
+    Attributes
+    ----------
+    told : list of list of float
+        Of each slice, the figures of ``slices.TOLD``.
+    values : list of ndarray, shapes (slices, particles, *shape)
+        Of each node.
+    log, weights : ndarray, shape (slices, particles)
+    ancestors : ndarray of int64, shape (slices, particles)
+        Of no meaning where a slice was not resampled.
+    """
+
+    told: list[list[float]]
+    values: list[np.ndarray]
+    log: np.ndarray
+    weights: np.ndarray
+    ancestors: np.ndarray
+
+
+class SliceKernel:
+    """Expressions of many particles, whose values in the slice before are those of their ancestors.
+
+    Parameters
+    ----------
+    roots : sequence of Expression
+        Values of nodes, and last the log density of what is seen.
+    own : dict
+        Leaf of normals, which each particle has of its own -> its shape, in the order of drawing.
+    chosen : frozenset of str
+        Leaves with a value for each particle before. Of all others there is one value.
+
+    Attributes
+    ----------
+    known : list of Leaf
+        Of which there is one value.
+
+    Raises
+    ------
+    TraceError
+    """
+
+    def __init__(
+        self, roots: Sequence[Expression], own: Mapping[str, Shape], chosen: frozenset[str]
+    ) -> None:
+        if not is_available():
+            raise TraceError("machine code needs llvmlite: pip install bayesmc[fast]")
+        if any(r.dtype.kind != "f" for r in roots):
+            raise TraceError("particles that are not real numbers")
+        varying = chosen | own.keys()
+        if not all(r.leaves & varying for r in roots) or not own:
+            raise TraceError("what is the same for all particles is made by plain steps")
+        if not is_numpys():
+            raise TraceError("this NumPy draws normals in a way of its own")
+        self.shapes = [r.shape for r in roots[:-1]]
+        self.own, self.chosen = dict(own), chosen
+        self.way = Way(roots, varying, chosen)
+        self.known = [n for n in self.way.kernel.leaves if n.name not in varying]
+
+
+class SliceCall:
+    """Calls of a kernel for filters of so many particles, not from two threads at once.
+
+    Parameters
+    ----------
+    kernel : SliceKernel
+    before : sequence of (str or None)
+        For each node of the kernel's results, the leaf of its value in the slice before.
+    particles : int
+        At most.
+    block : int
+        Particles that are worked on at a time.
+    """
+
+    def __init__(
+        self, kernel: SliceKernel, before: Sequence[str | None], particles: int, block: int
+    ) -> None:
+        way, self._kernel, self._block = kernel.way, kernel, min(block, particles)
+        results = len(kernel.shapes) + 1
+        self._table, self._memory = way.table(results)
+        first = len(self._table) - results
+        at = {n.name: k for k, n in enumerate(way.kernel.leaves)}
+        own = [(k, 8 * math.prod(s)) for k, s in enumerate(kernel.shapes, first)]
+        #: leaves that are no results of the slice before, in columns behind those of results
+        self._others = [n for n in at if n in kernel.chosen and n not in before]
+        self._leaves = [*before, *self._others]
+        node = [(place, at.get(leaf or "", -1), size) for leaf, (place, size) in zip(before, own, strict=True)]
+        node += [(-1, at[leaf], 0) for leaf in self._others]
+        self._node = np.array(node, np.int64)
+        sizes = {n: max(math.prod(s), 1) for n, s in kernel.own.items()}
+        self._noise = {n: np.empty(self._block * size) for n, size in sizes.items()}
+        self._noises = np.array([(address_of(self._noise[n]), size) for n, size in sizes.items()])
+        for name in self._noise.keys() & at.keys():
+            self._table[at[name]] = address_of(self._noise[name])
+        self._places = [at[n.name] for n in kernel.known]
+        self._rows_place = first - 1 if kernel.chosen else -1
+        self._identity = np.arange(particles, dtype=np.int64)
+        self._running = np.empty(particles)
+        self._run = passes()
+        self._fixed = [
+            *(way.loaded.address, address_of(self._table)),
+            *(address_of(a) for a in (ziggurat(), self._node, self._noises)),
+        ]
+
+    def __call__(
+        self,
+        slices: int,
+        particles: int,
+        least: float,
+        cloud: Cloud,
+        known: Sequence[tuple[int, int]],
+        arrays: Sequence[np.ndarray],
+        rng: np.random.Generator,
+    ) -> Made:
+        """Up to so many slices; none where the first one is to be made in another way.
+
+        Parameters
+        ----------
+        slices, particles : int
+        least : float
+            Effective number of particles below which they are resampled.
+        cloud : Cloud
+        known : sequence of (int, int)
+            Of each of the kernel's known leaves, where its value in the first slice lies, and the bytes to
+            that of the next one.
+        arrays : sequence of ndarray
+            To be filled: values of each node, log weights, weights, each ``(slices, particles, ...)``.
+        rng : Generator
+            It goes on behind the last slice that was made.
+        """
+        *values, log, weights = arrays
+        ancestors = np.empty((slices, particles + 1), np.int64)
+        columns = [log, weights, ancestors, *values]
+        at = np.zeros((slices + 1, 3 + len(self._leaves)), np.int64)
+        steps = np.arange(slices)[:, None]
+        at[1:, : len(columns)] = [address_of(a) for a in columns] + steps * [a[0].nbytes for a in columns]
+        held = [cloud.log, cloud.weights]
+        at[0, :2] = [address_of(a) for a in held]
+        for k, leaf in enumerate(self._leaves, 3):
+            if leaf in self._kernel.chosen:
+                held.append(np.ascontiguousarray(cloud.values[leaf], float))
+                at[0, k] = address_of(held[-1])
+        moving = np.array(
+            [(place, *each) for place, each in zip(self._places, known, strict=True)] or [(0, 0, 0)], np.int64
+        )
+        told, state = np.empty((slices + 1, len(TOLD))), state_of(rng)
+        told[0, :3] = 1.0, cloud.log_total, cloud.ess
+        rows = self._identity if cloud.rows is None else np.ascontiguousarray(cloud.rows, np.int64)
+        wholes = (slices, particles, self._block, len(self._leaves), len(self._noise), len(self._places))
+        kernel, table, *fixed = self._fixed
+        made = self._run(
+            *wholes, self._rows_place, len(self._table) - 1, least, math.log(particles), kernel, table, address_of(state),
+            *fixed, *(address_of(a) for a in (moving, at, rows, self._running, told)),
+        )  # fmt: skip
+        del held
+        put_state(rng, state)
+        return Made(
+            told[1 : made + 1].tolist(), [v[:made] for v in values], log[:made], weights[:made],
+            ancestors[:made, :particles],
+        )  # fmt: skip
+
+
+def known_column(leaf: Expression, values: np.ndarray) -> np.ndarray:
+    """Values of a leaf as its kernel reads them, whatever comes first."""
+    lead = values.shape[: values.ndim - len(leaf.shape)]
+    return np.ascontiguousarray(np.broadcast_to(values, (*lead, *leaf.shape)), DTYPES[kind_of(leaf)])
