@@ -10,21 +10,33 @@ from __future__ import annotations
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, compiled
 from bayesmc.lowering.kernel import Kernel
+from bayesmc.lowering.lineage import followed
 from bayesmc.lowering.machine import is_available
-from bayesmc.lowering.series import Cloud, Made, SliceCall, SliceKernel, known_column
+from bayesmc.lowering.series import (
+    NO_NUMBERS,
+    Cloud,
+    Made,
+    Numbers,
+    SliceCall,
+    SliceKernel,
+    known_column,
+)
 from bayesmc.lowering.trajectory import Told, Trajectories
 
 __all__ = [
+    "NO_NUMBERS",
     "Bound",
     "Cloud",
     "Compiled",
     "Kernel",
     "Made",
+    "Numbers",
     "SliceCall",
     "SliceKernel",
     "Told",
     "Trajectories",
     "compiled",
+    "followed",
     "held_against_numpy",
     "is_available",
     "is_worth_it",

@@ -13,7 +13,7 @@ from bayesmc.expression import Expression
 from bayesmc.lowering.compiled import Way, address_of
 from bayesmc.lowering.generator import is_numpys, put_state, state_of, ziggurat
 from bayesmc.lowering.machine import is_available
-from bayesmc.lowering.slices import TOLD, passes
+from bayesmc.lowering.slices import MOMENTS, TOLD, passes
 from bayesmc.lowering.ufuncs import kind_of
 from bayesmc.lowering.writer import DTYPES
 from bayesmc.shapes import Shape
@@ -29,8 +29,10 @@ class Cloud(NamedTuple):
     log : ndarray, shape (particles,)
         Log weights that particles bring along where they are not resampled.
     weights : ndarray, shape (particles,)
-    log_total, ess : float
+    total, log_total, ess, worst : float
         As ``slices.TOLD`` says.
+    moves : ndarray, shape (2, numbers)
+        What the moments of ``slices`` go on from.
     rows : ndarray of int64, optional
         Ancestors, where particles are not resampled; by default everybody has itself.
     """
@@ -38,30 +40,53 @@ class Cloud(NamedTuple):
     values: Mapping[str, np.ndarray]
     log: np.ndarray
     weights: np.ndarray
+    total: float
     log_total: float
     ess: float
+    worst: float = 0.0
+    moves: np.ndarray | None = None
     rows: np.ndarray | None = None
 
 
 class Made(NamedTuple):
-    """Slices that were made, as many as ``told`` has rows.
+    """Slices that were made; row 0 of what ``slices`` fills is that of the slice before.
 
     Attributes
     ----------
-    told : list of list of float
-        Of each slice, the figures of ``slices.TOLD``.
-    values : list of ndarray, shapes (slices, particles, *shape)
-        Of each node.
-    log, weights : ndarray, shape (slices, particles)
-    ancestors : ndarray of int64, shape (slices, particles)
-        Of no meaning where a slice was not resampled.
+    count : int
+    told : ndarray, shape (slices + 1, len(slices.TOLD))
+    moments : ndarray, shape (slices + 1, numbers, len(slices.MOMENTS))
+    at : ndarray of int64, shape (slices + 1, columns)
+    held : list of ndarray
+        What the addresses point to.
     """
 
-    told: list[list[float]]
-    values: list[np.ndarray]
-    log: np.ndarray
-    weights: np.ndarray
-    ancestors: np.ndarray
+    count: int
+    told: np.ndarray
+    moments: np.ndarray
+    at: np.ndarray
+    held: list[np.ndarray]
+
+
+class Numbers(NamedTuple):
+    """Of which numbers moments are taken, and how what rows do to them is followed.
+
+    Attributes
+    ----------
+    where : ndarray of int64, shape (numbers, 4)
+        As ``slices.passes`` says.
+    fading, kept, least : float
+        The same of its ``fading``, ``kept`` and ``least_expected``.
+    """
+
+    where: np.ndarray
+    fading: float
+    kept: float
+    least: float
+
+
+#: where none are
+NO_NUMBERS = Numbers(np.zeros((0, 4), np.int64), 0.0, 0.0, 0.0)
 
 
 class SliceKernel:
@@ -150,19 +175,17 @@ class SliceCall:
 
     def __call__(
         self,
-        slices: int,
-        particles: int,
         least: float,
         cloud: Cloud,
         known: Sequence[tuple[int, int]],
         arrays: Sequence[np.ndarray],
         rng: np.random.Generator,
+        numbers: Numbers = NO_NUMBERS,
     ) -> Made:
-        """Up to so many slices; none where the first one is to be made in another way.
+        """As many slices as arrays have rows, up to one that is to be made in another way.
 
         Parameters
         ----------
-        slices, particles : int
         least : float
             Effective number of particles below which they are resampled.
         cloud : Cloud
@@ -170,40 +193,43 @@ class SliceCall:
             Of each of the kernel's known leaves, where its value in the first slice lies, and the bytes to
             that of the next one.
         arrays : sequence of ndarray
-            To be filled: values of each node, log weights, weights, each ``(slices, particles, ...)``.
+            To be filled: log weights, weights, ancestors (one more than there are particles), values of each
+            node, each ``(slices, particles, ...)``.
         rng : Generator
             It goes on behind the last slice that was made.
+        numbers : Numbers, optional
         """
-        *values, log, weights = arrays
-        ancestors = np.empty((slices, particles + 1), np.int64)
-        columns = [log, weights, ancestors, *values]
+        slices, particles = arrays[0].shape
         at = np.zeros((slices + 1, 3 + len(self._leaves)), np.int64)
-        steps = np.arange(slices)[:, None]
-        at[1:, : len(columns)] = [address_of(a) for a in columns] + steps * [a[0].nbytes for a in columns]
-        held = [cloud.log, cloud.weights]
-        at[0, :2] = [address_of(a) for a in held]
+        sizes = np.array([a.nbytes // slices for a in arrays])
+        at[1:, : len(arrays)] = [address_of(a) for a in arrays] + np.arange(slices)[:, None] * sizes
+        held = [cloud.log, cloud.weights, *arrays]
+        at[0, :2] = [address_of(a) for a in held[:2]]
         for k, leaf in enumerate(self._leaves, 3):
             if leaf in self._kernel.chosen:
                 held.append(np.ascontiguousarray(cloud.values[leaf], float))
                 at[0, k] = address_of(held[-1])
         moving = np.array(
-            [(place, *each) for place, each in zip(self._places, known, strict=True)] or [(0, 0, 0)], np.int64
+            [(place, *each) for place, each in zip(self._places, known, strict=True)] or [(0, 0, 0)],
+            np.int64,
         )
         told, state = np.empty((slices + 1, len(TOLD))), state_of(rng)
-        told[0, :3] = 1.0, cloud.log_total, cloud.ess
+        told[0] = cloud.total, cloud.log_total, cloud.ess, 0.0, 0.0, 0.0, cloud.worst
+        many = len(numbers.where)
+        moments = np.zeros((slices + 1, many, len(MOMENTS)))
+        if cloud.moves is not None:
+            moments[0, :, -2:] = cloud.moves.T
         rows = self._identity if cloud.rows is None else np.ascontiguousarray(cloud.rows, np.int64)
-        wholes = (slices, particles, self._block, len(self._leaves), len(self._noise), len(self._places))
         kernel, table, *fixed = self._fixed
         made = self._run(
-            *wholes, self._rows_place, len(self._table) - 1, least, math.log(particles), kernel, table, address_of(state),
-            *fixed, *(address_of(a) for a in (moving, at, rows, self._running, told)),
+            slices, particles, self._block, len(self._leaves), len(self._noise), len(self._places),
+            self._rows_place, len(self._table) - 1, many, least, math.log(particles), numbers.fading,
+            numbers.kept, numbers.least, kernel, table, address_of(state), *fixed,
+            *(address_of(a) for a in (moving, at, rows, self._running, told)),
+            numbers.where.ctypes.data, moments.ctypes.data,
         )  # fmt: skip
-        del held
         put_state(rng, state)
-        return Made(
-            told[1 : made + 1].tolist(), [v[:made] for v in values], log[:made], weights[:made],
-            ancestors[:made, :particles],
-        )  # fmt: skip
+        return Made(made, told, moments, at, held)
 
 
 def known_column(leaf: Expression, values: np.ndarray) -> np.ndarray:

@@ -23,14 +23,22 @@ from bayesmc.lowering.machine import loaded
 from bayesmc.lowering.weights import LARGE, SMALL, loops
 
 #: what is told of a slice, in this order: sums of the weights, of their squares; logs; whether it was resampled
-TOLD = ("total", "log_total", "ess", "increment", "resampled", "unique", "level")
+TOLD = ("total", "log_total", "ess", "increment", "resampled", "unique", "worst")
+#: what is told of a number in a slice: its mean and variance; by how much it lies off the mean without the
+#: slice's row, and the variance there; the sum of what rows move it by, in units of its spread, and the
+#: variance of that
+MOMENTS = ("mean", "variance", "shift", "wide", "moved", "expected")
 #: columns of ``at`` beside those of nodes
 LOG, WEIGHTS, ANCESTORS = range(3)
 
-_WHOLES = ("slices", "particles", "block", "nodes", "noises", "known", "rows_place", "log_place")
-_REALS = ("least", "log_particles")
+_WHOLES = (
+    "slices", "particles", "block", "nodes", "noises", "known", "rows_place", "log_place",
+    "numbers",
+)  # fmt: skip
+_REALS = ("least", "log_particles", "fading", "kept", "least_expected")
 _POINTERS = (
-    "kernel", "arguments", "state", "ziggurat", "node", "noise", "moving", "at", "identity", "running", "told",
+    "kernel", "arguments", "state", "ziggurat", "node", "noise", "moving", "at", "identity", "running", "told", "number",
+    "moments",
 )  # fmt: skip
 
 
@@ -47,6 +55,11 @@ def passes() -> Any:
     value in the first slice, the bytes to the next one's. ``rows_place`` is where the kernel is told the ancestors (-1: nowhere), ``log_place``
     where it leaves the log density of what is seen. Particles are resampled where
     they are worth less than ``least``.
+
+    ``number`` (numbers, 4) says of which numbers moments are taken (slices + 1, numbers, len(MOMENTS)): the
+    column of ``at``, how many numbers of a particle lie there and which one it is, whether its moves count for
+    ``worst``: the largest sum of moves in units of what is expected of it. From slice to slice sums fade by
+    ``fading`` and the worst by ``kept``.
     """
     module = Module()
     texts = [*draws(module), *loops(module), _slices(module)]
@@ -103,6 +116,9 @@ class _Text:
         c.when(c.get(self.fine, TRUTH), self._propagate)
         c.when(c.get(self.fine, TRUTH), lambda: self._level(resampled))
         c.when(c.get(self.fine, TRUTH), lambda: self._weigh(resampled))
+        many = Number(c, "%numbers", WHOLE)
+        is_asked = c.get(self.fine, TRUTH) & (many > 0)
+        c.when(is_asked, lambda: c.loop(many, lambda k: self._moments(k, resampled)))
         c.when(~c.get(self.fine, TRUTH), self._back)
         step = c.where(c.get(self.fine, TRUTH), c.number(1, WHOLE), c.number(0, WHOLE))
         c.set(self.slice, s + step)
@@ -220,19 +236,70 @@ class _Text:
         c, new = self.c, self.new
         log, weights = self._array(self.now, LOG), self._array(self.now, WEIGHTS)
         level, sums = c.get(self.level, REAL), c.address("%told", new, REAL)
+        worst = self._told(self.old, "worst") * Number(c, "%kept", REAL)
         given = f"i64 {self.n.text}, double {level.text}, ptr {log}, ptr {weights}, ptr {sums}"
         c.do(f"call void @exponentials({given})")
         total, squares = (c.load(sums, k, REAL) for k in range(2))
         log_total = level + elementary(c, "log", total)
         told = {
-            "total": total, "log_total": log_total, "ess": total * total / squares, "level": level,
+            "total": total, "log_total": log_total, "ess": total * total / squares, "worst": worst,
             "increment": log_total - c.get(self.spent, REAL), "resampled": resampled.to(REAL),
             "unique": c.get(self.unique, WHOLE).to(REAL),
         }  # fmt: skip
         for k, name in enumerate(TOLD):
             c.store("%told", new + k, told[name])
 
+    def _moments(self, k: Number, resampled: Number) -> None:
+        """Those of one number, and what the row moves it by."""
+        c, n = self.c, self.n
+        column, size, which, counts = (c.load("%number", k * 4 + j, WHOLE) for j in range(4))
+        values = self._pointer(c.load("%at", self.now + column, WHOLE))
+        weights, before = (self._array(at, WEIGHTS) for at in (self.now, self.before))
+        total, zero = self._told(self.new, "total"), c.number(0.0)
+        mean, variance, shift, square = (c.variable(zero) for _ in range(4))
+
+        def value(i: Number) -> Number:
+            return c.load(values, i * size + which, REAL)
+
+        def add(place: str, term: Number) -> None:
+            c.set(place, c.op(REAL, f"fadd reassoc double {c.get(place, REAL).text}, {term.text}"))
+
+        c.loop(n, lambda i: add(mean, value(i) * c.load(weights, i, REAL)))
+        c.set(mean, c.get(mean, REAL) / total)
+
+        def terms(i: Number, is_even: bool) -> None:
+            off = value(i) - c.get(mean, REAL)
+            own = off if is_even else off * c.load(before, i, REAL)
+            add(variance, off * (off * c.load(weights, i, REAL)))
+            add(shift, own)
+            add(square, own * off)
+
+        c.when(resampled, lambda: c.loop(n, lambda i: terms(i, True)))
+        c.when(~resampled, lambda: c.loop(n, lambda i: terms(i, False)))
+        spent = c.where(resampled, n.to(REAL), self._told(self.old, "total"))
+        own, off = c.get(variance, REAL) / total, c.get(shift, REAL) / spent
+        wide = c.get(square, REAL) / spent - off * off
+        at = [(s * Number(c, "%numbers", WHOLE) + k) * len(MOMENTS) for s in (self.slice_of(0), self.slice_of(1))]
+        fading, some = Number(c, "%fading", REAL), wide > 0.0
+        moved, expected = (
+            c.load("%moments", at[0] + MOMENTS.index(name), REAL) for name in ("moved", "expected")
+        )
+        root, left = c.call("llvm.sqrt.f64", wide), 1.0 - own / wide
+        moved = moved * fading - c.where(some, off / root, 0.0)
+        left = c.where(left > 0.0, left, 0.0)
+        expected = expected * (fading * fading) + c.where(some, left, 0.0)
+        for j, found in enumerate((c.get(mean, REAL), own, off, wide, moved, expected)):
+            c.store("%moments", at[1] + j, found)
+        spread = c.call("llvm.sqrt.f64", expected + Number(c, "%least_expected", REAL))
+        far, worst = c.call("llvm.fabs.f64", moved) / spread, self._told(self.new, "worst")
+        is_worse = counts.ne(0) & (far > worst)
+        place = self.new + TOLD.index("worst")
+        c.store("%told", place, c.where(is_worse, far, worst))
+
     # ---- private -------------------------------------------------------------------------------
+
+    def slice_of(self, more: int) -> Number:
+        return self.c.get(self.slice, WHOLE) + more
 
     def _told(self, first: Number, name: str) -> Number:
         return self.c.load("%told", first + TOLD.index(name), REAL)

@@ -10,20 +10,32 @@ The machine code of each kind of slice is held against the plain steps before it
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from bayesmc.dbn import PREVIOUS, TIME, Row, SeriesProblem
+from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
+from bayesmc.engines.particles.made import MadeSlices, Store
 from bayesmc.engines.particles.smc import Particles, Selection
+from bayesmc.engines.particles.tracking import FADING, KEPT, LEAST, Tracker
 from bayesmc.engines.slice_densities import SliceDensities, read_slice
 from bayesmc.engines.slice_program import agree, plainly
 from bayesmc.engines.slice_steps import SlicePlan
 from bayesmc.errors import TraceError
 from bayesmc.expression import Leaf
-from bayesmc.lowering import Cloud, Kernel, SliceCall, SliceKernel, is_available, known_column
+from bayesmc.lowering import (
+    NO_NUMBERS,
+    Cloud,
+    Kernel,
+    Numbers,
+    SliceCall,
+    SliceKernel,
+    is_available,
+    known_column,
+)
 from bayesmc.resampling import systematic
 
 #: seconds in NumPy of a slice, and of a particle in it, below a tenth of which nothing is compiled
@@ -103,18 +115,29 @@ class SliceCode:
         return None if made is None else made.one(row, before, selection, rng)
 
     def several(
-        self, problem: SeriesProblem, k: int, earlier: Particles | None, rng: np.random.Generator
-    ) -> list[tuple[Row, Particles]]:
-        """As many slices from the k-th one on as can be made in one call; none where it is to be made alone."""
+        self,
+        problem: SeriesProblem,
+        k: int,
+        earlier: Particles | None,
+        rng: np.random.Generator,
+        beside: Callable[[], tuple[Tracker, Families] | None],
+    ) -> MadeSlices | None:
+        """As many slices from the k-th one on as can be made in one call; None where it is to be made alone.
+
+        Where ``beside`` says that families are followed, moments are taken.
+        """
         step = self._step
         if earlier is None or not _resamples(step):
-            return []
+            return None
         row = problem.series.row(k)
         before = {previous: earlier.values[n] for n, previous in step.before}
         n = len(earlier.weights)
         everyone = Selection(n, None, False, earlier.log_weights, earlier.log_total)
         made = self._of(row, before, everyone, rng)
-        return [] if made is None else made.several(problem, k, earlier, before, rng)
+        if made is None:
+            return None
+        found = made.several(problem, k, earlier, before, rng, beside())
+        return found if len(found) else None
 
     # ---- private -------------------------------------------------------------------------------
 
@@ -194,6 +217,7 @@ class _Slice:
         self._goes_on = chosen == {previous[n] for n in self._names if n in previous}
         self._wide = max(math.prod(shape) for shape in self._kernel.shapes)
         self._columns: list[tuple[np.ndarray, int]] | None = None
+        self._store = Store()
 
     @property
     def is_right(self) -> bool:
@@ -247,15 +271,24 @@ class _Slice:
             for leaf in self._kernel.known
         ]
         log = np.ascontiguousarray(np.broadcast_to(selection.log_weights, n), float)
-        cloud = Cloud(before, log, log, selection.log_normaliser, math.inf, selection.ancestors)
-        own = self._room(n)
-        made = self._call(
-            1, n, -math.inf, cloud, [(a.ctypes.data, 0) for a in columns], [a[None] for a in own], rng
-        )
-        if not made.told:
+        rows = selection.ancestors
+        cloud = Cloud(before, log, log, 1.0, selection.log_normaliser, math.inf, rows=rows)
+        shapes: list[Any] = [(), (), *self._kernel.shapes]
+        own = [self._step.room((n, *shape)) for shape in shapes]
+        arrays = [a[None] for a in own]
+        arrays.insert(2, np.empty((1, n + 1), np.int64))
+        addresses = [(a.ctypes.data, 0) for a in columns]
+        made = self._call(-math.inf, cloud, addresses, arrays, rng)
+        if not made.count:
             return None
-        found = self._particles(own, made.told[0], row.t, known)
-        return found._replace(ancestors=selection.ancestors, resampled=selection.resampled)
+        total, log_total, ess, increment = made.told[1, :4].tolist()
+        for array in own[2:]:
+            array.flags.writeable = n > self._step.layout.block  # large ones are used again
+        values = {**dict(zip(self._names, own[2:], strict=True)), **self._others(row)}
+        return Particles(
+            row.t, values, own[0], own[1], total, log_total, increment, ess, selection.ancestors,
+            selection.resampled,
+        )  # fmt: skip
 
     def several(
         self,
@@ -264,7 +297,8 @@ class _Slice:
         earlier: Particles,
         before: Mapping[str, np.ndarray],
         rng: np.random.Generator,
-    ) -> list[tuple[Row, Particles]]:
+        beside: tuple[Tracker, Families] | None,
+    ) -> MadeSlices:
         """Slices from the k-th one on, as many as are of this kind."""
         step, n = self._step, len(earlier.weights)
         if self._columns is None:
@@ -272,44 +306,41 @@ class _Slice:
         most = max(1, min(_TOGETHER, _NUMBERS // (n * self._wide))) if self._goes_on else 1
         rows = problem.series.alike(k, most)
         log, weights = (np.ascontiguousarray(a) for a in (earlier.log_weights, earlier.weights))
-        cloud = Cloud(before, log, weights, earlier.log_total, earlier.ess)
+        cloud = Cloud(before, log, weights, earlier.total, earlier.log_total, earlier.ess)
+        numbers = NO_NUMBERS
+        if beside is not None:
+            numbers, drift = self._numbers(beside[0]), beside[1].drift
+            if drift is not None and len(numbers.where):
+                moves = np.zeros((2, len(numbers.where)))
+                moves[:, numbers.where[:, 3] > 0] = drift.moves[:, 0]
+                cloud = cloud._replace(worst=drift.largest, moves=moves)
         known = [(a.ctypes.data + k * size, size) for a, size in self._columns]
-        if len(rows) == 1:
-            one = self._room(n)
-            arrays = [a[None] for a in one]
-        else:
-            shapes = [*self._kernel.shapes, (), ()]
-            arrays = [np.empty((len(rows), n, *shape)) for shape in shapes]
-        made = self._call(len(rows), n, step.threshold * n, cloud, known, arrays, rng)
-        found = []
-        for s, (row, figures) in enumerate(zip(rows, made.told, strict=False)):
-            own = one if len(rows) == 1 else [a[s] for a in arrays]
-            now = self._particles(own, figures, row.t, step.known(row))
-            if now.resampled:
-                now = now._replace(ancestors=made.ancestors[s])
-            found.append((row, now))
-        return found
+        count, store = len(rows), self._store
+        values = [store((count, n, *shape)) for shape in self._kernel.shapes]
+        arrays = [store((count, n)), store((count, n)), store((count, n + 1), np.int64), *values]
+        made = self._call(step.threshold * n, cloud, known, arrays, rng, numbers)
+        return MadeSlices(made, rows, arrays, self._names, self._others, numbers)
 
     # ---- private -------------------------------------------------------------------------------
 
-    def _room(self, n: int) -> list[np.ndarray]:
-        """Arrays of a slice: values of each node, log weights, weights."""
-        return [self._step.room((n, *shape)) for shape in (*self._kernel.shapes, (), ())]
+    def _others(self, row: Row) -> dict[str, np.ndarray]:
+        """Values of nodes that all particles agree on."""
+        known = self._step.known(row)
+        return {name: known[name] for name in self._rest}
 
-    def _particles(
-        self, arrays: Sequence[np.ndarray], figures: Sequence[float], t: int, known: Mapping[str, Any]
-    ) -> Particles:
-        *own, log, weights = arrays
-        total, log_total, ess, increment, resampled = figures[:5]
-        is_large = len(log) > self._step.layout.block
-        for array in own:
-            array.flags.writeable = is_large  # large ones are used again
-        values = dict(zip(self._names, own, strict=True))
-        for name in self._rest:
-            values[name] = known[name]
-        return Particles(
-            t, values, log, weights, total, log_total, increment, ess, None, bool(resampled)
-        )
+    def _numbers(self, tracker: Tracker) -> Numbers:
+        """All numbers of nodes, and which of them a tracker looks at the moves of; none where it takes others."""
+        compass = tracker.compass
+        moved = () if compass is None else tuple(n.name for n in compass.nodes)
+        if not set(moved) <= set(self._names):
+            return NO_NUMBERS
+        where = [
+            (3 + k, size, j, int(name in moved))
+            for k, (name, shape) in enumerate(zip(self._names, self._kernel.shapes, strict=True))
+            for size in (math.prod(shape),)
+            for j in range(size)
+        ]
+        return Numbers(np.array(where, np.int64), FADING, KEPT, LEAST)
 
     def _column(self, problem: SeriesProblem, leaf: Leaf) -> tuple[np.ndarray, int]:
         """A leaf's values in all slices of a series, and the bytes from one to the next."""

@@ -66,7 +66,17 @@ SEEMS = 2.8
 
 def rested(now: Particles) -> Any:
     """Whether a slice rests on particles enough for its error to be told."""
-    return now.ess >= min(RESTS, 0.9 * len(now.weights))
+    return now.ess >= rests(len(now.weights))
+
+
+def rests(particles: int) -> float:
+    """Equally weighted particles on which a slice of so many must rest for its error to be told."""
+    return min(RESTS, 0.9 * particles)
+
+
+def level_of(particles: int) -> float:
+    """Variance between two looks above which it matters where it comes from."""
+    return min(max(UNEVEN / particles, MATTERS[0]), MATTERS[1])
 
 
 def begun(now: Particles, layout: Layout) -> Families:
@@ -224,7 +234,7 @@ def _looked_at(families: Families, now: Particles) -> tuple[Families, Any]:
     resampled = np.asarray(now.resampled)
     variance = _variance(families, off)
     edge = np.zeros(resampled.shape, dtype=bool)
-    if variance.max() > _level(n):
+    if variance.max() > level_of(n):
         at_edge, odd = _at_edge(families, variance, off, families.explained, n)
         if odd.any():
             edge, doubted = resampled & at_edge, np.where(resampled & odd, now.t, families.doubted)
@@ -246,7 +256,7 @@ def _matters(
     families: Families, explained: np.ndarray, now: Particles, counts: np.ndarray, off: np.ndarray
 ) -> bool:
     """Whether anything is due, or seems odd, in a filter without plates: the same in Python's numbers."""
-    level, age = _level(len(now.weights)), now.t - int(families.born[YOUNG])
+    level, age = level_of(len(now.weights)), now.t - int(families.born[YOUNG])
     shares, far = _square(families.shares, 1).tolist(), _square(off, 1).tolist()
     few = shares[OLD] < LEFT * float(counts[OLD].dot(counts[OLD]))
     if age > LONGEST or (age > SHORTEST and few):
@@ -348,7 +358,7 @@ def _at_edge(
     Many of them must where rows do not pull the same way: a few are an accident.
     """
     every, bounded = explained[:, 0], explained[:, 1]
-    odd = (variance > _level(n)) & (variance > EDGE * every)
+    odd = (variance > level_of(n)) & (variance > EDGE * every)
     odd |= (variance > LONG) & (variance > EDGE * bounded)
     far = variance > MOST
     either = (odd | far).any(axis=0)
@@ -358,8 +368,3 @@ def _at_edge(
     by = squares.sum(axis=1) ** 2 / np.maximum((squares**2).sum(axis=1), 1e-300)
     some = np.where(families.drift.worst < SEEMS, SOME, np.inf)
     return ((odd & (by < some)) | far).any(axis=0), either
-
-
-def _level(n: int) -> float:
-    """Variance between two looks above which it matters where it comes from."""
-    return min(max(UNEVEN / n, MATTERS[0]), MATTERS[1])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,9 +22,10 @@ from bayesmc.engines.particles.errors import ByFamily, Variances, function_error
 from bayesmc.engines.particles.families import Families
 from bayesmc.engines.particles.filter_step import FilterStep
 from bayesmc.engines.particles.genealogy import evidence_error
+from bayesmc.engines.particles.made import MadeSlices
 from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Layout, Particles, quiet
-from bayesmc.engines.particles.sums import Tally, answers
+from bayesmc.engines.particles.sums import Tally, answers, figures
 from bayesmc.engines.particles.tracking import Tracker
 from bayesmc.errors import QueryError
 from bayesmc.network import Model
@@ -140,6 +140,35 @@ class Record:
             earlier = [*earlier[:-1], earlier[-1]._replace(particles=[], families=[])]
         self._written, self._waiting = [*earlier, worked_out], []
         self._tallies, self._figures, self._summed = [], [], []
+
+    def beside(self) -> tuple[Tracker, Families] | None:
+        """What is followed beside slices that are made together, if answers take no more than their sums."""
+        tracker = self.tracker
+        if tracker is None or self.asked or self.keep or not tracker.is_summed(self._nodes):
+            return None
+        self.write()
+        families = self.families
+        return None if families is None or families.scouts is not None else (tracker, families)
+
+    def add_made(self, made: MadeSlices) -> None:
+        """Take in slices that were made together, the next ones."""
+        assert self.tracker is not None and self.families is not None
+        earlier = self._written[-1].particles[-1]
+        families, sums = made.followed(self.tracker, self.families, earlier)
+        rows, low = Rows({what: {} for what in _KINDS}), 0
+        found, whole = dict[str, Sequence[np.ndarray]](), figures(sums)
+        for name, size in made.sizes().items():
+            found[name], low = [a[:, low : low + size] for a in whole], low + size
+        for node in self._nodes:
+            if node.name not in found:
+                value = np.array([made.known(row)[node.name] for row in made.rows], dtype=float)
+                found[node.name] = value, np.zeros_like(value), np.zeros_like(value)
+            for what, own in zip(("means", "variances", "errors"), found[node.name], strict=True):
+                rows[what][node.name] = own.reshape(-1, *node.value_shape)
+        rows["filter"] = made.diagnosed()
+        earlier_ones = self._written[-1]._replace(particles=[], families=[])
+        last = made.particles(len(made) - 1)
+        self._written = [*self._written[:-1], earlier_ones, Written(rows, [families], [last])]
 
     def _sum(self, now: Particles, row: Row) -> None:
         """Take the sums of a slice."""
@@ -408,6 +437,57 @@ class FilteredParticles(SeriesPosterior):
         return self.held
 
 
+class Ahead:
+    """Slices that are made together, and passed one by one.
+
+    Parameters
+    ----------
+    step : FilterStep
+    problem : SeriesProblem
+    record : Record
+    """
+
+    def __init__(self, step: FilterStep, problem: SeriesProblem, record: Record) -> None:
+        self._machine, self._problem, self._record = step.machine, problem, record
+        self._made: MadeSlices | None = None
+        self._before: Particles | None = None
+        self._first, self._is_followed = 0, False
+
+    def reaches(self, k: int, now: Particles | None, rng: np.random.Generator) -> bool:
+        """Whether the k-th slice, which follows that of some particles, is made together with others."""
+        if self._made is None and self._machine is not None:
+            self._is_followed = False
+            self._made = self._machine.several(self._problem, k, now, rng, self._beside)
+            self._first, self._before = k, now
+        return self._made is not None
+
+    def passed(self, k: int, looks: Replicates | None) -> Particles | None:
+        """Take in the k-th slice; its particles, or None where nobody asks for them."""
+        made, j = self._made, k - self._first
+        assert made is not None
+        if looks is not None and looks.wanted(k):
+            looks.look(k, made.particles(j - 1) if j else self._before, made.rows[j])
+        is_last = j == len(made) - 1
+        if not self._is_followed:
+            self._record.add(k, made.particles(j), made.rows[j])
+        elif is_last:
+            self._record.add_made(made)
+        if is_last:
+            self._made = None
+        return made.particles(j) if is_last else None
+
+    def stop(self, steps: int) -> None:
+        """Take in what was passed of so many slices."""
+        made, self._made = self._made, None
+        if made is not None and self._is_followed and steps > self._first:
+            self._record.add_made(made.first(steps - self._first))
+
+    def _beside(self) -> tuple[Tracker, Families] | None:
+        found = self._record.beside()
+        self._is_followed = found is not None
+        return found
+
+
 def filtered_by(
     engine: Any,
     step: FilterStep,
@@ -428,17 +508,17 @@ def filtered_by(
     check = stream(seed, Purpose.CHECK, unit)
     looks = Replicates(problem, step.plan, check) if unit == 0 else None
     now: Particles | None = None
-    made: list[tuple[Row, Particles]] = []  # and not looked at yet
+    ahead = Ahead(step, problem, record)
 
     def move(k: int) -> None:
-        nonlocal now, made
-        old = now
-        if not made and step.machine is not None:
-            made = step.machine.several(problem, k, old, rng)[::-1]
-        row, new = made.pop() if made else (rows.row(k), None)
+        nonlocal now
+        if look_back is None and ahead.reaches(k, now, rng):
+            now = ahead.passed(k, looks)
+            return
+        row, old = rows.row(k), now
         if looks is not None:
             looks.look(k, old, row)
-        now = step(old, row, rng) if new is None else new
+        now = step(old, row, rng)
         record.add(k, now, row)
         if look_back is not None:
             record.write()
@@ -448,6 +528,9 @@ def filtered_by(
             step.recycle(old)
 
     with Progress(problem.steps, engine.label, progress) as bar, quiet():
-        so_far = partial(record.posterior, engine, "filter")
+        def so_far(steps: int) -> FilteredParticles:
+            ahead.stop(steps)
+            return record.posterior(engine, "filter", steps)
+
         pass_slices(rows.start, problem.steps, move, so_far, bar.advance)
         return record.posterior(engine, predictive=None if looks is None else looks.found())

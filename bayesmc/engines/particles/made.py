@@ -1,0 +1,216 @@
+"""Slices that were made in one call of machine code, and what is followed beside their particles.
+
+The loop over slices in which nothing is to be said about families is machine code, too (``lowering.lineage``);
+any other slice is looked at by ``tracking``, as if it had been made by itself.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from bayesmc.dbn import Row
+from bayesmc.engines.particles import genealogy
+from bayesmc.engines.particles.errors import ENOUGH
+from bayesmc.engines.particles.families import LONGEST, OLD, YOUNG, Drift, Families
+from bayesmc.engines.particles.smc import Particles
+from bayesmc.engines.particles.sums import Sums
+from bayesmc.engines.particles.tracking import STRETCH, Tracker
+from bayesmc.lowering import Made, Numbers, followed
+
+#: columns of what is told of a slice: ``lowering.slices.TOLD``
+TOTAL, LOG_TOTAL, ESS, INCREMENT, RESAMPLED, UNIQUE, WORST = range(7)
+
+
+class MadeSlices:
+    """Slices in a row.
+
+    Parameters
+    ----------
+    made : Made
+    rows : sequence of Row
+    arrays : sequence of ndarray
+        Log weights, weights, ancestors, and values of each node, slices first.
+    names : sequence of str
+        These nodes.
+    known : callable
+        ``row -> values`` of nodes that all particles agree on.
+    numbers : Numbers
+        Of which the moments were taken.
+    """
+
+    def __init__(
+        self,
+        made: Made,
+        rows: Sequence[Row],
+        arrays: Sequence[np.ndarray],
+        names: Sequence[str],
+        known: Callable[[Row], dict[str, np.ndarray]],
+        numbers: Numbers,
+    ) -> None:
+        self.made, self.rows, self._arrays = made, list(rows[: made.count]), arrays
+        self.names, self.known, self.numbers = tuple(names), known, numbers
+        self.figures = made.told[1 : made.count + 1]
+        self._told = self.figures.tolist()
+        self._particles: dict[int, Particles] = {}
+        self.size = arrays[0].shape[1]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def first(self, count: int) -> MadeSlices:
+        """The first so many of them."""
+        made = self.made._replace(count=count)
+        return MadeSlices(made, self.rows, self._arrays, self.names, self.known, self.numbers)
+
+    def particles(self, k: int) -> Particles:
+        """Those of the k-th slice; read-only."""
+        if k not in self._particles:
+            total, log_total, ess, increment, resampled = self._told[k][:RESAMPLED + 1]
+            log, weights, ancestors, *own = (a[k] for a in self._arrays)
+            for array in own:
+                array.flags.writeable = False
+            chosen = ancestors[: self.size] if resampled else None
+            values = {**self.known(self.rows[k]), **dict(zip(self.names, own, strict=True))}
+            self._particles[k] = Particles(
+                self.rows[k].t, values, log, weights, total, log_total, increment, ess, chosen,
+                bool(resampled),
+            )  # fmt: skip
+        return self._particles[k]
+
+    def sizes(self) -> dict[str, int]:
+        """How many numbers of each node there are."""
+        values = self._arrays[3:]
+        return {n: math.prod(a.shape[2:]) for n, a in zip(self.names, values, strict=True)}
+
+    def diagnosed(self) -> dict[str, np.ndarray]:
+        """Figures of the filter itself: ``blocks.diagnosed``."""
+        never, n = np.zeros(len(self), dtype=bool), len(self)
+        return {
+            "increments": self.figures[:, INCREMENT].copy(),
+            "weight_ess": self.figures[:, ESS].copy(),
+            "resampled": self.figures[:, RESAMPLED] > 0.0,
+            "rejuvenated": never,
+            "counts": np.full(n, self.size),
+            "injected": np.zeros(n, dtype=int),
+            "unique_ancestors": self.figures[:, UNIQUE].astype(int),
+        }
+
+    def followed(
+        self, tracker: Tracker, families: Families, earlier: Particles
+    ) -> tuple[Families, Sums]:
+        """The families in the last slice, given those of the slice before, and the sums over all of them."""
+        return _Following(self, tracker, families, earlier).run()
+
+
+class Store:
+    """Arrays that are used again once nobody else holds them: fresh ones cost the machine a page at a time."""
+
+    def __init__(self) -> None:
+        self._held: dict[Any, list[np.ndarray]] = {}
+
+    def __call__(self, shape: tuple[int, ...], dtype: type = float) -> np.ndarray:
+        held = self._held.setdefault((shape, dtype), [])
+        count = getattr(sys, "getrefcount", None)
+        for k in range(len(held)):
+            if count is not None and count(held[k]) == 2:  # that of the list and of the argument
+                return held[k]
+        held.append(np.empty(shape, dtype))
+        del held[:-_SETS]
+        return held[-1]
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+#: arrays of a kind that are held: those of a node, of several blocks
+_SETS = 8
+_ORIGINS = 2
+
+
+class _Following:
+    """The run over slices."""
+
+    def __init__(
+        self, slices: MadeSlices, tracker: Tracker, families: Families, earlier: Particles
+    ) -> None:
+        self._slices, self._tracker, self._earlier = slices, tracker, earlier
+        made, self._count = slices.made, len(slices)
+        rows, numbers, groups = self._count + 1, len(slices.numbers.where), families.shares.shape[1]
+        self._families = families
+        self._t0 = slices.rows[0].t - 1
+        self.bounds = np.empty((rows, _ORIGINS, groups + 1), np.int64)
+        self.explained = np.empty((rows, _ORIGINS, 2))
+        self.sums = np.empty((rows, _ORIGINS, 1 + numbers, groups))
+        self.young, self.lost = np.zeros(rows, np.int64), np.zeros(rows, dtype=bool)
+        self._sizes = self._count, slices.size, made.at.shape[1] - 3, numbers, groups
+        compass = tracker.compass
+        self._columns = np.flatnonzero(slices.numbers.where[:, 3])
+        self._limit = math.inf if compass is None else compass.limit
+
+    def run(self) -> tuple[Families, Sums]:
+        row, families, tracker, slices = 0, self._families, self._tracker, self._slices
+        while True:
+            stop, families = self._on(row, families)
+            if stop > self._count:
+                break
+            earlier = slices.particles(stop - 2) if stop > 1 else self._earlier
+            now = slices.particles(stop - 1)
+            drift, at = self._drift(stop), slices.rows[stop - 1]
+            families = tracker.followed_by(families, earlier, now, at, drift)
+            row = stop
+            self.lost[row] = families.lost is not None and bool(families.lost.where)
+        made, last = slices.made, slice(1, self._count + 1)
+        moments = made.moments[last]
+        return families, Sums(
+            moments[..., 0], moments[..., 1], made.told[last, TOTAL], self.sums[last, OLD],
+            self.sums[last, YOUNG], self.young[last] > 0, self.lost[last],
+        )  # fmt: skip
+
+    def _on(self, row: int, families: Families) -> tuple[int, Families]:
+        """The next slice that is to be looked at, and the families in the one before."""
+        made, lost = self._slices.made, families.lost
+        self.bounds[row], self.explained[row] = families.bounds, families.explained
+        shares = np.ascontiguousarray(families.shares)
+        roots = np.zeros(1, np.int64)
+        if lost is not None:
+            n = self._slices.size
+            roots = np.empty(2 * n + 1, np.int64)
+            roots[0], roots[1 : n + 1] = 1, np.arange(n) if lost.roots is None else lost.roots
+        limits = self._limits(families)
+        arrays = (
+            limits, made.at, made.told, self._slices.numbers.where, made.moments, self.bounds, shares,
+            self.explained, self.sums, self.young, roots,
+        )  # fmt: skip
+        stop = followed()(row, *self._sizes, *(a.ctypes.data for a in arrays))
+        last = min(stop - 1, self._count)
+        if last == row:
+            return stop, families
+        if lost is not None:
+            self.lost[row + 1 : last + 1] = bool(lost.where)
+            if (made.told[row + 1 : last + 1, RESAMPLED] > 0).any():
+                lost = lost._replace(roots=roots[1 : self._slices.size + 1])
+        return stop, families._replace(
+            bounds=self.bounds[last].copy(), explained=self.explained[last].copy(), lost=lost,
+            drift=self._drift(last),
+        )  # fmt: skip
+
+    def _limits(self, families: Families) -> np.ndarray:
+        n, lost = self._slices.size, families.lost
+        return np.array([
+            genealogy.rests(n), genealogy.FEW * n, genealogy.SEEMS, ENOUGH, genealogy.level_of(n),
+            genealogy.EDGE, genealogy.LONG, genealogy.MOST, genealogy.LEFT, genealogy.STRIDE, self._t0,
+            self._t0 - int(families.born[YOUNG]), genealogy.SHORTEST, LONGEST,
+            math.inf if lost is None else lost.since + STRETCH - self._t0,
+        ])  # fmt: skip
+
+    def _drift(self, row: int) -> Drift | None:
+        if self._tracker.compass is None:
+            return None
+        made = self._slices.made
+        worst = float(made.told[row, WORST])
+        moves = made.moments[row, self._columns, -2:].T[:, None].copy()
+        return Drift(moves, worst, worst, self._limit)
