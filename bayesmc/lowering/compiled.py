@@ -171,17 +171,17 @@ class Way:
     roots : sequence of Expression
     varying : frozenset of str
         Leaves that have values of their own for each entry.
-    chosen : frozenset of str, optional
-        Of those the ones that are read at other entries.
+    kernel : Kernel, optional
+        Of these, where it is written already.
     """
 
     def __init__(
         self,
         roots: Sequence[Expression],
         varying: frozenset[str],
-        chosen: frozenset[str] = frozenset(),
+        kernel: Kernel | None = None,
     ) -> None:
-        self.kernel = Kernel(roots, varying, chosen)
+        self.kernel = kernel or Kernel(roots, varying)
         self.loaded: Loaded = loaded(self.kernel.text, self.kernel.foreign)
         self._constants = list(self.kernel.constants.values())
         self._own = threading.local()

@@ -1,4 +1,4 @@
-"""NumPy's random numbers in machine code: the uniform and normal numbers that a generator would hand out next.
+"""NumPy's random numbers in machine code: uniform and normal ones that a generator would hand out next.
 
 The generator is SFC64 and the normals are NumPy's ziggurat, so that whoever draws here and whoever draws by
 ``numpy.random.Generator`` gets the same numbers from the same state. NumPy may change how it draws: before
@@ -43,7 +43,12 @@ def ziggurat() -> np.ndarray:
     normal, state = np.random.Generator(bits).standard_normal, bits.state
     unit, widths = 1 << (_BITS - 1), np.empty(_LAYERS)
     for layer in range(_LAYERS):
-        state["state"]["state"][:] = layer | unit << 9, 0, 1, 0  # the next bits are the first of these
+        state["state"]["state"][:] = (
+            layer | unit << 9,
+            0,
+            1,
+            0,
+        )  # the next bits are the first of these
         bits.state = state
         widths[layer] = abs(normal()) / unit
     ends = widths * 2.0**_BITS
@@ -58,10 +63,7 @@ def ziggurat() -> np.ndarray:
 @lru_cache(maxsize=1)
 def is_numpys() -> bool:
     """Whether numbers and states are those of this NumPy."""
-    module = Module()
-    texts = draws(module)
-    texts[-1] = texts[-1].replace("internal ", "")
-    code = loaded("\n".join([str(module), *texts]), module.foreign)
+    code = loaded(*text())
     pointer = ctypes.c_void_p
     run = code.function("normals", None, ctypes.c_int64, pointer, pointer, pointer)
     rng = np.random.Generator(np.random.SFC64(1))
@@ -72,6 +74,14 @@ def is_numpys() -> bool:
     run(_TRIED, state.ctypes.data, tables.ctypes.data, found.ctypes.data)
     same = np.allclose(found, rng.standard_normal(_TRIED), rtol=1e-13, atol=0.0)
     return bool(same and np.array_equal(state, state_of(rng)))
+
+
+@lru_cache(maxsize=1)
+def text() -> tuple[str, tuple[str, ...]]:
+    """The module that is compared, and the functions that it calls and does not define."""
+    module = Module()
+    *others, normals = draws(module)
+    return "\n".join([str(module), *others, normals.replace("internal ", "")]), module.foreign
 
 
 def state_of(rng: np.random.Generator) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Families of particles followed over slices as machine code, with sums over each, up to a slice that asks for more.
+"""Families of particles followed over slices as machine code, with sums over each, until one asks for more.
 
 What families are, and what is to be said where something is due or seems odd, stands in
 ``engines.particles.genealogy`` and ``tracking``: this is the loop over slices in which nothing is.
@@ -26,7 +26,9 @@ LIMITS = (
 )  # fmt: skip
 
 _WHOLES = ("first", "slices", "particles", "nodes", "numbers", "groups")
-_POINTERS = ("limits", "at", "told", "number", "moments", "bounds", "shares", "explained", "sums", "young", "roots")
+_POINTERS = (
+    "limits", "at", "told", "number", "moments", "bounds", "shares", "explained", "sums", "young", "roots",
+)  # fmt: skip
 _ORIGINS = 2
 
 
@@ -39,15 +41,22 @@ def followed() -> Any:
     ``first`` (but of row 0), goes on while nothing is due, and gives the first row that it did not come to.
     ``sums`` (slices + 1, 2, 1 + numbers, groups): by family of the old origin and of the young one, of the
     weights, and of these times by how much each number lies off its mean. ``young`` (slices + 1) says whether
-    those of the young one were taken. ``roots`` (1 + 2 particles): whether there are any, who they are, and room for a copy.
+    those of the young one were taken. ``roots`` (1 + 2 particles): whether there are any, who they are, and
+    room for a copy.
     """
-    module = Module()
-    texts = [_below(module), _sums(module), _text(module)]
-    code = loaded("\n".join([str(module), *texts]), module.foreign)
+    code = loaded(*text())
     types = [ctypes.c_int64] * len(_WHOLES) + [ctypes.c_void_p] * len(_POINTERS)
     found = code.function("followed", ctypes.c_int64, *types)
     found.code = code  # the function lives as long as this
     return found
+
+
+@lru_cache(maxsize=1)
+def text() -> tuple[str, tuple[str, ...]]:
+    """The module of ``followed``, and the functions that it calls and does not define."""
+    module = Module()
+    texts = [_below(module), _sums(module), _whole(module)]
+    return "\n".join([str(module), *texts]), module.foreign
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -106,14 +115,16 @@ def _sums(module: Module) -> str:
 
     c.when(numbers > 0, lambda: c.loop(numbers, number))
     c.do("ret void")
-    pointers = ", ".join(f"ptr %{n}" for n in ("bounds", "weights", "at", "number", "moments", "sums"))
+    pointers = ", ".join(
+        f"ptr %{n}" for n in ("bounds", "weights", "at", "number", "moments", "sums")
+    )
     return f"define internal void @sums(i64 %groups, i64 %numbers, {pointers}) {{\n{c}\n}}"
 
 
-def _text(module: Module) -> str:
-    text = _Followed(module)
+def _whole(module: Module) -> str:
+    made = _Followed(module)
     head = [*(f"i64 %{n}" for n in _WHOLES), *(f"ptr noalias %{n}" for n in _POINTERS)]
-    return f"define i64 @followed({', '.join(head)}) {{\n{text.c}\n}}"
+    return f"define i64 @followed({', '.join(head)}) {{\n{made.c}\n}}"
 
 
 class _Followed:
@@ -153,7 +164,11 @@ class _Followed:
         total = self._told(row, "total")
         is_few = c.get(squares, REAL) * self._limit("enough") > total * total
         c.store("%young", row, is_few.to(WHOLE))
-        c.when(is_few, lambda: self._summed(1))
+
+        def young() -> None:
+            self._summed(1)
+
+        c.when(is_few, young)
 
     def _summed(self, origin: int) -> str:
         """Take the sums of an origin's families; where they are."""

@@ -10,9 +10,11 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression
+from bayesmc.lowering import generator, lineage, slices
 from bayesmc.lowering.compiled import Way, address_of
 from bayesmc.lowering.generator import is_numpys, put_state, state_of, ziggurat
-from bayesmc.lowering.machine import is_available
+from bayesmc.lowering.kernel import Kernel
+from bayesmc.lowering.machine import is_available, is_kept
 from bayesmc.lowering.slices import MOMENTS, TOLD, passes
 from bayesmc.lowering.ufuncs import kind_of
 from bayesmc.lowering.writer import DTYPES
@@ -53,7 +55,8 @@ class Made(NamedTuple):
 
     Attributes
     ----------
-    count : int
+    slices : int
+        How many.
     told : ndarray, shape (slices + 1, len(slices.TOLD))
     moments : ndarray, shape (slices + 1, numbers, len(slices.MOMENTS))
     at : ndarray of int64, shape (slices + 1, columns)
@@ -61,7 +64,7 @@ class Made(NamedTuple):
         What the addresses point to.
     """
 
-    count: int
+    slices: int
     told: np.ndarray
     moments: np.ndarray
     at: np.ndarray
@@ -101,6 +104,9 @@ class SliceKernel:
     chosen : frozenset of str
         Leaves with a value for each particle before. Of all others there is one value.
 
+    only_kept : bool, optional
+        Take what an earlier run has compiled, and compile nothing.
+
     Attributes
     ----------
     known : list of Leaf
@@ -112,7 +118,11 @@ class SliceKernel:
     """
 
     def __init__(
-        self, roots: Sequence[Expression], own: Mapping[str, Shape], chosen: frozenset[str]
+        self,
+        roots: Sequence[Expression],
+        own: Mapping[str, Shape],
+        chosen: frozenset[str],
+        only_kept: bool = False,
     ) -> None:
         if not is_available():
             raise TraceError("machine code needs llvmlite: pip install bayesmc[fast]")
@@ -121,11 +131,15 @@ class SliceKernel:
         varying = chosen | own.keys()
         if not all(r.leaves & varying for r in roots) or not own:
             raise TraceError("what is the same for all particles is made by plain steps")
+        kernel = Kernel(roots, varying, chosen)
+        texts = (kernel.text, *(module.text()[0] for module in (generator, slices, lineage)))
+        if only_kept and not all(map(is_kept, texts)):
+            raise TraceError("it would have to be compiled")
         if not is_numpys():
             raise TraceError("this NumPy draws normals in a way of its own")
         self.shapes = [r.shape for r in roots[:-1]]
         self.own, self.chosen = dict(own), chosen
-        self.way = Way(roots, varying, chosen)
+        self.way = Way(roots, varying, kernel)
         self.known = [n for n in self.way.kernel.leaves if n.name not in varying]
 
 
@@ -155,7 +169,8 @@ class SliceCall:
         #: leaves that are no results of the slice before, in columns behind those of results
         self._others = [n for n in at if n in kernel.chosen and n not in before]
         self._leaves = [*before, *self._others]
-        node = [(place, at.get(leaf or "", -1), size) for leaf, (place, size) in zip(before, own, strict=True)]
+        leaves = [at.get(leaf or "", -1) for leaf in before]
+        node = [(place, leaf, size) for leaf, (place, size) in zip(leaves, own, strict=True)]
         node += [(-1, at[leaf], 0) for leaf in self._others]
         self._node = np.array(node, np.int64)
         sizes = {n: max(math.prod(s), 1) for n, s in kernel.own.items()}
@@ -210,7 +225,8 @@ class SliceCall:
                 held.append(np.ascontiguousarray(cloud.values[leaf], float))
                 at[0, k] = address_of(held[-1])
         moving = np.array(
-            [(place, *each) for place, each in zip(self._places, known, strict=True)] or [(0, 0, 0)],
+            [(place, *each) for place, each in zip(self._places, known, strict=True)]
+            or [(0, 0, 0)],
             np.int64,
         )
         told, state = np.empty((slices + 1, len(TOLD))), state_of(rng)
@@ -235,4 +251,6 @@ class SliceCall:
 def known_column(leaf: Expression, values: np.ndarray) -> np.ndarray:
     """Values of a leaf as its kernel reads them, whatever comes first."""
     lead = values.shape[: values.ndim - len(leaf.shape)]
-    return np.ascontiguousarray(np.broadcast_to(values, (*lead, *leaf.shape)), DTYPES[kind_of(leaf)])
+    return np.ascontiguousarray(
+        np.broadcast_to(values, (*lead, *leaf.shape)), DTYPES[kind_of(leaf)]
+    )

@@ -1,9 +1,9 @@
 """Slices of a particle filter as machine code: several in one call, resampling included.
 
-The text is the same for every template, whose compiled slice (``compiled.SliceKernel``) is called from inside,
-so it is compiled once for all. Random numbers are those that NumPy's generator would hand out (``generator``),
-in the order of the plain steps: where particles are resampled, one uniform for the comb; then, block by block,
-the normals of each hidden node.
+The text is the same for every template, whose compiled slice (``series.SliceKernel``) is called from inside,
+so it is compiled once for all. Random numbers are those that NumPy's generator would hand out
+(``generator``), in the order of the plain steps: where particles are resampled, one uniform for the comb;
+then, block by block, the normals of each hidden node.
 
 A slice that is not what it should be (a parameter out of range, a weight that is no number, none that is
 positive) is left alone, with the generator where it was, and so are all after it.
@@ -22,7 +22,7 @@ from bayesmc.lowering.generator import draws
 from bayesmc.lowering.machine import loaded
 from bayesmc.lowering.weights import LARGE, SMALL, loops
 
-#: what is told of a slice, in this order: sums of the weights, of their squares; logs; whether it was resampled
+#: what is told of a slice, in this order
 TOLD = ("total", "log_total", "ess", "increment", "resampled", "unique", "worst")
 #: what is told of a number in a slice: its mean and variance; by how much it lies off the mean without the
 #: slice's row, and the variance there; the sum of what rows move it by, in units of its spread, and the
@@ -37,8 +37,8 @@ _WHOLES = (
 )  # fmt: skip
 _REALS = ("least", "log_particles", "fading", "kept", "least_expected")
 _POINTERS = (
-    "kernel", "arguments", "state", "ziggurat", "node", "noise", "moving", "at", "identity", "running", "told", "number",
-    "moments",
+    "kernel", "arguments", "state", "ziggurat", "node", "noise", "moving", "at", "identity", "running",
+    "told", "number", "moments",
 )  # fmt: skip
 
 
@@ -48,22 +48,23 @@ def passes() -> Any:
 
     It makes up to so many slices, and gives how many it made. Row 0 of ``at`` and ``told`` is that of the
     slice before. Of each slice, ``at`` (slices + 1, 3 + nodes) has the addresses of log weights, weights,
-    ancestors (one more than there are particles), and the values of each node. ``node`` (nodes, 3): where a
-    node's values are results of the kernel, where those of the slice before are its leaves (either -1: nowhere), and
-    the bytes of one particle. ``noise`` (noises, 2): the address of a leaf of normals, and the
-    numbers of one particle. ``moving`` (known, 3): the place of a leaf that all particles share, the address of its
-    value in the first slice, the bytes to the next one's. ``rows_place`` is where the kernel is told the ancestors (-1: nowhere), ``log_place``
-    where it leaves the log density of what is seen. Particles are resampled where
-    they are worth less than ``least``.
+    ancestors (one more than there are particles), and the values of each node.
 
-    ``number`` (numbers, 4) says of which numbers moments are taken (slices + 1, numbers, len(MOMENTS)): the
-    column of ``at``, how many numbers of a particle lie there and which one it is, whether its moves count for
-    ``worst``: the largest sum of moves in units of what is expected of it. From slice to slice sums fade by
-    ``fading`` and the worst by ``kept``.
+    ``node`` (nodes, 3): where a node's values are results of the kernel, where those of the slice before are
+    its leaves (either -1: nowhere), the bytes of one particle. ``noise`` (noises, 2): the address of a leaf
+    of normals, the numbers of one particle. ``moving`` (known, 3): the place of a leaf that all particles
+    share, the address of its value in the first slice, the bytes to the next one's. ``rows_place`` is where
+    the kernel is told the ancestors (-1: nowhere), ``log_place`` where it leaves the log density of what is
+    seen.
+
+    Particles are resampled where they are worth less than ``least``.
+
+    ``number`` (numbers, 4) says of which numbers ``moments`` (slices + 1, numbers, len(MOMENTS)) are taken:
+    the column of ``at``, how many numbers of a particle lie there and which one it is, whether its moves
+    count for ``worst``: the largest sum of moves in units of what is expected of it. From slice to slice sums
+    fade by ``fading`` and the worst by ``kept``.
     """
-    module = Module()
-    texts = [*draws(module), *loops(module), _slices(module)]
-    code = loaded("\n".join([str(module), *texts]), module.foreign)
+    code = loaded(*text())
     wholes, reals = [ctypes.c_int64] * len(_WHOLES), [ctypes.c_double] * len(_REALS)
     found = code.function(
         "slices", ctypes.c_int64, *wholes, *reals, *[ctypes.c_void_p] * len(_POINTERS)
@@ -72,14 +73,22 @@ def passes() -> Any:
     return found
 
 
+@lru_cache(maxsize=1)
+def text() -> tuple[str, tuple[str, ...]]:
+    """The module of ``passes``, and the functions that it calls and does not define."""
+    module = Module()
+    texts = [*draws(module), *loops(module), _slices(module)]
+    return "\n".join([str(module), *texts]), module.foreign
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 
 def _slices(module: Module) -> str:
-    text = _Text(module)
+    made = _Text(module)
     head = [*(f"i64 %{n}" for n in _WHOLES), *(f"double %{n}" for n in _REALS)]
     head += [f"ptr noalias %{n}" for n in _POINTERS]
-    return f"define i64 @slices({', '.join(head)}) {{\n{text.c}\n}}"
+    return f"define i64 @slices({', '.join(head)}) {{\n{made.c}\n}}"
 
 
 class _Text:
@@ -188,9 +197,7 @@ class _Text:
         def normals(k: Number) -> None:
             to = self._pointer(c.load("%noise", k * 2, WHOLE))
             numbers = count * c.load("%noise", k * 2 + 1, WHOLE)
-            c.do(
-                f"call void @normals(i64 {numbers.text}, ptr %state, ptr %ziggurat, ptr {to})"
-            )
+            c.do(f"call void @normals(i64 {numbers.text}, ptr %state, ptr %ziggurat, ptr {to})")
 
         c.loop(Number(c, "%noises", WHOLE), normals)
 
@@ -279,7 +286,8 @@ class _Text:
         spent = c.where(resampled, n.to(REAL), self._told(self.old, "total"))
         own, off = c.get(variance, REAL) / total, c.get(shift, REAL) / spent
         wide = c.get(square, REAL) / spent - off * off
-        at = [(s * Number(c, "%numbers", WHOLE) + k) * len(MOMENTS) for s in (self.slice_of(0), self.slice_of(1))]
+        many, s = Number(c, "%numbers", WHOLE), c.get(self.slice, WHOLE)
+        at = [(row * many + k) * len(MOMENTS) for row in (s, s + 1)]
         fading, some = Number(c, "%fading", REAL), wide > 0.0
         moved, expected = (
             c.load("%moments", at[0] + MOMENTS.index(name), REAL) for name in ("moved", "expected")
@@ -297,9 +305,6 @@ class _Text:
         c.store("%told", place, c.where(is_worse, far, worst))
 
     # ---- private -------------------------------------------------------------------------------
-
-    def slice_of(self, more: int) -> Number:
-        return self.c.get(self.slice, WHOLE) + more
 
     def _told(self, first: Number, name: str) -> Number:
         return self.c.load("%told", first + TOLD.index(name), REAL)

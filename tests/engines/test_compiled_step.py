@@ -13,7 +13,7 @@ from bayesmc.engines import slice_densities
 from bayesmc.engines.particles import compiled_step
 from bayesmc.errors import BayesmcError
 from bayesmc.expression import elementwise
-from bayesmc.lowering import machine, writer
+from bayesmc.lowering import machine, series, writer
 
 pytest.importorskip("llvmlite", reason="llvmlite is not installed")
 
@@ -89,7 +89,9 @@ def passed(name: str, monkeypatch: pytest.MonkeyPatch, code: bool, **options: An
     made: list[compiled_step.SliceCode] = []
     kind, read = compiled_step.SliceCode, options.pop("read", False)
     with monkeypatch.context() as patch:
-        patch.setattr(compiled_step, "SliceCode", lambda step: made.append(kind(step)) or made[-1])
+        patch.setattr(
+            compiled_step, "SliceCode", lambda *a, **k: made.append(kind(*a, **k)) or made[-1]
+        )
         patch.setattr(compiled_step, "_WORTH", 0.0 if code else np.inf)
         patch.setattr(compiled_step, "_READ", 0 if read else np.inf)
         dbn, seen = MODELS[name]()
@@ -194,13 +196,13 @@ def test_planted_faults_leave_it_to_the_plain_steps(
             slice_densities, "_draw", lambda n, f, z: draw(n, f, elementwise(np.multiply, z, 1.001))
         )
     else:
-        call = compiled_step._Slice.__call__
+        call = series.SliceCall.__call__
 
-        def turned(self: Any, row: Any, before: Any, selection: Any, rng: Any) -> Any:
-            rows = np.roll(np.arange(selection.particles), 1)
-            return call(self, row, before, selection._replace(ancestors=rows), rng)
+        def turned(self: Any, least: float, cloud: Any, *args: Any) -> Any:
+            rows = np.roll(np.arange(len(cloud.log)), 1)
+            return call(self, least, cloud._replace(rows=rows), *args)
 
-        monkeypatch.setattr(compiled_step._Slice, "__call__", turned)
+        monkeypatch.setattr(series.SliceCall, "__call__", turned)
     fast, code = passed("growth", monkeypatch, True)
     assert "other particles" in str(code.refused)
     np.testing.assert_allclose(fast.mean("x"), plain.mean("x"), rtol=1e-9, atol=1e-9)

@@ -1,8 +1,8 @@
 """The step of a particle filter as machine code: slices whose densities can be followed, weights, resampling.
 
-Random numbers are those that NumPy's generator would hand out, in the order in which the steps of a slice draw
-them, so that a seed gives the same particles to rounding. Whatever is out of the ordinary (a parameter out of
-range, a weight that is no number) is done again by the plain steps, which say what is wrong.
+Random numbers are those that NumPy's generator would hand out, in the order in which the steps of a slice
+draw them, so that a seed gives the same particles to rounding. Whatever is out of the ordinary (a parameter
+out of range, a weight that is no number) is done again by the plain steps, which say what is wrong.
 
 The machine code of each kind of slice is held against the plain steps before its first use.
 """
@@ -10,6 +10,7 @@ The machine code of each kind of slice is held against the plain steps before it
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -42,13 +43,15 @@ from bayesmc.resampling import systematic
 _SLICE, _PARTICLE, _WORTH = 1e-4, 4e-8, 0.1
 #: seconds that a program saves of a slice, and of a particle in it; and that reading its densities takes
 _CALLS, _PASSES, _READ = 6e-5, 4e-9, 5e-3
+#: seconds that machine code saves of a slice, and of a particle in it; that loading some takes, and llvmlite
+_SAVED, _PER_PARTICLE, _LOAD, _IMPORT = 5e-5, 1e-8, 0.02, 0.02
 #: machine code, where it is kept with a model
 _KEPT = "compiled slices"
 #: numbers of an array of slices that are made in one call, and such slices, at most
 _NUMBERS, _TOGETHER = 1 << 17, 100
 
 
-def compiled_step(step: FilterStep, steps: int) -> FilterStep:
+def compiled_step(step: FilterStep, steps: int, compiled: bool | None = None) -> FilterStep:
     """A step whose slices are programs of NumPy's, or machine code, where that pays; the same object.
 
     Parameters
@@ -56,19 +59,21 @@ def compiled_step(step: FilterStep, steps: int) -> FilterStep:
     step : FilterStep
     steps : int
         How many slices it will make.
+    compiled : bool, optional
+        Whether they are machine code; by default where that pays.
     """
     saved = steps * (_CALLS + _PASSES * step.layout.particles)
     step.plan.is_read = saved > _READ
-    if _why_not(step, steps) is None:
-        step.machine = SliceCode(step)
+    if _why_not(step, steps, compiled) is None:
+        step.machine = SliceCode(step, only_kept=compiled is None and _is_short(step, steps))
     return step
 
 
-def told(step: FilterStep, problem: SeriesProblem) -> str:
+def told(step: FilterStep, problem: SeriesProblem, compiled: bool | None = None) -> str:
     """What makes the slices of a series, and why nothing faster does; nothing where that is no question."""
-    if not is_available() or _is_short(step, problem.steps):
+    if compiled is None and (not is_available() or _is_short(step, problem.steps)):
         return ""
-    reason = _why_not(step, problem.steps)
+    reason = _why_not(step, problem.steps, compiled)
     row = problem.series.row(problem.steps - 1)
     try:
         if reason is None and any(seen.mask is not None for seen in row.seen.values()):
@@ -91,6 +96,8 @@ class SliceCode:
     Parameters
     ----------
     step : FilterStep
+    only_kept : bool, optional
+        Take what an earlier run has compiled, and compile nothing.
 
     Attributes
     ----------
@@ -98,8 +105,8 @@ class SliceCode:
         What kind of slice is not machine code -> why.
     """
 
-    def __init__(self, step: FilterStep) -> None:
-        self._step = step
+    def __init__(self, step: FilterStep, only_kept: bool = False) -> None:
+        self._step, self._only_kept = step, only_kept
         self._made: dict[Any, _Slice | None] = {}
         self.refused: dict[Any, str] = {}
 
@@ -157,13 +164,15 @@ class SliceCode:
         if key not in self._made:
             self._made[key] = None
             try:
-                made = _Slice(self._step, row, chosen)
+                made = _Slice(self._step, row, chosen, self._only_kept)
                 if not made.is_right:
                     made.hold(row, before, selection, rng)
                 self._made[key] = made
             except TraceError as error:
                 self.refused[key] = str(error)
-            except Exception:  # the plain steps break on what was tried: perhaps not on the next slice
+            except (
+                Exception
+            ):  # the plain steps break on what was tried: perhaps not on the next slice
                 del self._made[key]
                 return None
         return self._made[key]
@@ -172,10 +181,12 @@ class SliceCode:
 # ---- private ------------------------------------------------------------------------------------
 
 
-def _why_not(step: FilterStep, steps: int) -> str | None:
+def _why_not(step: FilterStep, steps: int, compiled: bool | None) -> str | None:
+    if compiled is False:
+        return "compiled=False"
     if not is_available():
-        return "there is no llvmlite"
-    if _is_short(step, steps):
+        return "there is no llvmlite: pip install bayesmc[fast]"
+    if compiled is None and _is_short(step, steps) and not _is_at_hand(step, steps):
         return "it takes no time"
     if step.layout.apart or step.injection is not None or type(step.plan) is not SlicePlan:
         return "plates apart, injection and proposals are made by plain steps"
@@ -184,6 +195,14 @@ def _why_not(step: FilterStep, steps: int) -> str | None:
 
 def _is_short(step: FilterStep, steps: int) -> bool:
     return steps * (_SLICE + _PARTICLE * step.layout.particles) < _WORTH
+
+
+def _is_at_hand(step: FilterStep, steps: int) -> bool:
+    """Whether machine code is loaded, or would be loaded in less time than it saves."""
+    if step.slices.later.cache.get(_KEPT):
+        return True
+    load = _LOAD if "llvmlite" in sys.modules else _LOAD + _IMPORT
+    return steps * (_SAVED + _PER_PARTICLE * step.layout.particles) > load
 
 
 def _resamples(step: FilterStep) -> bool:
@@ -198,14 +217,15 @@ def _read(step: FilterStep, row: Row) -> SliceDensities:
 class _Slice:
     """One kind of slice."""
 
-    def __init__(self, step: FilterStep, row: Row, chosen: frozenset[str]) -> None:
+    def __init__(self, step: FilterStep, row: Row, chosen: frozenset[str], only_kept: bool) -> None:
         self._step, model = step, step.slices.model(row.t)
         kept = model.cache.setdefault(_KEPT, {})  # the next series finds it there
         key = (frozenset(row.seen), step.kept, chosen)
         if key not in kept:
             read = _read(step, row)
             roots, noises = [*read.values.values(), read.flagged], read.drawn
-            kernel = SliceKernel(roots, {z.noise: z.shape for z in noises}, chosen)
+            own = {z.noise: z.shape for z in noises}
+            kernel = SliceKernel(roots, own, chosen, only_kept)
             kept[key] = [list(read.values), kernel, False]
         self._kept = kept[key]
         self._names, self._kernel, _ = self._kept
@@ -279,7 +299,7 @@ class _Slice:
         arrays.insert(2, np.empty((1, n + 1), np.int64))
         addresses = [(a.ctypes.data, 0) for a in columns]
         made = self._call(-math.inf, cloud, addresses, arrays, rng)
-        if not made.count:
+        if not made.slices:
             return None
         total, log_total, ess, increment = made.told[1, :4].tolist()
         for array in own[2:]:
@@ -329,7 +349,7 @@ class _Slice:
         return {name: known[name] for name in self._rest}
 
     def _numbers(self, tracker: Tracker) -> Numbers:
-        """All numbers of nodes, and which of them a tracker looks at the moves of; none where it takes others."""
+        """All numbers of nodes, and whose moves a tracker looks at; none where it takes others."""
         compass = tracker.compass
         moved = () if compass is None else tuple(n.name for n in compass.nodes)
         if not set(moved) <= set(self._names):
@@ -351,7 +371,9 @@ class _Slice:
             found = every[name]
         elif name.endswith(PREVIOUS):
             found = every[name.removesuffix(PREVIOUS)]
-            found = np.concatenate([found[:1], found[:-1]]) if name != TIME + PREVIOUS else times - 1
+            found = (
+                np.concatenate([found[:1], found[:-1]]) if name != TIME + PREVIOUS else times - 1
+            )
         else:
             return known_column(leaf, self._step.plan.static[name]), 0
         found = known_column(leaf, found)

@@ -1,26 +1,28 @@
-"""Slices that were made in one call of machine code, and what is followed beside their particles.
+"""Slices that are made in one call of machine code: passed one by one, and what is followed beside them.
 
-The loop over slices in which nothing is to be said about families is machine code, too (``lowering.lineage``);
-any other slice is looked at by ``tracking``, as if it had been made by itself.
+The loop over slices in which nothing is to be said about families is machine code, too
+(``lowering.lineage``); any other slice is looked at by ``tracking``, as if it had been made by itself.
 """
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import Row
+from bayesmc.dbn import Row, SeriesProblem
 from bayesmc.engines.particles import genealogy
 from bayesmc.engines.particles.errors import ENOUGH
 from bayesmc.engines.particles.families import LONGEST, OLD, YOUNG, Drift, Families
+from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.particles.sums import Sums
 from bayesmc.engines.particles.tracking import STRETCH, Tracker
 from bayesmc.lowering import Made, Numbers, followed
+from bayesmc.network import CompiledNode
 
 #: columns of what is told of a slice: ``lowering.slices.TOLD``
 TOTAL, LOG_TOTAL, ESS, INCREMENT, RESAMPLED, UNIQUE, WORST = range(7)
@@ -52,9 +54,9 @@ class MadeSlices:
         known: Callable[[Row], dict[str, np.ndarray]],
         numbers: Numbers,
     ) -> None:
-        self.made, self.rows, self._arrays = made, list(rows[: made.count]), arrays
+        self.made, self.rows, self._arrays = made, list(rows[: made.slices]), arrays
         self.names, self.known, self.numbers = tuple(names), known, numbers
-        self.figures = made.told[1 : made.count + 1]
+        self.figures = made.told[1 : made.slices + 1]
         self._told = self.figures.tolist()
         self._particles: dict[int, Particles] = {}
         self.size = arrays[0].shape[1]
@@ -64,13 +66,13 @@ class MadeSlices:
 
     def first(self, count: int) -> MadeSlices:
         """The first so many of them."""
-        made = self.made._replace(count=count)
+        made = self.made._replace(slices=count)
         return MadeSlices(made, self.rows, self._arrays, self.names, self.known, self.numbers)
 
     def particles(self, k: int) -> Particles:
         """Those of the k-th slice; read-only."""
         if k not in self._particles:
-            total, log_total, ess, increment, resampled = self._told[k][:RESAMPLED + 1]
+            total, log_total, ess, increment, resampled = self._told[k][: RESAMPLED + 1]
             log, weights, ancestors, *own = (a[k] for a in self._arrays)
             for array in own:
                 array.flags.writeable = False
@@ -82,10 +84,20 @@ class MadeSlices:
             )  # fmt: skip
         return self._particles[k]
 
-    def sizes(self) -> dict[str, int]:
-        """How many numbers of each node there are."""
-        values = self._arrays[3:]
-        return {n: math.prod(a.shape[2:]) for n, a in zip(self.names, values, strict=True)}
+    def figures_of(
+        self, nodes: Sequence[CompiledNode], whole: Sequence[np.ndarray]
+    ) -> Iterator[tuple[CompiledNode, list[np.ndarray]]]:
+        """For each node its part of means, variances and errors of all numbers, slices first."""
+        places, low = {}, 0
+        for name, values in zip(self.names, self._arrays[3:], strict=True):
+            size = math.prod(values.shape[2:])
+            places[name], low = slice(low, low + size), low + size
+        for node in nodes:
+            if node.name in places:
+                yield node, [a[:, places[node.name]] for a in whole]
+                continue
+            value = np.array([self.known(row)[node.name] for row in self.rows], dtype=float)
+            yield node, [value, np.zeros_like(value), np.zeros_like(value)]
 
     def diagnosed(self) -> dict[str, np.ndarray]:
         """Figures of the filter itself: ``blocks.diagnosed``."""
@@ -107,8 +119,66 @@ class MadeSlices:
         return _Following(self, tracker, families, earlier).run()
 
 
+class Ahead:
+    """Slices that are made together, and passed one by one.
+
+    Parameters
+    ----------
+    machine : SliceCode
+        Makes them.
+    problem : SeriesProblem
+    record : Record
+    """
+
+    def __init__(self, machine: Any, problem: SeriesProblem, record: Any) -> None:
+        self._machine, self._problem, self._record = machine, problem, record
+        self._made: MadeSlices | None = None
+        self._before: Particles | None = None
+        self._first, self._is_followed = 0, False
+
+    def reaches(self, k: int, now: Particles | None, rng: np.random.Generator) -> bool:
+        """Whether the k-th slice, which follows that of some particles, is made together with others."""
+        if self._made is None:
+            self._is_followed = False
+            self._made = self._machine.several(self._problem, k, now, rng, self._beside)
+            self._first, self._before = k, now
+        return self._made is not None
+
+    def passed(self, k: int, looks: Replicates | None) -> Particles | None:
+        """Take in the k-th slice; its particles, or None where nobody asks for them."""
+        made, j = self._made, k - self._first
+        assert made is not None
+        if looks is not None and looks.wanted(k):
+            looks.look(k, made.particles(j - 1) if j else self._before, made.rows[j])
+        is_last = j == len(made) - 1
+        if not self._is_followed:
+            self._record.add(k, made.particles(j), made.rows[j])
+        elif is_last:
+            self._record.add_made(made)
+        if is_last:
+            self._made = None
+        return made.particles(j) if is_last else None
+
+    def stop(self, steps: int) -> None:
+        """Take in what was passed of so many slices."""
+        made, self._made = self._made, None
+        if made is not None and self._is_followed and steps > self._first:
+            self._record.add_made(made.first(steps - self._first))
+
+    def _beside(self) -> tuple[Tracker, Families] | None:
+        """What is followed beside slices that are made together, if answers take no more than sums."""
+        record, tracker = self._record, self._record.tracker
+        nodes = [self._problem.model[n] for n in self._problem.hidden]
+        if tracker is None or record.asked or record.keep or not tracker.is_summed(nodes):
+            return None
+        record.write()
+        families = record.families
+        self._is_followed = families is not None and families.scouts is None
+        return (tracker, families) if self._is_followed else None
+
+
 class Store:
-    """Arrays that are used again once nobody else holds them: fresh ones cost the machine a page at a time."""
+    """Arrays that are used again once nobody else holds them: fresh ones cost a page at a time."""
 
     def __init__(self) -> None:
         self._held: dict[Any, list[np.ndarray]] = {}

@@ -112,16 +112,15 @@ class Tracker:
 
     def summing(self, nodes: Sequence[CompiledNode]) -> Summing | None:
         """What takes the sums of slices with these nodes, where these say all; else None."""
-        every = {n.name: n for n in (*nodes, *self.sight.nodes)}.values()
-        if self.layout.particles < MANY or not self.is_summed(nodes):
-            return None
+        every = list({n.name: n for n in (*nodes, *self.sight.nodes)}.values())
         few = sum(math.prod(n.value_shape) for n in every) <= NUMBERS
-        return Summing(list(every), self.layout.particles) if few else None
+        some = few and self.layout.particles >= MANY and self.is_summed(every)
+        return Summing(every, self.layout.particles) if some else None
 
     def is_summed(self, nodes: Iterable[CompiledNode]) -> bool:
         """Whether sums over particles say all of slices with these nodes."""
-        plain = all(n.domain is None and n.angles is None for n in (*nodes, *self.sight.nodes))
-        return self._is_plain and plain
+        every = (*nodes, *self.sight.nodes)
+        return self._is_plain and all(n.domain is None and n.angles is None for n in every)
 
     def tally(
         self,
@@ -137,8 +136,6 @@ class Tracker:
             drift = None if families is None else families.drift
             drift = self.compass.after_moments(drift, moments)
         return summing.tally(now, moments, self.followed_by(families, earlier, now, row, drift))
-
-    # ---- private -------------------------------------------------------------------------------
 
     def followed_by(
         self,
@@ -168,6 +165,8 @@ class Tracker:
         if missing is not False or lost is not None:
             lost = self.sight.after(lost, np.asarray(missing), now)
         return families._replace(settled=settled, lost=lost, scouts=scouts, drift=drift)
+
+    # ---- private -------------------------------------------------------------------------------
 
     def _quickly(
         self, families: Families, earlier: Particles, now: Particles, drift: Drift | None
