@@ -59,7 +59,7 @@ def infer(
         What to hold: all draws; means, variances and probabilities alone, in constant memory; or the
         draws of some nodes.
     resume : Posterior, optional
-        An earlier posterior of the same question whose draws are continued.
+        An earlier posterior of the same question whose draws are continued; ``engine`` may be left out then.
 
     Returns
     -------
@@ -81,6 +81,8 @@ def infer(
     """
     problem = pose_any(net, evidence, inputs, resume)
     _check_keep(keep, problem)
+    if engine is None and resume is not None:
+        engine = resume.engine
     chosen = _choose(problem)[0] if engine is None else _checked(engine)
     reason = None if isinstance(chosen, Exact) else chosen.refusal(problem)
     if reason is not None:

@@ -3,12 +3,18 @@
 A potential that orders two means has no conjugate pair; a term that reads all labels together (both groups of
 a mixture exist; a total was seen) ties them. Without such terms the conditional is drawn at once. That draw
 knows nothing of where the chain stands, and so the ratio of the terms left out alone decides (an independence
-Metropolis-Hastings step). Terms that say little accept nearly always; where they refuse most draws the node
-moves by the kernel that sees them, too.
+Metropolis-Hastings step). Such a chain forgets its start at one rate only where the ratio of the posterior to
+the proposal is bounded, and it is slow where the bound is far above its average: a place that the proposal
+hardly reaches and that the terms favour is never left once it is reached, or never reached, however often
+draws are accepted elsewhere. So the node moves by the kernel that sees the terms in every sweep, too, unless
+they only say what is possible (there a draw is accepted with the same probability wherever the chain stands)
+and do not refuse most draws.
 
 References
 ----------
-Tierney (1994), Markov chains for exploring posterior distributions, Annals of Statistics 22(4), sec. 2.3.3.
+Tierney (1994), Markov chains for exploring posterior distributions, Annals of Statistics 22(4), sec. 2.3.3;
+Mengersen and Tweedie (1996), Rates of convergence of the Hastings and Metropolis algorithms, Annals of
+Statistics 24(1), theorem 2.1.
 """
 
 from __future__ import annotations
@@ -23,11 +29,12 @@ from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
 from bayesmc.kernels.enumerate import Enumerate
 from bayesmc.kernels.slice import Slice
+from bayesmc.passes.branches import is_constraint
 from bayesmc.structure.blanket import Blanket, Child
 from bayesmc.structure.like_terms import with_like_children
 from bayesmc.structure.target import Values
 
-#: rate of acceptance below which the node moves by the other kernel, too, and how fast it is learnt
+#: rate of acceptance below which the node moves by the other kernel, too, and how fast it is learnt (from 0)
 _OFTEN, _RATE = 0.25, 0.1
 
 
@@ -42,7 +49,7 @@ class Accepted(Kernel):
     proposal : Kernel
         Draws the whole node from its conditional without them, wherever it stands: what has one colour.
     other : Kernel
-        Moves it where these terms refuse most draws.
+        Moves it, too, where these terms are more than constraints, or refuse most draws.
     """
 
     band = None  # where few are accepted the node moves otherwise
@@ -53,11 +60,15 @@ class Accepted(Kernel):
         self.blanket = blanket
         self.names = (blanket.name,)
         self.left_out = [child.term for child in left_out]
+        found = [term.expression for term in self.left_out]
+        self.constraints = all(e is not None and is_constraint(e) for e in found)
         self.proposal, self.other = proposal, other
         self.label = proposal.label
         names = ", ".join(repr(term.name) for term in self.left_out)
         self.match = f"{proposal.match}, accepted by {names}"
         self.evaluations = proposal.evaluations + 2
+        if not self.constraints:
+            self.evaluations += other.evaluations
 
     def expect(self, steps: int, chains: int) -> None:
         """Both kernels may want to know."""
@@ -67,7 +78,7 @@ class Accepted(Kernel):
     def start(self, values: Values, chains: int) -> Memory:
         """What the kernels remember, counts of what is accepted, and the rate learnt so far."""
         own, other = self.proposal.start(values, chains), self.other.start(values, chains)
-        counts = {"accepted": np.zeros(chains), "moves": 0, "rate": 1.0}
+        counts = {"accepted": np.zeros(chains), "moves": 0, "rate": 0.0}
         return {"proposal": own, "other": other, **counts}
 
     def step(
@@ -86,7 +97,7 @@ class Accepted(Kernel):
         chosen = taken.reshape(-1, *(1,) * (new.ndim - 1))
         moved = {name: np.where(chosen, new, values[name])}
         memory = {**memory, "proposal": own}
-        if memory["rate"] < _OFTEN:
+        if not self.constraints or memory["rate"] < _OFTEN:
             state = {**values, **moved}
             target.compute(state, self.blanket.path)
             moved, memory["other"] = self.other.step(state, memory["other"], rng, warmup)
@@ -94,6 +105,11 @@ class Accepted(Kernel):
             return moved, counted(memory, taken)
         rate = (1 - _RATE) * memory["rate"] + _RATE * float(taken.mean())
         return moved, {**memory, "rate": rate}
+
+    def moved(self, values: Values, memory: Memory) -> Memory:
+        """What both kernels knew of the old place goes."""
+        own = self.proposal.moved(values, memory["proposal"])
+        return {**memory, "proposal": own, "other": self.other.moved(values, memory["other"])}
 
     def end_warmup(self, memory: Memory) -> Memory:
         """Which kernels go on is settled."""

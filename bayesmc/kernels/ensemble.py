@@ -68,6 +68,8 @@ class BlockWalk(Kernel):
         Share of moves that are draws from a mixture fitted to the whole density, at the first step of a
         warmup: of all hidden numbers, few and none of them an angle (``parts.may_be_drawn_anew``). With 1
         there are no others.
+    every : int
+        Steps of which one moves the block.
 
     Examples
     --------
@@ -101,13 +103,14 @@ class BlockWalk(Kernel):
         adaptive: bool = True,
         alone: bool = False,
         anew: float = 0.0,
+        every: int = 1,
     ) -> None:
         self.block = Block(target, names)
         self.names = self.block.names
         self.ensemble = ensemble
         self.unconstrained = unconstrained
         self.alone = alone
-        self.anew = anew
+        self.anew, self.every = anew, every
         self.parts = parts_of(target, self.names, unconstrained)
         size = self.parts[-1].stop
         angles = [angles_of(target, part, unconstrained) for part in self.parts]
@@ -123,6 +126,7 @@ class BlockWalk(Kernel):
             )
         numbers = f"{size} number{'s' if size > 1 else ''}"
         self.match = f"{numbers} at once" + (f", {self.match}" if self.match else "")
+        self.evaluations = 1.0 / every
 
     @property
     def size(self) -> int:
@@ -140,6 +144,7 @@ class BlockWalk(Kernel):
             "moves": 0,
             "mixture": None,
             "fitted": not self.anew,
+            "step": 0,
         }
 
     def step(
@@ -147,7 +152,9 @@ class BlockWalk(Kernel):
     ) -> tuple[Values, Memory]:
         if warmup and not memory["fitted"]:
             memory = {**memory, "fitted": True, "mixture": self._fitted(values, rng)}
-        if self.anew == 1.0 and memory["mixture"] is None:
+        memory = {**memory, "step": memory["step"] + 1}
+        stays = self.anew == 1.0 and memory["mixture"] is None
+        if stays or memory["step"] % self.every:
             return {name: values[name] for name in self.names}, memory
         if self.alone and not self.block.has_own_data(values):
             u, log = memory["u"].copy(), memory["log"].copy()

@@ -6,11 +6,12 @@ become a kernel of nodes, and what was seen of trajectories is counted.
 
 from __future__ import annotations
 
+import warnings
 from typing import Any, Protocol
 
 import numpy as np
 
-from bayesmc.errors import DensityError, TraceError
+from bayesmc.errors import DensityError, EngineWarning, TraceError
 from bayesmc.kernels.base import Kernel, Memory, counted
 from bayesmc.kernels.compiled_transition import CompiledTransition
 from bayesmc.kernels.hamiltonian_warmup import (
@@ -145,6 +146,7 @@ class Hamiltonian(Kernel):
             "values": {n: values[n] for n in self.names},
             "metric": self.metric.start(slope),
             "step": self.step_size.start(np.zeros(chains)),
+            "machine": self._compiled is not None,
             "sweep": 0,
             "windows": 0,
             "work": np.zeros(2),
@@ -168,7 +170,8 @@ class Hamiltonian(Kernel):
         length = np.exp(memory["step"]["log"])
         early = warmup and memory["windows"] < min(2, len(self.ends))
         depth = min(self.max_depth, _EARLY) if early else self.max_depth
-        found = self._moved(gradient, place, length, scale, rng, depth, values)
+        memory = {**memory}
+        found = self._moved(gradient, place, length, scale, rng, depth, values, memory)
         place = found.place
         new = self.density.constrain(place.u, values)
         kept = {**memory, "place": place._asdict(), "values": new, "divergent": found.divergent}
@@ -213,15 +216,23 @@ class Hamiltonian(Kernel):
         rng: np.random.Generator,
         depth: int,
         values: Values,
+        memory: Memory,
     ) -> Transition:
-        """A transition in machine code where there is some, and it grows the trees that NumPy grows."""
-        if self._compiled is not None:
+        """A transition in machine code where there is some, and it grows the trees that NumPy grows.
+
+        Which of both a run began with, and has come to, is part of its memory: so a resumed run draws the
+        same numbers.
+        """
+        if self._compiled is not None and memory["machine"]:
             try:
                 return self._compiled(gradient, place, step, scale, rng, depth, values)
-            except TraceError:
+            except TraceError as error:
                 if self.debug:
                     raise
-                self._compiled = None
+                memory["machine"] = False
+                names = ", ".join(map(repr, self.names[:6]))
+                text = f"nodes {names}: trajectories go on in NumPy, more slowly: {error}"
+                warnings.warn(text, EngineWarning, stacklevel=2)
         return transition(gradient, place, step, scale, rng, depth)
 
     def _place(self, values: Values, memory: Memory, gradient: Gradient) -> Place:

@@ -51,6 +51,8 @@ class MixtureOfT(NamedTuple):
         Inverses of the roots.
     heights : ndarray, shape (components,)
         Log densities at the centres, shares included.
+    whitened : ndarray, shape (components, numbers)
+        The centres' distances from their mean, whitened.
     """
 
     shares: np.ndarray
@@ -58,6 +60,7 @@ class MixtureOfT(NamedTuple):
     roots: np.ndarray
     whitening: np.ndarray
     heights: np.ndarray
+    whitened: np.ndarray
 
     @classmethod
     def of(cls, shares: np.ndarray, centres: np.ndarray, roots: np.ndarray) -> MixtureOfT:
@@ -67,7 +70,9 @@ class MixtureOfT(NamedTuple):
         constant -= 0.5 * d * math.log(_DF * math.pi)
         pivots = np.diagonal(roots, axis1=1, axis2=2)
         heights = np.log(shares) - np.log(pivots).sum(axis=1) + constant
-        return cls(shares, centres, roots, np.linalg.inv(roots), heights)
+        whitening = np.linalg.inv(roots)
+        whitened = np.matvec(whitening, centres - centres.mean(axis=0))
+        return cls(shares, centres, roots, whitening, heights, whitened)
 
     def draw(self, rng: np.random.Generator, count: int) -> np.ndarray:
         """Independent draws, shape ``(count, numbers)``."""
@@ -78,8 +83,10 @@ class MixtureOfT(NamedTuple):
 
     def log_prob(self, u: np.ndarray) -> np.ndarray:
         """Log density of ``u``, shape ``(rows,)``."""
-        d = self.centres.shape[1]
-        z = np.matvec(self.whitening, u[:, None, :] - self.centres)
+        count, d = self.centres.shape
+        # one product for all components, of distances from the middle, so that no digits are lost
+        z = (u - self.centres.mean(axis=0)) @ self.whitening.reshape(-1, d).T
+        z = z.reshape(-1, count, d) - self.whitened
         logs = self.heights - 0.5 * (_DF + d) * np.log1p(np.vecdot(z, z) / _DF)
         top = logs.max(axis=1)
         return np.asarray(top + np.log(np.exp(logs - top[:, None]).sum(axis=1)))
@@ -187,7 +194,7 @@ def _about(u: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> Mixt
     spread = np.where(spread > 0, spread, 1e-3 * (1.0 + np.abs(u[0])))
     z, c = u / spread, centres / spread
     off = z[None] - c[:, None]  # (components, points, numbers)
-    squares = np.einsum("knd,knd->kn", off, off)
+    squares = np.vecdot(off, off)
     order = np.argsort(squares, axis=1)
     mass = np.cumsum(weights[order], axis=1) - weights[order]
     near = np.where(mass < _NEAR, weights[order], 0.0)
@@ -196,7 +203,7 @@ def _about(u: np.ndarray, weights: np.ndarray, rng: np.random.Generator) -> Mixt
     local = np.zeros(squares.shape)
     np.put_along_axis(local, order, near, axis=1)
     local /= local.sum(axis=1, keepdims=True)
-    cov = np.einsum("kn,knd,kne->kde", local, off, off)
+    cov = np.matmul((local[..., None] * off).swapaxes(1, 2), off)
     wide = np.trace(cov, axis1=1, axis2=2) / d
     # of a few points in many directions a covariance comes out too small
     cov = (1.0 + 0.25 * d) * cov + (0.02 * wide + 1e-12)[:, None, None] * np.eye(d)

@@ -161,10 +161,11 @@ def _called(model: Model, node: CompiledNode) -> tuple[Any, Shape]:
             node.called(entry(node, model.probe, model.probe_shape))
         except BayesmcError as alone:
             raise alone from alone.__cause__
+        instead = "np.exp for math.exp" if "Python scalars" in str(error) else "np.where for if"
         raise BroadcastError(
             f"node {node.name!r} works on one value at a time but not on arrays of them: "
             f"{str(error).removeprefix(f'node {node.name!r}: ')}; write it with NumPy "
-            "(np.where for if, axis=-1 for components), or declare vectorize=True (slow)"
+            f"({instead}, axis=-1 for components), or declare vectorize=True (slow)"
         ) from error
 
 

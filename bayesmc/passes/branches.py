@@ -1,10 +1,13 @@
 """Branches moved up: ``log(np.where(s, p, q))`` as ``np.where(s, log(p), log(q))``.
 
-Afterwards what is done to a leaf in one branch stands apart from what is done in the other.
+Afterwards what is done to a leaf in one branch stands apart from what is done in the other. Branches between
+few constants say what is possible.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import Any
 
 import numpy as np
@@ -28,6 +31,8 @@ from bayesmc.passes.reads import same_along
 
 #: branches in one operation, at most
 _MOST = 6
+#: values by which a factor is seen to be a constraint, at most
+_LEVELS = 4
 
 
 def branches_up(root: Expression, name: str) -> Expression:
@@ -46,7 +51,50 @@ def branches_up(root: Expression, name: str) -> Expression:
     return rewritten([root], lambda node, new: _up(node.with_operands(new), name))[0]
 
 
+def is_constraint(log_factor: Expression) -> bool:
+    """Whether a log factor only says what is possible: it is minus infinity, or always the same number.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from bayesmc.expression import TracedArray, leaf, trace
+    >>> from bayesmc.passes.branches import is_constraint
+    >>> x = TracedArray(leaf("x", (2,)))
+    >>> is_constraint(trace(lambda x: np.where(x[..., 0] < x[..., 1], 0.0, -np.inf), [x]))
+    True
+    >>> is_constraint(trace(lambda x: np.where(x[..., 0] < 4.0, 0.0, 12.0), [x]))
+    False
+    """
+    found = _levels(log_factor)
+    return found is not None and len(found - {-math.inf}) <= 1
+
+
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _levels(node: Expression) -> frozenset[float] | None:
+    """All values that an expression can take, where these are few and can be seen."""
+    if isinstance(node, Constant):
+        values = np.unique(node.value)
+        return frozenset(values.tolist()) if values.size <= _LEVELS else None
+    if node.dtype.kind == "b":
+        return frozenset((False, True))
+    if isinstance(node, Gather):
+        return _levels(node.operands[0])
+    if not isinstance(node, Elementwise):
+        return None
+    skipped = 1 if node.function is np.where else 0
+    levels = [_levels(operand) for operand in node.operands[skipped:]]
+    if any(found is None for found in levels):
+        return None
+    known = [found for found in levels if found is not None]
+    if skipped:
+        return known[0] | known[1]
+    if math.prod(map(len, known)) > _LEVELS**2:
+        return None
+    with np.errstate(all="ignore"):
+        reached = frozenset(float(node.function(*at)) for at in itertools.product(*known))
+    return reached if len(reached) <= _LEVELS else None
 
 
 def _is_branch(node: Expression, name: str) -> bool:

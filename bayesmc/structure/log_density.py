@@ -113,14 +113,22 @@ class LogDensity:
         Raises
         ------
         EvidenceError
-            A value is missing, or does not fit its node.
+            A value is missing, does not fit its node, or is not inside of its support.
         """
         model, stored = self._problem.model, {}
         for name in self.names:
             if name not in values:
                 raise EvidenceError(f"log_density: unconstrain wants a value of node {name!r}")
             stored[name] = store(model[name], np.asarray(values[name], float))
-        return self._density.unconstrain(stored)
+        with np.errstate(all="ignore"):
+            found = self._density.unconstrain(stored)
+        for k, label in enumerate(self.labels):
+            if not np.isfinite(found[..., k]).all():
+                raise EvidenceError(
+                    "log_density: unconstrain wants values inside of their support, and that of "
+                    f"{label!r} is outside, or at its edge"
+                )
+        return found
 
     def __reduce__(self) -> Any:
         net, *known = self._question

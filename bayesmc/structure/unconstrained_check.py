@@ -95,12 +95,24 @@ def hold_against_model(
     for name, is_seen in zip(names, seen, strict=True):
         if not is_seen:
             raise UnsupportedError(
-                f"the density of {name!r} is zero, or no number, at all points where it was tried, so that "
-                "its expression cannot be held against its function"
+                f"the density of {name!r} is zero, or no number, at all points where it was tried (is the "
+                "evidence possible?), so that its expression cannot be held against its function"
             )
     if not all(agreed):
         name = [*names, *density.names][agreed.index(False)]
         raise UnsupportedError(f"the term of {name!r}, written for free numbers, differs from it")
+
+
+def other_values(density: UnconstrainedDensity, k: int) -> Values:
+    """Stored values of all nodes that do not move, in one of the reachable states."""
+    target, states = density.target, density.target.states
+    values: Values = dict(target.known)
+    for name in target.chain:
+        if name not in density.names:
+            if states is None:
+                raise UnsupportedError(f"no reachable value of node {name!r} is known to try it on")
+            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
+    return values
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -112,7 +124,7 @@ def _points(density: UnconstrainedDensity) -> Iterator[tuple[np.ndarray, Values]
     states = target.states
     many = len(target.terms) > _MANY
     for k, spread in enumerate(_SPREADS[-4:] if many else _SPREADS):
-        values = _others(density, k)
+        values = other_values(density, k)
         u = rng.normal(size=density.size) * spread
         if states is not None and k % 2:  # reachable ones, moved a little
             row = {n: states[n][k % len(states[n])] for n in density.names}
@@ -135,7 +147,7 @@ def _positive(
     count = min(_SEARCHED, max(_NUMBERS // max(elements, 1), 1))
     rng, found = np.random.default_rng(density.size), 0
     for k in range(_FOUND):
-        values = _others(density, k)
+        values = other_values(density, k)
         u = rng.normal(size=(count, density.size)) * rng.choice(_SPREADS[1:], size=(count, 1))
         with np.errstate(all="ignore"):
             log = np.broadcast_to(density.value(u, values), (count,))
@@ -144,18 +156,6 @@ def _positive(
             if _completed(density, row, at):
                 found += 1
                 yield row, at
-
-
-def _others(density: UnconstrainedDensity, k: int) -> Values:
-    """Stored values of all nodes that do not move, in one of the reachable states."""
-    target, states = density.target, density.target.states
-    values: Values = dict(target.known)
-    for name in target.chain:
-        if name not in density.names:
-            if states is None:
-                raise UnsupportedError(f"no reachable value of node {name!r} is known to try it on")
-            values[name] = _with_seen(target, name, states[name][k % len(states[name])])
-    return values
 
 
 def _completed(density: UnconstrainedDensity, u: np.ndarray, values: Values) -> bool:

@@ -6,6 +6,7 @@ A small sampler of autoregressive chains stands in for the engines, so that ever
 from __future__ import annotations
 
 import functools
+import math
 import os
 import pickle
 import signal
@@ -470,6 +471,28 @@ def test_states_never_left_are_no_fault_unless_they_differ() -> None:
     assert warned(stuck=False) == []  # s is "no" in all chains, always
     first, *_ = warned(stuck=True)  # n stands at 1, 2, 3, 1
     assert "R-hat of 'n' is inf (every chain stands still, at different values)" in first
+
+
+@pytest.mark.parametrize("keep", ["draws", "summaries"])
+def test_numbers_that_never_move_are_told_of(keep: str) -> None:
+    """Sizes and errors of a constant mean nothing: here steps that are nothing beside the number."""
+    net = bmc.BayesNet(plates={"p": 2})
+    net.add("x", bmc.Normal([0.0, 1e17], 1.0), plates="p")
+    net.add("y", lambda x: bmc.StudentT(3.0, x, 1e9), plates="p")
+    walk = bmc.MetropolisHastings(50, chains=2, proposal={"x": bmc.RandomWalk(1.0)})
+    with pytest.warns(ConvergenceWarning) as told:
+        bmc.infer(net, {"y": [0.0, 1e17]}, engine=walk, rng=1, keep=keep)
+    assert any("1 of 2 elements of 'x' never moved, in any chain" in str(w.message) for w in told)
+
+
+def test_an_effective_size_is_asked_for_instead_of_draws() -> None:
+    for options, words in (
+        ({"draws": 10, "ess": 50}, r"Gibbs\(draws=10, ess=50\): give one of both"),
+        ({"ess": math.inf}, "give an effective size"),
+        ({"ess": math.nan}, "give an effective size"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            bmc.Gibbs(**options)
 
 
 def test_an_ensembles_members_do_not_pass_for_independent_draws() -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import os
 import pickle
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
+from multiprocessing import get_context
 from typing import Any
 
 import numpy as np
 import pytest
 
 import bayesmc as bmc
-from bayesmc.errors import TraceError
+from bayesmc.errors import EngineWarning, TraceError
 from bayesmc.kernels import hamiltonian
 from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.lowering import checked, writer
@@ -172,14 +175,42 @@ def test_gibbs_moves_beside_them() -> None:
         assert np.abs((found.mean(name) - wanted.mean(name)) / error).max() < 4.9
 
 
-@pytest.mark.usefixtures("at_once")
+@pytest.fixture
+def forgotten() -> Iterator[None]:
+    """Machine code with a fault does not outlive its test."""
+    yield
+    transitions.cache_clear()
+
+
+@pytest.mark.usefixtures("at_once", "forgotten")
+@pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
 def test_trees_that_differ_are_left_to_numpy() -> None:
-    engine = bmc.HamiltonianMonteCarlo(20, warmup=20, debug=False)
+    """Said aloud, and part of what a run remembers: going on draws the same numbers."""
+    half, whole = (bmc.HamiltonianMonteCarlo(n, warmup=20, chains=3) for n in (20, 40))
     with Edit("bayesmc.lowering.no_u_turn:_Text._leapt", "2.0 * half", "1.9 * half").planted():
         transitions.cache_clear()
-        found = answers(schools(), EVIDENCE, engine)
+        with pytest.warns(EngineWarning, match="'mu', 'z': trajectories go on in NumPy"):
+            first = bmc.infer(schools(), EVIDENCE, engine=half, rng=5)
+        once = answers(schools(), EVIDENCE, whole)
         with pytest.raises(TraceError, match="in machine code ends at"):
-            answers(schools(), EVIDENCE, replace(engine, debug=True))
+            answers(schools(), EVIDENCE, replace(half, debug=True))
     transitions.cache_clear()
-    right = answers(schools(), EVIDENCE, engine)
-    assert not np.array_equal(found["z"], right["z"])
+    more = answers(schools(), EVIDENCE, half, resume=first)  # whose machine code would do
+    assert np.array_equal(more["z"], once["z"])
+    right = answers(schools(), EVIDENCE, whole)
+    assert not np.array_equal(once["z"], right["z"])
+
+
+@pytest.mark.usefixtures("at_once")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_threads_in_a_forked_child() -> None:
+    """Threads end with the process that began them; a child begins its own instead of waiting for them."""
+    engine = bmc.HamiltonianMonteCarlo(20, warmup=20, chains=4, threads=2)
+    here = answers(schools(), EVIDENCE, engine)["z"]
+    with get_context("fork").Pool(1) as pool:
+        there = pool.apply_async(_drawn_again, (engine,)).get(timeout=60.0)
+    assert np.array_equal(here, there)
+
+
+def _drawn_again(engine: bmc.HamiltonianMonteCarlo) -> np.ndarray:
+    return np.asarray(answers(schools(), EVIDENCE, engine)["z"])

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import bayesmc as bmc
+from bayesmc.engines.mcmc.gibbs import plan_of
 from bayesmc.errors import (
     ConvergenceWarning,
     DensityError,
@@ -17,6 +18,7 @@ from bayesmc.errors import (
     ReducibleWarning,
     ZeroProbabilityError,
 )
+from bayesmc.kernels.accepted import Accepted
 from bayesmc.network import pose
 
 pytestmark = pytest.mark.filterwarnings("ignore::bayesmc.errors.ConvergenceWarning")
@@ -187,6 +189,12 @@ def test_resume_is_bit_for_bit(build, keep) -> None:
         np.testing.assert_array_equal(whole.mean(name), both.mean(name))
 
 
+def test_resumed_by_the_engine_that_made_it() -> None:
+    net, evidence = mixture()
+    first = bmc.infer(net, evidence, engine=bmc.Gibbs(5, warmup=2, chains=2), rng=1)
+    assert bmc.infer(net, evidence, resume=first)["mean"].shape[:2] == (2, 10)
+
+
 def test_the_same_seed_gives_the_same_draws() -> None:
     net, evidence = everything()
     engine = bmc.Gibbs(draws=15, warmup=15, chains=2)
@@ -315,6 +323,48 @@ def test_tied_nodes_move_together() -> None:
     exact = bmc.infer(net, {"parity": 0}, engine=bmc.Exact()).mean("x")
     # 8,000 independent draws: five standard errors, a false alarm in two million
     assert abs(posterior.mean("x") - exact) < 5 * np.sqrt(exact * (1 - exact) / 8000)
+
+
+@pytest.mark.parametrize(
+    "potential",
+    [lambda x: 0.36 * x**2, lambda x: np.where(x > 4.0, 12.0, 0.0), lambda x: -((x - 6.0) ** 2)],
+    ids=["heavier tails", "a rare place", "far away"],
+)
+def test_potentials_may_outgrow_what_is_drawn_without_them(potential: Any) -> None:
+    """Draws that know nothing of them are accepted often, and never where most of the mass is.
+
+    Squared errors of 6 runs, in their standard errors, are chi-squared: 40 is passed by chance in 1 of 10^6.
+    """
+    net = bmc.BayesNet("potential")
+    net.add("x", bmc.Normal(0.0, 10.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    net.potential("p", potential)
+    grid = np.linspace(-60.0, 60.0, 200_001)
+    log = bmc.Normal(0.0, 10.0).log_prob(grid) + bmc.Normal(grid, 1.0).log_prob(0.0)
+    weights = np.exp(log + potential(grid) - np.max(log + potential(grid)))
+    weights /= weights.sum()
+    mean = weights @ grid
+    errors = []
+    for seed in range(6):
+        found = bmc.infer(net, {"y": 0.0}, engine=bmc.Gibbs(), rng=seed)
+        around = found.expectation(lambda x: (x - mean) ** 2) - weights @ (grid - mean) ** 2
+        errors.append(
+            [
+                (found.mean("x") - mean) / found.mcse("x"),
+                around / found.mcse(lambda x: (x - mean) ** 2),
+            ]
+        )
+    assert np.all(np.sum(np.square(errors), axis=0) < 40.0), errors
+
+
+def test_constraints_alone_decide_where_they_refuse_little() -> None:
+    """Draws in order are accepted with one probability wherever the chain stands."""
+    net = bmc.BayesNet("order", plates={"k": 2})
+    net.add("x", bmc.Normal([0.0, 2.0], 1.0), plates="k")
+    net.add("y", lambda x: bmc.Normal(x, 1.0), plates="k")
+    net.potential("ordered", lambda x: np.log(x[0] < x[1]))
+    (kernel,) = plan_of(pose(net, {"y": [0.5, 1.5]})).kernels[:1]
+    assert isinstance(kernel, Accepted) and kernel.constraints
 
 
 def test_a_run_that_has_not_mixed_says_so() -> None:

@@ -168,7 +168,7 @@ def test_stopping_does_not_bend_the_mean(monkeypatch: pytest.MonkeyPatch) -> Non
     assert abs(errors.mean()) < LIMIT * errors.std() / np.sqrt(len(errors))
     assert abs(errors.mean()) < 0.35  # of a standard error of one run
 
-    def at_a_high(posterior: Any, forward: Any, ess: float) -> float:
+    def at_a_high(posterior: Any, forward: Any, ess: float, agree: bool = True) -> float:
         return 1.0 if posterior.mean("x") > 1.05 * np.exp(0.5) else 0.9
 
     monkeypatch.setattr(running, "share_reached", at_a_high)

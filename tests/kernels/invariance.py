@@ -43,6 +43,18 @@ Rows = dict[str, np.ndarray]
 Statistic = Callable[[Rows, Rows], np.ndarray]
 
 
+class Still(Kernel):
+    """Moves nothing: what stands beside it is tested alone."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = tuple(names)
+
+    def step(
+        self, values: Values, memory: Memory, rng: np.random.Generator, warmup: bool
+    ) -> tuple[Values, Memory]:
+        return {n: values[n] for n in self.names}, memory
+
+
 @dataclass(frozen=True, eq=False)
 class Model:
     """A net, what of it is data, and how to draw both.

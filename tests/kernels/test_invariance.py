@@ -26,7 +26,7 @@ from bayesmc.structure.blanket import Blanket
 from bayesmc.structure.stacked import stacks
 from bayesmc.structure.target import Target
 from tests.kernels import invariance_models as models
-from tests.kernels.invariance import Case, Make, Model, backwards, each_test
+from tests.kernels.invariance import Case, Make, Model, Still, backwards, each_test
 
 # ---- one node ----------------------------------------------------------------------------------------
 
@@ -231,6 +231,8 @@ def ordered_kernel(decides: bool = True, prior: bool = True) -> Make:
     def make(target: Target) -> Kernel:
         kernel = number_kernel(Blanket(target, "x"))
         assert isinstance(kernel, Accepted) and kernel.label == "conjugate"
+        assert not kernel.constraints  # both moves in every sweep
+        kernel.other = Still(kernel.names)
         if not decides:
             kernel.left_out = []
         if not prior:

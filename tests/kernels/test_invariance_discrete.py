@@ -31,6 +31,7 @@ from tests.kernels.invariance import (
     Model,
     Rows,
     Statistic,
+    Still,
     backwards,
     each_test,
 )
@@ -210,6 +211,8 @@ def at_once(tie: bool = True, proposal: bool = True) -> Make:
     def make(target: Target) -> Kernel:
         kernel = finite_kernel(Blanket(target, "z"))
         assert isinstance(kernel, Accepted) and len(kernel.left_out) == 1
+        assert not kernel.constraints  # both moves in every sweep
+        kernel.other = Still(kernel.names)
         if not tie:
             kernel.left_out = []
         if not proposal:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import re
 import tracemalloc
 from typing import Any
 
@@ -146,7 +148,16 @@ def test_functions_of_single_values_are_told_how_to_broadcast(function):
         match=r"node 'y' (works on one value at a time but not on arrays|does not broadcast)",
     ) as caught:
         net.validate()
-    assert "np.where for if" in str(caught.value) and "vectorize=True" in str(caught.value)
+    assert re.search("np.where for if|np.exp for math.exp", str(caught.value))
+    assert "vectorize=True" in str(caught.value)
+
+
+def test_math_is_told_to_be_numpy():
+    net = bmc.BayesNet()
+    net.add("x", bmc.Normal(0.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(math.exp(x), 1.0))
+    with pytest.raises(BroadcastError, match=r"np\.exp for math\.exp"):
+        net.validate()
 
 
 def test_components_stacked_on_the_first_axis_are_sent_to_the_last():

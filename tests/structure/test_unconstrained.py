@@ -13,7 +13,7 @@ from scipy import special, stats
 
 import bayesmc as bmc
 from bayesmc.distributions.base import marking_invalid
-from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.errors import BayesmcError, EvidenceError, UnsupportedError
 from bayesmc.expression import elementwise, ordered
 from bayesmc.network import pose
 from bayesmc.passes import alike
@@ -423,3 +423,12 @@ def test_points_of_positive_density_are_looked_for() -> None:
     value, slope = density.with_gradient(u)
     np.testing.assert_allclose(value, -0.5 * u @ u - 3 * np.log(2 * np.pi) - 5.0)
     np.testing.assert_allclose(slope, -u + np.array([1.0, 0, 0, 0, 0, -1.0]))
+
+
+@pytest.mark.parametrize("outside", [-1.0, 0.0, [2.0, -3.0]])
+def test_values_outside_their_support_are_refused(outside: Any) -> None:
+    net = bmc.BayesNet()
+    net.add("x", bmc.Gamma(1.0, 1.0))
+    net.add("y", lambda x: bmc.Normal(x, 1.0))
+    with pytest.raises(EvidenceError, match="that of 'x' is outside, or at its edge"):
+        bmc.log_density(net, {"y": 1.0}).unconstrain({"x": outside})

@@ -6,6 +6,7 @@ these have mixed is judged in ``convergence``.
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, replace
@@ -15,31 +16,29 @@ import numpy as np
 
 from bayesmc.engines.base import Engine
 from bayesmc.engines.mcmc.convergence import poor_acceptance, poor_mixing, share_reached
+from bayesmc.engines.mcmc.given import frozen_start, read_start
 from bayesmc.engines.mcmc.length import LEAST, WARMUP, chosen, in_words
 from bayesmc.engines.mcmc.loop import Kept, Lengths, Loop, Patience, Sampler, State
-from bayesmc.engines.mcmc.missed import missed_ends, never_left
+from bayesmc.engines.mcmc.missed import missed_ends, never_left, stood_still
 from bayesmc.engines.mcmc.question import difference
 from bayesmc.engines.mcmc.trajectories import faulty_trajectories
-from bayesmc.engines.proposal import check_targets
 from bayesmc.engines.unrolled import series_of
 from bayesmc.engines.weighted.drawing import check_count, no_memory
 from bayesmc.errors import (
     ConvergenceWarning,
-    EvidenceError,
     InterruptWarning,
     ReducibleWarning,
-    ShapeError,
     UnsupportedError,
 )
-from bayesmc.network import CompiledNode, Problem
-from bayesmc.network.evidence import store
+from bayesmc.network import Problem
 from bayesmc.progress import Progress
 from bayesmc.randomness import Purpose, stream
 from bayesmc.results import ChainsPosterior, ChainsSums, Posterior, RunningChains
-from bayesmc.shapes import first_index
 
 #: share of accepted proposals outside of which a random walk is ill adapted
 _BAND = (0.1, 0.9)
+#: effective size that is asked for where nothing is said
+_ESS = 1000
 
 
 class ChainEngine(Engine):
@@ -65,7 +64,7 @@ class ChainEngine(Engine):
     warmup: int | None
     chains: int | None
     thinning: int = 1
-    ess: float = 1000
+    ess: float = _ESS
     start: Mapping[str, Any] | None = None
     #: what the engine does, beside the progress bar
     label: ClassVar[str]
@@ -75,18 +74,20 @@ class ChainEngine(Engine):
     ensembles: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
+        name = type(self).__name__
         if self.draws is not None:
             check_count(self, "draws", self.draws, "1000")
         if self.warmup is not None and (isinstance(self.warmup, bool) or self.warmup != 0):
             check_count(self, "warmup", self.warmup, "1000 (or 0 for none)")
         if self.chains is not None:
             check_count(self, "chains", self.chains, "4")
-        if isinstance(self.ess, bool) or not isinstance(self.ess, (int, float)) or not self.ess > 0:
-            raise ValueError(
-                f"{type(self).__name__}(ess={self.ess!r}): give an effective size, such as 1000"
-            )
+        number = isinstance(self.ess, (int, float)) and not isinstance(self.ess, bool)
+        if not number or not 0 < self.ess < math.inf:
+            raise ValueError(f"{name}(ess={self.ess!r}): give an effective size, such as 1000")
+        if self.draws is not None and self.ess != _ESS:
+            raise ValueError(f"{name}(draws={self.draws}, ess={self.ess:g}): give one of both")
         check_count(self, "thinning", self.thinning, "1")
-        object.__setattr__(self, "start", frozen_start(type(self).__name__, self.start))
+        object.__setattr__(self, "start", frozen_start(name, self.start))
 
     def __repr__(self) -> str:
         """What was said, and the effective size where that says how many draws there are."""
@@ -159,6 +160,7 @@ class ChainEngine(Engine):
             draws=lengths.draws,
             warmup=None if lengths.judge else lengths.warmup,
             chains=lengths.chains,
+            **({} if self.ess == _ESS else {"ess": _ESS}),
         )
         sampler = ready.sampler(problem)
         if self.start and resume is None:
@@ -181,9 +183,9 @@ class ChainEngine(Engine):
                 if isinstance(resume, (ChainsPosterior, ChainsSums)):
                     loop.warmup = resume.warmup
 
-                def reached(ess: float) -> float:
+                def reached(ess: float, agree: bool = True) -> float:
                     made = self._posterior(problem, sampler, held, loop)
-                    return share_reached(made, self._forward(sampler), ess)
+                    return share_reached(made, self._forward(sampler), ess, agree)
 
                 finished = self._drawn(loop, state, held, bar, stop, reached)
         except MemoryError as error:
@@ -203,15 +205,15 @@ class ChainEngine(Engine):
         held: Kept | RunningChains,
         bar: Progress,
         stop: Patience,
-        reached: Callable[[float], float],
+        reached: Callable[..., float],
     ) -> bool:
         """Draws made, until they are enough where it is an effective size that is asked for."""
         lengths = loop.lengths
         before, draws, wanted = held.draws, lengths.first(), lengths.ess
         if (
             wanted is not None and before
-        ):  # what is gone on with has its own, and as much again is asked for
-            wanted += wanted * reached(wanted)
+        ):  # what is there has its own, and as much again is asked for
+            wanted += wanted * reached(wanted, agree=False)
         while True:
             if isinstance(held, Kept) and held.draws > before:
                 held.more(draws)
@@ -331,7 +333,7 @@ class ChainEngine(Engine):
         timed = problem is not None and series_of(problem) is not None
         if found and timed and "Particle" not in name:
             found[0] += "; ParticleGibbs(draws) draws whole trajectories of a template at once"
-        found += never_left(posterior)
+        found += [*never_left(posterior), *stood_still(posterior, forward)]
         if isinstance(posterior, ChainsPosterior):
             found += missed_ends(posterior, forward)
         assert posterior.checkpoint is not None
@@ -341,56 +343,6 @@ class ChainEngine(Engine):
             found += faulty_trajectories(posterior, sampler.kernels, state)  # type: ignore[attr-defined]
         for fault in [*found, *poor_acceptance(posterior.acceptance, band)]:
             warnings.warn(f"{name}: {fault}", ConvergenceWarning, stacklevel=4)
-
-
-def frozen_start(engine: str, start: Any) -> dict[str, Any] | None:
-    """A copy of the option that nobody else changes.
-
-    Raises
-    ------
-    TypeError
-        It is no dict from node to value.
-    """
-    if start is None:
-        return None
-    if not isinstance(start, Mapping) or not all(isinstance(name, str) for name in start):
-        raise TypeError(
-            f"{engine}(start={start!r:.80}): start is a dict from node name to where its chains "
-            "start, such as start={'x': 1.0}"
-        )
-    kept = {}
-    for name, value in start.items():
-        copied = np.array(value)
-        copied.flags.writeable = False
-        kept[name] = copied
-    return kept
-
-
-def read_start(
-    engine: str, problem: Problem, start: Mapping[str, Any], chains: int
-) -> dict[str, np.ndarray]:
-    """Stored values at which chains start.
-
-    Parameters
-    ----------
-    start : dict
-        Node -> value, shape ``(*plates, *event)``, or ``(chains, *plates, *event)`` with one for each chain.
-
-    Returns
-    -------
-    dict
-        Node -> stored values, shape ``(chains, *plates, *event)``.
-
-    Raises
-    ------
-    UnknownNodeError, ModelError, EvidenceError, ShapeError
-        A name that is no hidden node, or a value that it cannot have.
-    """
-    found = {}
-    for name, value in start.items():
-        check_targets(engine, problem, name, "start")
-        found[name] = _read(engine, problem, problem.model[name], value, chains)
-    return found
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -407,44 +359,3 @@ def _warn_of_ties(engine: str, names: Sequence[str]) -> None:
         ReducibleWarning,
         stacklevel=4,
     )
-
-
-def _read(engine: str, problem: Problem, node: CompiledNode, value: Any, chains: int) -> np.ndarray:
-    what = f"{engine}: start for {node.name!r}"
-    shape = np.shape(value)
-    wanted = node.value_shape
-    if shape not in (wanted, (chains, *wanted)):
-        raise ShapeError(
-            f"{what} has shape {shape}; give {wanted} for all chains (plates {node.plates}, then one value's "
-            f"shape), or {(chains, *wanted)} for each of the {chains}"
-        )
-    try:
-        stored = store(node, value)
-    except EvidenceError as error:
-        raise EvidenceError(f"{what}: {error}") from None
-    seen = problem.observed.get(node.name)
-    hidden = np.ones(node.plate_shape, dtype=bool)
-    if seen is not None and seen.mask is not None:
-        hidden = ~seen.mask
-    _check(what, node, stored, hidden)
-    return np.array(np.broadcast_to(stored, (chains, *wanted)))
-
-
-def _check(what: str, node: CompiledNode, stored: np.ndarray, hidden: np.ndarray) -> None:
-    """Refuse what is not finite, or outside of a support that does not depend on parents."""
-    event = tuple(range(stored.ndim - len(node.event_shape), stored.ndim))
-    wrong = np.zeros(stored.shape, dtype=bool)
-    if stored.dtype.kind == "f":
-        wrong = ~np.isfinite(stored)
-    support = node.support
-    if node.domain is None and support is not None:
-        inside = np.asarray(
-            support.contains(np.where(wrong, 0.0, stored) if wrong.any() else stored)
-        )
-        wrong = wrong | (np.expand_dims(~inside, event) if inside.ndim < stored.ndim else ~inside)
-    wrong = wrong & np.expand_dims(hidden, tuple(range(hidden.ndim, hidden.ndim + len(event))))
-    if wrong.any():
-        at = first_index(wrong)
-        within = f" ({support.describe()})" if support is not None else ""
-        where = f" at index {at if len(at) > 1 else at[0]}" if at else ""
-        raise EvidenceError(f"{what} is {stored[at]}{where}, which the node cannot be{within}")

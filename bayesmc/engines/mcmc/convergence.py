@@ -62,11 +62,15 @@ def poor_mixing(
 
 
 def share_reached(
-    posterior: ChainsPosterior | ChainsSums, forward: frozenset[str], ess: float
+    posterior: ChainsPosterior | ChainsSums,
+    forward: frozenset[str],
+    ess: float,
+    agree: bool = True,
 ) -> float:
     """The smallest effective size as a share of what is asked for; of tails a few hundred are enough.
 
-    Of few chains R-hat, too, must not tell them apart: what it exceeds 1 by falls with the draws.
+    Of few chains R-hat, too, must not tell them apart if they are to ``agree``: what it exceeds 1 by falls
+    with the draws.
     Where chains name components differently that the model does not tell apart, by their order.
     """
     if isinstance(posterior, ChainsSums):
@@ -77,7 +81,7 @@ def share_reached(
         stored = _named(posterior)[0]
         if stored is not posterior._stored:
             share = max(share, _share(_sizes(posterior, stored, forward, ess), ess))
-    if share < 1 or posterior.superchains:
+    if share < 1 or posterior.superchains or not agree:
         return share
     judged = _figures(posterior, stored, forward, ess)
     worst = max(np.nan_to_num(list(judged.rhat.values()), nan=0.0), default=0.0)

@@ -19,7 +19,7 @@ from bayesmc.engines.mcmc.cost import shares
 from bayesmc.engines.mcmc.jointly import trajectories_of
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import treatment
-from bayesmc.kernels.accepted import finite_kernel, number_kernel
+from bayesmc.kernels.accepted import Accepted, finite_kernel, number_kernel
 from bayesmc.kernels.base import Kernel
 from bayesmc.kernels.collapsed import CollapsedBlock, governing
 from bayesmc.kernels.conjugate import Conjugate, conjugate_kernel
@@ -45,6 +45,8 @@ from bayesmc.structure.blanket import Blanket, colours
 from bayesmc.structure.stacked import FEWEST, Forms, stacks
 from bayesmc.structure.target import Target, target_of
 
+#: sweeps of which one draws all numbers anew where trajectories move them, too
+_SELDOM = 4
 #: components that move together along learnt directions, at most
 _FACTOR_SIZE = 24
 #: supports that are boxes: every number on its own
@@ -290,7 +292,8 @@ def _planned(problem: Problem, debug: bool, only: Collection[str] | None) -> Pla
         kernels += [k for k in rescaled_kernels(target, slow) if moved >= set(k.names)]
     kernels += redrawn_kernels(target, blankets, kernels)
     if slow and may_be_drawn_anew(target, names):
-        kernels.append(BlockWalk(target, names, anew=1.0))
+        every = _SELDOM if any(isinstance(k, Hamiltonian) for k in kernels) else 1
+        kernels.append(BlockWalk(target, names, anew=1.0, every=every))
     return Plan(problem, target, blankets, kernels, refusals, constraints)
 
 
@@ -320,6 +323,8 @@ def _conjugate(
 
 
 def _is_slice(kernel: Kernel) -> bool:
+    if isinstance(kernel, Accepted):
+        return not kernel.constraints and _is_slice(kernel.other)
     return isinstance(
         kernel.kernel if isinstance(kernel, Stacked) else kernel, (Slice, FactorSlice, Hamiltonian)
     )

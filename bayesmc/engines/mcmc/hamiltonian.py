@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 from bayesmc.engines.base import Treatment
 from bayesmc.engines.mcmc.chains import ChainEngine
 from bayesmc.engines.mcmc.gibbs import Plan, plan_of
-from bayesmc.engines.mcmc.jointly import continuous, density_of
+from bayesmc.engines.mcmc.jointly import continuous, density_of, jumping
 from bayesmc.engines.mcmc.sweep import SweepSampler, refused
 from bayesmc.engines.weighted.drawing import check_count
 from bayesmc.kernels.hamiltonian import GRADIENTS, Hamiltonian
@@ -27,6 +27,7 @@ from bayesmc.structure.target import target_of
 
 #: sweeps of which one moves scales with what they scale: a trajectory in machine code costs far less
 _RESCALED = 4
+_JUMPS = "the density jumps where it is compared, which no gradient sees"
 _METRICS = ("diagonal", "dense")
 
 
@@ -135,7 +136,7 @@ class HamiltonianMonteCarlo(ChainEngine):
         return self._plan(problem).table()
 
     def effort(self, problem: Problem) -> str:
-        lengths, moving = self.lengths(problem), continuous(target_of(problem))
+        lengths, moving = self.lengths(problem), self._moving(problem)
         text = super().effort(problem)
         if not moving:
             return text
@@ -163,12 +164,18 @@ class HamiltonianMonteCarlo(ChainEngine):
         self._plan(problem)
         return None
 
+    def _moving(self, problem: Problem) -> tuple[str, ...]:
+        """Nodes that move along trajectories."""
+        names = continuous(target_of(problem))
+        jump = jumping(problem, density_of(problem, names)) if names else ()
+        return tuple(n for n in names if n not in jump)
+
     def _plan(self, problem: Problem) -> Plan:
         """Kernels of what is finite, and one for all that is continuous."""
         target = target_of(problem)
-        moving = continuous(target)
-        finite = [n for n in target.chain if n not in moving]
-        plan = plan_of(problem, only=finite)
+        moving = self._moving(problem)
+        rest = [n for n in target.chain if n not in moving]
+        plan = plan_of(problem, only=rest)
         if not moving:
             return plan
         density = density_of(problem, moving)
@@ -185,5 +192,7 @@ class HamiltonianMonteCarlo(ChainEngine):
         )
         blankets = {n: plan.blankets.get(n) or Blanket(target, n) for n in target.chain}
         kernels = [*plan.kernels, kernel, *rescaled_kernels(target, moving, _RESCALED)]
-        kernels += redrawn_kernels(target, blankets, kernels) if finite else []
-        return replace(plan, kernels=kernels, blankets=blankets)
+        kernels += redrawn_kernels(target, blankets, kernels) if rest else []
+        jump = dict.fromkeys((n for n in rest if n in continuous(target)), _JUMPS)
+        refusals = {**plan.refusals, **jump}
+        return replace(plan, kernels=kernels, blankets=blankets, refusals=refusals)

@@ -11,6 +11,7 @@ from bayesmc.kernels.hamiltonian import Hamiltonian
 from bayesmc.kernels.hamiltonian_warmup import Metric
 from bayesmc.network import Problem
 from bayesmc.structure.free_density import UnconstrainedDensity
+from bayesmc.structure.jumps import jumps
 from bayesmc.structure.target import Target, target_of
 from bayesmc.structure.unconstrained import unconstrained_density
 
@@ -45,6 +46,14 @@ def density_of(problem: Problem, names: tuple[str, ...]) -> UnconstrainedDensity
     if isinstance(found[names], str):
         raise UnsupportedError(found[names])
     return found[names]
+
+
+def jumping(problem: Problem, density: UnconstrainedDensity) -> frozenset[str]:
+    """Nodes at some values of which the density jumps, looked for once: slices move them."""
+    found = problem.cache.setdefault("jumps", {})
+    if density.names not in found:
+        found[density.names] = jumps(density)
+    return found[density.names]
 
 
 def trajectories_of(
@@ -94,7 +103,7 @@ def trajectories_of(
     fit = [n for n in _few(target, names, keys or {}) if n not in alone]
     for group in _groups(target, [n for n in fit if not _is_switched(target, n)]):
         joined = _joined(target, group, [n for n in closed if n not in alone])
-        density = _density_or_none(problem, joined) or _density_or_none(problem, group)
+        density = _smooth(problem, joined) or _smooth(problem, group)
         if density is not None:
             metric: Metric = "dense" if density.size <= DENSE else "diagonal"
             match = f"{density.size} free numbers jointly, {metric} metric"
@@ -105,6 +114,16 @@ def trajectories_of(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _smooth(problem: Problem, names: tuple[str, ...]) -> UnconstrainedDensity | None:
+    """The density of those of some nodes at no values of which it jumps; None where these are too few."""
+    density = _density_or_none(problem, names)
+    bent = frozenset() if density is None else jumping(problem, density)
+    if not bent:
+        return density
+    left = tuple(n for n in names if n not in bent)
+    return _density_or_none(problem, left) if _size(target_of(problem), left) > 1 else None
 
 
 def _density_or_none(problem: Problem, names: tuple[str, ...]) -> UnconstrainedDensity | None:

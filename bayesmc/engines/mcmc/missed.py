@@ -120,6 +120,30 @@ def never_left(posterior: ChainsPosterior | ChainsSums) -> Iterator[str]:
         )
 
 
+def stood_still(posterior: ChainsPosterior | ChainsSums, forward: frozenset[str]) -> Iterator[str]:
+    """What is said of numbers with a density that never moved: their draws tell nothing of an error.
+
+    Parameters
+    ----------
+    posterior : ChainsPosterior or ChainsSums
+    forward : frozenset of str
+        Nodes outside of the chain.
+    """
+    for name, node in posterior.model.nodes.items():
+        if not node.is_stochastic or node.is_discrete or node.domain is not None or name in forward:
+            continue
+        seen = posterior._seen.get(name)
+        if (seen is not None and seen.mask is None) or posterior._chains_and_draws[1] < 2:
+            continue
+        still = _still(posterior, name)
+        if still.any():
+            which = f"{int(still.sum())} of {still.size} elements of " if still.size > 1 else ""
+            yield (
+                f"{which}{name!r} never moved, in any chain: effective sizes and errors that are told of "
+                "them mean nothing; check start=, the scale of what was seen, or use another engine"
+            )
+
+
 # ---- private ------------------------------------------------------------------------------------
 
 

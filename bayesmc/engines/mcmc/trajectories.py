@@ -53,8 +53,8 @@ def faulty_trajectories(
             yield (
                 f"{diverged} of {moves} trajectories diverged{_where(posterior, kernel)}: the density bends "
                 "there more sharply than their steps can follow, and draws leave it out; declare effects "
-                "apart from their scale (z ~ Normal(0, 1), b = sigma * z), give tighter priors, or raise "
-                "target_accept= of HamiltonianMonteCarlo (0.95, 0.99)"
+                "apart from their scale (z ~ Normal(0, 1), b = sigma * z), give tighter priors, or "
+                f"{_shorter(posterior)}"
             )
         cut = int(memory["saturated"].sum())
         if cut > _CUT * moves:
@@ -71,6 +71,15 @@ def faulty_trajectories(
 
 
 # ---- private ------------------------------------------------------------------------------------
+
+
+def _shorter(posterior: ChainsPosterior | ChainsSums) -> str:
+    """How steps are made shorter, in words."""
+    known = getattr(posterior.engine, "target_accept", None)
+    if known is None:
+        return "use HamiltonianMonteCarlo(target_accept=0.95)"
+    higher = " or ".join(f"{a:g}" for a in (0.95, 0.99, 0.999) if a > known)
+    return f"raise target_accept={known:g} ({higher})" if higher else "another engine"
 
 
 def _where(posterior: ChainsPosterior | ChainsSums, kernel: Hamiltonian) -> str:

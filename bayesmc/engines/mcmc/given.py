@@ -1,0 +1,108 @@
+"""Where the user wants chains to start: ``start={"x": 1.0}`` read, every fault named."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from bayesmc.engines.proposal import check_targets
+from bayesmc.errors import EvidenceError, ShapeError
+from bayesmc.network import CompiledNode, Problem
+from bayesmc.network.evidence import store
+from bayesmc.shapes import first_index
+
+
+def frozen_start(engine: str, start: Any) -> dict[str, Any] | None:
+    """A copy of the option that nobody else changes.
+
+    Raises
+    ------
+    TypeError
+        It is no dict from node to value.
+    """
+    if start is None:
+        return None
+    if not isinstance(start, Mapping) or not all(isinstance(name, str) for name in start):
+        raise TypeError(
+            f"{engine}(start={start!r:.80}): start is a dict from node name to where its chains "
+            "start, such as start={'x': 1.0}"
+        )
+    kept = {}
+    for name, value in start.items():
+        copied = np.array(value)
+        copied.flags.writeable = False
+        kept[name] = copied
+    return kept
+
+
+def read_start(
+    engine: str, problem: Problem, start: Mapping[str, Any], chains: int
+) -> dict[str, np.ndarray]:
+    """Stored values at which chains start.
+
+    Parameters
+    ----------
+    start : dict
+        Node -> value, shape ``(*plates, *event)``, or ``(chains, *plates, *event)`` with one for each chain.
+
+    Returns
+    -------
+    dict
+        Node -> stored values, shape ``(chains, *plates, *event)``.
+
+    Raises
+    ------
+    UnknownNodeError, ModelError, EvidenceError, ShapeError
+        A name that is no hidden node, or a value that it cannot have.
+    """
+    found = {}
+    for name, value in start.items():
+        check_targets(engine, problem, name, "start")
+        found[name] = _read(engine, problem, problem.model[name], value, chains)
+    return found
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _read(engine: str, problem: Problem, node: CompiledNode, value: Any, chains: int) -> np.ndarray:
+    what = f"{engine}: start for {node.name!r}"
+    shape = np.shape(value)
+    wanted = node.value_shape
+    if shape not in (wanted, (chains, *wanted)):
+        raise ShapeError(
+            f"{what} has shape {shape}; give {wanted} for all chains (plates {node.plates}, then one value's "
+            f"shape), or {(chains, *wanted)} for each of the {chains}"
+        )
+    try:
+        stored = store(node, value)
+    except EvidenceError as error:
+        raise EvidenceError(f"{what}: {error}") from None
+    seen = problem.observed.get(node.name)
+    hidden = np.ones(node.plate_shape, dtype=bool)
+    if seen is not None and seen.mask is not None:
+        hidden = ~seen.mask
+    _check(what, node, stored, hidden)
+    return np.array(np.broadcast_to(stored, (chains, *wanted)))
+
+
+def _check(what: str, node: CompiledNode, stored: np.ndarray, hidden: np.ndarray) -> None:
+    """Refuse what is not finite, or outside of a support that does not depend on parents."""
+    event = tuple(range(stored.ndim - len(node.event_shape), stored.ndim))
+    wrong = np.zeros(stored.shape, dtype=bool)
+    if stored.dtype.kind == "f":
+        wrong = ~np.isfinite(stored)
+    support = node.support
+    if node.domain is None and support is not None:
+        inside = np.asarray(
+            support.contains(np.where(wrong, 0.0, stored) if wrong.any() else stored)
+        )
+        wrong = wrong | (np.expand_dims(~inside, event) if inside.ndim < stored.ndim else ~inside)
+    wrong = wrong & np.expand_dims(hidden, tuple(range(hidden.ndim, hidden.ndim + len(event))))
+    if wrong.any():
+        at = first_index(wrong)
+        within = f" ({support.describe()})" if support is not None else ""
+        where = f" at index {at if len(at) > 1 else at[0]}" if at else ""
+        raise EvidenceError(f"{what} is {stored[at]}{where}, which the node cannot be{within}")
