@@ -131,7 +131,7 @@ class SliceCode:
     ) -> MadeSlices | None:
         """As many slices from the k-th one on as can be made in one call; None where it is to be made alone.
 
-        Where ``beside`` says that families are followed, moments are taken.
+        Where ``beside`` says that families are followed, moments are taken if those say all.
         """
         step = self._step
         if earlier is None or not _resamples(step):
@@ -327,10 +327,10 @@ class _Slice:
         rows = problem.series.alike(k, most)
         log, weights = (np.ascontiguousarray(a) for a in (earlier.log_weights, earlier.weights))
         cloud = Cloud(before, log, weights, earlier.total, earlier.log_total, earlier.ess)
-        numbers = NO_NUMBERS
-        if beside is not None:
-            numbers, drift = self._numbers(beside[0]), beside[1].drift
-            if drift is not None and len(numbers.where):
+        numbers = None if beside is None else self._numbers(beside[0])
+        if numbers is not None and beside is not None:
+            drift = beside[1].drift
+            if drift is not None:
                 moves = np.zeros((2, len(numbers.where)))
                 moves[:, numbers.where[:, 3] > 0] = drift.moves[:, 0]
                 cloud = cloud._replace(worst=drift.largest, moves=moves)
@@ -338,7 +338,7 @@ class _Slice:
         count, store = len(rows), self._store
         values = [store((count, n, *shape)) for shape in self._kernel.shapes]
         arrays = [store((count, n)), store((count, n)), store((count, n + 1), np.int64), *values]
-        made = self._call(step.threshold * n, cloud, known, arrays, rng, numbers)
+        made = self._call(step.threshold * n, cloud, known, arrays, rng, numbers or NO_NUMBERS)
         return MadeSlices(made, rows, arrays, self._names, self._others, numbers)
 
     # ---- private -------------------------------------------------------------------------------
@@ -348,12 +348,12 @@ class _Slice:
         known = self._step.known(row)
         return {name: known[name] for name in self._rest}
 
-    def _numbers(self, tracker: Tracker) -> Numbers:
+    def _numbers(self, tracker: Tracker) -> Numbers | None:
         """All numbers of nodes, and whose moves a tracker looks at; none where it takes others."""
         compass = tracker.compass
         moved = () if compass is None else tuple(n.name for n in compass.nodes)
         if not set(moved) <= set(self._names):
-            return NO_NUMBERS
+            return None
         where = [
             (3 + k, size, j, int(name in moved))
             for k, (name, shape) in enumerate(zip(self._names, self._kernel.shapes, strict=True))

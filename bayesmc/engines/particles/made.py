@@ -41,8 +41,8 @@ class MadeSlices:
         These nodes.
     known : callable
         ``row -> values`` of nodes that all particles agree on.
-    numbers : Numbers
-        Of which the moments were taken.
+    numbers : Numbers or None
+        Of which the moments were taken; None where families are not followed by these.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class MadeSlices:
         arrays: Sequence[np.ndarray],
         names: Sequence[str],
         known: Callable[[Row], dict[str, np.ndarray]],
-        numbers: Numbers,
+        numbers: Numbers | None,
     ) -> None:
         self.made, self.rows, self._arrays = made, list(rows[: made.slices]), arrays
         self.names, self.known, self.numbers = tuple(names), known, numbers
@@ -139,8 +139,8 @@ class Ahead:
     def reaches(self, k: int, now: Particles | None, rng: np.random.Generator) -> bool:
         """Whether the k-th slice, which follows that of some particles, is made together with others."""
         if self._made is None:
-            self._is_followed = False
-            self._made = self._machine.several(self._problem, k, now, rng, self._beside)
+            made = self._made = self._machine.several(self._problem, k, now, rng, self._beside)
+            self._is_followed = made is not None and made.numbers is not None
             self._first, self._before = k, now
         return self._made is not None
 
@@ -173,8 +173,7 @@ class Ahead:
             return None
         record.write()
         families = record.families
-        self._is_followed = families is not None and families.scouts is None
-        return (tracker, families) if self._is_followed else None
+        return None if families is None or families.scouts is not None else (tracker, families)
 
 
 class Store:
@@ -208,8 +207,9 @@ class _Following:
         self, slices: MadeSlices, tracker: Tracker, families: Families, earlier: Particles
     ) -> None:
         self._slices, self._tracker, self._earlier = slices, tracker, earlier
-        made, self._count = slices.made, len(slices)
-        rows, numbers, groups = self._count + 1, len(slices.numbers.where), families.shares.shape[1]
+        assert slices.numbers is not None
+        made, self._count, self._where = slices.made, len(slices), slices.numbers.where
+        rows, numbers, groups = self._count + 1, len(self._where), families.shares.shape[1]
         self._families = families
         self._t0 = slices.rows[0].t - 1
         self.bounds = np.empty((rows, _ORIGINS, groups + 1), np.int64)
@@ -218,7 +218,7 @@ class _Following:
         self.young, self.lost = np.zeros(rows, np.int64), np.zeros(rows, dtype=bool)
         self._sizes = self._count, slices.size, made.at.shape[1] - 3, numbers, groups
         compass = tracker.compass
-        self._columns = np.flatnonzero(slices.numbers.where[:, 3])
+        self._columns = np.flatnonzero(self._where[:, 3])
         self._limit = math.inf if compass is None else compass.limit
 
     def run(self) -> tuple[Families, Sums]:
@@ -252,7 +252,7 @@ class _Following:
             roots[0], roots[1 : n + 1] = 1, np.arange(n) if lost.roots is None else lost.roots
         limits = self._limits(families)
         arrays = (
-            limits, made.at, made.told, self._slices.numbers.where, made.moments, self.bounds, shares,
+            limits, made.at, made.told, self._where, made.moments, self.bounds, shares,
             self.explained, self.sums, self.young, roots,
         )  # fmt: skip
         stop = followed()(row, *self._sizes, *(a.ctypes.data for a in arrays))
