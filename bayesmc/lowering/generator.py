@@ -29,8 +29,9 @@ _TRIED = 20_000
 
 
 def draws(module: Module) -> list[str]:
-    """Functions ``double uniform(state)`` and ``void normals(count, state, ziggurat, found)``."""
-    return [_bits(module), _uniform(module), _rejected(module), _normals(module)]
+    """Functions of a state: ``uniform``; ``uniforms`` and ``normals``, as many as asked for."""
+    every = (_bits, _uniform, _uniforms, _rejected, _normals)
+    return [written(module) for written in every]
 
 
 @lru_cache(maxsize=1)
@@ -138,6 +139,14 @@ def _uniform(module: Module) -> str:
     found = _right(c, _drawn(c, "bits", WHOLE), 11).to(REAL) * 2.0**-53
     c.do(f"ret double {found.text}")
     return f"define internal double @uniform(ptr %state) {{\n{c}\n}}"
+
+
+def _uniforms(module: Module) -> str:
+    c = Code(module)
+    count = Number(c, "%count", WHOLE)
+    c.loop(count, lambda i: c.store("%found", i, _drawn(c, "uniform", REAL)))
+    c.do("ret void")
+    return f"define internal void @uniforms(i64 %count, ptr %state, ptr %found) {{\n{c}\n}}"
 
 
 def _layer(c: Code, bits: Number) -> tuple[Number, Number, Number, Number]:

@@ -92,6 +92,13 @@ class Numbers(NamedTuple):
 NO_NUMBERS = Numbers(np.zeros((0, 4), np.int64), 0.0, 0.0, 0.0)
 
 
+class Noise(NamedTuple):
+    """Random numbers that each particle has of its own: standard normals, or uniform ones from [0, 1)."""
+
+    shape: Shape
+    is_uniform: bool = False
+
+
 class SliceKernel:
     """Expressions of many particles, whose values in the slice before are those of their ancestors.
 
@@ -100,7 +107,7 @@ class SliceKernel:
     roots : sequence of Expression
         Values of nodes, and last the log density of what is seen.
     own : dict
-        Leaf of normals, which each particle has of its own -> its shape, in the order of drawing.
+        Leaf of random numbers -> which, in the order of drawing.
     chosen : frozenset of str
         Leaves with a value for each particle before. Of all others there is one value.
 
@@ -120,7 +127,7 @@ class SliceKernel:
     def __init__(
         self,
         roots: Sequence[Expression],
-        own: Mapping[str, Shape],
+        own: Mapping[str, Noise],
         chosen: frozenset[str],
         only_kept: bool = False,
     ) -> None:
@@ -173,9 +180,12 @@ class SliceCall:
         node = [(place, leaf, size) for leaf, (place, size) in zip(leaves, own, strict=True)]
         node += [(-1, at[leaf], 0) for leaf in self._others]
         self._node = np.array(node, np.int64)
-        sizes = {n: max(math.prod(s), 1) for n, s in kernel.own.items()}
+        sizes = {n: math.prod(z.shape) for n, z in kernel.own.items()}
         self._noise = {n: np.empty(self._block * size) for n, size in sizes.items()}
-        self._noises = np.array([(address_of(self._noise[n]), size) for n, size in sizes.items()])
+        self._noises = np.array(
+            [(address_of(self._noise[n]), sizes[n], z.is_uniform) for n, z in kernel.own.items()],
+            np.int64,
+        )
         for name in self._noise.keys() & at.keys():
             self._table[at[name]] = address_of(self._noise[name])
         self._places = [at[n.name] for n in kernel.known]

@@ -3,7 +3,7 @@
 The text is the same for every template, whose compiled slice (``series.SliceKernel``) is called from inside,
 so it is compiled once for all. Random numbers are those that NumPy's generator would hand out
 (``generator``), in the order of the plain steps: where particles are resampled, one uniform for the comb;
-then, block by block, the normals of each hidden node.
+then, block by block, the normals or uniform numbers of each hidden node.
 
 A slice that is not what it should be (a parameter out of range, a weight that is no number, none that is
 positive) is left alone, with the generator where it was, and so are all after it.
@@ -51,11 +51,11 @@ def passes() -> Any:
     ancestors (one more than there are particles), and the values of each node.
 
     ``node`` (nodes, 3): where a node's values are results of the kernel, where those of the slice before are
-    its leaves (either -1: nowhere), the bytes of one particle. ``noise`` (noises, 2): the address of a leaf
-    of normals, the numbers of one particle. ``moving`` (known, 3): the place of a leaf that all particles
-    share, the address of its value in the first slice, the bytes to the next one's. ``rows_place`` is where
-    the kernel is told the ancestors (-1: nowhere), ``log_place`` where it leaves the log density of what is
-    seen.
+    its leaves (either -1: nowhere), the bytes of one particle. ``noise`` (noises, 3): the address of a leaf
+    of random numbers, how many one particle has, whether they are uniform. ``moving`` (known, 3): the place of
+    a leaf that all particles share, the address of its value in the first slice, the bytes to the next one's.
+    ``rows_place`` is where the kernel is told the ancestors (-1: nowhere), ``log_place`` where it leaves the
+    log density of what is seen.
 
     Particles are resampled where they are worth less than ``least``.
 
@@ -194,12 +194,15 @@ class _Text:
     def _block(self, low: Number, count: Number) -> None:
         c = self.c
 
-        def normals(k: Number) -> None:
-            to = self._pointer(c.load("%noise", k * 2, WHOLE))
-            numbers = count * c.load("%noise", k * 2 + 1, WHOLE)
-            c.do(f"call void @normals(i64 {numbers.text}, ptr %state, ptr %ziggurat, ptr {to})")
+        def drawn(k: Number) -> None:
+            first, many, even = (c.load("%noise", k * 3 + j, WHOLE) for j in range(3))
+            to, numbers, is_even = self._pointer(first), (count * many).text, even.ne(0)
+            normals = f"call void @normals(i64 {numbers}, ptr %state, ptr %ziggurat, ptr {to})"
+            c.when(~is_even, lambda: c.do(normals))
+            uniforms = f"call void @uniforms(i64 {numbers}, ptr %state, ptr {to})"
+            c.when(is_even, lambda: c.do(uniforms))
 
-        c.loop(Number(c, "%noises", WHOLE), normals)
+        c.loop(Number(c, "%noises", WHOLE), drawn)
 
         def result(k: Number) -> None:
             place, step = (c.load("%node", k * 3 + j, WHOLE) for j in (0, 2))

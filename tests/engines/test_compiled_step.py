@@ -80,8 +80,20 @@ def lagged() -> tuple[Any, dict[str, Any]]:
     return dbn, {"y": np.random.default_rng(3).normal(0.0, 2.0, size=30)}
 
 
+def families() -> tuple[Any, dict[str, Any]]:
+    """Hidden nodes that are drawn by uniform numbers, or folded; a vector that is seen."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Laplace(0.8 * x_prev, 0.5), initial=bmc.Laplace(0.0, 1.0))
+    dbn.add("u", lambda x: bmc.Uniform(np.minimum(x, 0.0) - 1.0, np.abs(x)))
+    dbn.add("h", lambda h_prev: bmc.HalfNormal(0.5 + 0.3 * h_prev), initial=bmc.HalfNormal(1.0))
+    cov = np.array([[0.5, 0.2], [0.2, 0.4]])
+    dbn.add("y", lambda x, u, h: bmc.MvNormal(bmc.stack([x + u, h - u], axis=-1), cov))
+    return dbn, {"y": np.random.default_rng(4).normal(0.0, 1.0, size=(25, 2))}
+
+
 MODELS: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
     "growth": growth, "several": several, "vector": vector, "lagged": lagged,
+    "families": families,
 }  # fmt: skip
 
 
@@ -115,9 +127,11 @@ def test_means_agree_in_every_slice(
         missing = "drawn from a family without machine code"  # counts that are not seen
         assert all(missing in why for why in code.refused.values())
         assert sum(made is not None for made in code._made.values()) >= 2
-        for node in {"several": ("level", "scale", "both"), "lagged": ("x", "b", "l")}.get(
-            name, "x"
-        ):
+        for node in {
+            "several": ("level", "scale", "both"),
+            "lagged": ("x", "b", "l"),
+            "families": ("x", "u", "h"),
+        }.get(name, "x"):
             np.testing.assert_allclose(fast.mean(node), plain.mean(node), rtol=1e-9, atol=1e-9)
             np.testing.assert_allclose(fast.var(node), plain.var(node), rtol=1e-8, atol=1e-9)
         assert fast.log_marginal_likelihood == pytest.approx(

@@ -31,6 +31,7 @@ from bayesmc.lowering import (
     NO_NUMBERS,
     Cloud,
     Kernel,
+    Noise,
     Numbers,
     SliceCall,
     SliceKernel,
@@ -224,7 +225,7 @@ class _Slice:
         if key not in kept:
             read = _read(step, row)
             roots, noises = [*read.values.values(), read.flagged], read.drawn
-            own = {z.noise: z.shape for z in noises}
+            own = {z.noise: Noise(z.shape, z.is_uniform) for z in noises}
             kernel = SliceKernel(roots, own, chosen, only_kept)
             kept[key] = [list(read.values), kernel, False]
         self._kept = kept[key]
