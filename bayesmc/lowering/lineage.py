@@ -1,7 +1,7 @@
 """Families of particles followed over slices as machine code, with sums over each, until one asks for more.
 
-What families are, and what is to be said where something is due or seems odd, stands in
-``engines.particles.genealogy`` and ``tracking``: this is the loop over slices in which nothing is.
+What families are, and what is to be said where something seems odd, stands in
+``engines.particles.genealogy`` and ``tracking``: this is the loop over slices in which nothing does.
 """
 
 from __future__ import annotations
@@ -15,19 +15,20 @@ from bayesmc.lowering.elementary import elementary
 from bayesmc.lowering.machine import loaded
 from bayesmc.lowering.slices import ANCESTORS, MOMENTS, TOLD, WEIGHTS
 
-#: what bounds the slices in which nothing is due: the least effective number of particles, that below which
+#: bounds of slices in which nothing seems odd: the least effective number of particles, that below which
 #: weights are looked at for a tail, the largest sum of moves; even families (in units of all) that call for
 #: the young origin's sums, too; variances: what matters, what is explained by so many times, that without a
-#: tail, at most; the share of families left; slices to a look, the age of the young origin in the first slice
-#: after that before, and its ages at the soonest and the latest; slices until what is lost is looked at
+#: tail, at most; the share of families left; slices to a look, the number of the slice before, ages of the
+#: young origin at the soonest and the latest; the row where what is lost is looked at
 LIMITS = (
-    "rest", "few", "seems", "enough", "level", "edge", "long", "most", "left", "stride", "slice", "age",
+    "rest", "few", "seems", "enough", "level", "edge", "long", "most", "left", "stride", "slice",
     "shortest", "longest", "lost",
 )  # fmt: skip
 
 _WHOLES = ("first", "slices", "particles", "nodes", "numbers", "groups")
 _POINTERS = (
     "limits", "at", "told", "number", "moments", "bounds", "shares", "explained", "sums", "young", "roots",
+    "origins", "even", "even_shares",
 )  # fmt: skip
 _ORIGINS = 2
 
@@ -38,7 +39,9 @@ def followed() -> Any:
 
     Arrays are those of ``slices``, and ``bounds`` (slices + 1, 2, groups + 1), ``explained``
     (slices + 1, 2, 2), both known of row ``first``; ``shares`` (2, groups). It takes the sums of row
-    ``first`` (but of row 0), goes on while nothing is due, and gives the first row that it did not come to.
+    ``first`` (but of row 0), goes on while nothing seems odd, and gives the first row that it did not come
+    to. Where the old origin is to be given up, ``origins`` (settled, born of both) and ``shares`` are written
+    to; ``even`` (groups + 1) and ``even_shares`` are bounds and shares of a new one.
     ``sums`` (slices + 1, 2, 1 + numbers, groups): by family of the old origin and of the young one, of the
     weights, and of these times by how much each number lies off its mean. ``young`` (slices + 1) says whether
     those of the young one were taken. ``roots`` (1 + 2 particles): whether there are any, who they are, and
@@ -225,11 +228,12 @@ class _Followed:
         c.when(resampled & t.eq(whole * stride), self._look)
 
     def _look(self) -> None:
-        """Whether anything is due, or seems odd: ``genealogy._matters``."""
-        c, n = self.c, self.n.to(REAL)
-        age = self._limit("age") + self.next.to(REAL)
-        matters = c.variable(age > self._limit("longest"))
+        """Whether anything seems odd, or the old origin is to be given up: ``genealogy._looked_at``."""
+        c, n, t = self.c, self.n.to(REAL), self._limit("slice") + self.next.to(REAL)
+        age = t - c.load("%origins", 2, REAL)
+        due, matters = c.variable(age > self._limit("longest")), c.variable(c.number(False, TRUTH))
         even, spread, square = (c.variable(c.number(0.0)) for _ in range(3))
+        gained = c.number(0.0)
         for origin in range(_ORIGINS):
             bounds = self._bounds(self.next, origin)
             for place in (even, spread, square):
@@ -253,12 +257,39 @@ class _Followed:
             other = self._most(self._limit("long"), self._limit("edge") * bounded)
             bound = c.where(above < other, above, other)
             bound = c.where(bound < self._limit("most"), bound, self._limit("most"))
-            odd = variance > bound
+            c.set(matters, c.get(matters, TRUTH) | (variance > bound))
+            gained = gained + (variance if origin == 0 else -variance)
             if origin == 0:
                 is_few = share < self._limit("left") * c.get(square, REAL)
-                odd = odd | (is_few & (age > self._limit("shortest")))
-            c.set(matters, c.get(matters, TRUTH) | odd)
+                c.set(due, c.get(due, TRUTH) | (is_few & (age > self._limit("shortest"))))
         c.set(self.go, ~c.get(matters, TRUTH))
+        is_due = c.get(self.go, TRUTH) & c.get(due, TRUTH)
+        c.when(is_due, lambda: self._begin_again(t, gained))
+
+    def _begin_again(self, t: Number, gained: Number) -> None:
+        """A new young origin, the young one in the place of the old one."""
+        c = self.c
+        c.store("%origins", 0, c.load("%origins", 0, REAL) + gained)
+        c.store("%origins", 1, c.load("%origins", 2, REAL))
+        c.store("%origins", 2, t)
+        places = [(self._bounds(self.next, 0), self._bounds(self.next, 1), "%even", WHOLE)]
+        explained = [c.address("%explained", self.next * 4 + 2 * k, REAL) for k in range(2)]
+        young = c.address("%shares", self.groups, REAL)
+        places.append(("%shares", young, "%even_shares", REAL))
+        for (old, new, fresh, kind), count in zip(
+            places, (self.groups + 1, self.groups), strict=True
+        ):
+
+            def one(
+                g: Number, old: str = old, new: str = new, fresh: str = fresh, kind: str = kind
+            ) -> None:
+                c.store(old, g, c.load(new, g, kind))
+                c.store(new, g, c.load(fresh, g, kind))
+
+            c.loop(count, one)
+        for k in range(2):
+            c.store(explained[0], k, c.load(explained[1], k, REAL))
+            c.store(explained[1], k, c.number(0.0))
 
     def _root(self) -> None:
         """Whom particles descend from, one slice later."""

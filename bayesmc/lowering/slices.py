@@ -52,10 +52,10 @@ def passes() -> Any:
 
     ``node`` (nodes, 3): where a node's values are results of the kernel, where those of the slice before are
     its leaves (either -1: nowhere), the bytes of one particle. ``noise`` (noises, 3): the address of a leaf
-    of random numbers, how many one particle has, whether they are uniform. ``moving`` (known, 3): the place of
-    a leaf that all particles share, the address of its value in the first slice, the bytes to the next one's.
-    ``rows_place`` is where the kernel is told the ancestors (-1: nowhere), ``log_place`` where it leaves the
-    log density of what is seen.
+    of random numbers, how many one particle has, whether they are uniform. ``moving`` (known, 3): the place
+    of a leaf that all particles share, the address of its value in the first slice, the bytes to the next
+    one's. ``rows_place`` is where the kernel is told the ancestors (-1: nowhere), ``log_place`` where it
+    leaves the log density of what is seen.
 
     Particles are resampled where they are worth less than ``least``.
 

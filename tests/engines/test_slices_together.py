@@ -363,12 +363,24 @@ def nothing_matters(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(lineage._Followed, "_look", lambda self: None)
 
 
+def origins_are_never_given_up(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(lineage._Followed, "_begin_again", lambda self, t, gained: None)
+
+
+def nothing_is_settled(patch: pytest.MonkeyPatch) -> None:
+    begin = lineage._Followed._begin_again
+    patch.setattr(
+        lineage._Followed, "_begin_again", lambda self, t, gained: begin(self, t, gained * 0.0)
+    )
+
+
 @pytest.mark.usefixtures("afresh")
 @pytest.mark.parametrize(
     "fault",
     [
         ancestors_are_stale, known_values_stay, log_weights_are_forgotten, evidence_is_of_even_weights,
         prior_weights_are_even, families_stay, roots_stay, nothing_matters,
+        origins_are_never_given_up, nothing_is_settled,
     ],
 )  # fmt: skip
 def test_planted_faults_are_seen(fault: Any, monkeypatch: pytest.MonkeyPatch) -> None:

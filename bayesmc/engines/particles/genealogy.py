@@ -83,7 +83,7 @@ def begun(now: Particles, layout: Layout) -> Families:
     """Families of the particles of the first slice, which were drawn independently."""
     n, lead = layout.particles, layout.lead
     groups = min(GROUPS, max(n // LEAST, 2), n)
-    bounds, shares = _even(len(now.weights), groups, len(lead))
+    bounds, shares = even_groups(len(now.weights), groups, len(lead))
     return Families(
         np.array(np.broadcast_to(bounds, (2, groups + 1, *lead))),
         np.array(np.broadcast_to(shares, (2, groups, *lead))),
@@ -141,6 +141,17 @@ def unremarkable(
     return bounds, explained
 
 
+@lru_cache(maxsize=64)
+def even_groups(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Groups of about as many particles: where they begin and end, and their shares."""
+    bounds = np.arange(groups + 1) * n // groups
+    tail = (1,) * axes
+    found = bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
+    for array in found:
+        array.flags.writeable = False
+    return found
+
+
 def evidence_error(families: Families, now: Particles) -> Any:
     """Root mean square error of the log evidence, with its bias of minus half its variance."""
     off = _off(families, _weights(families, now))
@@ -177,17 +188,6 @@ def family_sums(values: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-@lru_cache(maxsize=64)
-def _even(n: int, groups: int, axes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Groups of about as many particles: where they begin and end, and their shares."""
-    bounds = np.arange(groups + 1) * n // groups
-    tail = (1,) * axes
-    found = bounds.reshape(-1, *tail), (np.diff(bounds) / n).reshape(-1, *tail)
-    for array in found:
-        array.flags.writeable = False
-    return found
 
 
 def _moved(families: Families, earlier: Particles, now: Particles, steady: bool) -> Families:
@@ -279,7 +279,7 @@ def _renewed(families: Families, earlier: Particles, now: Particles) -> tuple[Fa
 def _begun_again(families: Families, now: Particles, where: np.ndarray, both: bool) -> Families:
     """A new young origin in this slice, the young one in the place of the old one, in some plate elements."""
     groups = families.shares.shape[1]
-    fresh: Any = (*_even(len(now.weights), groups, now.weights.ndim - 1), 0.0, 0.0, now.t)
+    fresh: Any = (*even_groups(len(now.weights), groups, now.weights.ndim - 1), 0.0, 0.0, now.t)
     found: list[Any] = []
     for value, new in zip(families[:5], fresh, strict=True):
         begun = np.empty_like(value)

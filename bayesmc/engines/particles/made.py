@@ -244,7 +244,9 @@ class _Following:
         """The next slice that is to be looked at, and the families in the one before."""
         made, lost = self._slices.made, families.lost
         self.bounds[row], self.explained[row] = families.bounds, families.explained
-        shares = np.ascontiguousarray(families.shares)
+        shares = np.array(families.shares, order="C")
+        origins = np.array([families.settled, *families.born], dtype=float)
+        even = genealogy.even_groups(self._slices.size, shares.shape[1], 0)
         roots = np.zeros(1, np.int64)
         if lost is not None:
             n = self._slices.size
@@ -253,7 +255,7 @@ class _Following:
         limits = self._limits(families)
         arrays = (
             limits, made.at, made.told, self._where, made.moments, self.bounds, shares,
-            self.explained, self.sums, self.young, roots,
+            self.explained, self.sums, self.young, roots, origins, *even,
         )  # fmt: skip
         stop = followed()(row, *self._sizes, *(a.ctypes.data for a in arrays))
         last = min(stop - 1, self._count)
@@ -263,6 +265,9 @@ class _Following:
             self.lost[row + 1 : last + 1] = bool(lost.where)
             if (made.told[row + 1 : last + 1, RESAMPLED] > 0).any():
                 lost = lost._replace(roots=roots[1 : self._slices.size + 1])
+        if origins[2] > families.born[YOUNG]:
+            born, settled = origins[1:].astype(np.int64), np.asarray(origins[0])
+            families = families._replace(shares=shares, born=born, settled=settled)
         return stop, families._replace(
             bounds=self.bounds[last].copy(), explained=self.explained[last].copy(), lost=lost,
             drift=self._drift(last),
@@ -273,7 +278,7 @@ class _Following:
         return np.array([
             genealogy.rests(n), genealogy.FEW * n, genealogy.SEEMS, ENOUGH, genealogy.level_of(n),
             genealogy.EDGE, genealogy.LONG, genealogy.MOST, genealogy.LEFT, genealogy.STRIDE, self._t0,
-            self._t0 - int(families.born[YOUNG]), genealogy.SHORTEST, LONGEST,
+ genealogy.SHORTEST, LONGEST,
             math.inf if lost is None else lost.since + STRETCH - self._t0,
         ])  # fmt: skip
 
