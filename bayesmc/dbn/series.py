@@ -106,17 +106,16 @@ class Series:
                 inputs[name + PREVIOUS] = values[k - 1, ...]
         return Row(t, seen, inputs)
 
-    def alike(self, k: int, most: int) -> list[Row]:
-        """The k-th row, and as many after it as have the same nodes seen, in full."""
-        found = [self.row(k)]
-        for other in range(k + 1, min(k + most, self.steps)):
-            row = self.row(other)
-            if list(row.seen) != list(found[0].seen):
-                break
-            if any(seen.mask is not None for seen in row.seen.values()):
-                break
-            found.append(row)
-        return found
+    def alike(self, k: int, most: int) -> int:
+        """How many rows from the k-th on see the same nodes, each in full or not at all; so many at most."""
+        last, looked_at = min(k + most, self.steps), self._looked_at.values()
+        masked = [(full, some) for _, full, some in looked_at if full is not None]
+        if not masked:
+            return last - k
+        for other in range(k, last):
+            if any(full[other] != full[k] or full[other] != some[other] for full, some in masked):
+                return other - k
+        return last - k
 
 
 def read_series(

@@ -8,7 +8,7 @@ nothing here is used.
 from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
-from bayesmc.lowering.compiled import Bound, Compiled, compiled
+from bayesmc.lowering.compiled import Bound, Compiled, address_of, compiled
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.lineage import followed
 from bayesmc.lowering.machine import is_available
@@ -37,6 +37,7 @@ __all__ = [
     "SliceKernel",
     "Told",
     "Trajectories",
+    "address_of",
     "compiled",
     "followed",
     "held_against_numpy",

@@ -137,12 +137,12 @@ def followed_alike(name: str, monkeypatch: pytest.MonkeyPatch, particles: int = 
 
     def kept(self: Any) -> Any:
         families, sums = run(self)
-        found.append((self._slices.rows[-1].t, families))
+        found.append((self._slices.t + len(self._slices) - 1, families))
         return families, sums
 
     def stopped(self: Any, row: int, families: Any) -> Any:
         stop, own = one(self, row, families)
-        found.append((self._slices.rows[0].t + min(stop - 1, self._count) - 1, own))
+        found.append((self._slices.t + min(stop - 1, self._count) - 1, own))
         return stop, own
 
     with monkeypatch.context() as patch:

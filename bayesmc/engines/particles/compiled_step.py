@@ -325,7 +325,7 @@ class _Slice:
         if self._columns is None:
             self._columns = [self._column(problem, leaf) for leaf in self._kernel.known]
         most = max(1, min(_TOGETHER, _NUMBERS // (n * self._wide))) if self._goes_on else 1
-        rows = problem.series.alike(k, most)
+        count, store = problem.series.alike(k, most), self._store
         log, weights = (np.ascontiguousarray(a) for a in (earlier.log_weights, earlier.weights))
         cloud = Cloud(before, log, weights, earlier.total, earlier.log_total, earlier.ess)
         numbers = None if beside is None else self._numbers(beside[0])
@@ -336,11 +336,10 @@ class _Slice:
                 moves[:, numbers.where[:, 3] > 0] = drift.moves[:, 0]
                 cloud = cloud._replace(worst=drift.largest, moves=moves)
         known = [(a.ctypes.data + k * size, size) for a, size in self._columns]
-        count, store = len(rows), self._store
         values = [store((count, n, *shape)) for shape in self._kernel.shapes]
         arrays = [store((count, n)), store((count, n)), store((count, n + 1), np.int64), *values]
         made = self._call(step.threshold * n, cloud, known, arrays, rng, numbers or NO_NUMBERS)
-        return MadeSlices(made, rows, arrays, self._names, self._others, numbers)
+        return MadeSlices(made, problem.series, k, arrays, self._names, self._rest, numbers)
 
     # ---- private -------------------------------------------------------------------------------
 

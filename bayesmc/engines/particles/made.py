@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from bayesmc.dbn import Row, SeriesProblem
+from bayesmc.dbn import Row, Series, SeriesProblem
 from bayesmc.engines.particles import genealogy
 from bayesmc.engines.particles.errors import ENOUGH
 from bayesmc.engines.particles.families import LONGEST, OLD, YOUNG, Drift, Families
@@ -21,7 +21,7 @@ from bayesmc.engines.particles.predictive import Replicates
 from bayesmc.engines.particles.smc import Particles
 from bayesmc.engines.particles.sums import Sums
 from bayesmc.engines.particles.tracking import STRETCH, Tracker
-from bayesmc.lowering import Made, Numbers, followed
+from bayesmc.lowering import Made, Numbers, address_of, followed
 from bayesmc.network import CompiledNode
 
 #: columns of what is told of a slice: ``lowering.slices.TOLD``
@@ -34,13 +34,15 @@ class MadeSlices:
     Parameters
     ----------
     made : Made
-    rows : sequence of Row
+    series : Series
+    start : int
+        The number of their first row.
     arrays : sequence of ndarray
         Log weights, weights, ancestors, and values of each node, slices first.
     names : sequence of str
         These nodes.
-    known : callable
-        ``row -> values`` of nodes that all particles agree on.
+    seen : sequence of str
+        Nodes that are seen, in full, of those whose values are held.
     numbers : Numbers or None
         Of which the moments were taken; None where families are not followed by these.
     """
@@ -48,26 +50,33 @@ class MadeSlices:
     def __init__(
         self,
         made: Made,
-        rows: Sequence[Row],
+        series: Series,
+        start: int,
         arrays: Sequence[np.ndarray],
         names: Sequence[str],
-        known: Callable[[Row], dict[str, np.ndarray]],
+        seen: Sequence[str],
         numbers: Numbers | None,
     ) -> None:
-        self.made, self.rows, self._arrays = made, list(rows[: made.slices]), arrays
-        self.names, self.known, self.numbers = tuple(names), known, numbers
+        self.made, self._series, self._start, self._arrays = made, series, start, arrays
+        self.names, self._seen, self.numbers = tuple(names), seen, numbers
+        self.t = series.start + start
         self.figures = made.told[1 : made.slices + 1]
         self._told = self.figures.tolist()
         self._particles: dict[int, Particles] = {}
         self.size = arrays[0].shape[1]
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return self.made.slices
 
     def first(self, count: int) -> MadeSlices:
         """The first so many of them."""
-        made = self.made._replace(slices=count)
-        return MadeSlices(made, self.rows, self._arrays, self.names, self.known, self.numbers)
+        made, series = self.made._replace(slices=count), self._series
+        rest = (self._arrays, self.names, self._seen, self.numbers)
+        return MadeSlices(made, series, self._start, *rest)
+
+    def row(self, k: int) -> Row:
+        """What is known of the k-th slice."""
+        return self._series.row(self._start + k)
 
     def particles(self, k: int) -> Particles:
         """Those of the k-th slice; read-only."""
@@ -77,9 +86,11 @@ class MadeSlices:
             for array in own:
                 array.flags.writeable = False
             chosen = ancestors[: self.size] if resampled else None
-            values = {**self.known(self.rows[k]), **dict(zip(self.names, own, strict=True))}
+            values = dict(zip(self.names, own, strict=True))
+            for name in self._seen:
+                values[name] = self._values(name)[k, ...]
             self._particles[k] = Particles(
-                self.rows[k].t, values, log, weights, total, log_total, increment, ess, chosen,
+                self.t + k, values, log, weights, total, log_total, increment, ess, chosen,
                 bool(resampled),
             )  # fmt: skip
         return self._particles[k]
@@ -96,7 +107,7 @@ class MadeSlices:
             if node.name in places:
                 yield node, [a[:, places[node.name]] for a in whole]
                 continue
-            value = np.array([self.known(row)[node.name] for row in self.rows], dtype=float)
+            value = self._values(node.name).astype(float)
             yield node, [value, np.zeros_like(value), np.zeros_like(value)]
 
     def diagnosed(self) -> dict[str, np.ndarray]:
@@ -117,6 +128,12 @@ class MadeSlices:
     ) -> tuple[Families, Sums]:
         """The families in the last slice, given those of the slice before, and the sums over all of them."""
         return _Following(self, tracker, families, earlier).run()
+
+    # ---- private -------------------------------------------------------------------------------
+
+    def _values(self, name: str) -> np.ndarray:
+        """What was seen of a node, slices first."""
+        return self._series.observed[name].value[self._start : self._start + len(self)]
 
 
 class Ahead:
@@ -149,10 +166,10 @@ class Ahead:
         made, j = self._made, k - self._first
         assert made is not None
         if looks is not None and looks.wanted(k):
-            looks.look(k, made.particles(j - 1) if j else self._before, made.rows[j])
+            looks.look(k, made.particles(j - 1) if j else self._before, made.row(j))
         is_last = j == len(made) - 1
         if not self._is_followed:
-            self._record.add(k, made.particles(j), made.rows[j])
+            self._record.add(k, made.particles(j), made.row(j))
         elif is_last:
             self._record.add_made(made)
         if is_last:
@@ -211,7 +228,7 @@ class _Following:
         made, self._count, self._where = slices.made, len(slices), slices.numbers.where
         rows, numbers, groups = self._count + 1, len(self._where), families.shares.shape[1]
         self._families = families
-        self._t0 = slices.rows[0].t - 1
+        self._t0 = slices.t - 1
         self.bounds = np.empty((rows, _ORIGINS, groups + 1), np.int64)
         self.explained = np.empty((rows, _ORIGINS, 2))
         self.sums = np.empty((rows, _ORIGINS, 1 + numbers, groups))
@@ -219,6 +236,9 @@ class _Following:
         self._sizes = self._count, slices.size, made.at.shape[1] - 3, numbers, groups
         compass = tracker.compass
         self._columns = np.flatnonzero(self._where[:, 3])
+        early = (made.at, made.told, self._where, made.moments, self.bounds)
+        late = (self.explained, self.sums, self.young)
+        self._addresses = [[address_of(a) for a in arrays] for arrays in (early, late)]
         self._limit = math.inf if compass is None else compass.limit
 
     def run(self) -> tuple[Families, Sums]:
@@ -229,7 +249,7 @@ class _Following:
                 break
             earlier = slices.particles(stop - 2) if stop > 1 else self._earlier
             now = slices.particles(stop - 1)
-            drift, at = self._drift(stop), slices.rows[stop - 1]
+            drift, at = self._drift(stop), slices.row(stop - 1)
             families = tracker.followed_by(families, earlier, now, at, drift)
             row = stop
             self.lost[row] = families.lost is not None and bool(families.lost.where)
@@ -253,11 +273,9 @@ class _Following:
             roots = np.empty(2 * n + 1, np.int64)
             roots[0], roots[1 : n + 1] = 1, np.arange(n) if lost.roots is None else lost.roots
         limits = self._limits(families)
-        arrays = (
-            limits, made.at, made.told, self._where, made.moments, self.bounds, shares,
-            self.explained, self.sums, self.young, roots, origins, *even,
-        )  # fmt: skip
-        stop = followed()(row, *self._sizes, *(a.ctypes.data for a in arrays))
+        early, late = self._addresses
+        own = [address_of(a) for a in (limits, shares, roots, origins, *even)]
+        stop = followed()(row, *self._sizes, own[0], *early, own[1], *late, *own[2:])
         last = min(stop - 1, self._count)
         if last == row:
             return stop, families
