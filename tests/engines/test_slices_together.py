@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 import bayesmc as bmc
 from bayesmc.engines.particles import compiled_step, made
-from bayesmc.errors import InterruptWarning
+from bayesmc.errors import DegeneracyError, InterruptWarning
 from bayesmc.lowering import lineage, slices
 from bayesmc.lowering.code import REAL, WHOLE
 from tests.engines.test_compiled_step import MODELS, growth
@@ -242,6 +243,38 @@ def test_slices_before_ctrl_c_are_handed_over(
     told = fast.log_marginal_likelihood_mcse
     assert told == pytest.approx(first.log_marginal_likelihood_mcse, rel=1e-6)
     assert whole.log_marginal_likelihood_mcse != told
+
+
+def degenerate() -> tuple[Any, dict[str, Any]]:
+    """Rows that no particle explains, now and then."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.add("x", lambda x_prev: bmc.Normal(0.9 * x_prev, 0.5), initial=bmc.Normal(0.0, 1.0))
+    dbn.add("y", lambda x: bmc.Bernoulli(np.where(x > 6.0, 0.7, 0.0)))
+    dbn.add("z", lambda x: bmc.Normal(x, 1.0))
+    rng = np.random.default_rng(3)
+    y, z = np.zeros(40), rng.normal(size=40)
+    y[[17, 30]], y[20:25] = 1.0, np.nan
+    return dbn, {"y": y, "z": z}
+
+
+def test_rows_that_no_particle_explains(together: list[int]) -> None:
+    dbn, seen = degenerate()
+    told, filtered = [], []
+    for compiled in (True, False):
+        with pytest.raises(DegeneracyError) as caught:
+            bmc.filter(dbn, seen, engine=bmc.ParticleFilter(400, compiled=compiled), rng=0)
+        told.append(str(caught.value))
+        filtered.append(caught.value.filtered)
+    assert told[0] == told[1] and max(together) > 1
+    np.testing.assert_allclose(filtered[0].mean("x"), filtered[1].mean("x"), rtol=1e-9)
+    assert len(filtered[0].weight_ess) == 17
+    renewed = {"x": bmc.Normal(7.0, 1.0)}
+    engine = bmc.ParticleFilter(400, on_degeneracy="rejuvenate", rejuvenation=renewed)
+    fast, plain = (
+        bmc.filter(dbn, seen, engine=replace(engine, compiled=own), rng=1) for own in (True, False)
+    )
+    assert plain.rejuvenated.sum() == 2
+    same(fast, plain, ("x",))
 
 
 def test_a_template_that_is_compiled_is_machine_code_for_short_series(together: list[int]) -> None:
