@@ -191,7 +191,7 @@ class SliceCall:
         self._places = [at[n.name] for n in kernel.known]
         self._rows_place = first - 1 if kernel.chosen else -1
         self._identity = np.arange(particles, dtype=np.int64)
-        self._running = np.empty(particles)
+        self._running, self._points = np.empty(particles), np.empty(particles + 1)
         self._run = passes()
         self._fixed = [
             *(way.loaded.address, address_of(self._table)),
@@ -206,6 +206,7 @@ class SliceCall:
         arrays: Sequence[np.ndarray],
         rng: np.random.Generator,
         numbers: Numbers = NO_NUMBERS,
+        strata: bool = False,
     ) -> Made:
         """As many slices as arrays have rows, up to one that is to be made in another way.
 
@@ -223,6 +224,8 @@ class SliceCall:
         rng : Generator
             It goes on behind the last slice that was made.
         numbers : Numbers, optional
+        strata : bool, optional
+            Particles are resampled by a point in each stratum, not by a comb.
         """
         slices, particles = arrays[0].shape
         at = np.zeros((slices + 1, 3 + len(self._leaves)), np.int64)
@@ -249,10 +252,10 @@ class SliceCall:
         kernel, table, *fixed = self._fixed
         made = self._run(
             slices, particles, self._block, len(self._leaves), len(self._noise), len(self._places),
-            self._rows_place, len(self._table) - 1, many, least, math.log(particles), numbers.fading,
+            self._rows_place, len(self._table) - 1, many, strata, least, math.log(particles), numbers.fading,
             numbers.kept, numbers.least, kernel, table, address_of(state), *fixed,
             *(address_of(a) for a in (moving, at, rows, self._running, told)),
-            numbers.where.ctypes.data, moments.ctypes.data,
+            numbers.where.ctypes.data, moments.ctypes.data, address_of(self._points),
         )  # fmt: skip
         put_state(rng, state)
         return Made(made, told, moments, at, held)

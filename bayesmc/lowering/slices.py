@@ -33,12 +33,12 @@ LOG, WEIGHTS, ANCESTORS = range(3)
 
 _WHOLES = (
     "slices", "particles", "block", "nodes", "noises", "known", "rows_place", "log_place",
-    "numbers",
+    "numbers", "strata",
 )  # fmt: skip
 _REALS = ("least", "log_particles", "fading", "kept", "least_expected")
 _POINTERS = (
     "kernel", "arguments", "state", "ziggurat", "node", "noise", "moving", "at", "identity", "running",
-    "told", "number", "moments",
+    "told", "number", "moments", "points",
 )  # fmt: skip
 
 
@@ -57,7 +57,8 @@ def passes() -> Any:
     one's. ``rows_place`` is where the kernel is told the ancestors (-1: nowhere), ``log_place`` where it
     leaves the log density of what is seen.
 
-    Particles are resampled where they are worth less than ``least``.
+    Particles are resampled where they are worth less than ``least``, by a comb or, ``strata``, by a point in
+    each stratum.
 
     ``number`` (numbers, 4) says of which numbers ``moments`` (slices + 1, numbers, len(MOMENTS)) are taken:
     the column of ``at``, how many numbers of a particle lie there and which one it is, whether its moves
@@ -146,15 +147,27 @@ class _Text:
         c.set(self.spent, Number(c, "%log_particles", REAL))
         c.set(self.rows, self._whole(f"ptrtoint ptr {found} to i64"))
 
-        def comb() -> None:
-            u = c.op(REAL, "call double @uniform(ptr %state)")
-            scale, shift = n.to(REAL) / total, c.where(u.eq(0.0), 0.0, 1.0 - u)
-            last = c.load("%running", n - 1, REAL) * scale + shift
+        def choose() -> None:
+            scale = n.to(REAL) / total
+            last = c.load("%running", n - 1, REAL) * scale
             c.loop(n + 1, lambda j: c.store(found, j, c.number(0, WHOLE)))
-            numbers = ", ".join(f"double {x.text}" for x in (scale, shift, last))
-            c.do(
-                f"call void @ancestors(i64 {n.text}, i64 {n.text}, {numbers}, ptr %running, ptr {found})"
-            )
+            sizes, arrays = f"i64 {n.text}, i64 {n.text}", f"ptr %running, ptr {found}"
+
+            def comb() -> None:
+                u = c.op(REAL, "call double @uniform(ptr %state)")
+                shift = c.where(u.eq(0.0), 0.0, 1.0 - u)
+                given = [f"double {x.text}" for x in (scale, last + shift, shift)]
+                c.do(f"call void @systematic({', '.join([sizes, *given, arrays])})")
+
+            def strata() -> None:
+                c.do(f"call void @uniforms(i64 {n.text}, ptr %state, ptr %points)")
+                c.store("%points", n, c.number(2.0))
+                given = [f"double {x.text}" for x in (scale, last)]
+                c.do(f"call void @stratified({', '.join([sizes, *given, 'ptr %points', arrays])})")
+
+            is_stratified = Number(c, "%strata", WHOLE).ne(0)
+            c.when(~is_stratified, comb)
+            c.when(is_stratified, strata)
             c.set(self.unique, c.number(1, WHOLE))
 
             def other(j: Number) -> None:
@@ -163,7 +176,7 @@ class _Text:
 
             c.when(n > 1, lambda: c.loop(n - 1, other))
 
-        c.when(c.get(self.fine, TRUTH), comb)
+        c.when(c.get(self.fine, TRUTH), choose)
 
     def _propagate(self) -> None:
         """Values and log densities, block by block."""

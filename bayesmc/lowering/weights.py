@@ -1,7 +1,7 @@
 """Loops of particle filters over all particles, which no element-wise expression says.
 
-Weights from their logs with their sums in one pass, and systematic resampling: the same numbers, to
-rounding, as ``resampling.systematic`` gives.
+Weights from their logs with their sums in one pass, and resampling: the same numbers, to rounding, as
+``resampling.systematic`` and ``stratified`` give.
 
 References
 ----------
@@ -19,8 +19,13 @@ SMALL, LARGE = 1e-200, 1e200
 
 
 def loops(module: Module) -> list[str]:
-    """Functions ``exponentials``, ``running`` and ``ancestors``."""
-    return [_exponentials(module), _running(module), _ancestors(module)]
+    """Functions ``exponentials`` and ``running``; ``systematic`` and ``stratified``, which give ancestors."""
+    return [
+        _exponentials(module),
+        _running(module),
+        _ancestors(module, "systematic"),
+        _ancestors(module, "stratified"),
+    ]
 
 
 # ---- private ------------------------------------------------------------------------------------
@@ -61,17 +66,25 @@ def _running(module: Module) -> str:
     return f"define double @running({head}) {{\n{c}\n}}"
 
 
-def _ancestors(module: Module) -> str:
-    """Every particle writes its number where its offspring begin; a running maximum fills the rest."""
+def _ancestors(module: Module, name: str) -> str:
+    """Every particle writes its number where its offspring begin; a running maximum fills the rest.
+
+    The comb is shifted by one number, or the point of each stratum by its own (one more is beyond reach).
+    """
     c = Code(module)
     draws = Number(c, "%draws", WHOLE)
-    scale, shift, last = (Number(c, f"%{n}", REAL) for n in ("scale", "shift", "last"))
+    scale, last = Number(c, "%scale", REAL), Number(c, "%last", REAL)
+    is_comb = name == "systematic"
     start = c.variable(c.number(0, WHOLE))
 
     def begin(i: Number) -> None:
         c.store("%found", c.get(start, WHOLE), i)
-        position = c.load("%running", i, REAL) * scale + shift
+        position = c.load("%running", i, REAL) * scale
+        position = position + Number(c, "%shift", REAL) if is_comb else position
         edge = position.to(WHOLE)
+        if not is_comb:
+            point = c.load("%points", c.where(edge > draws, draws, edge), REAL)
+            edge = edge + (position - edge.to(REAL) > point).to(WHOLE)
         is_end = (position >= last) | (edge > draws)
         c.set(start, c.where(is_end, draws, edge))
 
@@ -86,5 +99,6 @@ def _ancestors(module: Module) -> str:
 
     c.loop(draws, fill)
     c.do("ret void")
-    head = "i64 %n, i64 %draws, double %scale, double %shift, double %last"
-    return f"define void @ancestors({head}, ptr noalias %running, ptr noalias %found) {{\n{c}\n}}"
+    more = "double %shift" if is_comb else "ptr noalias %points"
+    head = f"i64 %n, i64 %draws, double %scale, double %last, {more}, ptr noalias %running"
+    return f"define void @{name}({head}, ptr noalias %found) {{\n{c}\n}}"

@@ -251,8 +251,8 @@ def test_explain_says_what_makes_the_slices(monkeypatch: pytest.MonkeyPatch) -> 
     dbn, seen = finite()
     told = bmc.explain(dbn, seen, engine=engine, question="filter").effort
     assert told == "slices in NumPy: node 'k' is drawn from a family without machine code"
-    stratified = bmc.ParticleFilter(500, resampling="stratified")
-    told = bmc.explain(*growth(), engine=stratified, question="filter").effort
+    other = bmc.ParticleFilter(500, resampling="residual")
+    told = bmc.explain(*growth(), engine=other, question="filter").effort
     assert told == "slices as machine code, but for resampling"
     guided = bmc.ParticleFilter(500, proposal={"x": lambda y: bmc.Normal(y, 9.0)})
     told = bmc.explain(*growth(), engine=guided, question="filter").effort

@@ -188,7 +188,15 @@ def test_what_was_lost_is_lost_in_both() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"ess_threshold": 1.0}, {"ess_threshold": 0.0}, {"resampling": "ssp"}], ids=str
+    "options",
+    [
+        {"ess_threshold": 1.0},
+        {"ess_threshold": 0.0},
+        {"resampling": "ssp"},
+        {"resampling": "stratified"},
+        {"resampling": "stratified", "ess_threshold": 1.0},
+    ],
+    ids=str,
 )
 def test_options_of_resampling(options: dict[str, Any]) -> None:
     fast, plain = (filtered("wandering", compiled, **options) for compiled in (True, False))

@@ -12,7 +12,7 @@ import pytest
 from bayesmc.lowering.code import Module
 from bayesmc.lowering.machine import loaded
 from bayesmc.lowering.weights import loops
-from bayesmc.resampling import systematic
+from bayesmc.resampling import stratified, systematic
 
 pytest.importorskip("llvmlite", reason="llvmlite is not installed")
 
@@ -36,12 +36,12 @@ def test_weights_and_their_sums(n: int) -> None:
     np.testing.assert_allclose(sums, [weights.sum(), weights @ weights], rtol=1e-13)
 
 
-def test_systematic_resampling_takes_the_same_ancestors() -> None:
+def test_resampling_takes_the_same_ancestors() -> None:
     whole, real, pointer = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
     running = compiled().function("running", real, whole, pointer, pointer)
-    ancestors = compiled().function(
-        "ancestors", None, whole, whole, real, real, real, pointer, pointer
-    )
+    first = [whole, whole, real, real]
+    comb = compiled().function("systematic", None, *first, real, pointer, pointer)
+    strata = compiled().function("stratified", None, *first, pointer, pointer, pointer)
     for seed in range(300):
         rng = np.random.default_rng(seed)
         n = int(rng.integers(1, 60))
@@ -51,10 +51,15 @@ def test_systematic_resampling_takes_the_same_ancestors() -> None:
         if not weights.any():
             weights[0] = 1.0
         draws = int(rng.integers(1, 80)) if seed % 2 else n
-        expected = systematic(weights, draws, np.random.default_rng(seed))
         sums, found = np.empty(n), np.zeros(draws + 1, np.int64)
         total = running(n, weights.ctypes.data, sums.ctypes.data)
-        shift = (1.0 - np.random.default_rng(seed).random()) % 1.0
-        last = sums[-1] * (draws / total) + shift
-        ancestors(n, draws, draws / total, shift, last, sums.ctypes.data, found.ctypes.data)
+        scale, shift = draws / total, (1.0 - np.random.default_rng(seed).random()) % 1.0
+        arrays = sums.ctypes.data, found.ctypes.data
+        comb(n, draws, scale, sums[-1] * scale + shift, shift, *arrays)
+        expected = systematic(weights, draws, np.random.default_rng(seed))
+        np.testing.assert_array_equal(found[:draws], expected, err_msg=str(seed))
+        points = np.append(np.random.default_rng(seed).random(draws), 2.0)
+        found[:] = 0
+        strata(n, draws, scale, sums[-1] * scale, points.ctypes.data, *arrays)
+        expected = stratified(weights, draws, np.random.default_rng(seed))
         np.testing.assert_array_equal(found[:draws], expected, err_msg=str(seed))

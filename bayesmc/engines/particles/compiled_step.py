@@ -38,7 +38,7 @@ from bayesmc.lowering import (
     is_available,
     known_column,
 )
-from bayesmc.resampling import systematic
+from bayesmc.resampling import stratified, systematic
 
 #: seconds in NumPy of a slice, and of a particle in it, below a tenth of which nothing is compiled
 _SLICE, _PARTICLE, _WORTH = 1e-4, 4e-8, 0.1
@@ -208,7 +208,8 @@ def _is_at_hand(step: FilterStep, steps: int) -> bool:
 
 def _resamples(step: FilterStep) -> bool:
     """Whether machine code decides on offspring."""
-    return step.resample is systematic and step.first_stage is None and step.counts is None
+    known = step.resample in (systematic, stratified)
+    return known and step.first_stage is None and step.counts is None
 
 
 def _read(step: FilterStep, row: Row) -> SliceDensities:
@@ -338,7 +339,10 @@ class _Slice:
         known = [(a.ctypes.data + k * size, size) for a, size in self._columns]
         values = [store((count, n, *shape)) for shape in self._kernel.shapes]
         arrays = [store((count, n)), store((count, n)), store((count, n + 1), np.int64), *values]
-        made = self._call(step.threshold * n, cloud, known, arrays, rng, numbers or NO_NUMBERS)
+        strata = step.resample is stratified
+        made = self._call(
+            step.threshold * n, cloud, known, arrays, rng, numbers or NO_NUMBERS, strata
+        )
         return MadeSlices(made, problem.series, k, arrays, self._names, self._rest, numbers)
 
     # ---- private -------------------------------------------------------------------------------
