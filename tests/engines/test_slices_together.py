@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -221,6 +222,20 @@ def test_particles_that_are_kept(particles: int, together: list[int]) -> None:
         for c in (True, False)
     ]
     np.testing.assert_allclose(smooth[0].mean("x"), smooth[1].mean("x"), rtol=1e-9, atol=1e-9)
+
+
+def test_fixed_lags_and_threads() -> None:
+    dbn, seen = lost()
+    engine = bmc.ParticleFilter(300, compiled=True)
+    plain = replace(engine, compiled=False)
+    lagged = [bmc.smooth(dbn, seen, engine=e, rng=0, lag=3) for e in (engine, plain)]
+    np.testing.assert_allclose(lagged[0].mean("x"), lagged[1].mean("x"), rtol=1e-9, atol=1e-9)
+    alone = [bmc.filter(dbn, seen, engine=engine, rng=seed) for seed in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        beside = list(pool.map(lambda k: bmc.filter(dbn, seen, engine=engine, rng=k), range(8)))
+    for one, other in zip(alone, beside, strict=True):
+        np.testing.assert_array_equal(one.mean("x"), other.mean("x"))
+        np.testing.assert_array_equal(one.mcse("x"), other.mcse("x"))
 
 
 @pytest.mark.parametrize("stopped", [1, 2, 37, 64])
