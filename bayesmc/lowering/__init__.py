@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from bayesmc.lowering.checked import held_against_numpy, is_worth_it
 from bayesmc.lowering.compiled import Bound, Compiled, address_of, compiled
+from bayesmc.lowering.gaussians import Coefficients, GaussianLoops, gaussian_loops
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.lineage import followed
 from bayesmc.lowering.machine import is_available
@@ -28,7 +29,9 @@ __all__ = [
     "NO_NUMBERS",
     "Bound",
     "Cloud",
+    "Coefficients",
     "Compiled",
+    "GaussianLoops",
     "Kernel",
     "Made",
     "Noise",
@@ -40,6 +43,7 @@ __all__ = [
     "address_of",
     "compiled",
     "followed",
+    "gaussian_loops",
     "held_against_numpy",
     "is_available",
     "is_worth_it",
