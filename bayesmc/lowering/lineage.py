@@ -12,8 +12,8 @@ from typing import Any
 
 from bayesmc.lowering.code import REAL, TRUTH, WHOLE, Code, Module, Number
 from bayesmc.lowering.elementary import elementary
+from bayesmc.lowering.filter_slices import ANCESTORS, MOMENTS, TOLD, WEIGHTS
 from bayesmc.lowering.machine import loaded
-from bayesmc.lowering.slices import ANCESTORS, MOMENTS, TOLD, WEIGHTS
 
 #: bounds of slices in which nothing seems odd: the least effective number of particles, that below which
 #: weights are looked at for a tail, the largest sum of moves; even families (in units of all) that call for
@@ -37,7 +37,7 @@ _ORIGINS = 2
 def followed() -> Any:
     """The function ``int64 f(...)`` of ``_WHOLES`` and ``_POINTERS``, where there is a compiler.
 
-    Arrays are those of ``slices``, and ``bounds`` (slices + 1, 2, groups + 1), ``explained``
+    Arrays are those of ``filter_slices``, and ``bounds`` (slices + 1, 2, groups + 1), ``explained``
     (slices + 1, 2, 2), both known of row ``first``; ``shares`` (2, groups). It takes the sums of row
     ``first`` (but of row 0), goes on while nothing seems odd, and gives the first row that it did not come
     to. Where the old origin is to be given up, ``origins`` (settled, born of both) and ``shares`` are written

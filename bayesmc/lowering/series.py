@@ -1,4 +1,4 @@
-"""Slices of one template as machine code: what ``slices`` is given, and the arrays that it fills."""
+"""Slices of one template as machine code: what ``filter_slices`` is given, and the arrays that it fills."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 
 from bayesmc.errors import TraceError
 from bayesmc.expression import Expression
-from bayesmc.lowering import generator, lineage, slices
+from bayesmc.lowering import filter_slices, generator, lineage
 from bayesmc.lowering.compiled import Way, address_of
+from bayesmc.lowering.filter_slices import MOMENTS, TOLD, passes
 from bayesmc.lowering.generator import is_numpys, put_state, state_of, ziggurat
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.machine import is_available, is_kept
-from bayesmc.lowering.slices import MOMENTS, TOLD, passes
 from bayesmc.lowering.ufuncs import kind_of
 from bayesmc.lowering.writer import DTYPES
 from bayesmc.shapes import Shape
@@ -32,9 +32,9 @@ class Cloud(NamedTuple):
         Log weights that particles bring along where they are not resampled.
     weights : ndarray, shape (particles,)
     total, log_total, ess, worst : float
-        As ``slices.TOLD`` says.
+        As ``filter_slices.TOLD`` says.
     moves : ndarray, shape (2, numbers)
-        What the moments of ``slices`` go on from.
+        What the moments of ``filter_slices`` go on from.
     rows : ndarray of int64, optional
         Ancestors, where particles are not resampled; by default everybody has itself.
     """
@@ -51,14 +51,14 @@ class Cloud(NamedTuple):
 
 
 class Made(NamedTuple):
-    """Slices that were made; row 0 of what ``slices`` fills is that of the slice before.
+    """Slices that were made; row 0 of what ``filter_slices`` fills is that of the slice before.
 
     Attributes
     ----------
     slices : int
         How many.
-    told : ndarray, shape (slices + 1, len(slices.TOLD))
-    moments : ndarray, shape (slices + 1, numbers, len(slices.MOMENTS))
+    told : ndarray, shape (slices + 1, len(filter_slices.TOLD))
+    moments : ndarray, shape (slices + 1, numbers, len(filter_slices.MOMENTS))
     at : ndarray of int64, shape (slices + 1, columns)
     held : list of ndarray
         What the addresses point to.
@@ -77,7 +77,7 @@ class Numbers(NamedTuple):
     Attributes
     ----------
     where : ndarray of int64, shape (numbers, 4)
-        As ``slices.passes`` says.
+        As ``filter_slices.passes`` says.
     fading, kept, least : float
         The same of its ``fading``, ``kept`` and ``least_expected``.
     """
@@ -139,7 +139,7 @@ class SliceKernel:
         if not all(r.leaves & varying for r in roots) or not own:
             raise TraceError("what is the same for all particles is made by plain steps")
         kernel = Kernel(roots, varying, chosen)
-        texts = (kernel.text, *(module.text()[0] for module in (generator, slices, lineage)))
+        texts = (kernel.text, *(module.text()[0] for module in (generator, filter_slices, lineage)))
         if only_kept and not all(map(is_kept, texts)):
             raise TraceError("it would have to be compiled")
         if not is_numpys():

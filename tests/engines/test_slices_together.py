@@ -13,7 +13,7 @@ import pytest
 import bayesmc as bmc
 from bayesmc.engines.particles import compiled_step, made
 from bayesmc.errors import DegeneracyError, InterruptWarning
-from bayesmc.lowering import lineage, slices
+from bayesmc.lowering import filter_slices, lineage
 from bayesmc.lowering.code import REAL, WHOLE
 from tests.engines.test_compiled_step import MODELS, growth
 from tests.engines.test_slice_program import NODES, wandering
@@ -346,7 +346,7 @@ def test_explain_and_wrong_options() -> None:
 @pytest.fixture
 def afresh() -> Iterator[None]:
     """Loops are written and compiled anew, before and after."""
-    kept = (slices.text, slices.passes, lineage.text, lineage.followed)
+    kept = (filter_slices.text, filter_slices.passes, lineage.text, lineage.followed)
     for function in kept:
         function.cache_clear()
     yield
@@ -355,48 +355,50 @@ def afresh() -> Iterator[None]:
 
 
 def ancestors_are_stale(patch: pytest.MonkeyPatch) -> None:
-    resample = slices._Text._resample
+    resample = filter_slices._Text._resample
 
     def stale(self: Any) -> None:
         rows = self.c.get(self.rows, WHOLE)
         resample(self)
         self.c.set(self.rows, rows)
 
-    patch.setattr(slices._Text, "_resample", stale)
+    patch.setattr(filter_slices._Text, "_resample", stale)
 
 
 def known_values_stay(patch: pytest.MonkeyPatch) -> None:
-    call = slices._Text._propagate
+    call = filter_slices._Text._propagate
 
     def first(self: Any) -> None:
         self.slice, kept = self.c.variable(self.c.number(0, WHOLE), once=True), self.slice
         call(self)
         self.slice = kept
 
-    patch.setattr(slices._Text, "_propagate", first)
+    patch.setattr(filter_slices._Text, "_propagate", first)
 
 
 def log_weights_are_forgotten(patch: pytest.MonkeyPatch) -> None:
-    level = slices._Text._level
+    level = filter_slices._Text._level
     patch.setattr(
-        slices._Text, "_level", lambda self, resampled: level(self, self.c.number(True, "i1"))
+        filter_slices._Text,
+        "_level",
+        lambda self, resampled: level(self, self.c.number(True, "i1")),
     )
 
 
 def evidence_is_of_even_weights(patch: pytest.MonkeyPatch) -> None:
-    weigh = slices._Text._weigh
+    weigh = filter_slices._Text._weigh
 
     def even(self: Any, resampled: Any) -> None:
-        self.c.set(self.spent, slices.Number(self.c, "%log_particles", REAL))
+        self.c.set(self.spent, filter_slices.Number(self.c, "%log_particles", REAL))
         weigh(self, resampled)
 
-    patch.setattr(slices._Text, "_weigh", even)
+    patch.setattr(filter_slices._Text, "_weigh", even)
 
 
 def prior_weights_are_even(patch: pytest.MonkeyPatch) -> None:
-    moments = slices._Text._moments
+    moments = filter_slices._Text._moments
     patch.setattr(
-        slices._Text,
+        filter_slices._Text,
         "_moments",
         lambda self, k, resampled: moments(self, k, resampled.eq(resampled)),
     )

@@ -24,7 +24,7 @@ from bayesmc.engines.particles.tracking import STRETCH, Tracker
 from bayesmc.lowering import Made, Numbers, address_of, followed
 from bayesmc.network import CompiledNode
 
-#: columns of what is told of a slice: ``lowering.slices.TOLD``
+#: columns of what is told of a slice: ``lowering.filter_slices.TOLD``
 TOTAL, LOG_TOTAL, ESS, INCREMENT, RESAMPLED, UNIQUE, WORST = range(7)
 
 
