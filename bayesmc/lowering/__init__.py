@@ -13,7 +13,6 @@ from bayesmc.lowering.gaussians import Coefficients, GaussianLoops, gaussian_loo
 from bayesmc.lowering.kernel import Kernel
 from bayesmc.lowering.lineage import followed
 from bayesmc.lowering.machine import is_available
-from bayesmc.lowering.slices import Slices, Turns
 from bayesmc.lowering.series import (
     NO_NUMBERS,
     Cloud,
@@ -24,6 +23,7 @@ from bayesmc.lowering.series import (
     SliceKernel,
     known_column,
 )
+from bayesmc.lowering.slices import Slices, Turns
 from bayesmc.lowering.trajectory import Told, Trajectories
 
 __all__ = [
