@@ -264,12 +264,13 @@ class DiscreteSlices:
         key = (number, rows.kind, reduce, frozenset(id(p) for p in fixed))
         if key not in self._fixed:
             table = self._product(fixed, pair)
-            self._fixed[key] = table.reshape(table.shape[1], size, size)
+            kept = tuple(fixed)  # what lives hands its id to nothing else
+            self._fixed[key] = kept, table.reshape(table.shape[1], size, size)
         moving = None
         if both:
             table = self._product(both, pair)
             moving = _full(table, rows, (size, size))
-        return Block(rows.start, rows.stop, self._fixed[key], moving, likelihood)
+        return Block(rows.start, rows.stop, self._fixed[key][1], moving, likelihood)
 
     def _product(self, pieces: Sequence[Piece], scope: Sequence[Variable]) -> np.ndarray:
         return log_product(pieces or [NEUTRAL], scope, self.cards)

@@ -139,6 +139,7 @@ class Always:
     """
 
     def __init__(self, tree: SliceTree, pieces: Sequence[Piece]) -> None:
+        self._kept = tuple(pieces)  # what lives hands its id to nothing else
         sums = [np.zeros(shape) for shape in tree.shapes]
         for piece in pieces:
             clique, table = tree.placed(piece.scope, piece.values[0])

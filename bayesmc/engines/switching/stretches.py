@@ -141,7 +141,8 @@ class Stretch:
                 found = [a.take(self.pairs.kind, axis=0) for a in found]
             return Linear(*found)
 
-        return self._memory((id(pattern), by_kind), choose) if timeless else choose()
+        key = "chosen", pattern.chosen.tobytes(), by_kind
+        return self._memory(key, choose) if timeless else choose()
 
     def coefficients(self, k: int, pattern: Pattern, by_kind: bool) -> Coefficients:
         """The same as machine code reads them."""
@@ -152,7 +153,7 @@ class Stretch:
 
         if len(self.linear.moves) > 1:
             return choose()
-        return self._memory(("coefficients", id(pattern), by_kind), choose)
+        return self._memory(("coefficients", pattern.chosen.tobytes(), by_kind), choose)
 
     @cached_property
     def linear(self) -> Linear:
