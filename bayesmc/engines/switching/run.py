@@ -92,7 +92,7 @@ class SwitchingRun:
         def move(k: int) -> None:
             place = places[k]
             after, increments[k] = advanced(merging, found[-1] if found else None, place, loops)
-            check_row(data.series.start + k, increments[k])
+            check_row(data.series.start + k, increments[k], place, found[-1] if found else None)
             found.append(after if k else self._over_all(after))
 
         def so_far(k: int) -> SwitchingSeries:
@@ -321,7 +321,7 @@ def row_taken(
     place = Place(stretch, 0, pattern, target, given, _is_carried(layout, pattern))
     after, increment = advanced(options.merging, None if before is None else before.found, place)
     after = whole(place, after)
-    check_row(row.t, increment)
+    check_row(row.t, increment, place, None if before is None else before.found)
     known = {n: row.seen[n].value for n in seen}
     plain = (n for n in layout.computed if n not in modes.names and not _of_modes(modes, layout, n))
     known |= {n: _evaluated(layout, n, {**static, **values}) for n in plain}
@@ -329,7 +329,7 @@ def row_taken(
     return state, increment
 
 
-def check_row(t: int, increment: Any) -> None:
+def check_row(t: int, increment: Any, place: Place, before: Mixture | None) -> None:
     """Refuse a row that no mode can have.
 
     Raises
@@ -338,12 +338,21 @@ def check_row(t: int, increment: Any) -> None:
     """
     if increment.ndim == 0 and math.isfinite(increment) or np.isfinite(increment).all():
         return
-    if not np.isnan(increment).any() and (increment < np.inf).all():
-        raise ZeroProbabilityError(
-            f"the row of slice {t} has probability zero given those before, whatever the modes; check the "
-            "row, or give what is known without noise (a scale of 0, a probability of 0) a little"
-        )
-    raise DegeneracyError(f"the row of slice {t} has no density given those before", t)
+    if np.isnan(increment).any() or not (increment < np.inf).all():
+        raise DegeneracyError(f"the row of slice {t} has no density given those before", t)
+    log = np.zeros((1, *increment.shape)) if before is None else before.log
+    node = place.stretch.ruling_out(place.at, log)
+    if node is None:
+        layout, numbers = place.layout, place.pattern.observed - place.layout.p
+        partly = (n for n, at in layout.rows.items() if np.isin(np.r_[at], numbers).any())
+        names = ", ".join(map(repr, (*layout.seen, *partly)))
+    else:
+        names = repr(node)
+    raise ZeroProbabilityError(
+        f"the row of slice {t} has probability zero given those before, whatever the modes: what was seen of "
+        f"{names} is impossible; check that row, or give what is known without noise (a scale of 0, a "
+        "probability of 0) a little"
+    )
 
 
 def values_by_mode(model: Any, told: Mapping[str, tuple[Any, Any]]) -> dict[str, np.ndarray]:

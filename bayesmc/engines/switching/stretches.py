@@ -6,7 +6,7 @@ All pairs of modes (``pairs``) and all slices of a stretch are worked out togeth
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import nullcontext
 from functools import cached_property
 from typing import Any
@@ -79,7 +79,7 @@ class Stretch:
         static = layout.slices.template.static
         self.fixed = {n: v for n, v in values.items() if n in static}
         self.timed = {n: v for n, v in values.items() if n not in static}
-        self.count = count
+        self.count, self._observed = count, observed
         self._memory = Memory()
         self._plan: Plan | None = None
         #: whether some row was met that machine code leaves to NumPy
@@ -87,6 +87,8 @@ class Stretch:
         every = np.arange(modes.count) if now is None else now
         table = self._table(observed, before, every)
         possible: np.ndarray = (table > -np.inf).reshape(*table.shape[:3], -1).any(axis=(0, 3))  # type: ignore[assignment]
+        if not possible.any():  # that the first row rules all out is told when it is come to
+            possible[:, :1] = True
         kept = np.flatnonzero(possible.any(axis=0)) if now is None else np.arange(len(every))
         src, dst = np.nonzero(possible[:, kept])
         if before is None:
@@ -167,6 +169,27 @@ class Stretch:
         for name in self.layout.computed:
             found[name] = self.layout.model.evaluate(name, found)[0]
         return found
+
+    def ruling_out(self, k: int, before: np.ndarray) -> str | None:
+        """The node that leaves no mode to the k-th slice, some element's at least; None if none does.
+
+        Parameters
+        ----------
+        before : ndarray, shape (modes before or 1, *lead)
+            Log probabilities.
+        """
+        part = slice(k, k + 1)
+        modes = modes_along(self.modes.at(np.arange(self.modes.count)), 1)
+        if len(self.pairs.before):
+            modes |= modes_along(self.modes.at(self.pairs.before, PREVIOUS), 2)
+        timed = along_time({n: v[part] for n, v in self.timed.items()}, 2)
+        seen = {n: _rows(o, part) for n, o in self._observed.items()}
+        values = {**self.fixed, **timed, **modes}
+        start = np.where(before > -np.inf, 0.0, -np.inf)[None, :, None]
+        for name, total in _running(self.layout, self.modes, values, seen, start):
+            if (total == -np.inf).all(axis=(0, 1, 2)).any():
+                return name
+        return None
 
     def told(self, name: str) -> tuple[np.ndarray, np.ndarray | None] | None:
         """What modes alone say of a node that is averaged over them, by slice and mode.
@@ -307,7 +330,23 @@ def log_factors(
     ParameterError
         Bad parameters where modes are possible.
     """
-    total: Any = np.zeros((1, 1, 1, *(1,) * len(layout.lead)))
+    total = np.zeros((1, 1, 1, *(1,) * len(layout.lead)))
+    for _, total in _running(layout, modes, values, observed, total):
+        pass
+    return total
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _running(
+    layout: Layout,
+    modes: Modes,
+    values: dict[str, np.ndarray],
+    observed: Mapping[str, Observed],
+    total: Any,
+) -> Iterator[tuple[str, Any]]:
+    """A total of log densities after every node that has one; see ``log_factors``."""
     for name in (n for n in layout.order if n in (*layout.certain, *layout.computed)):
         node, model = layout.model[name], layout.model
         is_mode = name in modes.names
@@ -344,10 +383,8 @@ def log_factors(
             if seen.mask is not None:
                 off = off & _behind_time(seen.mask)
             total = total + summed(np.where(off, -np.inf, 0.0), node, layout.apart)
-    return total
+        yield name, total
 
-
-# ---- private ------------------------------------------------------------------------------------
 
 
 def _moments(model: Any, name: str, values: Mapping[str, np.ndarray]) -> np.ndarray:
