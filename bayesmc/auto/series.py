@@ -236,21 +236,17 @@ def explained_series(
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
         nodes = chosen.describe(problem)
-        return Explanation(chosen, reasons, refused, nodes, effort=_effort(chosen, problem, asked))
+        return Explanation(chosen, reasons, refused, nodes, effort=chosen.effort_for(problem, asked))
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
     if why is None:
-        nodes, effort = checked.describe(problem), _effort(checked, problem, asked)
+        nodes, effort = checked.describe(problem), checked.effort_for(problem, asked)
         return Explanation(checked, ("it was asked for",), {}, nodes, effort=effort)
     reasons = ("it was asked for, but it cannot answer",)
     return Explanation(checked, reasons, {type(checked).__name__: why})
 
 
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _effort(engine: FilterEngine, problem: SeriesProblem, asked: Asked) -> str:
-    return engine.effort(problem) if asked.what == "filter" else ""
 
 
 def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -> FilterEngine:

@@ -134,6 +134,10 @@ class FilterEngine:
         """How it passes a series, where there is something to say."""
         return ""
 
+    def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
+        """The same for what is asked."""
+        return self.effort(problem)
+
     def filter(
         self,
         problem: SeriesProblem,

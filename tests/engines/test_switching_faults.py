@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,9 @@ import bayesmc as bmc
 from bayesmc import SwitchingKalmanFilter
 from bayesmc.dbn import pose_series
 from bayesmc.engines.kalman.data import pattern_of
-from bayesmc.errors import ZeroProbabilityError
+from bayesmc.errors import EngineWarning, ZeroProbabilityError
+from bayesmc.testing import session
+from bayesmc.testing.makers.switching_dbns import random_switching_dbn
 
 RULES = ("gpb1", "imm", "gpb2")
 
@@ -118,3 +121,106 @@ def test_an_impossible_mode_of_one_element_is_told() -> None:
     rows["s"] = [["a", None], [None, None], ["b", None]]
     found = bmc.filter(one_way(("k",)), rows, engine=SwitchingKalmanFilter())
     assert found.probabilities("s")[2, 0].tolist() == [0.0, 1.0]
+
+
+# ---- smoothing over gaps ------------------------------------------------------------------------
+
+
+def stock() -> bmc.DynamicBayesNet:
+    """As docs/switching.md has it: two numbers whose noise the mode tells."""
+    dbn = bmc.DynamicBayesNet()
+    table = [[0.95, 0.05], [0.2, 0.8]]
+    dbn.table("regime", ["regime_prev"], table, ("calm", "rough"), initial=[0.8, 0.2])
+    dbn.add(
+        "drift",
+        lambda drift_prev, regime: bmc.Normal(
+            0.9 * drift_prev, np.where(regime == "rough", 0.5, 0.05)
+        ),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add(
+        "level",
+        lambda level_prev, drift, regime: bmc.Normal(
+            level_prev + drift, np.where(regime == "rough", 1.0, 0.1)
+        ),
+        initial=bmc.Normal(0.0, 1.0),
+    )
+    dbn.add("price", lambda level: bmc.Normal(level, 0.3))
+    return dbn
+
+
+PRICES = [0.1, 0.0, 0.3, None, 2.6, 1.1, 1.4]
+
+
+@pytest.mark.parametrize("merging", RULES)
+@pytest.mark.parametrize("lag", [None, 2])
+def test_rows_without_data_at_the_end_change_nothing(merging: Any, lag: int | None) -> None:
+    dbn, engine, options = stock(), SwitchingKalmanFilter(merging), {} if lag is None else {"lag": lag}
+    short = bmc.smooth(dbn, {"price": PRICES}, engine=engine, **options)
+    rows = {"price": [*PRICES, None, None, None, None, None]}
+    filtered = bmc.filter(dbn, rows, engine=engine)
+    found = bmc.smooth(dbn, rows, engine=engine, **options)
+    steps = len(PRICES)
+    for name in ("level", "drift"):
+        for moment in ("mean", "var"):
+            one = getattr(found, moment)(name)
+            np.testing.assert_array_equal(one[:steps], getattr(short, moment)(name))
+            np.testing.assert_array_equal(one[steps - 1 :], getattr(filtered, moment)(name)[steps - 1 :])
+    now = found.probabilities("regime")
+    np.testing.assert_array_equal(now[:steps], short.probabilities("regime"))
+    np.testing.assert_array_equal(now[steps:], filtered.probabilities("regime")[steps:])
+
+
+@pytest.mark.parametrize("lag", [None, 1, 3])
+def test_every_element_apart_has_a_last_row_of_its_own(lag: int | None) -> None:
+    """Each is what it is by itself; one has no row at all, and one a gap within."""
+    rng, engine = np.random.default_rng(3), SwitchingKalmanFilter()
+    options: dict[str, Any] = {} if lag is None else {"lag": lag}
+    y = rng.normal(size=(7, 4))
+    y[4:, 0] = y[:, 1] = y[2:5, 2] = np.nan
+
+    def levels(count: int) -> bmc.DynamicBayesNet:
+        dbn = bmc.DynamicBayesNet(plates={"k": count})
+        dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5], plates="k")
+        first = bmc.Normal(0.0, 1.0)
+        dbn.add("x", lambda x_prev, s: bmc.Normal(x_prev + s, 0.3 + s), initial=first, plates="k")
+        dbn.add("y", lambda x: bmc.Normal(x, 0.3), plates="k")
+        return dbn
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", EngineWarning)
+        found = bmc.smooth(levels(4), {"y": y}, engine=engine, **options)
+        filtered = bmc.filter(levels(4), {"y": y}, engine=engine)
+        for k in range(4):
+            own = bmc.smooth(levels(1), {"y": y[:, k : k + 1]}, engine=engine, **options)
+            np.testing.assert_allclose(found.var("x")[:, k], own.var("x")[:, 0], rtol=1e-9)
+            np.testing.assert_allclose(found.mean("x")[:, k], own.mean("x")[:, 0], atol=1e-9)
+    for k, last in ((0, 3), (1, 0), (2, 6)):
+        np.testing.assert_array_equal(found.var("x")[last:, k], filtered.var("x")[last:, k])
+        assert lag or k == 1 or (found.var("x")[:last, k] != filtered.var("x")[:last, k]).all()
+
+
+def test_a_gap_over_which_the_smoother_is_lost_is_warned_of() -> None:
+    """Its deviations there are far above the exact ones; with data in all rows it says nothing."""
+    dbn, rows = stock(), {"price": [-0.6, None, None, None, None, -3.2, -5.1, -5.2, -4.8]}
+    assert "p(x[t+1] | s[t+1], all rows)" in str(bmc.explain(dbn, rows, question="smooth"))
+    with pytest.warns(EngineWarning, match="slice 0 the standard deviation of 'level' is") as told:
+        found = bmc.smooth(dbn, rows, engine=SwitchingKalmanFilter())
+    assert told[0].filename == __file__
+    right = bmc.infer(dbn, rows, engine=bmc.Exact())
+    assert np.sqrt(found.var("level")[0] / right.var("level[0]")) > 1.5
+    for seen in (PRICES, [0.1, 0.0, 0.3, 0.2, 2.6, 1.1, 1.4], [None, None, 0.3, 0.6]):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", EngineWarning)
+            bmc.smooth(dbn, {"price": seen}, engine=SwitchingKalmanFilter())
+
+
+def test_random_templates_raise_no_false_alarm_of_gaps() -> None:
+    """What is warned of is too wide; of 120 templates none was."""
+    for seed in range(session.scaled(40, 12)):
+        case = random_switching_dbn(seed)
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            engine = SwitchingKalmanFilter()
+            bmc.smooth(case.dbn, case.observations, inputs=case.inputs, engine=engine)
+        assert not [w for w in told if issubclass(w.category, EngineWarning)], seed

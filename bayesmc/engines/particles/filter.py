@@ -259,6 +259,9 @@ class ParticleFilter(FilterEngine):
         step = self._sized(START).step_of(problem.slices, problem.known_static)
         return told(step, problem, self.compiled)
 
+    def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
+        return self.effort(problem) if asked.what == "filter" else ""
+
     def filter(
         self,
         problem: SeriesProblem,

@@ -20,6 +20,7 @@ from bayesmc.engines.kalman.slices import Layout
 from bayesmc.engines.switching.modes import Modes
 from bayesmc.engines.switching.posterior import SwitchingSeries
 from bayesmc.engines.switching.run import Options, SwitchingRun, SwitchingState, row_taken
+from bayesmc.engines.switching.smoothing import warn_where_lost
 from bayesmc.errors import BayesmcError, UnsupportedError
 from bayesmc.network.node import nodes_read
 from bayesmc.progress import Progress
@@ -98,8 +99,12 @@ class SwitchingKalmanFilter(FilterEngine):
 
     Notes
     -----
-    ``smooth`` is Kim's smoother, on the filter's Gaussians whatever rule made them: given the mode of the
-    next slice, later rows are taken to tell no more of this one's. Gaussians are carried as triangular
+    ``smooth`` is Kim's smoother, on the filter's Gaussians whatever rule made them. It stands on two further
+    approximations: given the mode of the next slice, later rows tell no more of this one's; and p(x[t+1] |
+    s[t], s[t+1], all rows) is p(x[t+1] | s[t+1], all rows), numbers given two modes as given the later one
+    alone. The second fails where rows are missing that would tell which modes went with which numbers: before
+    and within a gap smoothed deviations come out too wide, and it warns (EngineWarning) where they are more
+    than 1.5 times the filtered ones. From the last row with data on they are the filtered ones. Gaussians are carried as triangular
     roots of their covariances, and merged as such; no covariance is subtracted or inverted. All pairs of
     modes are one array operation, with ``linearize`` one after the other. Plates whose elements never
     meet have a mode for each element. Finite nodes that nothing reads are averaged over where they are
@@ -211,6 +216,15 @@ class SwitchingKalmanFilter(FilterEngine):
             "approximation of unknown error"
         )
 
+    def effort_for(self, problem: SeriesProblem, asked: Asked) -> str:
+        found = self.effort(problem)
+        if asked.what not in ("smooth", "fixed-lag"):
+            return found
+        return (
+            f"{found}; smoothed by Kim's approximations, p(x[t+1] | s[t], s[t+1], all rows) taken to be "
+            "p(x[t+1] | s[t+1], all rows), which is too wide where rows are missing"
+        )
+
     def filter(
         self,
         problem: SeriesProblem,
@@ -244,8 +258,10 @@ class SwitchingKalmanFilter(FilterEngine):
     ) -> SwitchingSeries:
         run = self._run(problem)
         with Progress(problem.steps, self.label, progress) as bar, quiet():
-            found, increments = run.forward(partial(bar.advance, 1))
-            found = run.smoothed(found, lag)
+            filtered, increments = run.forward(partial(bar.advance, 1))
+            found = run.smoothed(filtered, lag)
+            both = run.whole(filtered), run.whole(found)
+        warn_where_lost(run.data.layouts[0], *both, run.last_rows, run.data.series.start)
         kind = "smooth" if lag is None else "fixed-lag"
         return run.answers(kind, found, increments, queries)
 

@@ -108,12 +108,16 @@ class Modes:
         for name in layout.computed:
             if name not in layout.slices.interface or name in self.names:
                 continue
-            if self.reach(layout, name) or self.reach(layout, name, PREVIOUS):
+            if self.tell(layout, name):
                 return (
                     f"node {name!r} is computed from finite nodes and read by the next slice, which should "
                     "read those nodes themselves"
                 )
         return None
+
+    def tell(self, layout: Layout, name: str) -> bool:
+        """Whether a function reads modes of either slice."""
+        return bool(self.reach(layout, name) or self.reach(layout, name, PREVIOUS))
 
     def reach(self, layout: Layout, name: str, ending: str = "") -> frozenset[str]:
         """Nodes of the mode that a function reads, directly or through computed nodes.

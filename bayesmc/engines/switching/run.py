@@ -19,17 +19,9 @@ from bayesmc.engines.kalman.reading import reads_time
 from bayesmc.engines.kalman.slices import Layout, unknown_nodes
 from bayesmc.engines.switching.merging import Mixture
 from bayesmc.engines.switching.modes import Modes
-from bayesmc.engines.switching.passes import (
-    Back,
-    Place,
-    Smoothed,
-    advanced,
-    smoothed,
-    turned_back,
-    unsmoothed,
-    whole,
-)
+from bayesmc.engines.switching.passes import Place, advanced, whole
 from bayesmc.engines.switching.posterior import Beliefs, SwitchingSeries, answers, by_modes
+from bayesmc.engines.switching.smoothing import last_rows, smoothed_back
 from bayesmc.engines.switching.stretches import Stretch
 from bayesmc.errors import DegeneracyError, UnsupportedError, ZeroProbabilityError
 from bayesmc.lowering import gaussian_loops, is_available
@@ -103,25 +95,12 @@ class SwitchingRun:
 
     def smoothed(self, filtered: list[Mixture], lag: int | None) -> list[Mixture]:
         """The same given all rows, or those of so many slices later: Kim's smoother."""
-        carried, steps, places = self.data.layouts[0].carried, self.data.steps, self.places
-        filtered = [whole(place, found) for place, found in zip(places, filtered, strict=True)]
-        backs: list[Back | None] = [None] * steps
-        for k in range(1, steps):
-            backs[k] = turned_back(filtered[k - 1], places[k])
-        found: list[Mixture] = [filtered[-1]] * steps
-        ends = [steps - 1] if lag is None else range(steps)
-        for end in ends:
-            here = unsmoothed(filtered[end], carried)
-            stop = 0 if lag is None else max(0, end - lag)
-            if lag is None or end == steps - 1 or not lag:
-                found[end] = filtered[end]
-            for k in range(end, stop, -1):
-                back = backs[k]
-                assert back is not None
-                here = smoothed(back, places[k], filtered[k], here)
-                if lag is None or end == steps - 1 or k - 1 == end - lag:
-                    found[k - 1] = _applied(filtered[k - 1], here)
-        return found
+        return smoothed_back(self.places, filtered, self.last_rows, lag)
+
+    @cached_property
+    def last_rows(self) -> np.ndarray:
+        """The last slice with data so far, shape (time, *lead)."""
+        return last_rows(self.data, self.modes, self.observed)
 
     @cached_property
     def places(self) -> list[Place]:
@@ -323,7 +302,7 @@ def row_taken(
     after = whole(place, after)
     check_row(row.t, increment, place, None if before is None else before.found)
     known = {n: row.seen[n].value for n in seen}
-    plain = (n for n in layout.computed if n not in modes.names and not _of_modes(modes, layout, n))
+    plain = (n for n in layout.computed if n not in modes.names and not modes.tell(layout, n))
     known |= {n: _evaluated(layout, n, {**static, **values}) for n in plain}
     state = SwitchingState(modes, stretch.pairs.now, after, layout, known, told, observed, memory)
     return state, increment
@@ -375,15 +354,6 @@ def _check_count(count: int, options: Options) -> None:
         )
 
 
-def _applied(filtered: Mixture, later: Smoothed) -> Mixture:
-    """Numbers whose noise has other moments than the filter's."""
-    c = later.noise.shape[-1]
-    left = filtered.factor[..., :c]
-    mean = filtered.mean + np.matvec(left, later.noise)
-    factor = np.concatenate([left @ later.spread, filtered.factor[..., c:]], axis=-1)
-    return Mixture(later.log, mean, factor)
-
-
 def _is_carried(layout: Layout, pattern: Pattern) -> bool:
     """Whether the next slice reads numbers that are observed in this one."""
     return pattern.given is not None and bool(pattern.given[..., : layout.carried].any())
@@ -403,10 +373,6 @@ def _is_still(modes: Modes, layout: Layout) -> bool:
     given = {*modes.names, *modes.leaves}
     known = {*given, *(n + PREVIOUS for n in modes.names), *layout.computed}
     return set(layout.certain) <= given and not reads_time(layout, known)
-
-
-def _of_modes(modes: Modes, layout: Layout, name: str) -> bool:
-    return bool(modes.reach(layout, name) or modes.reach(layout, name, PREVIOUS))
 
 
 def _evaluated(layout: Layout, name: str, values: dict[str, np.ndarray]) -> np.ndarray:
