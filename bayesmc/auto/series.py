@@ -236,7 +236,9 @@ def explained_series(
     if engine is None:
         chosen, reasons, refused, _ = _choose(problem, asked)
         nodes = chosen.describe(problem)
-        return Explanation(chosen, reasons, refused, nodes, effort=chosen.effort_for(problem, asked))
+        return Explanation(
+            chosen, reasons, refused, nodes, effort=chosen.effort_for(problem, asked)
+        )
     checked = _checked(engine)
     why = _why_not(checked, problem, asked)
     if why is None:

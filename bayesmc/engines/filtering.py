@@ -384,8 +384,9 @@ def in_slice(t: int) -> Iterator[None]:
     try:
         yield
     except BayesmcError as error:
-        if not re.search(rf"\bslice {t}\b", str(error)):
-            error.args = (f"slice {t}: {error}", *error.args[1:])
+        told = str(error)
+        if not re.search(rf"\bslice {t}\b", told) and not re.match(r"slice \d+: ", told):
+            error.args = (f"slice {t}: {told}", *error.args[1:])
         raise
     except Exception as error:  # somebody else's: its arguments may mean anything
         with suppress(AttributeError):

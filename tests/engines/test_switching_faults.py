@@ -12,7 +12,7 @@ import bayesmc as bmc
 from bayesmc import SwitchingKalmanFilter
 from bayesmc.dbn import pose_series
 from bayesmc.engines.kalman.data import pattern_of
-from bayesmc.errors import EngineWarning, ZeroProbabilityError
+from bayesmc.errors import EngineWarning, ParameterError, ZeroProbabilityError
 from bayesmc.testing import session
 from bayesmc.testing.makers.switching_dbns import random_switching_dbn
 
@@ -32,9 +32,7 @@ def sensors() -> bmc.DynamicBayesNet:
     """A number that two sensors see."""
     dbn = bmc.DynamicBayesNet(plates={"k": 2})
     dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
-    dbn.add(
-        "x", lambda x_prev, s: bmc.Normal(x_prev + s, 0.3 + s), initial=bmc.Normal(0.0, 1.0)
-    )
+    dbn.add("x", lambda x_prev, s: bmc.Normal(x_prev + s, 0.3 + s), initial=bmc.Normal(0.0, 1.0))
     dbn.add("y", lambda x: bmc.Normal(x, 0.3), plates=["k"])
     return dbn
 
@@ -155,7 +153,11 @@ PRICES = [0.1, 0.0, 0.3, None, 2.6, 1.1, 1.4]
 @pytest.mark.parametrize("merging", RULES)
 @pytest.mark.parametrize("lag", [None, 2])
 def test_rows_without_data_at_the_end_change_nothing(merging: Any, lag: int | None) -> None:
-    dbn, engine, options = stock(), SwitchingKalmanFilter(merging), {} if lag is None else {"lag": lag}
+    dbn, engine, options = (
+        stock(),
+        SwitchingKalmanFilter(merging),
+        {} if lag is None else {"lag": lag},
+    )
     short = bmc.smooth(dbn, {"price": PRICES}, engine=engine, **options)
     rows = {"price": [*PRICES, None, None, None, None, None]}
     filtered = bmc.filter(dbn, rows, engine=engine)
@@ -165,7 +167,9 @@ def test_rows_without_data_at_the_end_change_nothing(merging: Any, lag: int | No
         for moment in ("mean", "var"):
             one = getattr(found, moment)(name)
             np.testing.assert_array_equal(one[:steps], getattr(short, moment)(name))
-            np.testing.assert_array_equal(one[steps - 1 :], getattr(filtered, moment)(name)[steps - 1 :])
+            np.testing.assert_array_equal(
+                one[steps - 1 :], getattr(filtered, moment)(name)[steps - 1 :]
+            )
     now = found.probabilities("regime")
     np.testing.assert_array_equal(now[:steps], short.probabilities("regime"))
     np.testing.assert_array_equal(now[steps:], filtered.probabilities("regime")[steps:])
@@ -224,3 +228,72 @@ def test_random_templates_raise_no_false_alarm_of_gaps() -> None:
             engine = SwitchingKalmanFilter()
             bmc.smooth(case.dbn, case.observations, inputs=case.inputs, engine=engine)
         assert not [w for w in told if issubclass(w.category, EngineWarning)], seed
+
+
+# ---- parameters that are bad where modes cannot be ----------------------------------------------
+
+
+def bad_where(which: str) -> bmc.DynamicBayesNet:
+    """Mode 1 is impossible where ``u`` is negative, and so are some scales of it."""
+    dbn = bmc.DynamicBayesNet()
+    dbn.input("u")
+    start = bmc.Bernoulli(0.5 if which == "now" else 0.0)
+    if which == "table":  # a bad probability where the mode before cannot be
+        dbn.add(
+            "s",
+            lambda s_prev, u: bmc.Bernoulli(
+                np.where((s_prev == 1) & (u < 0), 2.0, np.where(u > 0, 0.3, 0.0))
+            ),
+            initial=start,
+        )
+    else:
+        dbn.add("s", lambda s_prev, u: bmc.Bernoulli(np.where(u > 0, 0.3, 0.0)), initial=start)
+    x0 = bmc.Normal(0.0, 1.0)
+    if which == "before":
+        dbn.add(
+            "x",
+            lambda x_prev, s_prev, u: bmc.Normal(x_prev, np.where(s_prev == 1, u, 1.0)),
+            initial=x0,
+        )
+    else:
+        dbn.add("x", lambda x_prev, s, u: bmc.Normal(x_prev, np.where(s == 1, u, 1.0)), initial=x0)
+    dbn.add("y", lambda x: bmc.Normal(x, 0.3))
+    return dbn
+
+
+BAD = [
+    ("now", [1.0, -1.0, 2.0, -6.0, 1.0]),
+    ("before", [1.0, -1.0, -2.0, -2.0, 1.0]),
+    ("table", [1.0, -1.0, -2.0, 1.0, 2.0]),
+]
+
+
+@pytest.mark.parametrize("linearize", [False, True])
+@pytest.mark.parametrize(("which", "u"), BAD)
+def test_what_is_bad_only_where_modes_cannot_be_is_no_matter(
+    which: str, u: Any, linearize: bool
+) -> None:
+    """Where the mode is sure in every slice but the last, the answer is exact."""
+    dbn, rows = bad_where(which), {"y": [0.1, 0.2, 0.3, 0.4, 0.5]}
+    engine = SwitchingKalmanFilter(linearize=linearize)
+    found = bmc.filter(dbn, rows, inputs={"u": u}, engine=engine)
+    right = bmc.infer(dbn, rows, inputs={"u": u}, engine=bmc.Exact())
+    assert abs(found.mean("x")[-1] - right.mean("x[4]")) < 1e-4
+    bound = 1e-9 if which == "before" else 0.01
+    assert abs(found.log_marginal_likelihood - right.log_marginal_likelihood) < bound
+    smoothed = bmc.smooth(dbn, rows, inputs={"u": u}, engine=engine)
+    assert abs(smoothed.mean("x")[0] - right.mean("x[0]")) < 1e-2
+    belief = engine.start(dbn)
+    for t in range(5):
+        belief = engine.step(belief, {"y": rows["y"][t]}, inputs={"u": u[t]})
+    assert abs(belief.mean("x") - found.mean("x")[-1]) < 1e-9
+
+
+def test_what_is_bad_where_a_mode_can_be_is_told_with_one_slice_and_the_mode() -> None:
+    dbn, rows = bad_where("now"), {"y": [0.1, 0.2, 0.3, 0.4, 0.5]}
+    dbn.add("z", lambda x, u, s: bmc.Normal(x, np.where((u < -5) & (s == 0), u, 1.0)))
+    inputs = {"u": [1.0, -1.0, 2.0, -6.0, 1.0]}
+    with pytest.raises(ParameterError) as told:
+        bmc.filter(dbn, {**rows, "z": rows["y"]}, inputs=inputs, engine=SwitchingKalmanFilter())
+    told_of = "slice 3: node 'z': Normal: scale must be positive and finite; got -6."
+    assert str(told.value) == f"{told_of} (where s is 0, s_prev is 0)"

@@ -104,11 +104,12 @@ class SwitchingKalmanFilter(FilterEngine):
     s[t], s[t+1], all rows) is p(x[t+1] | s[t+1], all rows), numbers given two modes as given the later one
     alone. The second fails where rows are missing that would tell which modes went with which numbers: before
     and within a gap smoothed deviations come out too wide, and it warns (EngineWarning) where they are more
-    than 1.5 times the filtered ones. From the last row with data on they are the filtered ones. Gaussians are carried as triangular
-    roots of their covariances, and merged as such; no covariance is subtracted or inverted. All pairs of
-    modes are one array operation, with ``linearize`` one after the other. Plates whose elements never
-    meet have a mode for each element. Finite nodes that nothing reads are averaged over where they are
-    missing, and so are other families that depend on modes alone.
+    than 1.5 times the filtered ones. From the last row with data on they are the filtered ones.
+
+    Gaussians are carried as triangular roots of their covariances, and merged as such; no covariance is
+    subtracted or inverted. All pairs of modes are one array operation, with ``linearize`` one after the
+    other. Plates whose elements never meet have a mode for each element. Finite nodes that nothing reads are
+    averaged over where they are missing, and so are other families that depend on modes alone.
 
     References
     ----------

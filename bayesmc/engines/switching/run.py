@@ -63,13 +63,22 @@ class SwitchingRun:
             later = data.values(1, data.steps), self._seen(1, data.steps), data.steps - 1
             while True:
                 _check_count(len(self.now), options)
-                found = Stretch(data.layouts[1], modes, *later, self.now, rule=rule)
+                start = self._reached(first)
+                found = Stretch(data.layouts[1], modes, *later, self.now, rule=rule, reached=start)
                 more = np.union1d(self.now, found.pairs.now)
                 if len(more) == len(self.now):
                     break
                 self.now = more
             self.stretches.append(
-                Stretch(data.layouts[1], modes, *later, self.now, self.now, rule=rule)
+                Stretch(
+                    data.layouts[1],
+                    modes,
+                    *later,
+                    self.now,
+                    self.now,
+                    rule,
+                    self._reached(first),
+                )  # fmt: skip
             )
         _check_count(len(self.now), options)
 
@@ -186,6 +195,13 @@ class SwitchingRun:
             for n, o in self.observed.items()
             if n in wanted
         }
+
+    def _reached(self, first: Stretch) -> np.ndarray:
+        """Which modes slice 0 can have, shape (modes, *lead)."""
+        pairs, log = first.pairs, first.log_of(0)
+        found = np.zeros((len(self.now), *log.shape[1:]), dtype=bool)
+        found[np.searchsorted(self.now, pairs.now[pairs.dst])] = log > -np.inf
+        return found
 
     def _over_all(self, first: Mixture) -> Mixture:
         """Slice 0 over all modes that there are later; those that it cannot have weigh nothing."""

@@ -56,8 +56,8 @@ def last_rows(data: SeriesData, modes: Modes, observed: Mapping[str, Observed]) 
         if seen.parts is not None:
             mask = mask | seen.parts.any(axis=tuple(range(mask.ndim, seen.parts.ndim)))
         node = layout.model[name]
-        mask = mask.reshape(steps, *node.plate_shape, -1).any(axis=-1)
-        here = summed(mask.astype(float), node, layout.apart) > 0
+        by_element = mask.reshape(steps, *node.plate_shape, -1).sum(axis=-1, dtype=float)
+        here = summed(by_element, node, layout.apart) > 0
         some |= here.reshape(steps, *here.shape[1:], *(1,) * (some.ndim - here.ndim))
     clock = np.arange(steps).reshape(-1, *(1,) * len(layout.lead))
     return np.maximum.accumulate(np.where(some, clock, -1), axis=0)

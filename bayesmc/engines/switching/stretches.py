@@ -6,8 +6,8 @@ All pairs of modes (``pairs``) and all slices of a stretch are worked out togeth
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from typing import Any
 
@@ -21,14 +21,17 @@ from bayesmc.engines.kalman.levels import Plan, Rule, expected_slice
 from bayesmc.engines.kalman.passes import Ahead, Expected, Memory
 from bayesmc.engines.kalman.reading import Linear, composed, reads_time
 from bayesmc.engines.kalman.slices import Layout
+from bayesmc.engines.switching.mode_factors import (
+    along_time,
+    log_factors,
+    modes_along,
+    running_totals,
+)
 from bayesmc.engines.switching.modes import Modes
 from bayesmc.engines.switching.pairs import Pairs
-from bayesmc.errors import BayesmcError, UnsupportedError
+from bayesmc.errors import BayesmcError, ParameterError, UnsupportedError
 from bayesmc.lowering import Coefficients
 from bayesmc.network import Observed
-from bayesmc.network.forward import summed
-from bayesmc.network.model import invalid_error
-from bayesmc.network.noiseless import point_log_density
 
 #: entries of a table over time and pairs
 _ENTRIES = 1 << 25
@@ -52,6 +55,9 @@ class Stretch:
         or not; by default those that are possible.
     rule : Rule or None
         Makes slices linear that are not.
+    reached : ndarray of bool, shape (before, *lead), optional
+        Which configurations can be there just before the first slice; by default all of them. What is bad
+        only where modes cannot be is not refused.
 
     Attributes
     ----------
@@ -74,6 +80,7 @@ class Stretch:
         before: np.ndarray | None,
         now: np.ndarray | None = None,
         rule: Rule | None = None,
+        reached: np.ndarray | None = None,
     ) -> None:
         self.layout, self.modes, self.rule = layout, modes, rule
         static = layout.slices.template.static
@@ -82,6 +89,7 @@ class Stretch:
         self.count, self._observed = count, observed
         self._memory = Memory()
         self._plan: Plan | None = None
+        self._reached = reached
         #: whether some row was met that machine code leaves to NumPy
         self.is_singular = rule is not None
         every = np.arange(modes.count) if now is None else now
@@ -178,15 +186,14 @@ class Stretch:
         before : ndarray, shape (modes before or 1, *lead)
             Log probabilities.
         """
-        part = slice(k, k + 1)
         modes = modes_along(self.modes.at(np.arange(self.modes.count)), 1)
         if len(self.pairs.before):
             modes |= modes_along(self.modes.at(self.pairs.before, PREVIOUS), 2)
-        timed = along_time({n: v[part] for n, v in self.timed.items()}, 2)
-        seen = {n: _rows(o, part) for n, o in self._observed.items()}
+        timed, seen = self._slice(k, self._observed)
+        timed = along_time(timed, 2)
         values = {**self.fixed, **timed, **modes}
         start = np.where(before > -np.inf, 0.0, -np.inf)[None, :, None]
-        for name, total in _running(self.layout, self.modes, values, seen, start):
+        for name, total in running_totals(self.layout, self.modes, values, seen, start):
             if (total == -np.inf).all(axis=(0, 1, 2)).any():
                 return name
         return None
@@ -228,11 +235,16 @@ class Stretch:
             modes |= modes_along(self.modes.at(before, PREVIOUS), 2)
         size = len(now) * (1 if before is None else len(before)) * math.prod(self.layout.lead)
 
-        def over(timed: dict[str, np.ndarray], seen: Mapping[str, Observed]) -> np.ndarray:
+        def over(timed: dict[str, np.ndarray], seen: Any, start: Any = None) -> np.ndarray:
             values = {**self.fixed, **along_time(timed, 2), **modes}
-            return log_factors(self.layout, self.modes, values, seen)
+            return log_factors(self.layout, self.modes, values, seen, start)
 
-        found = self._in_time(over, observed)
+        try:
+            found = self._in_time(over, observed)
+        except ParameterError:
+            if before is None:
+                raise
+            found = self._in_turn(over, observed, np.searchsorted(now, before))
         if found.size > _ENTRIES or size > _ENTRIES:
             raise UnsupportedError(
                 f"modes of {self.count} slices and of those before make tables of {found.size:.3g} numbers; "
@@ -241,20 +253,113 @@ class Stretch:
         whole = (len(found), 1 if before is None else len(before), len(now), *self.layout.lead)
         return np.broadcast_to(found, whole)
 
+    def _in_turn(
+        self, over: Callable[..., np.ndarray], observed: Mapping[str, Observed], before: np.ndarray
+    ) -> np.ndarray:
+        """Slice by slice, each from the modes that can be there before; ``before`` are their places now."""
+        reached = self._all_before(len(before)) if self._reached is None else self._reached
+        parts: list[np.ndarray] = []
+        for k in range(self.count):
+            start = np.where(reached, 0.0, -np.inf)[None, :, None]
+            timed, seen = self._slice(k, observed)
+            with self._naming(k):
+                parts.append(over(timed, seen, start))
+            arrived = np.asarray((parts[-1] > -np.inf).any(axis=(0, 1)))
+            reached = (
+                arrived[before] if len(arrived) > 1 else np.broadcast_to(arrived, reached.shape)
+            )
+        whole = np.broadcast_shapes(*(p.shape[1:] for p in parts))
+        return np.concatenate([np.broadcast_to(p, (1, *whole)) for p in parts])
+
+    def _all_before(self, count: int) -> np.ndarray:
+        return np.ones((count, *self.layout.lead), dtype=bool)
+
     def _coefficients(self) -> Linear:
         layout, pairs = self.layout, self.pairs
         values = modes_along(pairs.values(self.modes, pairs.of_kind), 0)
         still = {*values, *layout.computed}
 
-        def over(timed: dict[str, np.ndarray], seen: Mapping[str, Observed]) -> Linear:
+        def over(timed: dict[str, np.ndarray]) -> Linear:
             count = len(next(iter(timed.values()))) if timed else 1
             known = {**self.fixed, **along_time(timed, 1), **values}
             return composed(layout, known, (count, len(pairs.of_kind)))
 
-        if not reads_time(layout, still):
-            return over({n: v[:1] for n, v in self.timed.items()}, {})
-        parts: list[Linear] = self._in_time(lambda timed, seen: [over(timed, seen)], {})
+        def one(k: int, needed: np.ndarray) -> Linear:
+            timed = self._slice(k, {})[0]
+            try:
+                return over(timed)
+            except BayesmcError:
+                return self._each({n: v[0] for n, v in timed.items()}, needed)
+
+        timeless = not reads_time(layout, still)
+        try:
+            return over({n: v[:1] for n, v in self.timed.items()} if timeless else self.timed)
+        except (
+            BayesmcError
+        ):  # slice by slice they say in which one, and what is impossible there is left out
+            needed = self._needed
+        if timeless:
+            with self._naming(0):
+                return one(0, np.asarray(needed.any(axis=0)))
+        parts = []
+        for k in range(self.count):
+            with self._naming(k):
+                parts.append(one(k, needed[k]))
         return Linear(*(np.concatenate(p) for p in zip(*parts, strict=True)))
+
+    def _each(self, timed: dict[str, np.ndarray], needed: np.ndarray) -> Linear:
+        """Of one slice, kind by kind; those that are not needed have another's coefficients if they fail."""
+        layout, pairs = self.layout, self.pairs
+        found: list[Linear | None] = []
+        for kind, pair in enumerate(pairs.of_kind):
+            values = pairs.values(self.modes, np.asarray(pair))
+            try:
+                found.append(composed(layout, {**self.fixed, **timed, **values}, ()))
+            except BayesmcError as error:
+                if needed[kind] or not needed.any():
+                    shown = (
+                        f"{n} is {_label(layout, n, v)}" for n, v in values.items() if not v.ndim
+                    )
+                    words = ", ".join(shown)
+                    told = f"{error} (where {words})" if words else str(error)
+                    error.args = (told, *error.args[1:])
+                    raise
+                found.append(None)
+        some = found[int(needed.argmax())]
+        assert some is not None
+        whole = [some if f is None else f for f in found]
+        return Linear(*(np.concatenate(p)[None] for p in zip(*whole, strict=True)))
+
+    @cached_property
+    def _needed(self) -> np.ndarray:
+        """Which kinds can be in which slice, shape (time, kinds)."""
+        pairs = self.pairs
+        found = np.zeros((self.count, len(pairs.of_kind)), dtype=bool)
+        count = max(len(pairs.before), 1)
+        reached = self._all_before(count) if self._reached is None else self._reached
+        src = pairs.src if len(pairs.before) else np.zeros(len(pairs.dst), dtype=np.intp)
+        for k in range(self.count):
+            can = (self.log_of(k) > -np.inf) & reached[src]
+            np.logical_or.at(found[k], pairs.kind, can.reshape(len(can), -1).any(axis=1))
+            if (
+                len(pairs.now) == count
+            ):  # later slices go from the modes of one to the same of the next
+                reached = np.zeros_like(reached)
+                np.logical_or.at(reached, pairs.dst, can)
+        return found
+
+    def _slice(
+        self, k: int, observed: Mapping[str, Observed]
+    ) -> tuple[dict[str, np.ndarray], dict[str, Observed]]:
+        """Values of the k-th slice, with an axis of length 1 for time."""
+        part = slice(k, k + 1)
+        return {n: v[part] for n, v in self.timed.items()}, {
+            n: _rows(o, part) for n, o in observed.items()
+        }
+
+    def _naming(self, k: int) -> AbstractContextManager[None]:
+        """Has errors say which slice they happened in, if there are several."""
+        return in_slice(int(self.timed[TIME][k])) if self.count > 1 else nullcontext()
 
     def _in_time(self, function: Callable[..., Any], observed: Mapping[str, Observed]) -> Any:
         """A function of all slices at once, or one by one where functions do not take arrays of slices."""
@@ -263,13 +368,8 @@ class Stretch:
         except BayesmcError:  # one by one they say in which slice
             parts = []
             for k in range(self.count):
-                part = slice(k, k + 1)
-                clock = int(self.timed[TIME][k])
-                with in_slice(clock) if self.count > 1 else nullcontext():
-                    timed = {n: v[part] for n, v in self.timed.items()}
-                    parts.append(function(timed, {n: _rows(o, part) for n, o in observed.items()}))
-        if isinstance(parts[0], list):
-            return [one for part in parts for one in part]
+                with self._naming(k):
+                    parts.append(function(*self._slice(k, observed)))
         whole = np.broadcast_shapes(*(p.shape[1:] for p in parts))
         return np.concatenate([np.broadcast_to(p, (1, *whole)) for p in parts])
 
@@ -278,13 +378,22 @@ class Stretch:
     ) -> Expected:
         """One after the other, each made linear at its own mean."""
         assert self.rule is not None
-        layout, parts = self.layout, []
+        layout = self.layout
+        found: list[tuple[np.ndarray, np.ndarray] | None] = []
         pairs = self.pairs.of_kind if by_kind else np.arange(len(self.pairs.dst))
         for unit, pair in enumerate(pairs):
             values = self.known(k, int(pair))
             plan = self._plan = self._plan or Plan(layout, values)
             ahead = Ahead(layout, values, mean[unit], factor[unit], pattern, self._memory)
-            parts.append(expected_slice(ahead, self.rule, plan))
+            try:
+                found.append(expected_slice(ahead, self.rule, plan))
+            except ParameterError:
+                needed = self._needed[k]
+                if needed[self.pairs.kind[pair]] or not needed.any():
+                    raise
+                found.append(None)
+        some = next(p for p in found if p is not None)
+        parts = [some if p is None else p for p in found]
         widest = max(rows.shape[-1] for _, rows in parts)
         wide = [
             np.concatenate([r, np.zeros((*r.shape[:-1], widest - r.shape[-1]))], axis=-1)
@@ -293,98 +402,7 @@ class Stretch:
         return Expected(np.stack([m for m, _ in parts]), np.stack(wide))
 
 
-def along_time(timed: Mapping[str, np.ndarray], behind: int) -> dict[str, np.ndarray]:
-    """Values with time first and so many further batch axes of length 1 behind it."""
-    return {n: v.reshape(len(v), *(1,) * behind, *v.shape[1:]) for n, v in timed.items()}
-
-
-def modes_along(values: Mapping[str, np.ndarray], behind: int) -> dict[str, np.ndarray]:
-    """Values by configuration as a batch: time and, for the last of two, the mode before are in front.
-
-    With ``behind`` 2 they are those of the slice before, and this slice's mode has the axis behind them.
-    """
-    shape = {0: (1, -1), 1: (1, 1, -1), 2: (1, -1, 1)}[behind]
-    return {
-        n: v.reshape(*(len(v) if s < 0 else s for s in shape), *v.shape[1:])
-        for n, v in values.items()
-    }
-
-
-def log_factors(
-    layout: Layout,
-    modes: Modes,
-    values: dict[str, np.ndarray],
-    observed: Mapping[str, Observed],
-) -> np.ndarray:
-    """Log densities of all nodes that depend on modes and data alone, shape (time, before, now, *lead).
-
-    Parameters
-    ----------
-    values : dict
-        Known values and those of modes, with batch axes of time, the modes before and the modes now.
-    observed : dict
-        What is seen of modes and of nodes that may be missing, time first.
-
-    Raises
-    ------
-    ParameterError
-        Bad parameters where modes are possible.
-    """
-    total = np.zeros((1, 1, 1, *(1,) * len(layout.lead)))
-    for _, total in _running(layout, modes, values, observed, total):
-        pass
-    return total
-
-
 # ---- private ------------------------------------------------------------------------------------
-
-
-def _running(
-    layout: Layout,
-    modes: Modes,
-    values: dict[str, np.ndarray],
-    observed: Mapping[str, Observed],
-    total: Any,
-) -> Iterator[tuple[str, Any]]:
-    """A total of log densities after every node that has one; see ``log_factors``."""
-    for name in (n for n in layout.order if n in (*layout.certain, *layout.computed)):
-        node, model = layout.model[name], layout.model
-        is_mode = name in modes.names
-        if name in layout.computed:
-            result = model.evaluate(name, values)[0]
-            if is_mode:
-                log = np.where(result == values[name], 0.0, -np.inf)
-                total = total + summed(log, node, layout.apart)
-            else:
-                values[name] = result
-        else:
-            seen = observed.get(name)
-            mask = None
-            if not is_mode and name in modes.leaves:
-                if seen is None:
-                    continue
-                values[name], mask = _behind_time(seen.value), seen.mask
-            result, batch = model.evaluate(name, values)
-            if result.invalid is not None:
-                error = invalid_error(node, result, _counts(total, batch), batch, noiseless=True)
-                if error is not None:
-                    raise error
-            log = None
-            if result.noiseless is not None:
-                log = point_log_density(model, name, result, values)
-            if log is None:
-                log = model.log_density(name, result, values[name])
-            if mask is not None:
-                log = np.where(_behind_time(mask), log, 0.0)
-            total = total + summed(np.asarray(log), node, layout.apart)
-        if is_mode and name in observed:
-            seen = observed[name]
-            off = values[name] != _behind_time(seen.value)
-            if seen.mask is not None:
-                off = off & _behind_time(seen.mask)
-            total = total + summed(np.where(off, -np.inf, 0.0), node, layout.apart)
-        yield name, total
-
 
 
 def _moments(model: Any, name: str, values: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -405,16 +423,9 @@ def _moments(model: Any, name: str, values: Mapping[str, np.ndarray]) -> np.ndar
     return np.broadcast_to(found, (*found.shape[:2], *node.value_shape, found.shape[-1]))
 
 
-def _behind_time(array: np.ndarray) -> np.ndarray:
-    return array.reshape(len(array), 1, 1, *array.shape[1:])
-
-
-def _counts(total: np.ndarray, batch: tuple[int, ...]) -> np.ndarray:
-    """Which parts of a batch are possible so far."""
-    single = tuple(axis for axis in range(3) if not batch or batch[axis] == 1)
-    largest = np.max(total.reshape(*total.shape[:3], -1), axis=3)
-    possible = np.max(largest, axis=single, keepdims=True) > -np.inf
-    return np.broadcast_to(possible, batch) if batch else possible.reshape(())
+def _label(layout: Layout, name: str, stored: np.ndarray) -> str:
+    domain = layout.slices.first[name.removesuffix(PREVIOUS)].domain
+    return repr(domain.states[int(stored)]) if domain is not None else str(stored)
 
 
 def _rows(seen: Observed, part: slice) -> Observed:
