@@ -186,6 +186,12 @@ def _elements(
                 f"BoyenKoller(clusters=): {(name, *at)!r}: node {name!r} has plates "
                 f"{dict(zip(node.plates, node.plate_shape, strict=True))}; give one position in each"
             )
+        alone = [p for p in node.plates if p in apart]
+        if at and alone:
+            raise UnsupportedError(
+                f"BoyenKoller(clusters=): {(name, *at)!r}: elements of plate {alone[0]!r} never meet, "
+                f"and each is filtered by itself with the same clusters; name all of them at once, {name!r}"
+            )
     sizes = {
         p: size
         for name, *at in names if not at
