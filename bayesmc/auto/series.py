@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -268,7 +269,9 @@ def _engine(problem: SeriesProblem, engine: FilterEngine | None, asked: Asked) -
         return engine  # what else it cannot do, its own method says best
     others = [c() for c in _CANDIDATES if not isinstance(engine, c)]
     able = next((type(o).__name__ for o in others if _why_not(o, problem, asked) is None), None)
-    raise UnsupportedError(reason if able is None else f"{reason}. {able}() can answer")
+    if able is None or re.search(rf"\buse [^.;]*\b{able}\b", reason):  # which says it already
+        raise UnsupportedError(reason)
+    raise UnsupportedError(f"{reason}. {able}() can answer")
 
 
 class _Chosen(NamedTuple):

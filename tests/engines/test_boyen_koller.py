@@ -16,7 +16,12 @@ import bayesmc as bmc
 from bayesmc.dbn import pose_series
 from bayesmc.engines.factored import coupling
 from bayesmc.engines.factored.slices import FactoredSlices
-from bayesmc.errors import UnknownNodeError, UnsupportedError, ZeroProbabilityError
+from bayesmc.errors import (
+    ModelMisfitWarning,
+    UnknownNodeError,
+    UnsupportedError,
+    ZeroProbabilityError,
+)
 from tests.engines.factored_references import boyen_koller, coupled, factored_frontier, margin
 from tests.matrix_time import MANY, Whole, cases
 
@@ -685,3 +690,35 @@ def test_what_no_cluster_holds_has_a_budget(monkeypatch: pytest.MonkeyPatch) -> 
     assert found.expectation(lambda x0: x0 * 1.0).shape == (3,)
     with pytest.raises(bmc.errors.BudgetError, match="x0, x3 together, which no cluster holds"):
         found.expectation(lambda x0, x3: x0 * x3 * 1.0)
+
+
+def test_elements_of_a_plate_filtered_apart_are_not_named_one_by_one() -> None:
+    dbn = bmc.DynamicBayesNet(plates={"k": 2})
+    infects = [[[0.95, 0.05], [0.3, 0.7]], [[0.7, 0.3], [0.2, 0.8]]]
+    dbn.table("a", ["b_prev", "a_prev"], infects, initial=[0.9, 0.1], plates="k")
+    dbn.table("b", ["a_prev", "b_prev"], infects, initial=[0.9, 0.1], plates="k")
+    dbn.table("test", ["a"], [[0.9, 0.1], [0.2, 0.8]], plates="k")
+    rows = {"test": [[0, 1], [1, 1]]}
+    named = [[("a", 0), ("b", 0)], [("a", 1)], [("b", 1)]]
+    with pytest.raises(UnsupportedError, match=r"\('a', 0\): elements of plate 'k' never meet"):
+        bmc.filter(dbn, rows, engine=bmc.BoyenKoller(named))
+    bmc.filter(dbn, rows, engine=bmc.BoyenKoller([["a", "b"]]))
+
+
+@pytest.mark.parametrize("family", [bmc.BoyenKoller, bmc.FactoredFrontier])
+def test_they_say_who_they_are_and_that_answers_are_approximate(family: Any) -> None:
+    dbn = bmc.DynamicBayesNet()
+    infects = [[[0.999, 0.001], [0.5, 0.5]], [[0.5, 0.5], [0.2, 0.8]]]
+    dbn.table("a", ["b_prev", "a_prev"], infects, initial=[0.999, 0.001])
+    dbn.table("b", ["a_prev", "b_prev"], infects, initial=[0.999, 0.001])
+    dbn.table("test", ["a"], [[0.999, 0.001], [0.9, 0.1]])
+    engine = bmc.BoyenKoller([["a"], ["b"]]) if family is bmc.BoyenKoller else family()
+    rows = {"test": np.ones(60, dtype=int)}
+    for ask in (bmc.filter, bmc.smooth):
+        with pytest.warns(ModelMisfitWarning, match=family.__name__) as told:
+            ask(dbn, rows, engine=engine)
+        assert not any("DiscreteFilter" in str(w.message) for w in told)
+    for question in ("filter", "smooth", "fixed-lag", "forecast"):
+        assert "approximate" in str(bmc.explain(dbn, rows, engine=engine, question=question))
+    with pytest.raises(ValueError, match="positive number of bytes"):
+        family(max_bytes=True)

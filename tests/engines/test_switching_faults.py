@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import warnings
 from typing import Any
 
@@ -12,7 +14,7 @@ import bayesmc as bmc
 from bayesmc import SwitchingKalmanFilter
 from bayesmc.dbn import pose_series
 from bayesmc.engines.kalman.data import pattern_of
-from bayesmc.errors import EngineWarning, ParameterError, ZeroProbabilityError
+from bayesmc.errors import EngineWarning, ParameterError, UnsupportedError, ZeroProbabilityError
 from bayesmc.testing import session
 from bayesmc.testing.makers.switching_dbns import random_switching_dbn
 
@@ -297,3 +299,43 @@ def test_what_is_bad_where_a_mode_can_be_is_told_with_one_slice_and_the_mode() -
         bmc.filter(dbn, {**rows, "z": rows["y"]}, inputs=inputs, engine=SwitchingKalmanFilter())
     told_of = "slice 3: node 'z': Normal: scale must be positive and finite; got -6."
     assert str(told.value) == f"{told_of} (where s is 0, s_prev is 0)"
+
+
+# ---- remedies -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("has_modes", [False, True])
+def test_remedies_that_are_named_can_answer(has_modes: bool) -> None:
+    """A hidden count is for none of them; what counts by a hidden number is for those made linear."""
+    hidden, seen = bmc.DynamicBayesNet(), bmc.DynamicBayesNet()
+    for dbn in (hidden, seen):
+        if has_modes:
+            dbn.table("s", ["s_prev"], [[0.9, 0.1], [0.2, 0.8]], initial=[0.5, 0.5])
+    first = bmc.Poisson(3.0)
+    if has_modes:
+        hidden.add("n", lambda n_prev, s: bmc.Poisson(1.0 + n_prev + s), initial=first)
+    else:
+        hidden.add("n", lambda n_prev: bmc.Poisson(1.0 + n_prev), initial=first)
+    hidden.add("y", lambda n: bmc.Normal(n, 1.0))
+    start = bmc.Normal(0.0, 1.0)
+    if has_modes:
+        seen.add("x", lambda x_prev, s: bmc.Normal(x_prev, 0.1 + s), initial=start)
+    else:
+        seen.add("x", lambda x_prev: bmc.Normal(x_prev, 0.1), initial=start)
+    seen.add("y", lambda x: bmc.Poisson(np.exp(x)))
+    able = {
+        "ExtendedKalmanFilter": bmc.ExtendedKalmanFilter(),
+        "UnscentedKalmanFilter": bmc.UnscentedKalmanFilter(),
+        "SwitchingKalmanFilter(linearize=True)": SwitchingKalmanFilter(linearize=True),
+        "SwitchingKalmanFilter or": SwitchingKalmanFilter(linearize=True),
+        "ParticleFilter": bmc.ParticleFilter(200),
+    }
+    for dbn, engine in itertools.product(
+        (hidden, seen), (bmc.KalmanFilter(), SwitchingKalmanFilter())
+    ):
+        with pytest.raises(UnsupportedError) as told:
+            bmc.filter(dbn, {"y": [1, 2, 3]}, engine=engine)
+        text = str(told.value)
+        assert text.count("ParticleFilter") == 1, text
+        for remedy in (r for r in able if re.search(rf"\b{re.escape(r)}", text.split("; use ")[1])):
+            bmc.filter(dbn, {"y": [1, 2, 3]}, engine=able[remedy], rng=0)

@@ -75,7 +75,8 @@ class DiscreteFilter(FiniteFilter):
             raise ValueError(
                 f"DiscreteFilter(max_states={n!r}): give a number of states, 1 or more"
             )
-        if not (isinstance(self.max_bytes, (int, float)) and self.max_bytes > 0):
+        most = self.max_bytes
+        if isinstance(most, bool) or not (isinstance(most, (int, float)) and most > 0):
             raise ValueError(
                 f"DiscreteFilter(max_bytes={self.max_bytes!r}): give a positive number of bytes"
             )

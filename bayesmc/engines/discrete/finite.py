@@ -103,7 +103,7 @@ class FiniteFilter(FilterEngine):
                 f"keep={keep!r}: a filter of tables has no particles to keep; leave it out"
             )
         found = self._answer(problem, seed, "filter", None, queries, progress)
-        warn_of_misfit(found.predictive, "DiscreteFilter", found.start, 3)
+        warn_of_misfit(found.predictive, self._name, found.start, 3)
         return found
 
     def smooth(
@@ -117,7 +117,7 @@ class FiniteFilter(FilterEngine):
     ) -> DiscretePosterior:
         kind = "smooth" if lag is None else "fixed-lag"
         found = self._answer(problem, seed, kind, lag, queries, progress)
-        warn_of_misfit(found.predictive, "DiscreteFilter", found.start, 3)
+        warn_of_misfit(found.predictive, self._name, found.start, 3)
         return found
 
     def _bound(self, belief: FiniteBelief, dbn: DynamicBayesNet, slices: Slices) -> FiniteBelief:

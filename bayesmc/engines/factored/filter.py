@@ -42,7 +42,8 @@ class FactoredFilter(FiniteFilter):
     max_bytes: float
 
     def __post_init__(self) -> None:
-        if not (isinstance(self.max_bytes, (int, float)) and self.max_bytes > 0):
+        most = self.max_bytes
+        if isinstance(most, bool) or not (isinstance(most, (int, float)) and most > 0):
             raise ValueError(
                 f"{self._name}(max_bytes={self.max_bytes!r}): give a positive number of bytes"
             )

@@ -317,7 +317,8 @@ def _others(*layouts: Layout) -> str:
     """Filters that take such slices."""
     for layout in layouts:
         nodes = [layout.model[n] for n in layout.drawn]
-        if any(n.domain is not None for n in nodes) and any(n.domain is None for n in nodes):
+        numbers = [n for n in nodes if n.domain is None]
+        if len(nodes) > len(numbers) and numbers and not any(n.is_discrete for n in numbers):
             return "use SwitchingKalmanFilter or ParticleFilter"
     if any(layout.silent or why_not_matched(layout) is not None for layout in layouts):
         return "use ParticleFilter"

@@ -273,13 +273,8 @@ class SwitchingKalmanFilter(FilterEngine):
         why = modes.why_not(layout)
         if why is not None:
             return why
-        if self.linearize:
-            why = why_not_matched(layout)
-            angular = next((n for n in layout.placed if layout.angles_of(n).any()), None)
-            if why is None and angular is not None:
-                why = f"node {angular!r} is an angle, and Gaussians of several modes are merged on a line"
-        else:
-            why = why_not_gaussian(layout, values)
+        bent = _why_not_linearized(layout)
+        why = bent if self.linearize else why_not_gaussian(layout, values)
         if why is None:
             return None
         guarded = [n for n in layout.seen if n in modes.names or n in modes.leaves]
@@ -289,9 +284,9 @@ class SwitchingKalmanFilter(FilterEngine):
                 f"the finite node {guarded[0]!r} depends on continuous nodes that are hidden (it reads "
                 f"{reads}), and modes must not; use ParticleFilter"
             )
-        if self.linearize:
+        if self.linearize or bent is not None:
             return f"{why}; use ParticleFilter"
-        if not modes.names:
+        if not modes.names and not modes.leaves:
             return f"{why}; use ExtendedKalmanFilter or ParticleFilter"
         return f"{why}; use SwitchingKalmanFilter(linearize=True) or ParticleFilter"
 
@@ -349,3 +344,15 @@ class SwitchingKalmanFilter(FilterEngine):
             why = self.refused_slice(modes, layout, values)
             if why is not None:
                 raise UnsupportedError(why)
+
+
+# ---- private ------------------------------------------------------------------------------------
+
+
+def _why_not_linearized(layout: Layout) -> str | None:
+    angular = next((n for n in layout.placed if layout.angles_of(n).any()), None)
+    if angular is None:
+        return why_not_matched(layout)
+    return why_not_matched(layout) or (
+        f"node {angular!r} is an angle, and Gaussians of several modes are merged on a line"
+    )
